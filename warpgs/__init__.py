@@ -1,0 +1,33 @@
+"""Sparse-view Gaussian splatting on any machine: `warpgs fit scene/`, or `warpgs.rasterize` for the rasterizer alone."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+__version__ = "0.1.0"
+
+__all__ = ["Camera", "Gaussians", "RasterizeOptions", "Render", "Scene", "load_scene", "rasterize"]
+
+if TYPE_CHECKING:
+    from warpgs.io.load import load_scene
+    from warpgs.rasterize import RasterizeOptions, rasterize
+    from warpgs.scene import Camera, Gaussians, Render, Scene
+
+_HOMES = {
+    "Camera": "warpgs.scene",
+    "Gaussians": "warpgs.scene",
+    "Render": "warpgs.scene",
+    "Scene": "warpgs.scene",
+    "RasterizeOptions": "warpgs.rasterize",
+    "rasterize": "warpgs.rasterize",
+    "load_scene": "warpgs.io.load",
+}
+
+
+def __getattr__(name: str):
+    # Public names load on first use: torch and Warp cost seconds that `warpgs --help` must not pay.
+    if name in _HOMES:
+        import importlib
+
+        return getattr(importlib.import_module(_HOMES[name]), name)
+    raise AttributeError(f"module 'warpgs' has no attribute {name!r}")

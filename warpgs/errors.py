@@ -1,0 +1,28 @@
+"""Errors that a user can mend, each with the exit code of its class."""
+
+
+class WarpgsError(Exception):
+    """Base of every error shown to a user without a traceback.
+
+    A message says what is wrong, where, why it matters, and how to mend it.
+    """
+
+    exit_code = 5
+
+
+class UsageError(WarpgsError):
+    """A flag or an argument cannot be honoured as given."""
+
+    exit_code = 2
+
+
+class DataError(WarpgsError):
+    """A scene, an image, a model file or a run folder is not what it must be."""
+
+    exit_code = 3
+
+
+class ResourceError(WarpgsError):
+    """Memory, disk or a device does not suffice; the message names the need and what there is."""
+
+    exit_code = 4

@@ -1,0 +1,1 @@
+"""Warp kernels: one file per op, forward and hand-written backward side by side."""
