@@ -1,0 +1,57 @@
+"""Numbers that decide what is drawn, each with its derivation, and the three rule sets made of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+ALPHA_CUT = 1.0 / 255.0
+"""Smallest alpha that is blended: half of what an 8-bit channel resolves, doubled (Kerbl et al. 2023, renderer)."""
+
+TRANSMITTANCE_STOP = 1e-4
+"""A pixel is finished below this transmittance. Tied to the clamp: (1 - 0.99)^2 = 1e-4, two opaque layers."""
+
+ALPHA_MAX = 0.99
+"""Largest alpha of one Gaussian, so that 1 / (1 - alpha) in the backward pass stays below 100."""
+
+LOW_PASS = 0.3
+"""Variance added to both image axes [px^2]: about the box filter of one pixel (1/12) plus margin against aliasing."""
+
+NEAR = 0.01
+"""Nearest depth that is drawn [u]."""
+
+FRUSTUM_MARGIN = 0.15
+"""The Jacobian is taken at the projected mean clamped to the image grown by this share of its size on every side,
+which is the factor 1.3 on tan(fov / 2) of Kerbl et al. 2023 for a centred principal point."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """One consistent set of cut-offs for projecting and blending."""
+
+    name: str
+    """Its name in options and reports."""
+    alpha_cut: float = ALPHA_CUT
+    """Contributions with a smaller alpha are skipped; 0 keeps them all, and every Gaussian then spans every tile."""
+    alpha_max: float = ALPHA_MAX
+    """Alpha is clamped to this; where clamped, its gradient is zero."""
+    transmittance_stop: float = TRANSMITTANCE_STOP
+    """A pixel stops once its transmittance is below this."""
+    inclusive_stop: bool = True
+    """True: the Gaussian that crosses the stop is still blended, so what lies behind keeps at most 1e-4 of the pixel
+    and accumulated alpha is monotone in every opacity within that. False: it is dropped, and up to 1e-2 leaks."""
+    near: float = NEAR
+    """Nearest depth drawn [u]."""
+    low_pass: float = LOW_PASS
+    """Variance added to both image axes [px^2]."""
+    square_sigma: float = 0.0
+    """0: a Gaussian reaches exactly where alpha >= alpha_cut. Else it reaches the tiles that the square of half side
+    ceil(square_sigma * longest axis) touches, as the first 3DGS renderer did."""
+
+
+RULES = {
+    "exact": Rule("exact"),
+    # gsplat 1.5.3: MAX_ALPHA 0.999, exclusive stop. Its extent of 3.33 sigma never binds: sqrt(2 ln 255) = 3.329.
+    "gsplat": Rule("gsplat", alpha_max=0.999, inclusive_stop=False),
+    # diff-gaussian-rasterization (2023): near plane 0.2, square of 3 sigma.
+    "inria": Rule("inria", inclusive_stop=False, near=0.2, square_sigma=3.0),
+}

@@ -1,0 +1,97 @@
+"""Adam (Kingma and Ba 2015) in place, one pass over parameter, gradient and both moments."""
+
+import functools
+
+import torch
+import warp as wp
+
+from warpgs.kernels import bridge
+
+SEGMENT = 4096
+"""Elements that one task updates on a CPU."""
+
+
+@functools.cache
+def make_kernel(real, split: bool):
+    """The update kernel for one scalar type; a task updates a segment of the flat parameter.
+
+    ``split`` says whether the head of each row has a rate of its own: finding it costs a division that does not vectorise.
+    """
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def update(
+        begin: int, gradient: wp.array(dtype=real), length: int, row: int, head: int, head_rate: real, rate: real,
+        beta1: real, beta2: real, rest1: real, rest2: real, root_correction2: real, eps: real,
+        # outputs
+        parameter: wp.array(dtype=real), mean: wp.array(dtype=real), square: wp.array(dtype=real),
+    ):  # fmt: skip
+        task = begin + wp.tid()
+        first = task * length
+        for i in range(first, wp.min(first + length, parameter.shape[0])):
+            g = gradient[i]
+            m = beta1 * mean[i] + rest1 * g
+            s = beta2 * square[i] + rest2 * g * g
+            mean[i] = m
+            square[i] = s
+            step = rate
+            if wp.static(split):
+                step = wp.where(i % row < head, head_rate, rate)
+            parameter[i] = parameter[i] - step * m / (wp.sqrt(s) / root_correction2 + eps)
+
+    return update
+
+
+def adam_step(
+    param: torch.Tensor,
+    grad: torch.Tensor,
+    exp_avg: torch.Tensor,
+    exp_avg_sq: torch.Tensor,
+    *,
+    lr: float,
+    step: int,
+    betas: tuple[float, float] = (0.9, 0.999),
+    eps: float = 1e-15,
+    head_lr: float | None = None,
+    head: int = 0,
+) -> None:
+    """Update a parameter and its moments in place, with bias correction as in `torch.optim.Adam`.
+
+    Args:
+        param: Parameter, contiguous, shape [N, ...].
+        grad: Its gradient, same shape.
+        exp_avg: Running mean of the gradient, same shape, contiguous.
+        exp_avg_sq: Running mean of its square, same shape, contiguous.
+        lr: Learning rate.
+        step: Number of this step, from 1.
+        betas: Decay of the two running means.
+        eps: Added to the root; 1e-15 as in Kerbl et al. 2023, whose gradients are tiny.
+        head_lr: Learning rate of the first ``head`` numbers of each of the N rows.
+        head: How many numbers of a row take ``head_lr``; 0 for none.
+
+    Raises:
+        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        ValueError: A shape or device disagrees, a tensor to be updated is not contiguous, or ``step`` is below 1.
+    """
+    pattern = " ".join(str(s) for s in param.shape)
+    bridge.check(
+        param=(param, pattern), grad=(grad, pattern), exp_avg=(exp_avg, pattern), exp_avg_sq=(exp_avg_sq, pattern)
+    )
+    if not (param.is_contiguous() and exp_avg.is_contiguous() and exp_avg_sq.is_contiguous()):
+        raise ValueError("param, exp_avg and exp_avg_sq are updated in place and must be contiguous")
+    if step < 1:
+        raise ValueError(f"step counts from 1, not {step}")
+    if param.numel() == 0:
+        return
+    real, device = bridge.real_of(param), param.device
+    beta1, beta2 = betas
+    correction1, correction2 = 1 - beta1**step, 1 - beta2**step
+    row = param[0].numel()
+    length = SEGMENT if device.type == "cpu" else 1
+    flat = [bridge.view(t.view(-1), real) for t in (param, exp_avg, exp_avg_sq)]
+    with bridge.stream_of(device):
+        inputs = [
+            bridge.view(grad.contiguous().view(-1), real), length, row, head,
+            (lr if head_lr is None else head_lr) / correction1, lr / correction1,
+            beta1, beta2, 1 - beta1, 1 - beta2, correction2**0.5, eps, *flat,
+        ]  # fmt: skip
+        bridge.launch(make_kernel(real, head > 0), -(-param.numel() // length), inputs, device, cost=max(1, length // 10))

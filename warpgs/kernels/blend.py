@@ -1,0 +1,223 @@
+"""Composite binned Gaussians front to back: colour, alpha, expected depth, and each Gaussian's share of the picture."""
+
+import functools
+from types import SimpleNamespace
+
+import torch
+import warp as wp
+from torch.autograd.function import once_differentiable
+
+from warpgs.constants import Rule
+from warpgs.kernels import blend_cpu, blend_cuda, bridge
+from warpgs.kernels.tiles import Tiles, grid
+
+VALUES = 10
+"""Gradient values of an instance: the record of `project` without its last two entries."""
+
+
+@functools.cache
+def make_segments(real):
+    """Kernels that gather the slots of each Gaussian, in slot order and so repeatably."""
+    vec10 = wp.types.vector(VALUES, real)
+
+    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.blend.{real.__name__}")
+    def sum_gradients(
+        begin: int, v_slots: wp.array2d(dtype=real), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
+        # outputs, zero on entry
+        v_splats: wp.array2d(dtype=real),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        total = vec10()
+        for slot in range(starts[i], starts[i] + counts[i]):
+            for k in range(VALUES):
+                total[k] += v_slots[slot, k]
+        for k in range(VALUES):
+            v_splats[i, k] = total[k]
+
+    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.blend.{real.__name__}")
+    def gather_weights(
+        begin: int, weights: wp.array2d(dtype=real), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
+        # outputs
+        sums: wp.array(dtype=real), maxima: wp.array(dtype=real),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        total = real(0.0)
+        largest = real(0.0)
+        for slot in range(starts[i], starts[i] + counts[i]):
+            total += weights[slot, 0]
+            largest = wp.max(largest, weights[slot, 1])
+        sums[i] = total
+        maxima[i] = largest
+
+    return SimpleNamespace(sum_gradients=sum_gradients, gather_weights=gather_weights)
+
+
+def _kernels(real, device: torch.device, tile_size: int):
+    """The kernels for a device, and how to launch them over tiles."""
+    if device.type == "cuda" and real is wp.float32:
+        threads = tile_size * tile_size
+        k = blend_cuda.make_kernels(tile_size)
+
+        def launch(kernel, tiles: int, inputs: list) -> None:
+            bridge.launch(kernel, tiles * threads, inputs, device, block_dim=threads)
+
+    else:
+        k = blend_cpu.make_kernels(real, tile_size)
+
+        def launch(kernel, tiles: int, inputs: list) -> None:
+            bridge.launch(kernel, tiles, inputs, device, cost=10_000, block_dim=32)
+
+    return k, launch
+
+
+def _tile_inputs(splats: torch.Tensor, tiles: Tiles, real) -> list[wp.array]:
+    return [
+        bridge.view(splats.view(-1, splats.shape[-1]), real),
+        bridge.view(tiles.ranges, wp.int32),
+        bridge.view(tiles.splat_ids, wp.int32),
+    ]
+
+
+def _frame(width: int, height: int, tile_size: int) -> list[int]:
+    columns, rows = grid(width, height, tile_size)
+    return [width, height, columns, columns * rows]
+
+
+def _forward(splats, tiles, backgrounds, width, height, rule):
+    real, device = bridge.real_of(splats), splats.device
+    k, launch = _kernels(real, device, tiles.size)
+    shape = (len(backgrounds), height, width)
+    rgb = splats.new_empty(*shape, 3)
+    alpha, depth, transmittances, weights = (splats.new_empty(shape) for _ in range(4))
+    ends = torch.empty(shape, dtype=torch.int32, device=device)
+    with bridge.stream_of(device):
+        inputs = [
+            *_tile_inputs(splats, tiles, real), bridge.view(backgrounds, real), *_frame(width, height, tiles.size),
+            rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), rule.transmittance_stop, int(rule.inclusive_stop),
+            bridge.view(rgb.view(-1, 3), real), *(bridge.view(t.view(-1), real) for t in (alpha, depth, transmittances, weights)),
+            bridge.view(ends.view(-1), wp.int32),
+        ]  # fmt: skip
+        launch(k.forward, len(tiles.ranges), inputs)
+    return rgb, alpha, depth, transmittances, weights, ends
+
+
+class _Blend(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, splats, backgrounds, tiles, width, height, rule):
+        splats, backgrounds = splats.contiguous(), backgrounds.contiguous()
+        rgb, alpha, depth, transmittances, weights, ends = _forward(splats, tiles, backgrounds, width, height, rule)
+        ctx.save_for_backward(splats, backgrounds, transmittances, weights, depth, ends)
+        ctx.tiles, ctx.rule = tiles, rule
+        return rgb, alpha, depth
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, v_rgb, v_alpha, v_depth):
+        splats, backgrounds, transmittances, weights, depth, ends = ctx.saved_tensors
+        tiles, rule = ctx.tiles, ctx.rule
+        real, device = bridge.real_of(splats), splats.device
+        k, launch = _kernels(real, device, tiles.size)
+        _, height, width = depth.shape
+        v_splats = torch.zeros_like(splats)
+        v_slots = splats.new_zeros(len(tiles.slots), VALUES)
+        pixels = [transmittances, weights, depth, ends, v_rgb.contiguous(), v_alpha.contiguous(), v_depth.contiguous()]
+        flat = [bridge.view(t.view(-1), real) for t in (transmittances, weights, depth)]
+        upstream = [
+            bridge.view(pixels[4].view(-1, 3), real), bridge.view(pixels[5].view(-1), real),
+            bridge.view(pixels[6].view(-1), real),
+        ]  # fmt: skip
+        with bridge.stream_of(device):
+            inputs = [
+                *_tile_inputs(splats, tiles, real), bridge.view(tiles.slots, wp.int32), bridge.view(backgrounds, real),
+                *_frame(width, height, tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
+                *flat, bridge.view(ends.view(-1), wp.int32), *upstream, bridge.view(v_slots, real),
+            ]  # fmt: skip
+            launch(k.backward, len(tiles.ranges), inputs)
+            inputs = [
+                bridge.view(v_slots, real), bridge.view(tiles.starts, wp.int32), bridge.view(tiles.counts, wp.int32),
+                bridge.view(v_splats.view(-1, v_splats.shape[-1]), real),
+            ]  # fmt: skip
+            bridge.launch(make_segments(real).sum_gradients, len(tiles.counts), inputs, device, cost=5)
+        v_backgrounds = None
+        if ctx.needs_input_grad[1]:
+            v_backgrounds = torch.einsum("chw,chwk->ck", transmittances, v_rgb)
+        return v_splats, v_backgrounds, None, None, None, None
+
+
+def _check(splats: torch.Tensor, tiles: Tiles, width: int, height: int, **backgrounds) -> None:
+    sizes = bridge.check(splats=(splats, "C N 12"), **backgrounds)
+    columns, rows = grid(width, height, tiles.size)
+    if len(tiles.ranges) != sizes["C"] * columns * rows:
+        raise ValueError(
+            f"tiles were made for another image: {len(tiles.ranges)} tiles, but {sizes['C']} images of {width} x {height} px "
+            f"have {sizes['C'] * columns * rows} of {tiles.size} px"
+        )
+
+
+def blend(
+    splats: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, *, width: int, height: int, rule: Rule
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Composite C images of H x W pixels (Kerbl et al. 2023, eq. 3; order and early stop as ``rule`` says).
+
+    Differentiable in the first ten values of each record and in ``backgrounds``; the gradient of a clamped alpha is zero.
+    Derivation of the backward pass: docs/blend.md. Bitwise repeatable on a CPU, whatever the number of threads, and on CUDA.
+
+    Args:
+        splats: Records of `project`, shape [C, N, 12].
+        tiles: Instances of `bin_tiles` for the same image size.
+        backgrounds: Colour behind everything, shape [C, 3].
+        width: Image width [px].
+        height: Image height [px].
+        rule: Cut-offs.
+
+    Returns:
+        ``rgb`` [C, H, W, 3]; ``alpha`` [C, H, W], accumulated opacity; ``depth`` [C, H, W], the mean z-depth [u] under the
+        blending weights, 0 where nothing was blended.
+
+    Raises:
+        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        ValueError: A shape or device disagrees, or the tiles belong to another image size.
+    """
+    _check(splats, tiles, width, height, backgrounds=(backgrounds, "C 3"))
+    return _Blend.apply(splats, backgrounds, tiles, width, height, rule)
+
+
+def contributions(
+    splats: torch.Tensor, tiles: Tiles, *, width: int, height: int, rule: Rule
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """How much each Gaussian shows in each image: sum and maximum over pixels of its weight alpha * T. Not differentiable.
+
+    Args:
+        splats: Records of `project`, shape [C, N, 12].
+        tiles: Instances of `bin_tiles` for the same image size.
+        width: Image width [px].
+        height: Image height [px].
+        rule: Cut-offs.
+
+    Returns:
+        ``weight_sums`` [C, N] and ``weight_maxima`` [C, N].
+
+    Raises:
+        TypeError: The scalar type is neither float32 nor float64.
+        ValueError: A shape disagrees, or the tiles belong to another image size.
+    """
+    _check(splats, tiles, width, height)
+    splats = splats.detach().contiguous()
+    real, device = bridge.real_of(splats), splats.device
+    k, launch = _kernels(real, device, tiles.size)
+    ends = _forward(splats, tiles, splats.new_zeros(len(splats), 3), width, height, rule)[-1]
+    weights = splats.new_zeros(len(tiles.slots), 2)
+    sums, maxima = splats.new_empty(splats.shape[:2]), splats.new_empty(splats.shape[:2])
+    with bridge.stream_of(device):
+        inputs = [
+            *_tile_inputs(splats, tiles, real), bridge.view(tiles.slots, wp.int32), *_frame(width, height, tiles.size),
+            rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), bridge.view(ends.view(-1), wp.int32),
+            bridge.view(weights, real),
+        ]  # fmt: skip
+        launch(k.contributions, len(tiles.ranges), inputs)
+        inputs = [
+            bridge.view(weights, real), bridge.view(tiles.starts, wp.int32), bridge.view(tiles.counts, wp.int32),
+            bridge.view(sums.view(-1), real), bridge.view(maxima.view(-1), real),
+        ]  # fmt: skip
+        bridge.launch(make_segments(real).gather_weights, len(tiles.counts), inputs, device)
+    return sums, maxima

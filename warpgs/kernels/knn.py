@@ -1,0 +1,140 @@
+"""Exact mean squared distance of each point to its nearest neighbours, by Morton order and boxes."""
+
+import functools
+from types import SimpleNamespace
+
+import torch
+import warp as wp
+
+from warpgs.kernels import bridge
+
+BOX = 32
+"""Points per box and boxes per group. A query enters a group, a box, only if it lies closer than the neighbours so far."""
+
+MAX_NEIGHBORS = 8
+
+
+@functools.cache
+def make_kernels(real):
+    """Kernels for one scalar type; points are sorted along the Morton curve."""
+    vec3 = wp.types.vector(3, real)
+    vec8 = wp.types.vector(MAX_NEIGHBORS, real)
+
+    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.knn.{real.__name__}")
+    def bounds(
+        begin: int, lower: wp.array(dtype=vec3), upper: wp.array(dtype=vec3),
+        # outputs: the box around each run of BOX boxes (or points, whose lower and upper corner are the same)
+        group_lower: wp.array(dtype=vec3), group_upper: wp.array(dtype=vec3),
+    ):  # fmt: skip
+        box = begin + wp.tid()
+        lo = lower[box * BOX]
+        hi = upper[box * BOX]
+        for i in range(box * BOX + 1, wp.min((box + 1) * BOX, lower.shape[0])):
+            lo = wp.min(lo, lower[i])
+            hi = wp.max(hi, upper[i])
+        group_lower[box] = lo
+        group_upper[box] = hi
+
+    @wp.func
+    def gap_squared(lo: vec3, hi: vec3, p: vec3) -> real:
+        return wp.length_sq(wp.max(wp.max(lo - p, p - hi), vec3()))
+
+    @wp.func
+    def insert(nearest: vec8, k: wp.int32, squared: real) -> vec8:
+        """Keep the k smallest squared distances in ascending order."""
+        if squared < nearest[k - 1]:
+            j = k - 1
+            while j > 0 and nearest[wp.max(j - 1, 0)] > squared:
+                nearest[j] = nearest[j - 1]
+                j -= 1
+            nearest[j] = squared
+        return nearest
+
+    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.knn.{real.__name__}")
+    def search(
+        begin: int, points: wp.array(dtype=vec3), lower: wp.array(dtype=vec3), upper: wp.array(dtype=vec3),
+        group_lower: wp.array(dtype=vec3), group_upper: wp.array(dtype=vec3), k: int,
+        # outputs
+        mean_squares: wp.array(dtype=real),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        p = points[i]
+        nearest = vec8()
+        for j in range(MAX_NEIGHBORS):
+            nearest[j] = real(wp.inf)
+        # The own box first: it gives a bound that rules out nearly all others.
+        home = i // BOX
+        for j in range(home * BOX, wp.min((home + 1) * BOX, points.shape[0])):
+            if j != i:
+                nearest = insert(nearest, k, wp.length_sq(points[j] - p))
+        for group in range(group_lower.shape[0]):
+            if gap_squared(group_lower[group], group_upper[group], p) < nearest[k - 1]:
+                for box in range(group * BOX, wp.min((group + 1) * BOX, lower.shape[0])):
+                    if box != home and gap_squared(lower[box], upper[box], p) < nearest[k - 1]:
+                        for j in range(box * BOX, wp.min((box + 1) * BOX, points.shape[0])):
+                            nearest = insert(nearest, k, wp.length_sq(points[j] - p))
+        total = real(0.0)
+        for j in range(k):
+            total += nearest[j]
+        mean_squares[i] = total / real(k)
+
+    return SimpleNamespace(bounds=bounds, search=search, vec3=vec3)
+
+
+def _spread(bits: torch.Tensor) -> torch.Tensor:
+    """Put two zero bits between the 21 low bits (Morton order)."""
+    for shift, mask in (
+        (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249),
+    ):  # fmt: skip
+        bits = (bits | (bits << shift)) & mask
+    return bits
+
+
+def morton_codes(points: torch.Tensor) -> torch.Tensor:
+    """Position of each point along a Morton curve through the cloud's box, int64, shape [N]; points [N, 3]."""
+    lower = points.amin(0)
+    extent = (points.amax(0) - lower).clamp_min(torch.finfo(points.dtype).tiny)
+    cells = ((points - lower) / extent * (2**21 - 1)).to(torch.int64)
+    return _spread(cells[:, 0]) | (_spread(cells[:, 1]) << 1) | (_spread(cells[:, 2]) << 2)
+
+
+def mean_square_distances(points: torch.Tensor, k: int = 3) -> torch.Tensor:
+    """Mean squared distance [u^2] of each point to its min(k, N - 1) nearest other points. Exact, not differentiable.
+
+    Args:
+        points: Finite positions [u], shape [N, 3]. Coincident points have distance 0 from each other.
+        k: Number of neighbours, 1 to 8.
+
+    Returns:
+        Shape [N]; 0 for a single point.
+
+    Raises:
+        TypeError: The scalar type is neither float32 nor float64.
+        ValueError: The shape is wrong, k is out of range, or a position is not finite.
+    """
+    count = bridge.check(points=(points, "N 3"))["N"]
+    if not 1 <= k <= MAX_NEIGHBORS:
+        raise ValueError(f"k must be 1 to {MAX_NEIGHBORS}, not {k}")
+    if not bool(torch.isfinite(points).all()):
+        raise ValueError("points holds positions that are not finite")
+    if count < 2:
+        return points.new_zeros(count)
+    real, device = bridge.real_of(points), points.device
+    kernels = make_kernels(real)
+    points = points.detach()
+    order = torch.argsort(morton_codes(points), stable=True)
+    ordered = points[order].contiguous()
+    result, ordered_result = points.new_empty(count), points.new_empty(count)
+    with bridge.stream_of(device):
+        levels = [(ordered, ordered)]
+        for _ in range(2):
+            size = -(-len(levels[-1][0]) // BOX)
+            levels.append((points.new_empty(size, 3), points.new_empty(size, 3)))
+            inputs = [bridge.view(t, kernels.vec3) for level in levels[-2:] for t in level]
+            bridge.launch(kernels.bounds, size, inputs, device, cost=BOX)
+        inputs = [bridge.view(t, kernels.vec3) for t in (ordered, *levels[1], *levels[2])]
+        inputs += [min(k, count - 1), bridge.view(ordered_result, real)]
+        bridge.launch(kernels.search, count, inputs, device, cost=1000)
+    result[order] = ordered_result
+    return result

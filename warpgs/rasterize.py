@@ -1,0 +1,89 @@
+"""The rasterizer as one differentiable call: Gaussians and cameras in, pictures out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from warpgs.constants import RULES, Rule
+from warpgs.errors import UsageError
+from warpgs.kernels.blend import blend, contributions
+from warpgs.kernels.project import project
+from warpgs.kernels.tiles import bin_tiles
+from warpgs.scene import Camera, Gaussians, Render
+
+TILE_SIZES = (8, 16)
+
+
+@dataclass(frozen=True)
+class RasterizeOptions:
+    """How to draw; the defaults are exact."""
+
+    rule: str | Rule = "exact"
+    """Cut-offs: exact, gsplat, inria, or a Rule of your own."""
+    sh_degree: int | None = None
+    """Spherical-harmonics degree used; None for all that is stored."""
+    background: torch.Tensor | None = None
+    """Colour behind the scene, shape [3] or [C, 3]; None for black. Gradients flow into it."""
+    tile_size: int = 16
+    """Side of a tile [px]: 8 or 16. The picture does not depend on it."""
+    contributions: bool = False
+    """Also report each Gaussian's blending weight, summed and at its largest."""
+    memory_budget: int | None = None
+    """Bytes that the (Gaussian, tile) instances may take; None for four fifths of what is free."""
+
+
+def _as_batch(array, like: torch.Tensor, rows: int) -> torch.Tensor:
+    tensor = torch.as_tensor(array, dtype=like.dtype, device=like.device)
+    return tensor.reshape(-1, rows, rows) if tensor.ndim < 3 else tensor
+
+
+def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = RasterizeOptions()) -> Render:  # noqa: B008
+    """Draw Gaussians as one camera, or each camera of a batch, sees them.
+
+    Differentiable in the five tensors of ``gaussians``, in ``camera.viewmat`` and ``camera.K`` where those are tensors that
+    require gradients, and in ``options.background``. Float32 or float64, CPU or CUDA, as the tensors are; the same inputs
+    give the same bits every time. Cameras are moved to the type and device of ``gaussians.means``.
+
+    Args:
+        gaussians: The scene, N Gaussians.
+        camera: One camera ([4, 4], [3, 3]) or C of them ([C, 4, 4], [C, 3, 3]).
+        options: How to draw.
+
+    Returns:
+        The pictures; without a leading axis for a single camera. To get gradients of the projected means, call
+        ``render.splats.retain_grad()`` before the backward pass: they are ``render.splats.grad[..., :2]``.
+
+    Raises:
+        ResourceError: The Gaussians touch more tiles than memory allows.
+        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        UsageError: The rule's name or the tile size is unknown.
+        ValueError: A shape or device disagrees; the message names argument, wanted and found.
+    """
+    rule = options.rule if isinstance(options.rule, Rule) else RULES.get(options.rule)
+    if rule is None:
+        raise UsageError(f"unknown rule {options.rule!r}: choose one of {', '.join(RULES)}, or give a Rule")
+    means = gaussians.means
+    if options.tile_size not in TILE_SIZES:
+        raise UsageError(f"tile size {options.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
+    viewmats, Ks = _as_batch(camera.viewmat, means, 4), _as_batch(camera.K, means, 3)
+    background = means.new_zeros(3) if options.background is None else options.background
+    background = torch.as_tensor(background, dtype=means.dtype, device=means.device)
+    backgrounds = background.expand(len(viewmats), 3) if background.ndim == 1 else background
+    size = {"width": camera.width, "height": camera.height}
+    degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
+
+    splats, tile_counts = project(
+        *gaussians.tensors().values(), viewmats, Ks, **size, degree=degree, rule=rule, tile_size=options.tile_size
+    )
+    tiles = bin_tiles(
+        splats, tile_counts, **size, tile_size=options.tile_size, rule=rule, budget_bytes=options.memory_budget
+    )
+    rgb, alpha, depth = blend(splats, tiles, backgrounds, **size, rule=rule)
+    sums = maxima = None
+    if options.contributions:
+        sums, maxima = contributions(splats, tiles, **size, rule=rule)
+    if len(camera.viewmat.shape) == 2:
+        rgb, alpha, depth = rgb[0], alpha[0], depth[0]
+    return Render(rgb, alpha, depth, splats, tile_counts > 0, sums, maxima)
