@@ -1,0 +1,1 @@
+"""Measurements that anyone can rerun: speed, memory and agreement with other programs."""

@@ -1,0 +1,55 @@
+"""Benchmark inputs from a photographed cloud: the garden points that gsplat's test suite uses."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from warpgs.scene import Camera, Gaussians
+
+
+def garden_inputs(
+    path: str, *, tiles: int = 1, sh_degree: int = 3, width: int = 648, height: int = 420, seed: int = 0, device="cuda"
+) -> tuple[Gaussians, Camera]:
+    """Gaussians on the points of `test_garden.npz` and its three cameras.
+
+    Points within 2.5 u of the origin on x and y (112k of them), repeated on a grid of ``tiles`` x ``tiles`` cells. Scales
+    are uniform up to 0.02 u, rotations and opacities uniform, colours the points' own with small random higher degrees.
+
+    Args:
+        path: The npz file with means3d, colors, viewmats, Ks, width, height.
+        tiles: Cells per side; 1 gives 112k Gaussians, 5 gives 2.8M.
+        sh_degree: Degree of the colour coefficients.
+        width: Image width [px]; intrinsics are scaled to it.
+        height: Image height [px].
+        seed: Of the random parameters.
+        device: Where the tensors go.
+
+    Returns:
+        Gaussians that require gradients, and a batch of three cameras.
+    """
+    data = np.load(path)
+    points, colors = data["means3d"], data["colors"].astype(np.float32) / 255
+    inside = (np.abs(points[:, :2]) < 2.5).all(1) & (np.abs(points[:, 2]) < 2.5)
+    points, colors = points[inside], colors[inside]
+    shifts = [(i - tiles // 2, j - tiles // 2) for i in range(tiles) for j in range(tiles)]
+    points = np.concatenate([points + np.array([5.0 * i, 5.0 * j, 0], np.float32) for i, j in shifts])
+    colors = np.concatenate([colors] * len(shifts))
+
+    generator = torch.Generator().manual_seed(seed)
+    count, coefficients = len(points), (sh_degree + 1) ** 2
+    sh = torch.randn(count, coefficients, 3, generator=generator) * 0.1
+    sh[:, 0] = (torch.from_numpy(colors) - 0.5) / 0.28209479177387814
+    tensors = {
+        "means": torch.from_numpy(points),
+        "quats": torch.randn(count, 4, generator=generator),
+        "log_scales": torch.log(torch.rand(count, 3, generator=generator) * 0.02 + 1e-6),
+        "logit_opacities": torch.logit(torch.rand(count, generator=generator).clamp(1e-4, 1 - 1e-4)),
+        "sh": sh,
+    }
+    gaussians = Gaussians(**{n: t.float().to(device).contiguous().requires_grad_() for n, t in tensors.items()})
+    Ks = data["Ks"].copy()
+    Ks[:, 0] *= width / float(data["width"])
+    Ks[:, 1] *= height / float(data["height"])
+    viewmats = torch.from_numpy(data["viewmats"]).float().to(device)
+    return gaussians, Camera(viewmats, torch.from_numpy(Ks).float().to(device), width, height)
