@@ -13,7 +13,7 @@ def garden_inputs(
 ) -> tuple[Gaussians, Camera]:
     """Gaussians on the points of `test_garden.npz` and its three cameras.
 
-    Points within 2.5 u of the origin on x and y (112k of them), repeated on a grid of ``tiles`` x ``tiles`` cells. Scales
+    Points within 2 u of the origin (112k of them), repeated on a grid of ``tiles`` x ``tiles`` cells. Scales
     are uniform up to 0.02 u, rotations and opacities uniform, colours the points' own with small random higher degrees.
 
     Args:
@@ -30,10 +30,10 @@ def garden_inputs(
     """
     data = np.load(path)
     points, colors = data["means3d"], data["colors"].astype(np.float32) / 255
-    inside = (np.abs(points[:, :2]) < 2.5).all(1) & (np.abs(points[:, 2]) < 2.5)
+    inside = (np.abs(points) < 2).all(1)
     points, colors = points[inside], colors[inside]
     shifts = [(i - tiles // 2, j - tiles // 2) for i in range(tiles) for j in range(tiles)]
-    points = np.concatenate([points + np.array([5.0 * i, 5.0 * j, 0], np.float32) for i, j in shifts])
+    points = np.concatenate([points + np.array([4.0 * i, 4.0 * j, 0], np.float32) for i, j in shifts])
     colors = np.concatenate([colors] * len(shifts))
 
     generator = torch.Generator().manual_seed(seed)
