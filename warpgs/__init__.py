@@ -10,7 +10,7 @@ __all__ = ["Camera", "Gaussians", "RasterizeOptions", "Render", "Scene", "load_s
 
 if TYPE_CHECKING:
     from warpgs.io.load import load_scene
-    from warpgs.rasterize import RasterizeOptions, rasterize
+    from warpgs.rasterizer import RasterizeOptions, rasterize
     from warpgs.scene import Camera, Gaussians, Render, Scene
 
 _HOMES = {
@@ -18,8 +18,8 @@ _HOMES = {
     "Gaussians": "warpgs.scene",
     "Render": "warpgs.scene",
     "Scene": "warpgs.scene",
-    "RasterizeOptions": "warpgs.rasterize",
-    "rasterize": "warpgs.rasterize",
+    "RasterizeOptions": "warpgs.rasterizer",
+    "rasterize": "warpgs.rasterizer",
     "load_scene": "warpgs.io.load",
 }
 

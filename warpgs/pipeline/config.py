@@ -1,0 +1,69 @@
+"""Everything that decides a fit, composed of the dataclasses that live beside the code which reads them."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass, field
+
+from warpgs.errors import UsageError
+from warpgs.pipeline.density import DensityConfig
+from warpgs.pipeline.init import InitConfig
+from warpgs.pipeline.loss import LossConfig
+from warpgs.pipeline.optimizer import OptimizerConfig
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """All settings of a fit."""
+
+    preset: str = "3dgs"
+    """Named set of settings that the others start from; see `warpgs fit --help`."""
+    steps: int = 7000
+    """Optimisation steps, one view each."""
+    seed: int = 0
+    """Decides every random choice; the same seed, data and device kind give the same bytes."""
+    rule: str = "exact"
+    """Cut-offs of the rasterizer: exact, gsplat or inria."""
+    sh_every: int = 1000
+    """Steps after which the spherical-harmonics degree in use rises by one."""
+    checkpoint_every: int = 1000
+    """Steps between checkpoints; one is written at the end in any case."""
+    init: InitConfig = field(default_factory=InitConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    density: DensityConfig = field(default_factory=DensityConfig)
+
+    def __post_init__(self):
+        for name in ("steps", "sh_every", "checkpoint_every"):
+            if getattr(self, name) < 1:
+                raise UsageError(f"{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
+        if self.rule not in ("exact", "gsplat", "inria"):
+            raise UsageError(f"rule {self.rule!r} is not one of exact, gsplat, inria")
+
+    def to_json(self) -> dict:
+        """Nested plain values, as stored in a run folder."""
+        return dataclasses.asdict(self)
+
+    @staticmethod
+    def from_json(values: dict) -> FitConfig:
+        """The configuration that `to_json` stored; UsageError where a field is unknown."""
+        rooms = {"init": InitConfig, "loss": LossConfig, "optimizer": OptimizerConfig, "density": DensityConfig}
+        try:
+            return FitConfig(**{k: rooms[k](**v) if k in rooms else v for k, v in values.items()})
+        except TypeError as e:
+            raise UsageError(f"the stored configuration is of another version of warpgs ({e})") from e
+
+    def fingerprint(self) -> str:
+        """First 12 hexadecimal digits of the SHA-256 of the settings."""
+        return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:12]
+
+
+PRESETS: dict[str, FitConfig] = {
+    "3dgs": FitConfig(),
+}
+"""3dgs: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few."""
+
+DEFAULT_STEPS = {"cuda": 7000, "cpu": 1000}
+"""Steps where the user names none: what a device gets through in minutes at sparse-view sizes."""

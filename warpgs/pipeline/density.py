@@ -1,0 +1,144 @@
+"""Where Gaussians are added and removed during a fit: clone, split, prune (Kerbl et al. 2023, section 5.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from warpgs.errors import UsageError
+from warpgs.scene import Gaussians, Render
+
+
+@dataclass(frozen=True)
+class DensityConfig:
+    """Thresholds and times of densification."""
+
+    start: int = 500
+    """First step after which Gaussians are added and removed."""
+    every: int = 100
+    """Steps between two such events."""
+    stop_share: float = 0.5
+    """Share of the fit after which the set is left alone."""
+    gradient: float = 2e-4
+    """Mean gradient of the projected mean, in half image widths and heights, above which a Gaussian is densified."""
+    clone_size: float = 0.01
+    """Gaussians smaller than this share of the extent are cloned, larger ones split."""
+    prune_opacity: float = 0.005
+    """Gaussians below this opacity are removed."""
+    prune_size: float = 0.1
+    """Gaussians larger than this share of the extent are removed, once an opacity reset has happened; 0 for never."""
+    reset_every: int = 0
+    """Steps between opacity resets, 3000 in Kerbl et al. 2023; 0 for none. With few views a reset costs decibels that the
+    rest of the fit does not win back (docs/decisions/002-no-opacity-reset.md)."""
+    reset_opacity: float = 0.01
+    """Largest opacity after a reset."""
+    max_gaussians: int = 1_000_000
+    """No Gaussian is added beyond this number."""
+
+    def __post_init__(self):
+        if self.every < 1 or self.start < 0 or self.reset_every < 0 or self.max_gaussians < 1:
+            raise UsageError("density: every and max gaussians must be at least 1, start and reset every at least 0")
+        if not 0 <= self.stop_share <= 1:
+            raise UsageError(f"density stop share {self.stop_share} must lie between 0 and 1")
+
+    def times(self, steps: int) -> tuple[int, int, int]:
+        """First event, interval and last event [steps] in a fit of that length; a short fit starts after a quarter of it."""
+        return min(self.start, steps // 4), self.every, int(self.stop_share * steps)
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """Which rows stay, and what is appended after them."""
+
+    keep: torch.Tensor
+    """Numbers of the surviving rows in ascending order, int64, shape [S]."""
+    added: dict[str, torch.Tensor]
+    """New rows of each of the five tensors."""
+
+
+class DensityStats:
+    """What the backward passes since the last event said of each Gaussian."""
+
+    def __init__(self, count: int, device: torch.device):
+        self.gradient = torch.zeros(count, device=device)
+        """Sum of the norms of the gradient of the projected mean, in half image sizes, shape [N]."""
+        self.seen = torch.zeros(count, device=device)
+        """Number of images in which the Gaussian was visible, shape [N]."""
+
+    def add(self, render: Render) -> None:
+        """Take in one backward pass; ``render.splats`` must have retained its gradient."""
+        height, width = render.alpha.shape[-2:]
+        half = render.splats.new_tensor([0.5 * width, 0.5 * height])
+        norms = (render.splats.grad[..., :2] * half).norm(dim=-1)
+        self.gradient += torch.where(render.visible, norms, 0).sum(0)
+        self.seen += render.visible.sum(0)
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Both tensors by name, for the checkpoint."""
+        return {"density.gradient": self.gradient, "density.seen": self.seen}
+
+    def load(self, state: dict[str, torch.Tensor]) -> None:
+        """Take over what `state` gave."""
+        self.gradient = state["density.gradient"].to(self.gradient.device)
+        self.seen = state["density.seen"].to(self.seen.device)
+
+
+def _split(gaussians: dict[str, torch.Tensor], ids: torch.Tensor, generator: torch.Generator) -> dict[str, torch.Tensor]:
+    """Two children for each: drawn from the parent's own distribution, 1.6 times smaller (Kerbl et al. 2023)."""
+    pair = ids.repeat(2)
+    rows = {n: t[pair] for n, t in gaussians.items()}
+    noise = torch.randn(len(pair), 3, generator=generator).to(ids.device) * rows["log_scales"].exp()
+    w, *vector = (rows["quats"] / rows["quats"].norm(dim=1, keepdim=True)).unbind(1)
+    axis = torch.stack(vector, 1)
+    cross = 2 * torch.linalg.cross(axis, noise)
+    rows["means"] = rows["means"] + noise + w[:, None] * cross + torch.linalg.cross(axis, cross)
+    rows["log_scales"] = rows["log_scales"] - torch.log(torch.tensor(1.6)).item()
+    return rows
+
+
+def refine(
+    gaussians: Gaussians,
+    stats: DensityStats,
+    config: DensityConfig,
+    *,
+    extent: float,
+    after_reset: bool,
+    generator: torch.Generator,
+) -> Refinement:
+    """Clone small Gaussians and split large ones where the image pulls at them; prune the transparent and the huge.
+
+    Args:
+        gaussians: The current set, N rows.
+        stats: What the images said since the last event.
+        config: Thresholds.
+        extent: Size of the scene [u].
+        after_reset: An opacity reset has happened, so size pruning is on.
+        generator: CPU generator for the children's positions; the same numbers on every device.
+
+    Returns:
+        Rows that stay and rows to append. At least one Gaussian always stays, the most opaque.
+    """
+    with torch.no_grad():
+        tensors = {n: t.detach() for n, t in gaussians.tensors().items()}
+        scales = tensors["log_scales"].exp().amax(1)
+        opacities = tensors["logit_opacities"].sigmoid()
+        pull = stats.gradient / stats.seen.clamp_min(1)
+        grows = pull > config.gradient
+        room = max(0, config.max_gaussians - len(gaussians))
+        if int(grows.sum()) > room:
+            strongest = torch.topk(pull, room).indices
+            grows = torch.zeros_like(grows).index_fill(0, strongest, True) & grows
+        small = scales <= config.clone_size * extent
+        faint = ~(opacities >= config.prune_opacity)
+        if after_reset and config.prune_size > 0:
+            faint |= scales > config.prune_size * extent
+        if bool(faint.all()):
+            faint[opacities.argmax()] = False
+        cloned = torch.nonzero(grows & small & ~faint).squeeze(1)
+        split = torch.nonzero(grows & ~small & ~faint).squeeze(1)
+        remove = faint.clone()
+        remove[split] = True
+        children = _split(tensors, split, generator)
+        added = {n: torch.cat([t[cloned], children[n]]) for n, t in tensors.items()}
+        return Refinement(torch.nonzero(~remove).squeeze(1), added)

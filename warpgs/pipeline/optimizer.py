@@ -1,0 +1,107 @@
+"""Parameters of a fit with their Adam moments, kept row by row in step when Gaussians come and go."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from warpgs.errors import UsageError
+from warpgs.kernels.adam import adam_step
+from warpgs.pipeline.density import Refinement
+from warpgs.pipeline.schedule import log_linear
+from warpgs.scene import Gaussians
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """Learning rates (Kerbl et al. 2023, reference implementation)."""
+
+    means_lr: float = 1.6e-4
+    """Of positions, times the scene's extent, at the start."""
+    means_lr_final: float = 1.6e-6
+    """The same at the last step; log-linear between."""
+    quats_lr: float = 1e-3
+    """Of rotations."""
+    scales_lr: float = 5e-3
+    """Of log scales."""
+    opacities_lr: float = 0.05
+    """Of opacity logits."""
+    sh_lr: float = 2.5e-3
+    """Of the constant colour coefficient."""
+    sh_rest_factor: float = 0.05
+    """Share of that for the other coefficients."""
+
+    def __post_init__(self):
+        for name, value in vars(self).items():
+            if not value > 0:
+                raise UsageError(f"optimizer {name} must be positive, not {value}")
+
+
+class Optimizer:
+    """Adam over the five tensors of a set of Gaussians."""
+
+    def __init__(self, gaussians: Gaussians, config: OptimizerConfig, extent: float):
+        self.config, self.extent = config, extent
+        self.params = {n: t.detach().clone().contiguous().requires_grad_() for n, t in gaussians.tensors().items()}
+        self.means = {n: torch.zeros_like(t) for n, t in self.params.items()}
+        self.squares = {n: torch.zeros_like(t) for n, t in self.params.items()}
+        self.step_count = 0
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The current parameters; they require gradients."""
+        return Gaussians(**self.params)
+
+    def rates(self, progress: float) -> dict[str, float]:
+        """Learning rate of each tensor at a share [0, 1] of the fit."""
+        c = self.config
+        return {
+            "means": self.extent * log_linear(c.means_lr, c.means_lr_final, progress),
+            "quats": c.quats_lr,
+            "log_scales": c.scales_lr,
+            "logit_opacities": c.opacities_lr,
+            "sh": c.sh_lr * c.sh_rest_factor,
+        }
+
+    def step(self, progress: float) -> None:
+        """Update all parameters from their gradients, which are then cleared."""
+        self.step_count += 1
+        for name, rate in self.rates(progress).items():
+            param = self.params[name]
+            if param.grad is None:
+                continue
+            head = {"head": 3, "head_lr": self.config.sh_lr} if name == "sh" else {}
+            state = (param.detach(), param.grad, self.means[name], self.squares[name])
+            adam_step(*state, lr=rate, step=self.step_count, **head)
+            param.grad = None
+
+    def apply(self, change: Refinement) -> None:
+        """Keep the named rows with their moments and append new rows with zero moments."""
+        for name, param in self.params.items():
+            added = change.added[name].to(param.dtype)
+            self.params[name] = torch.cat([param.detach()[change.keep], added]).requires_grad_()
+            for moments in (self.means, self.squares):
+                moments[name] = torch.cat([moments[name][change.keep], torch.zeros_like(added)])
+
+    def cap_opacity(self, opacity: float) -> None:
+        """Lower every opacity to at most this and forget the moments of all opacities (the classic reset)."""
+        limit = torch.logit(torch.tensor(opacity)).item()
+        self.params["logit_opacities"] = self.params["logit_opacities"].detach().clamp(max=limit).requires_grad_()
+        self.means["logit_opacities"].zero_()
+        self.squares["logit_opacities"].zero_()
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Everything that a continued fit needs, by flat names."""
+        groups = (("param", self.params), ("mean", self.means), ("square", self.squares))
+        return {f"{kind}.{n}": t.detach() for kind, group in groups for n, t in group.items()}
+
+    def load(self, state: dict[str, torch.Tensor], step_count: int) -> None:
+        """Take over what `state` gave."""
+        device = next(iter(self.params.values())).device
+        for kind, group in (("param", self.params), ("mean", self.means), ("square", self.squares)):
+            for name in group:
+                group[name] = state[f"{kind}.{name}"].to(device).contiguous()
+        for name, t in self.params.items():
+            self.params[name] = t.requires_grad_()
+        self.step_count = step_count
