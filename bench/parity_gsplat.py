@@ -33,7 +33,10 @@ def compare(path: str, degree: int, width: int, height: int) -> dict:
     """Differences of one configuration: the image's, and per parameter those of the gradient of a random projection."""
     gaussians, camera = garden_inputs(path, sh_degree=degree, width=width, height=height)
     pictures, gradients = [], []
-    for draw in (lambda: rasterize(gaussians, camera, RasterizeOptions(rule="gsplat")).rgb, lambda: peer(gaussians, camera, degree)):
+    for draw in (
+        lambda: rasterize(gaussians, camera, RasterizeOptions(rule="gsplat")).rgb,
+        lambda: peer(gaussians, camera, degree),
+    ):
         picture = draw()
         generator = torch.Generator(device=picture.device).manual_seed(1)
         weights = torch.rand(picture.shape, generator=generator, device=picture.device)

@@ -39,7 +39,7 @@ def _as_batch(array, like: torch.Tensor, rows: int) -> torch.Tensor:
     return tensor.reshape(-1, rows, rows) if tensor.ndim < 3 else tensor
 
 
-def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = RasterizeOptions()) -> Render:  # noqa: B008
+def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = RasterizeOptions()) -> Render:
     """Draw Gaussians as one camera, or each camera of a batch, sees them.
 
     Differentiable in the five tensors of ``gaussians``, in ``camera.viewmat`` and ``camera.K`` where those are tensors that
@@ -77,9 +77,7 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
     splats, tile_counts = project(
         *gaussians.tensors().values(), viewmats, Ks, **size, degree=degree, rule=rule, tile_size=options.tile_size
     )
-    tiles = bin_tiles(
-        splats, tile_counts, **size, tile_size=options.tile_size, rule=rule, budget_bytes=options.memory_budget
-    )
+    tiles = bin_tiles(splats, tile_counts, **size, tile_size=options.tile_size, rule=rule, budget_bytes=options.memory_budget)
     rgb, alpha, depth = blend(splats, tiles, backgrounds, **size, rule=rule)
     sums = maxima = None
     if options.contributions:

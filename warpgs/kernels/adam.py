@@ -73,9 +73,7 @@ def adam_step(
         ValueError: A shape or device disagrees, a tensor to be updated is not contiguous, or ``step`` is below 1.
     """
     pattern = " ".join(str(s) for s in param.shape)
-    bridge.check(
-        param=(param, pattern), grad=(grad, pattern), exp_avg=(exp_avg, pattern), exp_avg_sq=(exp_avg_sq, pattern)
-    )
+    bridge.check(param=(param, pattern), grad=(grad, pattern), exp_avg=(exp_avg, pattern), exp_avg_sq=(exp_avg_sq, pattern))
     if not (param.is_contiguous() and exp_avg.is_contiguous() and exp_avg_sq.is_contiguous()):
         raise ValueError("param, exp_avg and exp_avg_sq are updated in place and must be contiguous")
     if step < 1:

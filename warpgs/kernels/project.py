@@ -220,9 +220,7 @@ def make_forward(real):
         rows = s.tile_rows(e.pixel[1], half_height, height, tile_size)
         tiles = int(0)
         for row in range(rows[0], rows[1]):
-            columns = s.tile_columns(
-                e.pixel[0], e.pixel[1], factor, reach, half_width, half_height, row, width, tile_size
-            )
+            columns = s.tile_columns(e.pixel[0], e.pixel[1], factor, reach, half_width, half_height, row, width, tile_size)
             tiles += columns[1] - columns[0]
         if tiles == 0:
             return

@@ -190,9 +190,7 @@ def make_kernels(real, lanes: int):
         for lane in range(count):
             v_a[base + lane] = s0[lane] + real(2.0) * a[base + lane] * s1[lane] + b[base + lane] * s2[lane]
 
-    return SimpleNamespace(
-        vertical=vertical, similarity=similarity, vertical_backward=vertical_backward, combine=combine
-    )
+    return SimpleNamespace(vertical=vertical, similarity=similarity, vertical_backward=vertical_backward, combine=combine)
 
 
 class _Plan:

@@ -72,9 +72,7 @@ class Fit:
         self.generator = torch.Generator().manual_seed(config.seed)
         cloud, self.start = initial_points(train, points, config.init, np.random.default_rng(config.seed))
         self.extent = self._extent([v.camera for v in train], cloud)
-        self.optimizer = Optimizer(
-            initial_gaussians(cloud, config.init, self.extent, device), config.optimizer, self.extent
-        )
+        self.optimizer = Optimizer(initial_gaussians(cloud, config.init, self.extent, device), config.optimizer, self.extent)
         self.stats = DensityStats(len(cloud), device)
         self.step, self.reset_done = 0, False
         self.order: list[int] = []

@@ -1,0 +1,71 @@
+"""Poses at the door: checked to be rigid and finite, converted to camera_from_world with OpenCV axes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from warpgs.errors import DataError
+
+TOLERANCE = 1e-3
+"""Largest entry of R R^T - 1 that is put down to rounding in the file."""
+
+
+def rigid(viewmat: np.ndarray, where: str) -> np.ndarray:
+    """Check a [4, 4] pose and return it with its rotation made exactly orthonormal.
+
+    Raises:
+        DataError: It is not finite, or its upper left 3 x 3 block is no rotation; ``where`` names file and image.
+    """
+    if viewmat.shape != (4, 4) or not np.isfinite(viewmat).all():
+        raise DataError(f"{where}: the pose is not finite; estimate it again, or remove the image")
+    R = viewmat[:3, :3]
+    error = float(np.abs(R @ R.T - np.eye(3)).max())
+    if error > TOLERANCE:
+        raise DataError(
+            f"{where}: the pose is not rigid (R R^T is off by {error:.2g}): it scales or shears. Give pure rotations"
+        )
+    if np.linalg.det(R) < 0:
+        raise DataError(f"{where}: the pose mirrors the scene (determinant -1); two axes are probably swapped")
+    u, _, vt = np.linalg.svd(R)
+    result = np.eye(4)
+    result[:3, :3] = u @ vt
+    result[:3, 3] = viewmat[:3, 3]
+    return result
+
+
+def quat_rotation(quat: tuple[float, ...], where: str) -> np.ndarray:
+    """Rotation [3, 3] of a quaternion wxyz; DataError where it is zero or not finite."""
+    q = np.array(quat, np.float64)
+    norm = float(np.linalg.norm(q))
+    if not (np.isfinite(norm) and norm > 1e-12):
+        raise DataError(f"{where}: the rotation quaternion {tuple(quat)} is zero or not finite")
+    w, x, y, z = q / norm
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def from_camera_to_world(matrix: np.ndarray, where: str, *, opengl: bool) -> np.ndarray:
+    """camera_from_world, OpenCV axes, from a camera-to-world matrix [3 or 4, 4].
+
+    Args:
+        matrix: Camera to world.
+        where: Names file and image in errors.
+        opengl: The camera looks along -z with +y up (OpenGL, Blender); the two axes are turned round.
+
+    Raises:
+        DataError: The matrix is not rigid or not finite.
+    """
+    pose = np.eye(4)
+    pose[: matrix.shape[0]] = matrix
+    if opengl:
+        pose[:3, 1:3] *= -1
+    pose = rigid(pose, where)
+    result = np.eye(4)
+    result[:3, :3] = pose[:3, :3].T
+    result[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return result
