@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from pathlib import Path
 
 import torch
 
-from warpgs.errors import DataError, ResourceError
+from warpgs.errors import DataError
+from warpgs.files import write_bytes
 
 TENSORS = "checkpoint.safetensors"
 FORMAT = 1
@@ -33,25 +33,10 @@ def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict)
     """
     from safetensors.torch import save
 
-    path, temporary = folder / TENSORS, folder / f"{TENSORS}.tmp.{os.getpid()}"
+    path = folder / TENSORS
     on_cpu = {n: t.detach().cpu().contiguous().clone() for n, t in tensors.items()}
     data = save(on_cpu, metadata={"format": str(FORMAT), "state": json.dumps(state)})
-    try:
-        with temporary.open("wb") as f:
-            f.write(data)
-            f.write(hashlib.sha256(data).digest())
-            f.flush()
-            os.fsync(f.fileno())
-        temporary.replace(path)
-        directory = os.open(folder, os.O_RDONLY)
-        os.fsync(directory)
-        os.close(directory)
-    except OSError as e:
-        temporary.unlink(missing_ok=True)
-        raise ResourceError(
-            f"{path}: the checkpoint of {len(data) / 2**20:.1f} MiB could not be written ({e.strerror}); "
-            "the last one is untouched. Free some disk space, or choose another --out."
-        ) from e
+    write_bytes(path, data, hashlib.sha256(data).digest())
     return path
 
 

@@ -56,9 +56,7 @@ def triangulate_matches(views: list[View]) -> PointCloud:
         # OpenCV's pixel centres are at whole numbers
         features.append((np.array([k.pt for k in keypoints]).reshape(-1, 2) + 0.5, descriptors))
     centers = [v.camera.center for v in views]
-    pairs = sorted(
-        itertools.combinations(range(len(views)), 2), key=lambda p: np.linalg.norm(centers[p[0]] - centers[p[1]])
-    )
+    pairs = sorted(itertools.combinations(range(len(views)), 2), key=lambda p: np.linalg.norm(centers[p[0]] - centers[p[1]]))
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.float32)]
     for i, j in pairs[:MAX_PAIRS]:
         (pixels_i, descriptors_i), (pixels_j, descriptors_j) = features[i], features[j]

@@ -1,0 +1,228 @@
+import struct
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from warpgs.errors import DataError, ResourceError
+from warpgs.export.ply import HEADER_LIMIT, read_ply, write_ply
+from warpgs.scene import Gaussians, Normalization
+
+
+def make(n=7, degree=3, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    k = (degree + 1) ** 2
+    return Gaussians(
+        means=torch.randn(n, 3, generator=g),
+        quats=torch.randn(n, 4, generator=g),
+        log_scales=torch.randn(n, 3, generator=g) - 4,
+        logit_opacities=torch.randn(n, generator=g),
+        sh=torch.randn(n, k, 3, generator=g),
+    )
+
+
+def split(path):
+    head, body = path.read_bytes().split(b"end_header\n", 1)
+    return head.decode().splitlines(), body
+
+
+def ply(lines, body=b""):
+    return ("\n".join(["ply", "format binary_little_endian 1.0", *lines, "end_header"]) + "\n").encode() + body
+
+
+NAMES = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
+PROPERTIES = [f"property float {n}" for n in NAMES]
+ROW = np.arange(1, 15, dtype="<f4").tobytes()
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("n", [0, 1, 7])
+def test_round_trip_is_exact(tmp_path, degree, n):
+    model = make(n, degree)
+    write_ply(tmp_path / "a.ply", model, Normalization())
+    back = read_ply(tmp_path / "a.ply")
+    for name, tensor in model.tensors().items():
+        got = getattr(back, name)
+        assert got.dtype == torch.float32 and got.device.type == "cpu"
+        assert torch.equal(got, tensor), name
+
+
+def test_more_rows_than_a_chunk(tmp_path, monkeypatch):
+    monkeypatch.setattr("warpgs.export.ply.CHUNK_ROWS", 3)
+    model = make(10)
+    write_ply(tmp_path / "a.ply", model, Normalization())
+    assert torch.equal(read_ply(tmp_path / "a.ply").sh, model.sh)
+
+
+def test_layout_on_disk(tmp_path):
+    """Names and bytes spelled out by hand: channel-major coefficients, wxyz, logits and logarithms."""
+    sh = torch.arange(12, dtype=torch.float32).reshape(1, 4, 3)  # coefficient k of channel c is 3 k + c
+    model = Gaussians(
+        torch.tensor([[1.0, 2, 3]]), torch.tensor([[0.5, 0.1, 0.2, 0.3]]), torch.tensor([[-1.0, -2, -3]]),
+        torch.tensor([2.5]), sh,
+    )  # fmt: skip
+    write_ply(tmp_path / "a.ply", model, Normalization())
+    lines, body = split(tmp_path / "a.ply")
+    names = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2".split() + [f"f_rest_{i}" for i in range(9)]
+    names += "opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
+    assert lines[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 1"]
+    assert lines[3:] == [f"property float {n}" for n in names]
+    rest = [3, 6, 9, 4, 7, 10, 5, 8, 11]
+    want = [1, 2, 3, 0, 0, 0, 0, 1, 2, *rest, 2.5, -1, -2, -3, 0.5, 0.1, 0.2, 0.3]
+    assert body == struct.pack(f"<{len(want)}f", *want)
+
+
+def test_file_coordinates_are_restored_in_float64(tmp_path):
+    """An offset of 5e6 m: the result must be the float64 sum rounded once, not a float32 sum."""
+    model = make(50)
+    normalization = Normalization(np.array([5e6, -3e5, 0.25]), 0.04)
+    write_ply(tmp_path / "a.ply", model, normalization)
+    back = read_ply(tmp_path / "a.ply")
+    want = model.means.numpy().astype(np.float64) / 0.04 + normalization.offset
+    np.testing.assert_array_equal(back.means.numpy(), want.astype(np.float32))
+    scales = np.exp(model.log_scales.numpy().astype(np.float64)) / 0.04
+    np.testing.assert_allclose(np.exp(back.log_scales.numpy()), scales, rtol=2e-6)
+    for name in ("quats", "logit_opacities", "sh"):
+        assert torch.equal(getattr(back, name), getattr(model, name))
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "log_scales", "logit_opacities", "sh"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_non_finite_is_refused_by_name_and_the_old_file_stays(tmp_path, name, value):
+    path = tmp_path / "a.ply"
+    path.write_bytes(b"old")
+    model = make()
+    getattr(model, name).view(-1)[0] = value
+    with pytest.raises(DataError, match=rf"a\.ply.*{name} holds 1 non-finite"):
+        write_ply(path, model, Normalization())
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_overflow_on_the_way_to_file_coordinates_is_refused(tmp_path):
+    with pytest.raises(DataError, match="means"):
+        write_ply(tmp_path / "a.ply", make(), Normalization(np.zeros(3), 1e-39))
+    for scale in (0.0, -1.0, float("nan")):
+        with pytest.raises(DataError, match="normalization"):
+            write_ply(tmp_path / "a.ply", make(), Normalization(np.zeros(3), scale))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_failing_disk_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "a.ply"
+    path.write_bytes(b"old")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("warpgs.export.ply.os.fsync", full)
+    with pytest.raises(ResourceError, match="No space left"):
+        write_ply(path, make(), Normalization())
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_missing_folder_and_missing_file(tmp_path):
+    with pytest.raises(ResourceError, match="cannot be written"):
+        write_ply(tmp_path / "no" / "a.ply", make(), Normalization())
+    with pytest.raises(DataError, match="cannot be read"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_unknown_properties_and_elements_are_ignored(tmp_path):
+    path = tmp_path / "a.ply"
+    lines = ["comment end_header is not here", "obj_info x", "element camera 2", "property double f", "property uchar g",
+             "element vertex 1", "property uchar red", *PROPERTIES, "property double error",
+             "element face 1", "property list uchar int vertex_indices"]  # fmt: skip
+    path.write_bytes(ply(lines, b"\0" * 18 + b"\7" + ROW + b"\0" * 8 + b"\3" + b"\0" * 12))
+    model = read_ply(path)
+    assert model.means.tolist() == [[1, 2, 3]] and model.sh.tolist() == [[[4, 5, 6]]]
+    assert model.quats.tolist() == [[11, 12, 13, 14]] and model.logit_opacities.tolist() == [7]
+
+
+def test_any_property_order_doubles_and_crlf(tmp_path):
+    path = tmp_path / "a.ply"
+    lines = ["element vertex 1", *(f"property double {n}" for n in reversed(NAMES))]
+    body = np.arange(14, 0, -1, dtype="<f8").tobytes()
+    path.write_bytes(ply(lines).replace(b"\n", b"\r\n") + body)
+    model = read_ply(path)
+    assert model.means.tolist() == [[1, 2, 3]] and model.log_scales.tolist() == [[8, 9, 10]]
+
+
+REST = [f"property float f_rest_{i}" for i in range(9)]
+MALFORMED = {
+    "empty": (b"", "start with 'ply'"),
+    "not ply": (b"solid cube\n", "start with 'ply'"),
+    "no end": (b"ply\nformat binary_little_endian 1.0\n", "no 'end_header'"),
+    "long header": (b"ply\n" + b"comment a\n" * (HEADER_LIMIT // 10) + b"end_header\n", "no 'end_header'"),
+    "not ascii": (ply(["comment \u00e9"]), "not ASCII"),
+    "ascii format": (ply([]).replace(b"binary_little_endian", b"ascii"), "its format is ascii"),
+    "big endian": (ply([]).replace(b"little", b"big"), "its format is binary_big_endian"),
+    "no format": (b"ply\nelement vertex 0\nend_header\n", "not given"),
+    "no vertex": (ply(["element face 0"]), "one 'element vertex'"),
+    "two vertices": (ply(["element vertex 0", "element vertex 0"]), "one 'element vertex'"),
+    "negative count": (ply(["element vertex -1", *PROPERTIES]), "makes no sense"),
+    "endless count": (ply(["element vertex " + "9" * 5000, *PROPERTIES]), "makes no sense"),
+    "huge count": (ply(["element vertex 999999999999999999", *PROPERTIES], ROW), "cut short"),
+    "cut short": (ply(["element vertex 2", *PROPERTIES], ROW), "need .* bytes"),
+    "property first": (ply(["property float x"]), "makes no sense"),
+    "odd type": (ply(["element vertex 0", "property half x"]), "makes no sense"),
+    "twice": (ply(["element vertex 1", *PROPERTIES, "property float x"], ROW * 2), "appears twice"),
+    "missing": (ply(["element vertex 1", *PROPERTIES[1:]], ROW), "missing: x"),
+    "half a degree": (ply(["element vertex 0", *PROPERTIES, *REST[:5]]), "5 f_rest"),
+    "gap": (ply(["element vertex 0", *PROPERTIES, *REST[:8], "property float f_rest_9"]), "missing: f_rest_8"),
+    "vertex list": (ply(["element vertex 0", *PROPERTIES, "property list uchar int i"]), "lists in element 'vertex'"),
+    "list before": (
+        ply(["element face 1", "property list uchar int i", "element vertex 0"]),
+        "lists in element 'face'",
+    ),
+    "nan": (ply(["element vertex 1", *PROPERTIES], ROW[:24] + b"\0\0\xc0\x7f" + ROW[28:]), "opacity of Gaussian 0"),
+    "zero rotation": (ply(["element vertex 1", *PROPERTIES], ROW[:40] + bytes(16)), "zero length"),
+}
+
+
+@pytest.mark.parametrize("name", MALFORMED)
+def test_malformed_files_are_told_with_path_and_remedy(tmp_path, name):
+    data, message = MALFORMED[name]
+    path = tmp_path / "bad.ply"
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=message) as error:
+        read_ply(path)
+    assert str(path) in str(error.value) and "Export" in str(error.value)
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory):
+    path = tmp_path_factory.mktemp("ply") / "good.ply"
+    write_ply(path, make(3, 1), Normalization())
+    return path.read_bytes()
+
+
+@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    edits=st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), max_size=6),
+    cut=st.one_of(st.none(), st.integers(0, 10_000)),
+    insert=st.tuples(st.integers(0, 700), st.binary(max_size=12)),
+)
+def test_damaged_bytes_give_gaussians_or_a_data_error(good, tmp_path, edits, cut, insert):
+    data = bytearray(good)
+    for place, value in edits:
+        data[place % len(data)] = value
+    data[insert[0] : insert[0]] = insert[1]
+    path = tmp_path / "fuzz.ply"
+    path.write_bytes(bytes(data[:cut]))
+    try:
+        model = read_ply(path)
+    except DataError:
+        return
+    assert all(torch.isfinite(t).all() for t in model.tensors().values())
+    assert len(model) * 56 <= len(data)
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.binary(max_size=200))
+def test_noise_behind_the_magic_is_a_data_error(tmp_path, data):
+    path = tmp_path / "noise.ply"
+    path.write_bytes(b"ply\nformat binary_little_endian 1.0\n" + data)
+    with pytest.raises(DataError):
+        read_ply(path)

@@ -1,0 +1,268 @@
+"""The command line: parses, calls, prints; no logic."""
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from warpgs import __version__
+from warpgs.errors import UsageError, WarpgsError
+
+if TYPE_CHECKING:
+    from warpgs.pipeline.config import FitConfig
+
+COMMANDS = {
+    "fit": "fit Gaussians to a scene folder and fill a run folder",
+    "eval": "score a run again on its held-out views",
+    "render": "render a run: its views, an orbit or a spiral, as PNG and mp4",
+    "export": "write a run's Gaussians to a PLY file",
+    "demo": "write a synthetic scene to try things with",
+    "doctor": "say what this machine has, what is missing, and how to get it",
+}
+
+
+def _help() -> str:
+    width = max(map(len, COMMANDS))
+    rows = "\n".join(f"  {name:<{width}}  {text}" for name, text in COMMANDS.items())
+    return (
+        f"warpgs {__version__}: from a handful of posed photographs to a 3D Gaussian scene\n\n"
+        f"usage: warpgs COMMAND [flags]\n\n{rows}\n\n"
+        "`warpgs COMMAND --help` lists a command's flags. First steps: warpgs demo scene && warpgs fit scene --out run\n"
+    )
+
+
+def _parse(kind: type, name: str, arguments: list[str], default: object = None):
+    import tyro
+
+    extra = {} if default is None else {"default": default}
+    return tyro.cli(kind, args=arguments, prog=f"warpgs {name}", description=COMMANDS[name], **extra)
+
+
+def _fit_arguments(arguments: list[str]):
+    """Parse `fit`, whose defaults depend on the preset and the device."""
+    import dataclasses
+
+    import tyro
+
+    from warpgs.pipeline.config import DEFAULT_STEPS, PRESETS
+    from warpgs.pipeline.density import DensityConfig
+    from warpgs.pipeline.init import InitConfig
+    from warpgs.pipeline.loss import LossConfig
+    from warpgs.pipeline.optimizer import OptimizerConfig
+
+    name = "3dgs"
+    for i, word in enumerate(arguments):
+        if word == "--preset" and i + 1 < len(arguments):
+            name = arguments[i + 1]
+        elif word.startswith("--preset="):
+            name = word.removeprefix("--preset=")
+    if name not in PRESETS:
+        raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
+    base = PRESETS[name]
+
+    @dataclass(frozen=True)
+    class Fit:
+        scene: tyro.conf.Positional[Path]
+        """Scene folder: COLMAP, transforms.json, LLFF, DTU or Middlebury."""
+        out: Path
+        """Run folder to fill; must not exist yet."""
+        split: str | None = None
+        """llff:K, mip360:K, dtu:3|6|9, blender:8, every:N, all, or train=NAMES;test=NAMES."""
+        downscale: int = 1
+        """Factor by which both image sides shrink."""
+        steps: int | None = None
+        """Optimisation steps; 7000 on CUDA and 1000 on a CPU where not given."""
+        preset: str = name
+        """Named settings that the flags below start from."""
+        device: str = "auto"
+        """auto, cpu or cuda."""
+        threads: int = 0
+        """CPU threads; 0 for as many as there are cores."""
+        seed: int = 0
+        """Decides every random choice."""
+        resume: bool = False
+        """Continue the run in --out from its last checkpoint."""
+        strict: bool = False
+        """A frame without an image file is an error."""
+        allow_outside: bool = False
+        """Let transforms.json name files outside the scene folder."""
+        invert_masks: bool = False
+        """White in a mask removes a pixel."""
+        rule: str = base.rule
+        """Cut-offs of the rasterizer: exact, gsplat or inria."""
+        sh_every: int = base.sh_every
+        """Steps after which the spherical-harmonics degree rises by one."""
+        checkpoint_every: int = base.checkpoint_every
+        """Steps between checkpoints."""
+        init: InitConfig = field(default_factory=lambda: base.init)
+        loss: LossConfig = field(default_factory=lambda: base.loss)
+        optimizer: OptimizerConfig = field(default_factory=lambda: base.optimizer)
+        density: DensityConfig = field(default_factory=lambda: base.density)
+
+    a = _parse(Fit, "fit", arguments)
+    if a.threads < 0:
+        raise UsageError(f"--threads must be 0 or more, not {a.threads}")
+    rooms = {n: getattr(a, n) for n in ("rule", "seed", "sh_every", "checkpoint_every", "init", "loss", "optimizer", "density")}
+
+    def config(device: str) -> "FitConfig":
+        return dataclasses.replace(base, steps=a.steps if a.steps is not None else DEFAULT_STEPS[device], **rooms)
+
+    return a, config
+
+
+def _fit(arguments: list[str]) -> int:
+    a, config = _fit_arguments(arguments)
+    from warpgs.kernels.bridge import set_threads
+    from warpgs.pipeline.run import FitRequest, SceneRequest, choose_device, fit_scene
+
+    if a.threads:
+        set_threads(a.threads)
+    device, _ = choose_device(a.device)
+    settings = config(device.type)
+    if a.steps is None:
+        print(f"preset {settings.preset}, {settings.steps} steps, as usual on {device.type}; --steps changes that")
+    scene = SceneRequest(str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.invert_masks)
+    fit_scene(FitRequest(scene, a.out, settings, a.device, a.resume))
+    return 0
+
+
+def _eval(arguments: list[str]) -> int:
+    import tyro
+
+    @dataclass(frozen=True)
+    class Eval:
+        run: tyro.conf.Positional[Path]
+        """Run folder of `warpgs fit`."""
+        device: str = "auto"
+        """auto, cpu or cuda."""
+
+    a = _parse(Eval, "eval", arguments)
+    from warpgs.pipeline.reuse import evaluate
+
+    for line in evaluate(a.run, a.device):
+        print(line)
+    return 0
+
+
+def _render(arguments: list[str]) -> int:
+    import tyro
+
+    @dataclass(frozen=True)
+    class Render:
+        run: tyro.conf.Positional[Path]
+        """Run folder of `warpgs fit`."""
+        path: str = "views"
+        """views (every view of the scene), orbit or spiral."""
+        out: Path | None = None
+        """Folder for the pictures and the film; RUN/path-PATH where not given."""
+        frames: int = 90
+        """Number of frames of an orbit or a spiral."""
+        fps: int = 30
+        """Frames per second of the film."""
+        device: str = "auto"
+        """auto, cpu or cuda."""
+
+    a = _parse(Render, "render", arguments)
+    from warpgs.pipeline.reuse import render
+
+    print(render(a.run, a.path, a.out, a.frames, a.fps, a.device))
+    return 0
+
+
+def _export(arguments: list[str]) -> int:
+    import tyro
+
+    @dataclass(frozen=True)
+    class Export:
+        run: tyro.conf.Positional[Path]
+        """Run folder of `warpgs fit`."""
+        to: Path
+        """File to write; its suffix says the format: .ply."""
+
+    a = _parse(Export, "export", arguments)
+    from warpgs.pipeline.reuse import export
+
+    print(export(a.run, a.to))
+    return 0
+
+
+def _demo(arguments: list[str]) -> int:
+    import tyro
+
+    @dataclass(frozen=True)
+    class Demo:
+        folder: tyro.conf.Positional[Path]
+        """Folder to write; must not exist yet."""
+        views: int = 24
+        """Number of photographs."""
+        width: int = 320
+        """Image width [px]."""
+        height: int = 240
+        """Image height [px]."""
+        seed: int = 0
+        """Decides the textures."""
+
+    a = _parse(Demo, "demo", arguments)
+    from warpgs.demo import write_demo
+
+    split = write_demo(a.folder, views=a.views, width=a.width, height=a.height, seed=a.seed)
+    print(f"{a.folder}: {a.views} views of {a.width} x {a.height} px as a COLMAP folder")
+    print(f"next: warpgs fit {a.folder} --split '{split}' --out run")
+    return 0
+
+
+def _doctor(arguments: list[str]) -> int:
+    @dataclass(frozen=True)
+    class Doctor:
+        pass
+
+    _parse(Doctor, "doctor", arguments)
+    from warpgs.doctor import diagnose, print_report
+
+    return print_report(diagnose())
+
+
+RUN = {"fit": _fit, "eval": _eval, "render": _render, "export": _export, "demo": _demo, "doctor": _doctor}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; returns its exit code: 0 done, 2 usage, 3 data, 4 resources, 5 internal, 130 interrupted."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(_help(), end="")
+        return 0 if arguments else 2
+    if arguments[0] in ("--version", "-V"):
+        print(f"warpgs {__version__}")
+        return 0
+    name = arguments[0]
+    try:
+        if name not in RUN:
+            raise UsageError(f"there is no command {name!r}; choose one of {', '.join(RUN)}")
+        return RUN[name](arguments[1:])
+    except WarpgsError as e:
+        print(f"warpgs: {e}", file=sys.stderr)
+        return e.exit_code
+    except KeyboardInterrupt:
+        print("warpgs: interrupted; --resume continues from the last checkpoint", file=sys.stderr)
+        return 130
+    except Exception as e:
+        return _internal_error(e, arguments)
+
+
+def _internal_error(error: Exception, arguments: list[str]) -> int:
+    """Keep the traceback for a bug report; the user sees one line."""
+    import tempfile
+    import traceback
+
+    with tempfile.NamedTemporaryFile("w", prefix="warpgs-error-", suffix=".txt", delete=False) as f:
+        f.write(f"warpgs {__version__} {' '.join(arguments)}\n\n{''.join(traceback.format_exception(error))}")
+    print(
+        f"warpgs: internal error, {type(error).__name__}: {error}. This is a defect of warpgs; the details are in {f.name}, "
+        "please report them",
+        file=sys.stderr,
+    )
+    return 5
+
+
+if __name__ == "__main__":
+    sys.exit(main())

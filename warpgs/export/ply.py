@@ -1,0 +1,291 @@
+"""Gaussians as a PLY file in the layout of the INRIA 3DGS code, which splat viewers and editors read.
+
+One vertex per Gaussian, binary little endian: position, an unused normal, spherical-harmonics coefficients (degree 0
+first, the rest channel-major), opacity as a logit, log scales, rotation wxyz as stored (not normalised).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from warpgs.errors import DataError, ResourceError
+from warpgs.scene import Gaussians, Normalization
+
+HEADER_LIMIT = 65536
+"""A header longer than this [bytes] is refused: a real one has some two thousand."""
+CHUNK_ROWS = 65536
+"""Gaussians written at a time, so that the interleaved copy of a large model never exists as a whole."""
+
+MEND = "Export the model again with warpgs, or with any tool that writes the binary layout of the INRIA 3DGS code."
+
+_TYPES = {
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "<i2",
+    "int16": "<i2",
+    "ushort": "<u2",
+    "uint16": "<u2",
+    "int": "<i4",
+    "int32": "<i4",
+    "uint": "<u4",
+    "uint32": "<u4",
+    "float": "<f4",
+    "float32": "<f4",
+    "double": "<f8",
+    "float64": "<f8",
+}
+_POSITION = ("x", "y", "z")
+_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+_SCALE = ("scale_0", "scale_1", "scale_2")
+_ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+_REST_COUNTS = (0, 9, 24, 45)
+
+
+@dataclass
+class _Element:
+    """One element of a PLY header."""
+
+    name: str
+    count: int
+    properties: list[tuple[str, str]] = field(default_factory=list)
+    """(name, numpy type) in file order."""
+    has_list: bool = False
+    """True where a property is a list, so that rows differ in length."""
+
+
+def write_ply(path: str | os.PathLike, gaussians: Gaussians, normalization: Normalization) -> None:
+    """Write Gaussians in the coordinates of the scene's files.
+
+    The file appears whole or not at all: it is written beside ``path`` and moved there once it is on the disk.
+
+    Args:
+        path: Where to write; an existing file is replaced.
+        gaussians: N Gaussians in scene coordinates [u], on any device.
+        normalization: How scene coordinates came from file coordinates.
+
+    Raises:
+        DataError: A tensor holds a NaN or an infinity, or would after the change of coordinates.
+        ResourceError: The folder or the disk does not take the file.
+    """
+    path = Path(path)
+    arrays = {name: t.detach().cpu().numpy() for name, t in gaussians.tensors().items()}
+    _refuse_non_finite(path, arrays)
+    if not (math.isfinite(normalization.scale) and normalization.scale > 0 and np.isfinite(normalization.offset).all()):
+        raise DataError(f"{path}: not written, the scene's normalization is not a similarity: {normalization}. Read it again.")
+    # float64 throughout: georeferenced offsets (10^6 m) would eat the millimetres of a float32 sum.
+    with np.errstate(over="ignore"):
+        means = arrays["means"].astype(np.float64) / normalization.scale + np.asarray(normalization.offset, np.float64)
+        log_scales = arrays["log_scales"].astype(np.float64) - math.log(normalization.scale)
+        arrays |= {"means": means.astype(np.float32), "log_scales": log_scales.astype(np.float32)}
+    _refuse_non_finite(path, arrays)
+
+    n, k = arrays["sh"].shape[:2]
+    try:
+        with _replacing(path) as file:
+            file.write(_header(n, 3 * (k - 1)))
+            for start in range(0, n, CHUNK_ROWS):
+                file.write(_rows({name: a[start : start + CHUNK_ROWS] for name, a in arrays.items()}).tobytes())
+    except OSError as e:
+        raise ResourceError(
+            f"{path}: cannot be written ({e.strerror or e}). Free some disk space, or name a folder you may write to."
+        ) from e
+
+
+def read_ply(path: str | os.PathLike) -> Gaussians:
+    """Read Gaussians from a PLY file in the INRIA 3DGS layout.
+
+    Properties and elements that are not part of the layout are ignored. Nothing is allocated from the header's word
+    alone: the number of rows is checked against the size of the file first.
+
+    Args:
+        path: The file.
+
+    Returns:
+        N Gaussians in the coordinates of the file, torch float32 tensors on the CPU.
+
+    Raises:
+        DataError: The file is missing, malformed, cut short or holds NaNs, infinities or a rotation of zero length.
+    """
+    path = Path(path)
+    try:
+        with open(path, "rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            elements, start = _parse_header(path, file.read(HEADER_LIMIT))
+            vertex, start = _locate_vertices(path, elements, start)
+            rest = _check_properties(path, vertex)
+            dtype = np.dtype(vertex.properties)
+            end = start + vertex.count * dtype.itemsize
+            if end > size:
+                raise _error(
+                    path,
+                    f"cut short: {vertex.count} Gaussians of {dtype.itemsize} bytes need {end} bytes, it has {size}",
+                )
+            file.seek(start)
+            rows = np.fromfile(file, dtype=dtype, count=vertex.count)
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({e.strerror or e}). Check the path and its permissions.") from e
+    if len(rows) != vertex.count:
+        raise _error(path, f"cut short: {vertex.count} Gaussians announced, {len(rows)} read")
+    return _assemble(path, rows, rest)
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[BinaryIO]:
+    """A file to write that takes the place of ``path`` when the block ends well and vanishes when it does not."""
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        with open(temporary, "xb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def _refuse_non_finite(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Raise a DataError that names the first tensor with a NaN or an infinity."""
+    for name, array in arrays.items():
+        bad = array.size - int(np.isfinite(array).sum())
+        if bad:
+            raise DataError(
+                f"{path}: not written, {name} holds {bad} non-finite of {array.size} values, which no viewer can show. "
+                "Export an earlier checkpoint, or fit again with a lower learning rate."
+            )
+
+
+def _names(rest: int) -> list[str]:
+    """Property names of the layout with ``rest`` coefficients above degree 0, in file order."""
+    return [*_POSITION, "nx", "ny", "nz", *_DC, *(f"f_rest_{i}" for i in range(rest)), "opacity", *_SCALE, *_ROTATION]
+
+
+def _header(n: int, rest: int) -> bytes:
+    """The header of a file with ``n`` Gaussians."""
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
+    lines += [f"property float {name}" for name in _names(rest)]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
+
+
+def _rows(arrays: dict[str, np.ndarray]) -> np.ndarray:
+    """Interleave the tensors of n Gaussians: little-endian float32, shape [n, 17 + 3 (K - 1)]."""
+    sh = arrays["sh"]
+    n = len(sh)
+    # Channel-major: all coefficients of red, then green, then blue.
+    rest = sh[:, 1:, :].transpose(0, 2, 1).reshape(n, -1)
+    opacity = arrays["logit_opacities"][:, None]
+    columns = [arrays["means"], np.zeros((n, 3)), sh[:, 0, :], rest, opacity, arrays["log_scales"], arrays["quats"]]
+    return np.concatenate(columns, axis=1, dtype="<f4", casting="same_kind")
+
+
+def _error(path: Path, what: str) -> DataError:
+    """A DataError about a malformed file, with the way to mend it."""
+    return DataError(f"{path}: not a usable Gaussian PLY file: {what}. {MEND}")
+
+
+def _parse_header(path: Path, head: bytes) -> tuple[list[_Element], int]:
+    """Elements of the header in the first bytes of a file, and the offset [bytes] of the data behind it."""
+    if not re.match(rb"ply\r?\n", head):
+        raise _error(path, "it does not start with 'ply'")
+    end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
+    if end is None:
+        raise _error(path, f"no 'end_header' line within the first {HEADER_LIMIT} bytes")
+    try:
+        lines = head[: end.start()].decode("ascii").splitlines()[1:]
+    except UnicodeDecodeError as e:
+        raise _error(path, f"byte {e.start} of the header is not ASCII") from e
+
+    elements: list[_Element] = []
+    formats = []
+    for line in lines:
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", *words]:
+                formats.append(" ".join(words))
+            case ["element", name, count] if re.fullmatch(r"[0-9]{1,18}", count):
+                elements.append(_Element(name, int(count)))
+            case ["property", "list", count, item, _] if elements and count in _TYPES and item in _TYPES:
+                elements[-1].has_list = True
+            case ["property", kind, name] if elements and kind in _TYPES:
+                elements[-1].properties.append((name, _TYPES[kind]))
+            case _:
+                raise _error(path, f"header line {line[:80]!r} makes no sense")
+    if formats != ["binary_little_endian 1.0"]:
+        raise _error(path, f"its format is {' and '.join(formats)[:80] or 'not given'}, not binary_little_endian 1.0")
+    return elements, end.end()
+
+
+def _locate_vertices(path: Path, elements: list[_Element], start: int) -> tuple[_Element, int]:
+    """The vertex element and the offset [bytes] of its rows, behind the rows of any elements before it."""
+    if [e.name for e in elements].count("vertex") != 1:
+        raise _error(path, "the header must have one 'element vertex'")
+    for element in elements:
+        if element.has_list and (element.count or element.name == "vertex"):
+            raise _error(path, f"the lists in element {element.name[:40]!r} leave the place of the Gaussians unknown")
+        if element.name == "vertex":
+            break
+        start += element.count * sum(np.dtype(kind).itemsize for _, kind in element.properties)
+    return element, start
+
+
+def _check_properties(path: Path, vertex: _Element) -> int:
+    """Number of coefficients above degree 0; raises where the layout is incomplete."""
+    names = [name for name, _ in vertex.properties]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise _error(path, f"property {twice[:40]!r} appears twice")
+    rest = sum(bool(re.fullmatch(r"f_rest_[0-9]+", name)) for name in names)
+    if rest not in _REST_COUNTS:
+        raise _error(path, f"it has {rest} f_rest properties, but degrees 0 to 3 have 0, 9, 24 or 45")
+    # Normals carry nothing, and some tools leave them out.
+    missing = sorted(set(_names(rest)) - set(names) - {"nx", "ny", "nz"})
+    if missing:
+        raise _error(path, f"properties missing: {', '.join(missing[:8])}{' ...' if len(missing) > 8 else ''}")
+    return rest
+
+
+def _assemble(path: Path, rows: np.ndarray, rest: int) -> Gaussians:
+    """Gaussians from structured rows, shape [N]; raises where a value cannot be used."""
+    import torch
+
+    def columns(names: list[str] | tuple[str, ...]) -> np.ndarray:
+        out = np.empty((len(rows), len(names)), np.float32)
+        # A double beyond float32 becomes an infinity, and the check below names it.
+        with np.errstate(over="ignore", invalid="ignore"):
+            for i, name in enumerate(names):
+                out[:, i] = rows[name]
+        bad = ~np.isfinite(out)
+        if bad.any():
+            row, column = np.argwhere(bad)[0]
+            raise _error(path, f"{names[column]} of Gaussian {row} is not finite in float32")
+        return out
+
+    sh = np.empty((len(rows), 1 + rest // 3, 3), np.float32)
+    sh[:, 0, :] = columns(_DC)
+    if rest:
+        sh[:, 1:, :] = columns([f"f_rest_{i}" for i in range(rest)]).reshape(len(rows), 3, -1).transpose(0, 2, 1)
+    quats = columns(_ROTATION)
+    zero = ~quats.any(axis=1)
+    if zero.any():
+        raise _error(path, f"the rotation of Gaussian {int(np.argmax(zero))} has zero length")
+
+    return Gaussians(
+        means=torch.from_numpy(columns(_POSITION)),
+        quats=torch.from_numpy(quats),
+        log_scales=torch.from_numpy(columns(_SCALE)),
+        logit_opacities=torch.from_numpy(columns(["opacity"])[:, 0]),
+        sh=torch.from_numpy(sh),
+    )

@@ -1,0 +1,122 @@
+"""What a fit leaves for people: pictures of held-out views, scores, the report page."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from warpgs.files import write_bytes
+from warpgs.io.splits import Split
+from warpgs.pipeline.evaluate import guesses, render_view, score, summarize
+from warpgs.rasterizer import RasterizeOptions
+from warpgs.report.curve import curve
+from warpgs.report.events import read_events
+from warpgs.report.overview import render_overview
+from warpgs.report.page import ViewPictures, write_page
+from warpgs.report.pictures import depth_map, error_map, png, side_by_side
+from warpgs.scene import Gaussians, Scene, View
+
+SHOWN_VIEWS = 6
+"""Held-out views with pictures in the report; all have files in the run folder."""
+
+
+def options_for(rule: str, background: tuple[float, float, float], gaussians: Gaussians) -> RasterizeOptions:
+    """Rendering options of a run."""
+    return RasterizeOptions(rule=rule, background=gaussians.means.new_tensor(background))
+
+
+def file_stem(name: str) -> str:
+    """A view's name as one file name without suffix."""
+    return str(PurePosixPath(name).with_suffix("")).replace("/", "_")
+
+
+def evaluate_run(
+    out: Path, gaussians: Gaussians, train: list[View], test: list[View], rule: str, background: tuple[float, float, float]
+) -> dict:
+    """Score held-out and training views, and save a picture and a depth map of each held-out view (of each training view
+    where none is held out).
+
+    Returns:
+        Means over held-out and over training views, a row per held-out view, and what guessing scores.
+    """
+    options = options_for(rule, background, gaussians)
+    (out / "renders").mkdir(exist_ok=True)
+    (out / "depth").mkdir(exist_ok=True)
+    rows, train_rows = [], []
+    for view in train:
+        train_rows.append(score(view, render_view(gaussians, view, options)[0]))
+    for view in test or train:
+        image, depth, alpha = render_view(gaussians, view, options)
+        rows.append(score(view, image))
+        stem = file_stem(view.name)
+        row = side_by_side([np.clip(image, 0, 1), view.image, error_map(image, view.image)])
+        write_bytes(out / "renders" / f"{stem}.png", png(row))
+        write_bytes(out / "depth" / f"{stem}.png", png(depth_map(depth, alpha)))
+    return {
+        "test": summarize(rows) if test else {}, "train": summarize(train_rows),
+        "views": [asdict(r) for r in rows] if test else [],
+        "guesses": guesses(train, test) if test else {},
+        "metrics": "PSNR on 8-bit images; ssim: 11x11 Gaussian, zero padding; ssim_skimage: border cropped; LPIPS not measured",
+    }  # fmt: skip
+
+
+def _pictures(views: list[View], gaussians: Gaussians, options: RasterizeOptions, rows: dict[str, dict]) -> list[ViewPictures]:
+    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(SHOWN_VIEWS, len(views))).round().astype(int))]
+    result = []
+    for view in chosen:
+        image, depth, alpha = render_view(gaussians, view, options)
+        row = rows.get(view.name)
+        region = f", over {row['region']}" if row and row["region"] != "all" else ""
+        caption = f"PSNR {row['psnr']:.2f} dB{region}, SSIM {row['ssim']:.3f}" if row else "training view"
+        parts = (image, view.image, error_map(image, view.image), depth_map(depth, alpha))
+        result.append(ViewPictures(view.name, caption, *map(png, parts)))
+    return result
+
+
+def write_report(out: Path, scene: Scene, split: Split, gaussians: Gaussians, metrics: dict, record: dict) -> None:
+    """Write report.html for a run whose scores are known."""
+    train, test = [scene.view(n) for n in split.train], [scene.view(n) for n in split.test]
+    notes = list(record["notes"])
+    means = gaussians.means.cpu().numpy()
+    colors = np.clip(0.28209479 * gaussians.sh[:, 0].cpu().numpy() + 0.5, 0, 1)
+    sample = np.random.default_rng(0).permutation(len(means))[:60_000]
+    cameras = ([v.camera for v in train], [v.camera for v in test])
+    overview, why = render_overview(*cameras, means[sample].astype(np.float64), colors[sample])
+    if why:
+        notes.append(why)
+        print(f"  {why}")
+    events = read_events(out / "metrics.jsonl")
+    steps = [e["step"] for e in events]
+    curves = [
+        curve("Training loss", steps, [e["loss"] for e in events]),
+        curve("Training PSNR", steps, [e["psnr"] for e in events], "dB"),
+        curve("Gaussians", steps, [e["count"] for e in events]),
+    ]
+    figures = []
+    if metrics["test"]:
+        best = max(metrics["guesses"].values(), default=float("nan"))
+        figures = [
+            ("held-out PSNR", f"{metrics['test']['psnr']:.2f} dB"), ("held-out SSIM", f"{metrics['test']['ssim']:.3f}"),
+            ("best guess without a fit", f"{best:.2f} dB"),
+        ]  # fmt: skip
+    seconds = metrics["seconds"]
+    figures += [
+        ("training PSNR", f"{metrics['train']['psnr']:.2f} dB"), ("Gaussians", f"{metrics['gaussians']:,}"),
+        ("steps", f"{metrics['steps']:,}"), ("time", f"{seconds['total']:.0f} s"),
+    ]  # fmt: skip
+    table = [["view", "PSNR [dB]", "SSIM", "SSIM (scikit-image)", "pixels"]] + [
+        [r["name"], f"{r['psnr']:.2f}", f"{r['ssim']:.4f}", f"{r['ssim_skimage']:.4f}", r["region"]] for r in metrics["views"]
+    ]
+    options = options_for(record["config"]["rule"], tuple(record["background"]), gaussians)
+    pictures = _pictures(test or train, gaussians, options, {r["name"]: r for r in metrics["views"]})
+    camera = train[0].camera
+    details = {k: v for k, v in record.items() if k != "cameras"} | {"metrics": metrics["metrics"]}
+    write_page(
+        out / "report.html",
+        title=Path(scene.path).resolve().name,
+        subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
+        f"{camera.width} x {camera.height} px, {metrics['device']}",
+        figures=figures, notes=notes, table=table, views=pictures, curves=curves, overview=overview, details=details,
+    )  # fmt: skip

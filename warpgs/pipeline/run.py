@@ -1,0 +1,258 @@
+"""A run folder: set up, filled by a fit, read again by eval, render and export."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import platform
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from warpgs import __version__
+from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.export.ply import write_ply
+from warpgs.files import write_json
+from warpgs.io.load import load_scene
+from warpgs.io.splits import Split, default_split, split_views
+from warpgs.pipeline.checkpoint import load_checkpoint, save_checkpoint
+from warpgs.pipeline.config import FitConfig
+from warpgs.pipeline.fit import Fit, StepReport, run, train_views
+from warpgs.pipeline.results import evaluate_run, write_report
+from warpgs.report.events import EventLog
+from warpgs.report.progress import Progress
+from warpgs.scene import Camera, Gaussians, Normalization, Scene
+
+CONFIG = "config.json"
+
+
+@dataclass(frozen=True)
+class SceneRequest:
+    """What to read, and how."""
+
+    path: str
+    split: str | None = None
+    downscale: int = 1
+    strict: bool = False
+    allow_outside: bool = False
+    invert_masks: bool = False
+
+
+@dataclass(frozen=True)
+class FitRequest:
+    """Everything that `warpgs fit` was asked for."""
+
+    scene: SceneRequest
+    out: Path
+    config: FitConfig
+    device: str
+    resume: bool = False
+
+
+def choose_device(name: str) -> tuple[torch.device, str]:
+    """The device for auto, cpu or cuda, and a sentence on it.
+
+    Raises:
+        ResourceError: CUDA was asked for and is not there.
+        UsageError: The name is none of the three.
+    """
+    if name not in ("auto", "cpu", "cuda"):
+        raise UsageError(f"device {name!r} is not one of auto, cpu, cuda")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ResourceError("--device cuda: torch sees no CUDA device here; `warpgs doctor` says why. Use --device cpu")
+    if name != "cpu" and torch.cuda.is_available():
+        return torch.device("cuda"), f"on {torch.cuda.get_device_name()}"
+    return torch.device("cpu"), f"on the CPU, {torch.get_num_threads()} threads"
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on."""
+    names = ("torch", "warp-lang", "numpy", "opencv-contrib-python-headless", "scikit-image", "safetensors")
+    found = {"warpgs": __version__, "python": platform.python_version(), "system": platform.platform(terse=True)}
+    for name in names:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed as a package"
+    return found
+
+
+def read_scene(request: SceneRequest) -> tuple[Scene, Split, list[str]]:
+    """Load a scene and split its views; returns both with the notes for the user."""
+    scene = load_scene(
+        request.path, downscale=request.downscale, strict=request.strict,
+        allow_outside=request.allow_outside, invert_masks=request.invert_masks,
+    )  # fmt: skip
+    if request.split is None:
+        split, note = default_split(scene)
+        return scene, split, [*scene.notes, note]
+    return scene, split_views(scene, request.split), list(scene.notes)
+
+
+def _prepare_folder(out: Path, resume: bool) -> None:
+    if resume:
+        if not (out / CONFIG).is_file():
+            raise UsageError(f"--resume: {out} holds no {CONFIG}, so there is no run to continue; leave out --resume")
+        return
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UsageError(f"{out} exists already; choose another --out, or continue that run with --resume")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as e:
+        raise ResourceError(f"{out}: cannot be written ({e.strerror}); choose another --out") from e
+
+
+def _camera_values(camera: Camera) -> dict:
+    return {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": camera.width, "height": camera.height}
+
+
+def _record(request: FitRequest, scene: Scene, split: Split, notes: list[str], device: torch.device) -> dict:
+    return {
+        "scene": {**asdict(request.scene), "path": str(Path(request.scene.path).resolve())},
+        "format": scene.format, "fingerprint": scene.fingerprint,
+        "train": split.train, "test": split.test, "notes": notes,
+        "normalization": {"offset": scene.normalization.offset.tolist(), "scale": scene.normalization.scale},
+        "background": scene.background, "config": request.config.to_json(), "config_hash": request.config.fingerprint(),
+        "device": device.type, "versions": versions(),
+        "cameras": {v.name: _camera_values(v.camera) for v in scene.views},
+    }  # fmt: skip
+
+
+def _check_same(record: dict, stored: dict, out: Path) -> None:
+    """A continued run must be the same run: same data, views, settings and kind of device."""
+    for key in ("fingerprint", "train", "test", "config", "device"):
+        now, then = json.loads(json.dumps(record[key])), stored.get(key)
+        if now != then:
+            if isinstance(now, dict) and isinstance(then, dict):
+                changed = [k for k in now if now[k] != then.get(k)]
+                key = f"{key} ({', '.join(changed)})"
+            raise UsageError(
+                f"--resume: {key} differs from the run in {out}; give the flags it was started with, or a new --out"
+            )
+
+
+def fit_scene(request: FitRequest) -> dict:
+    """Fit a scene and fill the run folder: configuration, log, checkpoint, PLY, pictures, scores, report.
+
+    Prints what was chosen for the user, progress, and where the results are.
+
+    Returns:
+        The contents of metrics.json.
+
+    Raises:
+        WarpgsError: Anything that a user can mend; before training wherever it can be known by then.
+    """
+    began = time.perf_counter()
+    out = request.out
+    _prepare_folder(out, request.resume)
+    device, where = choose_device(request.device)
+    scene, split, notes = read_scene(request.scene)
+    train, test = train_views(scene, split.train), train_views(scene, split.test)
+    record = _record(request, scene, split, notes, device)
+    tensors, plain = {}, None
+    if request.resume:
+        _check_same(record, json.loads((out / CONFIG).read_text("utf-8")), out)
+        if (out / "checkpoint.safetensors").is_file():
+            tensors, plain = load_checkpoint(out)
+    else:
+        write_json(out / CONFIG, record)
+
+    fit = Fit(train, scene.points, request.config, device, scene.background)
+    if plain is not None:
+        fit.load(tensors, plain)
+        notes.append(f"continued from step {fit.step}")
+    notes.append(f"start: {fit.start}")
+    size = f"{train[0].camera.width} x {train[0].camera.height} px"
+    print(f"{scene.path}: {scene.format}, {len(train)} views to fit, {len(test)} held out, {size}, {where}")
+    for note in notes:
+        print(f"  {note}")
+
+    setup = time.perf_counter() - began
+    _train(fit, out)
+    trained = time.perf_counter() - began - setup
+    write_ply(out / "point_cloud.ply", fit.gaussians, scene.normalization)
+    metrics = evaluate_run(out, fit.gaussians, train, test, request.config.rule, scene.background)
+    metrics |= {
+        "steps": fit.step, "gaussians": len(fit.gaussians), "preset": request.config.preset, "seed": request.config.seed,
+        "config_hash": request.config.fingerprint(), "fingerprint": scene.fingerprint, "device": where.removeprefix("on "),
+        "seconds": {"setup": setup, "training": trained, "total": time.perf_counter() - began},
+    }  # fmt: skip
+    if device.type == "cuda":
+        metrics["peak_torch_bytes"] = torch.cuda.max_memory_allocated(device)
+    write_json(out / "metrics.json", metrics)
+    record["notes"] = notes
+    write_report(out, scene, split, fit.gaussians, metrics, record)
+    _print_result(out, metrics)
+    return metrics
+
+
+def _train(fit: Fit, out: Path) -> None:
+    log = EventLog(out / "metrics.jsonl", fit.step)
+
+    def save(current: Fit) -> None:
+        log.flush()
+        save_checkpoint(out, *current.state())
+
+    with Progress(fit.config.steps, fit.step) as progress:
+
+        def on_step(r: StepReport) -> None:
+            progress.update(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count)
+            log.write(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=round(r.seconds, 6))
+
+        try:
+            run(fit, on_step, save)
+        except KeyboardInterrupt:
+            save(fit)
+            raise
+        finally:
+            log.close()
+
+
+def _print_result(out: Path, metrics: dict) -> None:
+    if metrics["test"]:
+        scores = metrics["test"]
+        print(f"held-out PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f} over {len(metrics['views'])} views")
+        for name, value in metrics["guesses"].items():
+            print(f"  without a fit, the {name.replace('_', ' ')} scores {value:.2f} dB")
+    print(f"{metrics['gaussians']:,} Gaussians; report: {out / 'report.html'}  pictures: {out / 'renders'}")
+
+
+@dataclass(frozen=True)
+class StoredRun:
+    """What a run folder holds."""
+
+    folder: Path
+    record: dict
+    gaussians: Gaussians
+    cameras: dict[str, Camera]
+
+    @property
+    def normalization(self) -> Normalization:
+        """How scene coordinates came from those of the files."""
+        n = self.record["normalization"]
+        return Normalization(np.array(n["offset"]), n["scale"])
+
+
+def open_run(folder: Path, device: torch.device) -> StoredRun:
+    """Read a finished or interrupted run.
+
+    Raises:
+        DataError: The folder is no run folder, or its checkpoint is not whole.
+    """
+    path = folder / CONFIG
+    try:
+        record = json.loads(path.read_text("utf-8"))
+        cameras = {
+            n: Camera(np.array(c["viewmat"]), np.array(c["K"]), c["width"], c["height"]) for n, c in record["cameras"].items()
+        }
+    except (OSError, ValueError, KeyError, TypeError) as e:
+        raise DataError(f"{path}: cannot be read ({e}); give a folder that `warpgs fit --out` filled") from e
+    tensors, _ = load_checkpoint(folder)
+    gaussians = Gaussians(**{n: tensors[f"param.{n}"].to(device) for n in Gaussians.__dataclass_fields__})
+    return StoredRun(folder, record, gaussians, cameras)

@@ -1,0 +1,84 @@
+"""The record of a fit: one JSON object per line of metrics.jsonl, appended as the steps go by."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+from warpgs.errors import ResourceError
+from warpgs.files import write_bytes
+
+
+class EventLog:
+    """Appends events to a file and, where a fit goes on, first forgets what came after the state it goes on from."""
+
+    def __init__(self, path: Path, step: int = 0):
+        """Open the log of a fit that has done ``step`` steps: events of later steps are dropped, 0 starts empty.
+
+        Raises:
+            ResourceError: The file cannot be written.
+        """
+        self.path = Path(path)
+        kept = [e for e in read_events(self.path) if e["step"] <= step] if step and self.path.is_file() else []
+        # The old log stays until the shortened one is on the disk.
+        write_bytes(self.path, *(_line(e) for e in kept))
+        try:
+            self._file = self.path.open("ab")
+        except OSError as e:
+            raise self._failure(e) from e
+
+    def write(self, *, step: int, **values: object) -> None:
+        """Append the event of one step; NaN and infinity become null.
+
+        Raises:
+            ResourceError: The disk does not take it.
+        """
+        try:
+            self._file.write(_line({"step": step, **values}))
+        except OSError as e:
+            raise self._failure(e) from e
+
+    def flush(self) -> None:
+        """Hand everything written to the system, so that the log never lags behind a checkpoint.
+
+        Raises:
+            ResourceError: The disk does not take it.
+        """
+        try:
+            self._file.flush()
+        except OSError as e:
+            raise self._failure(e) from e
+
+    def close(self) -> None:
+        """Flush and close; the log takes no further events."""
+        try:
+            self._file.close()
+        except OSError as e:
+            raise self._failure(e) from e
+
+    def _failure(self, error: OSError) -> ResourceError:
+        return ResourceError(f"{self.path}: cannot be written ({error.strerror or error}). Free some disk space")
+
+
+def read_events(path: Path) -> list[dict]:
+    """All events of a log in file order.
+
+    A line that is no object with a whole-numbered ``step`` is skipped: a killed run may leave its last one torn. Null
+    is read as NaN, so that a series has a number at every step.
+    """
+    events = []
+    for line in Path(path).read_bytes().splitlines():
+        try:
+            event = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(event, dict) and isinstance(event.get("step"), int):
+            events.append({k: math.nan if v is None else v for k, v in event.items()})
+    return events
+
+
+def _line(event: dict) -> bytes:
+    """An event as a line; what is not finite becomes null, which JSON can hold."""
+    plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in event.items()}
+    return (json.dumps(plain, allow_nan=False) + "\n").encode()

@@ -1,0 +1,106 @@
+"""A picture of cameras and points in space, drawn by pyvista in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from warpgs.scene import Camera
+
+REMEDY = "install a software renderer: on Debian or Ubuntu `apt-get install libegl1 libgl1 libgl1-mesa-dri libxrender1`"
+TIMEOUT = 90
+TRAIN_COLOR, TEST_COLOR = "#149696", "#e08a2c"
+
+PROBE = (
+    "import pyvista as pv; p = pv.Plotter(off_screen=True, window_size=(16, 16)); p.add_mesh(pv.Sphere()); p.screenshot(None)"
+)
+
+
+def _python(code: str, *arguments: str) -> tuple[bool, str]:
+    """Run Python apart from this process, since VTK ends the process where it finds no way to draw."""
+    environment = {**os.environ, "VTK_DEFAULT_OPENGL_WINDOW": "vtkEGLRenderWindow"}
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code, *arguments],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return False, f"pyvista did not finish within {TIMEOUT} s"
+    if done.returncode == 0:
+        return True, ""
+    last = done.stderr.strip().splitlines()
+    return False, f"pyvista ended with code {done.returncode}" + (f" ({last[-1][:100]})" if last else "")
+
+
+def probe_rendering() -> tuple[bool, str]:
+    """Whether pyvista can draw here, and the reason with a remedy if not."""
+    works, why = _python(PROBE)
+    return works, "off-screen through EGL" if works else f"{why}; {REMEDY}"
+
+
+def _frusta(cameras: list[Camera], size: float) -> np.ndarray:
+    """Line segments [S, 2, 3] of camera pyramids whose image planes lie ``size`` [u] away."""
+    lines = []
+    for c in cameras:
+        corners = np.array([[0, 0, 1], [c.width, 0, 1], [c.width, c.height, 1], [0, c.height, 1]], float)
+        rays = corners @ np.linalg.inv(c.K).T * size
+        world = (rays - c.viewmat[:3, 3]) @ c.viewmat[:3, :3]
+        lines += [(c.center, p) for p in world] + [(world[i], world[(i + 1) % 4]) for i in range(4)]
+    return np.array(lines)
+
+
+DRAW = f"""
+import sys, numpy as np, pyvista as pv
+d = np.load(sys.argv[1])
+p = pv.Plotter(off_screen=True, window_size=(1280, 640))
+p.set_background("white")
+cloud = pv.PolyData(d["points"])
+cloud["rgb"] = d["colors"]
+p.add_mesh(cloud, scalars="rgb", rgb=True, point_size=4, render_points_as_spheres=False)
+for key, color in (("train", "{TRAIN_COLOR}"), ("test", "{TEST_COLOR}")):
+    if len(d[key]):
+        p.add_lines(d[key].reshape(-1, 3), color=color, width=2)
+p.camera.position, p.camera.focal_point, p.camera.up = d["view"]
+p.camera.view_angle = 40
+p.screenshot(sys.argv[2])
+"""
+
+
+def render_overview(
+    train: list[Camera], test: list[Camera], points: np.ndarray, colors: np.ndarray
+) -> tuple[bytes | None, str]:
+    """Draw training and held-out cameras among points [N, 3] [u] with colours in [0, 1] [N, 3].
+
+    Returns:
+        PNG bytes and an empty string; or None and the reason with a remedy, where this machine cannot draw.
+    """
+    centers = np.array([c.center for c in train])
+    low, high = np.percentile(points, [5, 95], axis=0)
+    inside = ((points >= low - (high - low)) & (points <= high + (high - low))).all(1)
+    middle, spread = np.median(points, axis=0), float(np.linalg.norm(high - low)) + 1e-9
+    forward = np.mean([c.viewmat[2, :3] for c in train], axis=0)
+    up = -np.mean([c.viewmat[1, :3] for c in train], axis=0)
+    back = centers.mean(0) - middle
+    reach = max(float(np.linalg.norm(back)), 0.5 * spread)
+    side = np.cross(forward, up)
+    eye = middle + 1.5 * back + 0.7 * reach * side / max(np.linalg.norm(side), 1e-9) + 0.5 * reach * up
+    size = 0.12 * max(reach, 1e-6)
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder) / "scene.npz", Path(folder) / "overview.png"
+        np.savez(
+            source, points=points[inside].astype(np.float32), colors=np.round(255 * np.clip(colors[inside], 0, 1)).astype(np.uint8),
+            train=_frusta(train, size), test=_frusta(test, size), view=np.stack([eye, 0.7 * middle + 0.3 * centers.mean(0), up]),
+        )  # fmt: skip
+        works, why = _python(DRAW, str(source), str(target))
+        if works and target.is_file():
+            return target.read_bytes(), ""
+    return None, f"no overview picture: {why}; {REMEDY}"

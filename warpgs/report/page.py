@@ -1,0 +1,145 @@
+"""The report of a fit: one HTML file with everything in it."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from warpgs.files import write_text
+
+STYLE = """
+:root{--ink:#1b1d21;--soft:#666c76;--line:#dfe2e7;--paper:#fbfbf9;--card:#fff;--accent:#0b6e6e}
+@media(prefers-color-scheme:dark){:root{--ink:#e8e9ec;--soft:#9aa1ac;--line:#30343b;--paper:#131518;--card:#1b1e22;--accent:#55c2bd}}
+*{box-sizing:border-box}body{margin:0;background:var(--paper);color:var(--ink);
+font:16px/1.55 -apple-system,BlinkMacSystemFont,"Segoe UI",Helvetica,Arial,sans-serif}
+main{max-width:1080px;margin:0 auto;padding:48px 24px 80px}
+h1{font-size:34px;letter-spacing:-.02em;margin:0 0 4px;overflow-wrap:anywhere}
+h2{font-size:20px;margin:52px 0 14px;letter-spacing:-.01em}
+.sub,figcaption,.dim{color:var(--soft)}.sub{margin:0}
+.figures{display:grid;grid-template-columns:repeat(auto-fit,minmax(150px,1fr));gap:1px;background:var(--line);
+border:1px solid var(--line);border-radius:10px;overflow:hidden;margin:28px 0 0}
+.figures div{background:var(--card);padding:16px 18px}.figures b{display:block;font-size:25px;font-weight:600;letter-spacing:-.02em;
+font-variant-numeric:tabular-nums}.figures span{color:var(--soft);font-size:13px}
+ul{padding-left:20px;margin:0}li{margin:3px 0}
+table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums}
+th,td{padding:7px 14px 7px 0;text-align:right;border-bottom:1px solid var(--line)}
+th{font-weight:500;color:var(--soft);font-size:13px}th:first-child,td:first-child{text-align:left;overflow-wrap:anywhere}
+.view{margin:0 0 40px}.row{display:grid;grid-template-columns:2fr 1fr;gap:10px;align-items:start}
+.stack{display:grid;gap:10px}img{display:block;width:100%;height:auto;border-radius:6px}
+figure{margin:0}figcaption{font-size:13px;padding:5px 0 0}
+.slider{position:relative;border-radius:6px;overflow:hidden;touch-action:none;cursor:ew-resize;--cut:50%}
+.slider img{border-radius:0}.slider .top{position:absolute;inset:0;clip-path:inset(0 calc(100% - var(--cut)) 0 0)}
+.slider .bar{position:absolute;top:0;bottom:0;left:var(--cut);width:2px;background:#fff;box-shadow:0 0 4px #0008}
+.slider input{position:absolute;inset:0;width:100%;height:100%;opacity:0;cursor:ew-resize;margin:0}
+.tag{position:absolute;top:8px;padding:1px 8px;border-radius:4px;background:#000a;color:#fff;font-size:12px}
+.curves{display:grid;grid-template-columns:repeat(auto-fit,minmax(300px,1fr));gap:24px}
+.curve{width:100%;height:auto}.curve text{font-size:11px;fill:var(--soft)}.curve .title{font-size:13px;fill:var(--ink);font-weight:600}
+.curve .grid{stroke:var(--line)}.curve .line{fill:none;stroke:var(--accent);stroke-width:1.8;stroke-linejoin:round}
+details{margin-top:14px}summary{cursor:pointer}
+pre{background:var(--card);border:1px solid var(--line);border-radius:8px;padding:16px;overflow:auto;font-size:13px;line-height:1.45}
+@media(max-width:700px){.row{grid-template-columns:1fr}.stack{grid-template-columns:1fr 1fr}}
+"""
+SCRIPT = (
+    "document.querySelectorAll('.slider input').forEach(i=>i.addEventListener('input',"
+    "()=>i.parentElement.style.setProperty('--cut',i.value+'%')))"
+)
+
+
+@dataclass(frozen=True)
+class ViewPictures:
+    """What the page shows of one view; pictures are PNG bytes."""
+
+    name: str
+    caption: str
+    render: bytes
+    truth: bytes
+    error: bytes
+    depth: bytes
+
+
+def _embed(data: bytes, alternative: str, style: str = "") -> str:
+    source = base64.b64encode(data).decode()
+    return f'<img alt="{html.escape(alternative)}"{style} src="data:image/png;base64,{source}">'
+
+
+def _figure(data: bytes, caption: str) -> str:
+    return f"<figure>{_embed(data, caption)}<figcaption>{html.escape(caption)}</figcaption></figure>"
+
+
+def _view(v: ViewPictures) -> str:
+    name = html.escape(v.name)
+    return (
+        f'<div class="view"><div class="row"><figure><div class="slider">{_embed(v.truth, f"photograph {v.name}")}'
+        f'<div class="top">{_embed(v.render, f"rendering {v.name}")}</div><div class="bar"></div>'
+        '<span class="tag" style="left:8px">rendering</span><span class="tag" style="right:8px">photograph</span>'
+        f'<input type="range" min="0" max="100" value="50" aria-label="rendering against photograph of {name}"></div>'
+        f"<figcaption><b>{name}</b> &nbsp; {html.escape(v.caption)}</figcaption></figure>"
+        f'<div class="stack">{_figure(v.error, "absolute error, 0 to 0.3")}{_figure(v.depth, "depth, near red, far blue")}</div>'
+        "</div></div>"
+    )
+
+
+def _table(rows: list[list[str]]) -> str:
+    head, *body = ["".join(f"<{t}>{html.escape(c)}</{t}>" for c in row) for t, row in zip(["th"] + ["td"] * len(rows), rows)]
+    return f"<table><tr>{head}</tr>{''.join(f'<tr>{r}</tr>' for r in body)}</table>"
+
+
+def write_page(
+    path: Path,
+    *,
+    title: str,
+    subtitle: str,
+    figures: list[tuple[str, str]],
+    notes: list[str],
+    table: list[list[str]],
+    views: list[ViewPictures],
+    curves: list[str],
+    overview: bytes | None,
+    details: dict,
+) -> None:
+    """Write the report, self-contained and without a link to anywhere.
+
+    Args:
+        path: The HTML file.
+        title: Headline.
+        subtitle: A line under it.
+        figures: Label and value of each key figure.
+        notes: Choices made for the user.
+        table: Header row, then a row per held-out view.
+        views: Pictures of held-out views.
+        curves: SVG charts.
+        overview: Picture of cameras and points, or None.
+        details: Configuration, versions and data, shown as JSON on request.
+
+    Raises:
+        ResourceError: The file cannot be written.
+    """
+    sections = [
+        f'<h1>{html.escape(title)}</h1><p class="sub">{html.escape(subtitle)}</p>',
+        f'<div class="figures">{"".join(f"<div><b>{html.escape(v)}</b><span>{html.escape(k)}</span></div>" for k, v in figures)}</div>',
+    ]
+    if notes:
+        sections.append(f"<h2>Choices made for you</h2><ul>{''.join(f'<li>{html.escape(n)}</li>' for n in notes)}</ul>")
+    if views:
+        sections.append("<h2>Views the fit has not seen</h2>" + "".join(map(_view, views)))
+    if len(table) > 1:
+        sections.append("<h2>Scores</h2>" + _table(table))
+    if curves:
+        sections.append(f'<h2>The fit</h2><div class="curves">{"".join(curves)}</div>')
+    if overview:
+        sections.append(
+            "<h2>Cameras and first points</h2>" + _figure(overview, "training cameras teal, held-out cameras orange")
+        )
+    settings = html.escape(json.dumps(details, indent=1))
+    sections.append(
+        f"<h2>Settings</h2><details><summary>configuration, versions, data</summary><pre>{settings}</pre></details>"
+    )
+    write_text(
+        path,
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,'
+        f'initial-scale=1"><title>{html.escape(title)}</title><style>{STYLE}</style></head><body><main>'
+        f"{''.join(sections)}</main><script>{SCRIPT}</script></body></html>\n",
+    )
