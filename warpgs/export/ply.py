@@ -276,7 +276,7 @@ def _assemble(path: Path, rows: np.ndarray, rest: int) -> Gaussians:
     sh = np.empty((len(rows), 1 + rest // 3, 3), np.float32)
     sh[:, 0, :] = columns(_DC)
     if rest:
-        sh[:, 1:, :] = columns([f"f_rest_{i}" for i in range(rest)]).reshape(len(rows), 3, -1).transpose(0, 2, 1)
+        sh[:, 1:, :] = columns([f"f_rest_{i}" for i in range(rest)]).reshape(len(rows), 3, rest // 3).transpose(0, 2, 1)
     quats = columns(_ROTATION)
     zero = ~quats.any(axis=1)
     if zero.any():
