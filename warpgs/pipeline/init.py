@@ -16,6 +16,12 @@ from warpgs.scene import Gaussians, PointCloud, View
 
 MIN_POINTS = 100
 """With fewer sparse points a random start is better: they leave most of the picture empty."""
+MIN_MATCHES = 10
+"""Matched points that a view must hold to guide its random points."""
+NEIGHBORS = 5
+"""Matched points that a random pixel takes its depth from."""
+DEPTH_SPREAD = 0.1
+"""Standard deviation of the logarithm of depth around a matched point."""
 
 
 @dataclass(frozen=True)
@@ -40,58 +46,66 @@ class InitConfig:
             raise UsageError(f"init random count {self.random_count} must be at least 1")
 
 
-def depth_bounds(views: list[View]) -> tuple[float, float, str]:
-    """Near and far depth [u] of what the views see, and how it was found.
-
-    From triangulated SIFT matches between the views where there are enough (their 2nd and 98th percentile, widened by a
-    quarter); else from a tenth of the distance to the cameras' focus point to ten times it.
-    """
-    cloud = triangulate_matches(views)
-    if len(cloud) >= 30:
-        depths = np.concatenate([geometry.project_points(v.camera, cloud.points)[1] for v in views])
-        near, far = np.percentile(depths[depths > 0], [2, 98])
-        return 0.8 * near, 1.25 * far, f"depths {0.8 * near:.2f} to {1.25 * far:.2f} from {len(cloud)} matched points"
+def camera_depths(views: list[View]) -> tuple[float, float]:
+    """Near and far depth [u] where nothing else is known: a tenth of the distance to the cameras' focus point to ten times it."""
     focus = geometry.focus_point([v.camera for v in views])
     distance = float(np.median([np.linalg.norm(v.camera.center - focus) for v in views]))
-    distance = max(distance, 1e-3)
-    return 0.1 * distance, 10 * distance, f"depths {0.1 * distance:.2f} to {10 * distance:.2f} guessed from the cameras"
+    return 0.1 * max(distance, 1e-3), 10 * max(distance, 1e-3)
+
+
+class _Depths:
+    """Draws depths for pixels of one view: near those of matched points around the pixel, else anywhere the cameras allow."""
+
+    def __init__(self, view: View, matched: PointCloud, bounds: tuple[float, float]):
+        from scipy.spatial import cKDTree
+
+        seen = geometry.in_image(view.camera, matched.points)
+        pixels, self.known = geometry.project_points(view.camera, matched.points)
+        self.known, self.bounds = self.known[seen], bounds
+        self.tree = cKDTree(pixels[seen]) if seen.sum() >= MIN_MATCHES else None
+
+    def draw(self, pixels: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+        count = len(pixels)
+        if self.tree is None:
+            near, far = self.bounds
+            return 1 / generator.uniform(1 / far, 1 / near, size=count)
+        _, ids = self.tree.query(pixels, k=NEIGHBORS)
+        chosen = ids[np.arange(count), generator.integers(NEIGHBORS, size=count)]
+        return self.known[chosen] * np.exp(generator.normal(0, DEPTH_SPREAD, count))
 
 
 def random_points(views: list[View], count: int, generator: np.random.Generator) -> tuple[PointCloud, str]:
-    """Points on random pixels of random training views, uniform in inverse depth, kept where two views see them.
+    """Points behind random pixels of the training views, with those pixels' colours.
 
-    Colours are those of the pixels. Returns the cloud and a sentence on how it was made.
+    A view in which at least 10 triangulated SIFT matches lie takes each depth from one of the 5 matches nearest to the pixel,
+    spread by a tenth (docs/decisions/003-random-start.md); any other view draws inverse depths uniformly, and keeps points
+    that a second view sees where there are any. Returns the cloud and a sentence on how it was made.
     """
-    near, far, how = depth_bounds(views)
-    need = min(2, len(views))
-    kept_points, kept_colors, kept = [], [], 0
-    for attempt in range(50):
-        size = 4 * count
-        points, colors = np.empty((size, 3)), np.empty((size, 3), np.float32)
-        which = generator.integers(len(views), size=size)
-        for i, view in enumerate(views):
-            rows = np.flatnonzero(which == i)
-            x = generator.integers(view.camera.width, size=len(rows))
-            y = generator.integers(view.camera.height, size=len(rows))
-            depths = 1 / generator.uniform(1 / far, 1 / near, size=len(rows))
-            points[rows] = geometry.back_project(view.camera, np.stack([x, y], 1) + 0.5, depths)
-            colors[rows] = view.image[y, x]
-            if view.mask is not None:
-                which[rows[~view.mask[y, x]]] = -1
-        seen = sum(geometry.in_image(v.camera, points).astype(int) for v in views)
-        keep = (seen >= need) & (which >= 0)
-        kept_points.append(points[keep])
-        kept_colors.append(colors[keep])
-        kept += int(keep.sum())
-        if kept >= count:
-            break
-        if attempt == 9 and kept < count // 10:
-            need = 1  # the views hardly overlap: rather points that one view sees than none
-    points, colors = np.concatenate(kept_points)[:count], np.concatenate(kept_colors)[:count]
-    if len(points) == 0:
+    matched = triangulate_matches(views)
+    bounds = camera_depths(views)
+    sources = [_Depths(v, matched, bounds) for v in views]
+    points, colors = [], []
+    for i, (view, source) in enumerate(zip(views, sources)):
+        wanted = (i + 1) * count // len(views) - i * count // len(views)
+        free = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask
+        rows, columns = np.nonzero(free)
+        if len(rows) == 0:
+            continue
+        chosen = generator.integers(len(rows), size=8 * wanted)
+        rows, columns = rows[chosen], columns[chosen]
+        pixels = np.stack([columns, rows], 1) + 0.5
+        candidates = geometry.back_project(view.camera, pixels, source.draw(pixels, generator))
+        if source.tree is None and len(views) > 1:
+            shared = sum(geometry.in_image(v.camera, candidates).astype(int) for v in views) >= 2
+            order = np.argsort(~shared, kind="stable")  # points that two views see first
+            candidates, rows, columns = candidates[order], rows[order], columns[order]
+        points.append(candidates[:wanted])
+        colors.append(view.image[rows[:wanted], columns[:wanted]])
+    if not points:
         raise DataError("no random start: every pixel of the training views is masked out; check the masks' polarity")
-    seen_by = "at least two training views" if need == 2 else "one training view"
-    return PointCloud(points, colors), f"{len(points):,} random points that {seen_by} see, {how}"
+    guided = sum(s.tree is not None for s in sources)
+    how = f"{count:,} random points, {guided} of {len(views)} views guided by {len(matched):,} matched points"
+    return PointCloud(np.concatenate(points), np.concatenate(colors)), how
 
 
 def initial_points(

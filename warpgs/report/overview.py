@@ -14,6 +14,7 @@ from warpgs.scene import Camera
 
 REMEDY = "install a software renderer: on Debian or Ubuntu `apt-get install libegl1 libgl1 libgl1-mesa-dri libxrender1`"
 TIMEOUT = 90
+WIDTH, HEIGHT, VIEW_ANGLE = 1280, 640, 40.0  # [px], [px], vertical [deg]
 TRAIN_COLOR, TEST_COLOR = "#149696", "#e08a2c"
 
 PROBE = (
@@ -61,7 +62,7 @@ def _frusta(cameras: list[Camera], size: float) -> np.ndarray:
 DRAW = f"""
 import sys, numpy as np, pyvista as pv
 d = np.load(sys.argv[1])
-p = pv.Plotter(off_screen=True, window_size=(1280, 640))
+p = pv.Plotter(off_screen=True, window_size=({WIDTH}, {HEIGHT}))
 p.set_background("white")
 cloud = pv.PolyData(d["points"])
 cloud["rgb"] = d["colors"]
@@ -70,9 +71,34 @@ for key, color in (("train", "{TRAIN_COLOR}"), ("test", "{TEST_COLOR}")):
     if len(d[key]):
         p.add_lines(d[key].reshape(-1, 3), color=color, width=2)
 p.camera.position, p.camera.focal_point, p.camera.up = d["view"]
-p.camera.view_angle = 40
+p.camera.view_angle = {VIEW_ANGLE}
 p.screenshot(sys.argv[2])
 """
+
+
+def _framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Eye, focal point and up vector [3, 3] from which all of ``shown`` [N, 3] [u] is in the picture.
+
+    Args:
+        shown: What must be seen.
+        direction: From the scene to the eye, any length.
+        up: Roughly up; any perpendicular to the view serves where it lies along ``direction``.
+    """
+    length = np.linalg.norm(direction)
+    forward = -direction / length if length > 0 else np.array([0.0, 0.0, 1.0])
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-3:
+        right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
+    axes = np.stack([right / np.linalg.norm(right), np.zeros(3), forward])
+    axes[1] = np.cross(axes[0], forward)
+    seen = shown @ axes.T
+    middle = (seen.min(0) + seen.max(0)) / 2
+    x, y, z = np.abs(seen[:, 0] - middle[0]), np.abs(seen[:, 1] - middle[1]), seen[:, 2] - middle[2]
+    # Near content fills more of the picture: every point asks for its own distance, and the largest serves all.
+    slope = np.tan(np.radians(VIEW_ANGLE / 2))
+    distance = 1.06 * max(float((np.maximum(y / slope, x / (slope * WIDTH / HEIGHT)) - z).max()), 1e-6)
+    focus = middle @ axes
+    return np.stack([focus - distance * forward, focus, axes[1]])
 
 
 def render_overview(
@@ -83,6 +109,8 @@ def render_overview(
     Returns:
         PNG bytes and an empty string; or None and the reason with a remedy, where this machine cannot draw.
     """
+    if not (len(points) and train):
+        return None, "no overview picture: there are no points or no training cameras to draw"
     centers = np.array([c.center for c in train])
     low, high = np.percentile(points, [5, 95], axis=0)
     inside = ((points >= low - (high - low)) & (points <= high + (high - low))).all(1)
@@ -92,13 +120,16 @@ def render_overview(
     back = centers.mean(0) - middle
     reach = max(float(np.linalg.norm(back)), 0.5 * spread)
     side = np.cross(forward, up)
-    eye = middle + 1.5 * back + 0.7 * reach * side / max(np.linalg.norm(side), 1e-9) + 0.5 * reach * up
+    direction = 1.5 * back + 0.7 * reach * side / max(np.linalg.norm(side), 1e-9) + 0.5 * reach * up
     size = 0.12 * max(reach, 1e-6)
+    frusta = {"train": _frusta(train, size), "test": _frusta(test, size)}
+    core = points[((points >= low) & (points <= high)).all(1)]
+    view = _framing(np.concatenate([core, *(f.reshape(-1, 3) for f in frusta.values())]), direction, up)
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "scene.npz", Path(folder) / "overview.png"
         np.savez(
-            source, points=points[inside].astype(np.float32), colors=np.round(255 * np.clip(colors[inside], 0, 1)).astype(np.uint8),
-            train=_frusta(train, size), test=_frusta(test, size), view=np.stack([eye, 0.7 * middle + 0.3 * centers.mean(0), up]),
+            source, points=points[inside].astype(np.float32),
+            colors=np.round(255 * np.clip(colors[inside], 0, 1)).astype(np.uint8), view=view, **frusta,
         )  # fmt: skip
         works, why = _python(DRAW, str(source), str(target))
         if works and target.is_file():

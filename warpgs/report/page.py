@@ -21,7 +21,8 @@ h2{font-size:20px;margin:52px 0 14px;letter-spacing:-.01em}
 .sub,figcaption,.dim{color:var(--soft)}.sub{margin:0}
 .figures{display:flex;flex-wrap:wrap;gap:1px;background:var(--line);
 border:1px solid var(--line);border-radius:10px;overflow:hidden;margin:28px 0 0}
-.figures div{background:var(--card);padding:16px 18px;flex:1 1 125px}.figures b{display:block;font-size:25px;font-weight:600;letter-spacing:-.02em;
+.figures div{background:var(--card);padding:16px 18px;flex:1 1 125px}
+.figures b{display:block;font-size:25px;font-weight:600;letter-spacing:-.02em;
 font-variant-numeric:tabular-nums}.figures span{color:var(--soft);font-size:13px}
 ul{padding-left:20px;margin:0}li{margin:3px 0}
 table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums}
@@ -31,15 +32,18 @@ th{font-weight:500;color:var(--soft);font-size:13px}th:first-child,td:first-chil
 .stack{display:grid;gap:10px}img{display:block;width:100%;height:auto;border-radius:6px}
 figure{margin:0}figcaption{font-size:13px;padding:5px 0 0}
 .slider{position:relative;border-radius:6px;overflow:hidden;touch-action:none;cursor:ew-resize;--cut:50%}
+.slider:focus-within{outline:2px solid var(--accent);outline-offset:2px}
 .slider img{border-radius:0}.slider .top{position:absolute;inset:0;clip-path:inset(0 calc(100% - var(--cut)) 0 0)}
 .slider .bar{position:absolute;top:0;bottom:0;left:var(--cut);width:2px;background:#fff;box-shadow:0 0 4px #0008}
 .slider input{position:absolute;inset:0;width:100%;height:100%;opacity:0;cursor:ew-resize;margin:0}
 .tag{position:absolute;top:8px;padding:1px 8px;border-radius:4px;background:#000a;color:#fff;font-size:12px}
 .curves{display:grid;grid-template-columns:repeat(auto-fit,minmax(300px,1fr));gap:24px}
-.curve{width:100%;height:auto}.curve text{font-size:11px;fill:var(--soft)}.curve .title{font-size:13px;fill:var(--ink);font-weight:600}
+.curve{width:100%;height:auto}.curve text{font-size:11px;fill:var(--soft)}
+.curve .title{font-size:13px;fill:var(--ink);font-weight:600}
 .curve .grid{stroke:var(--line)}.curve .line{fill:none;stroke:var(--accent);stroke-width:1.8;stroke-linejoin:round}
 details{margin-top:14px}summary{cursor:pointer}
-pre{background:var(--card);border:1px solid var(--line);border-radius:8px;padding:16px;overflow:auto;font-size:13px;line-height:1.45}
+pre{background:var(--card);border:1px solid var(--line);border-radius:8px;padding:16px;overflow:auto;
+font-size:13px;line-height:1.45}
 @media(max-width:700px){.row{grid-template-columns:1fr}.stack{grid-template-columns:1fr 1fr}}
 """
 SCRIPT = (
@@ -77,7 +81,8 @@ def _view(v: ViewPictures) -> str:
         '<span class="tag" style="left:8px">rendering</span><span class="tag" style="right:8px">photograph</span>'
         f'<input type="range" min="0" max="100" value="50" aria-label="rendering against photograph of {name}"></div>'
         f"<figcaption><b>{name}</b> &nbsp; {html.escape(v.caption)}</figcaption></figure>"
-        f'<div class="stack">{_figure(v.error, "absolute error, 0 to 0.3")}{_figure(v.depth, "depth, near red, far blue")}</div>'
+        f'<div class="stack">{_figure(v.error, "absolute error, 0 to 0.3")}'
+        f"{_figure(v.depth, 'depth, near red, far blue')}</div>"
         "</div></div>"
     )
 
@@ -117,9 +122,10 @@ def write_page(
     Raises:
         ResourceError: The file cannot be written.
     """
+    cells = "".join(f"<div><b>{html.escape(v)}</b><span>{html.escape(k)}</span></div>" for k, v in figures)
     sections = [
         f'<h1>{html.escape(title)}</h1><p class="sub">{html.escape(subtitle)}</p>',
-        f'<div class="figures">{"".join(f"<div><b>{html.escape(v)}</b><span>{html.escape(k)}</span></div>" for k, v in figures)}</div>',
+        f'<div class="figures">{cells}</div>',
     ]
     if notes:
         sections.append(f"<h2>Choices made for you</h2><ul>{''.join(f'<li>{html.escape(n)}</li>' for n in notes)}</ul>")
@@ -130,9 +136,7 @@ def write_page(
     if curves:
         sections.append(f'<h2>The fit</h2><div class="curves">{"".join(curves)}</div>')
     if overview:
-        sections.append(
-            "<h2>Cameras and first points</h2>" + _figure(overview, "training cameras teal, held-out cameras orange")
-        )
+        sections.append("<h2>Cameras and Gaussians</h2>" + _figure(overview, "training cameras teal, held-out cameras orange"))
     settings = html.escape(json.dumps(details, indent=1))
     sections.append(
         f"<h2>Settings</h2><details><summary>configuration, versions, data</summary><pre>{settings}</pre></details>"

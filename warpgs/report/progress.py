@@ -89,4 +89,7 @@ class Progress:
         names, values = zip(*self._values())
         table.add_row(*names, style="dim")
         table.add_row(*values, style="bold")
-        return Group(ProgressBar(total=self.total, completed=self.step, width=78), table)
+        # Alone, the bar does not end its line, and the names would follow on it; a grid row does.
+        bar = Table.grid()
+        bar.add_row(ProgressBar(total=self.total, completed=self.step, width=78))
+        return Group(bar, table)
