@@ -119,19 +119,22 @@ def make_kernels(real, lanes: int):
         for lane in range(count):
             ma = s0[lane]
             mb = s1[lane]
-            raw = s2[lane] - ma * ma
-            # rounding can make a variance slightly negative, and the similarity would then exceed 1
-            va = wp.max(raw, real(0.0))
-            vb = wp.max(s3[lane] - mb * mb, real(0.0))
-            cov = s4[lane] - ma * mb
+            raw_a = s2[lane] - ma * ma
+            raw_b = s3[lane] - mb * mb
+            # Rounding can make a variance slightly negative. It is zero then, and so is the covariance, which Cauchy and
+            # Schwarz bound by the variances; else the similarity of two equal flat images would miss 1 by 3e-4.
+            va = wp.max(raw_a, real(0.0))
+            vb = wp.max(raw_b, real(0.0))
+            varies = wp.where(raw_a > real(0.0), wp.where(raw_b > real(0.0), 1, 0), 0)
+            cov = wp.where(varies == 1, s4[lane] - ma * mb, real(0.0))
             n1 = real(2.0) * ma * mb + real(C1)
             n2 = real(2.0) * cov + real(C2)
             d1 = ma * ma + mb * mb + real(C1)
             d2 = va + vb + real(C2)
             inverse = real(1.0) / (d1 * d2)
             s = n1 * n2 * inverse
-            v = wp.where(raw > real(0.0), -s / d2, real(0.0))
-            c = real(2.0) * n1 * inverse
+            v = wp.where(raw_a > real(0.0), -s / d2, real(0.0))
+            c = wp.where(varies == 1, real(2.0) * n1 * inverse, real(0.0))
             result[base + lane] = s
             # the mean also acts through the variance, -ma^2, and the covariance, -ma mb
             by_mean[base + lane] = real(2.0) * (mb * n2 * inverse - ma * s / d1 - ma * v) - mb * c
@@ -249,7 +252,7 @@ def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Structural similarity at every pixel and channel, the variant of the 3DGS papers.
 
     Gaussian window of 11 x 11 px with sigma 1.5, zeros outside the image, data range 1; it works for images of any size.
-    Differentiable in ``image`` only. A variance that rounding makes negative counts as 0 and passes no gradient.
+    Differentiable in ``image`` only. A variance that rounding makes negative counts as 0, and so does the covariance then; neither passes a gradient.
     Derivation: docs/ssim.md.
 
     Args:

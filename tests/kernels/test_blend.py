@@ -1,0 +1,240 @@
+"""Compositing against a plain loop over Gaussians: pictures, gradients, rules, repeatability."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from tests.reference.blend import blend_reference
+from tests.reference.project import project_reference
+from tests.splats import SMOOTH, camera, cloud, hand_placed, leaves
+from tests.tolerances import close
+from warpgs.constants import RULES
+from warpgs.kernels.blend import blend, contributions
+from warpgs.kernels.project import project
+from warpgs.kernels.tiles import bin_tiles
+
+
+def drawn(gaussians, cam, background, rule, tile_size=16, degree=1):
+    """Pictures of the kernels: rgb, alpha, depth, and what they were made of."""
+    size = {"width": cam.width, "height": cam.height}
+    splats, counts = project(
+        *gaussians.tensors().values(), cam.viewmat, cam.K, **size, degree=degree, rule=rule, tile_size=tile_size
+    )
+    tiles = bin_tiles(splats, counts, **size, tile_size=tile_size, rule=rule)
+    return *blend(splats, tiles, background, **size, rule=rule), splats, tiles
+
+
+def twins(tensors, cam, background, rule, tile_size=16, degree=1):
+    """The same pictures by the references, stacked over cameras, and the weights [C, N, H, W]."""
+    *gaussians, viewmats, Ks = tensors
+    means, covs, colors, depths, opacities = project_reference(
+        *gaussians, viewmats, Ks, width=cam.width, height=cam.height, degree=degree, low_pass=rule.low_pass
+    )
+    rows = [
+        blend_reference(
+            means[c], covs[c], opacities, colors[c], depths[c], background[c], cam.width, cam.height, rule, tile_size=tile_size
+        )
+        for c in range(len(viewmats))
+    ]
+    return [torch.stack(t) for t in zip(*rows)]
+
+
+def doubles(gaussians, cam):
+    return [t.detach().cpu().double().requires_grad_() for t in (*gaussians.tensors().values(), cam.viewmat, cam.K)]
+
+
+def backgrounds(count, dtype, device):
+    return torch.rand(count, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64).to(device, dtype)
+
+
+@pytest.mark.parametrize("rule", ["exact", "gsplat", "inria", "smooth"])
+@pytest.mark.parametrize("tile_size", [8, 16])
+def test_pictures_and_gradients_equal_reference(device, dtype, rule, tile_size):
+    """Colour, alpha, depth, and the gradients of a random mix of them, under every rule."""
+    rule = SMOOTH if rule == "smooth" else RULES[rule]
+    gaussians, cam = leaves(hand_placed(dtype, device)), camera(33, 21, cameras=2, dtype=dtype, device=device)
+    background = backgrounds(2, dtype, device).requires_grad_()
+    other = doubles(gaussians, cam)
+    other_background = background.detach().cpu().double().requires_grad_()
+    rgb, alpha, depth, _, _ = drawn(gaussians, cam, background, rule, tile_size, degree=3)
+    wanted = twins(other, cam, other_background, rule, tile_size, degree=3)
+    for found, twin in zip((rgb, alpha, depth), wanted):
+        close("image", found, twin)
+    upstream = [torch.randn(t.shape, generator=torch.Generator().manual_seed(7), dtype=torch.float64) for t in wanted[:3]]
+    sum((a * u.to(a)).sum() for a, u in zip((rgb, alpha, depth), upstream)).backward()
+    sum((a * u).sum() for a, u in zip(wanted, upstream)).backward()
+    for t, twin in zip((*gaussians.tensors().values(), background), (*other[:5], other_background)):
+        assert bool(t.grad.any())
+        close("gradient", t.grad, twin.grad)
+
+
+def test_gradcheck(device):
+    """Finite differences agree with the backward kernel for every entry of the record and for the background."""
+    gaussians, cam = hand_placed(device=device), camera(cameras=2, device=device)
+    size = {"width": cam.width, "height": cam.height}
+    background = backgrounds(2, torch.float64, device).requires_grad_()
+    splats, counts = project(*gaussians.tensors().values(), cam.viewmat, cam.K, **size, degree=3, rule=SMOOTH)
+    tiles = bin_tiles(splats, counts, **size, rule=SMOOTH)
+    tail = splats[..., 10:].detach()
+
+    def pictures(record, behind):
+        return blend(torch.cat([record, tail], -1), tiles, behind, **size, rule=SMOOTH)
+
+    record = splats[..., :10].detach().clone().requires_grad_()
+    assert torch.autograd.gradcheck(pictures, (record, background), eps=1e-6, atol=1e-7, rtol=1e-5, nondet_tol=0.0)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 17), (17, 1), (33, 47)])
+def test_odd_image_sizes(device, dtype, width, height):
+    """Images smaller than a tile, and no multiple of one."""
+    gaussians, cam = cloud(40, dtype, device), camera(width, height, cameras=1, dtype=dtype, device=device)
+    background = backgrounds(1, dtype, device)
+    rgb, alpha, _, _, _ = drawn(gaussians, cam, background, SMOOTH)
+    wanted = twins(doubles(gaussians, cam), cam, background.cpu().double(), SMOOTH)
+    close("image", rgb, wanted[0])
+    close("image", alpha, wanted[1])
+
+
+def stack_of(opacities, dtype=torch.float64, device="cpu"):
+    """Huge white Gaussians one behind another that cover the whole image, with the given opacities."""
+    gaussians = cloud(len(opacities), dtype, device, degree=0)
+    gaussians.means[:] = 0
+    gaussians.means[:, 2] = torch.arange(len(opacities)) * 0.1 + 2
+    gaussians.log_scales[:] = 8.0
+    gaussians.logit_opacities[:] = torch.logit(torch.tensor(opacities, dtype=torch.float64))
+    gaussians.sh[:] = 2.0
+    return gaussians
+
+
+def test_what_leaks_through_two_opaque_layers(device):
+    """`exact` leaves at most 1e-4 of the background, the exclusive stop of the classic rule 1e-2."""
+    cam = camera(8, 8, cameras=1, device=device)
+    black = torch.zeros(1, 3, dtype=torch.float64, device=device)
+    opaque = stack_of([0.9999999, 0.9999999, 0.9999999], device=device)
+    leak = {}
+    for rule in ("exact", "inria"):
+        _, alpha, _, _, _ = drawn(opaque, cam, black, RULES[rule], degree=0)
+        leak[rule] = float((1 - alpha).max())
+    assert leak["exact"] <= 1.0001e-4
+    # float64: (1 - 0.99)^2 rounds to just above 1e-4 or below; either way `exact` does not leak more
+    assert leak["inria"] >= leak["exact"]
+    low = stack_of([0.99, 0.99], torch.float32, device)
+    alpha = drawn(low, camera(8, 8, cameras=1, dtype=torch.float32, device=device), black.float(), RULES["inria"], degree=0)[1]
+    assert 0.0099 <= float((1 - alpha).max()) <= 0.0101
+
+
+def test_exact_alpha_is_monotone_in_opacity(device):
+    """Raising an opacity never lowers accumulated alpha by more than 1e-4 under `exact`."""
+    cam = camera(8, 8, cameras=1, dtype=torch.float32, device=device)
+    black = torch.zeros(1, 3, device=device)
+    previous = torch.zeros(1, 8, 8, device=device)
+    for opacity in (0.5, 0.9, 0.98, 0.985, 0.99, 0.995, 0.9999):
+        alpha = drawn(stack_of([0.99, opacity, 0.3], torch.float32, device), cam, black, RULES["exact"], degree=0)[1]
+        assert bool((alpha >= previous - 1e-4).all())
+        previous = alpha
+
+
+def test_gradient_of_a_clamped_alpha_is_zero(device):
+    """Where alpha is held at its maximum, opacity has no effect and no gradient."""
+    cam = camera(8, 8, cameras=1, device=device)
+    gaussians = leaves(stack_of([0.999], device=device))
+    drawn(gaussians, cam, torch.zeros(1, 3, dtype=torch.float64, device=device), RULES["exact"], degree=0)[0].sum().backward()
+    assert not bool(gaussians.logit_opacities.grad.any()) and not bool(gaussians.means.grad.any())
+    assert bool(gaussians.sh.grad.any())
+
+
+def test_many_layers_recover_their_transmittance(device):
+    """5000 faint layers: the backward pass, which divides transmittance back, stays on the reference."""
+    gaussians = leaves(stack_of([0.01] * 5000, torch.float32, device))
+    cam = camera(4, 4, cameras=1, dtype=torch.float32, device=device)
+    rgb, alpha, _, _, _ = drawn(gaussians, cam, torch.ones(1, 3, device=device), RULES["exact"], degree=0)
+    assert float(alpha.detach().min()) > 0.9998
+    rgb.sum().backward()
+    assert all(bool(torch.isfinite(t.grad).all()) for t in gaussians.tensors().values())
+    # colour gradients are the weights: 16 pixels of total weight alpha each, times the basis constant and three channels
+    total = float(gaussians.sh.grad.double().sum()) / 0.28209479177387814 / 3
+    assert abs(total - float(alpha.detach().double().sum())) <= 1e-4 * total
+
+
+def test_partition_of_unity_and_linearity(device):
+    """All colours equal to the background give that colour; colours add."""
+    gaussians, cam = cloud(200, torch.float32, device, degree=0), camera(40, 30, cameras=1, dtype=torch.float32, device=device)
+    gaussians.sh[:] = (0.7 - 0.5) / 0.28209479177387814
+    rgb = drawn(gaussians, cam, torch.full((1, 3), 0.7, device=device), RULES["exact"], degree=0)[0]
+    assert float((rgb - 0.7).abs().max()) <= 1e-6
+
+
+def test_contributions_are_the_weights(device, dtype):
+    """Sum and maximum over pixels of each Gaussian's blending weight."""
+    gaussians, cam = cloud(60, dtype, device), camera(40, 30, cameras=2, dtype=dtype, device=device)
+    rule = dataclasses.replace(RULES["exact"], alpha_cut=0.0)
+    background = backgrounds(2, dtype, device)
+    *_, splats, tiles = drawn(gaussians, cam, background, rule)
+    sums, maxima = contributions(splats, tiles, width=40, height=30, rule=rule)
+    weights = twins(doubles(gaussians, cam), cam, background.cpu().double(), rule)[3]
+    close("gradient", sums, weights.sum((2, 3)))
+    close("gradient", maxima, weights.amax((2, 3)))
+
+
+def everything(gaussians, cam, tile_size=16):
+    """All pictures and gradients of one rendering, for bitwise comparison."""
+    gaussians = leaves(gaussians)
+    background = torch.full((len(cam.viewmat), 3), 0.3, device=gaussians.means.device)
+    rgb, alpha, depth, _, _ = drawn(gaussians, cam, background, RULES["exact"], tile_size)
+    (rgb.sum() + (alpha * depth).sum()).backward()
+    return [rgb.detach(), alpha.detach(), depth.detach(), *(t.grad for t in gaussians.tensors().values())]
+
+
+def test_repeats_and_threads_give_the_same_bits(device):
+    """Pictures and gradients are the same on every run, and for one thread and two."""
+    gaussians, cam = cloud(2000, device=device), camera(80, 60, cameras=2, dtype=torch.float32, device=device)
+    torch.set_num_threads(1)
+    first = everything(gaussians, cam)
+    torch.set_num_threads(2)
+    for _ in range(5):
+        assert all(torch.equal(a, b) for a, b in zip(first, everything(gaussians, cam)))
+
+
+def test_tile_size_permutation_and_batch_give_the_same_picture(device):
+    """The bits of the picture depend neither on the tile size, nor on the order of Gaussians, nor on the batch."""
+    gaussians, cam = cloud(500, device=device), camera(80, 60, cameras=3, dtype=torch.float32, device=device)
+    pictures = everything(gaussians, cam)[:3]
+    assert all(torch.equal(a, b) for a, b in zip(pictures, everything(gaussians, cam, tile_size=8)))
+    order = torch.randperm(500, generator=torch.Generator().manual_seed(0)).to(device)
+    shuffled = type(gaussians)(**{n: t[order] for n, t in gaussians.tensors().items()})
+    assert all(torch.equal(a, b) for a, b in zip(pictures, everything(shuffled, cam)))
+    for c in range(3):
+        single = dataclasses.replace(cam, viewmat=cam.viewmat[c : c + 1], K=cam.K[c : c + 1])
+        assert all(torch.equal(a[c], b[0]) for a, b in zip(pictures, everything(gaussians, single)))
+
+
+def test_no_gaussians_show_the_background(device, dtype):
+    """Exactly the background, alpha 0, depth 0, and gradients of the right shape."""
+    gaussians, cam = leaves(cloud(0, dtype, device)), camera(20, 10, cameras=2, dtype=dtype, device=device)
+    background = backgrounds(2, dtype, device).requires_grad_()
+    rgb, alpha, depth, _, _ = drawn(gaussians, cam, background, RULES["exact"])
+    assert torch.equal(rgb, background[:, None, None].expand(2, 10, 20, 3)) and not bool(alpha.any()) and not bool(depth.any())
+    rgb.sum().backward()
+    assert gaussians.means.grad.shape == (0, 3) and bool((background.grad == 200).all())
+
+
+def test_bad_input_names_the_argument():
+    """Tiles of another image and a background of another shape are refused."""
+    gaussians, cam = cloud(5), camera(40, 30, cameras=1, dtype=torch.float32)
+    *_, splats, tiles = drawn(gaussians, cam, torch.zeros(1, 3), RULES["exact"])
+    with pytest.raises(ValueError, match="tiles were made for another image"):
+        blend(splats, tiles, torch.zeros(1, 3), width=80, height=30, rule=RULES["exact"])
+    with pytest.raises(ValueError, match="backgrounds"):
+        blend(splats, tiles, torch.zeros(2, 3), width=40, height=30, rule=RULES["exact"])
+
+
+@pytest.mark.cuda
+def test_cpu_equals_cuda():
+    """The CUDA kernels draw what the CPU draws, gradients included, where no threshold is near."""
+    found = {}
+    for device in ("cpu", "cuda:0"):
+        gaussians, cam = hand_placed(torch.float32, device), camera(33, 21, cameras=2, dtype=torch.float32, device=device)
+        found[device] = everything(gaussians, cam)
+    for a, b in zip(found["cuda:0"], found["cpu"]):
+        close("gradient", a, b)

@@ -1,0 +1,117 @@
+"""Binning: every tile that a Gaussian draws in is listed, in depth order, within the budget."""
+
+import pytest
+import torch
+
+from tests.reference.project import project_reference
+from tests.reference.tiles import touched_reference
+from tests.splats import SMOOTH, camera, cloud
+from warpgs.constants import RULES
+from warpgs.errors import ResourceError
+from warpgs.kernels.project import project
+from warpgs.kernels.tiles import bin_tiles
+
+EXACT = RULES["exact"]
+SIZES = [(1, 1), (1, 17), (17, 1), (15, 15), (16, 16), (17, 17), (33, 47), (97, 129)]
+
+
+def binned(gaussians, cam, rule=EXACT, tile_size=16, degree=1, **options):
+    size = {"width": cam.width, "height": cam.height}
+    splats, counts = project(
+        *gaussians.tensors().values(), cam.viewmat, cam.K, **size, degree=degree, rule=rule, tile_size=tile_size
+    )
+    return splats, counts, bin_tiles(splats, counts, **size, tile_size=tile_size, rule=rule, **options)
+
+
+def listed(tiles, camera_count, per_camera):
+    """For each flat Gaussian the set of tile numbers it is listed in."""
+    result = [set() for _ in range(camera_count * per_camera)]
+    for tile, (begin, end) in enumerate(tiles.ranges.tolist()):
+        for i in tiles.splat_ids[begin:end].tolist():
+            result[i].add(tile)
+    return result
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+@pytest.mark.parametrize("tile_size", [8, 16])
+def test_every_drawn_tile_is_listed(device, width, height, tile_size):
+    """The lists are a superset of what a look at every pixel finds, and at most slightly larger."""
+    gaussians, cam = cloud(150, torch.float64, device), camera(width, height, cameras=2, device=device)
+    _, counts, tiles = binned(gaussians, cam, tile_size=tile_size)
+    tensors = [t.cpu() for t in gaussians.tensors().values()]
+    means, covs, _, depths, opacities = project_reference(
+        *tensors, cam.viewmat.cpu(), cam.K.cpu(), width=width, height=height, degree=1, low_pass=EXACT.low_pass
+    )
+    columns, rows = -(-width // tile_size), -(-height // tile_size)
+    found = listed(tiles, 2, 150)
+    needed_total = 0
+    for c in range(2):
+        touched = touched_reference(means[c], covs[c], opacities, width, height, tile_size, EXACT.alpha_cut)
+        for i, needed in enumerate(touched):
+            if depths[c, i] >= EXACT.near:
+                wanted = {c * columns * rows + row * columns + column for row, column in needed}
+                assert wanted <= found[c * 150 + i]
+                needed_total += len(wanted)
+    assert sum(map(len, found)) == int(counts.sum()) == len(tiles.splat_ids)
+    assert sum(map(len, found)) <= 1.1 * needed_total + 30
+
+
+def test_order_is_by_depth_then_number(device):
+    """Within a tile instances come front to back; equal depths keep the Gaussians' order."""
+    gaussians, cam = cloud(300, torch.float32, device), camera(64, 48, cameras=1, dtype=torch.float32, device=device)
+    gaussians.means[100:200, 2] = 4.0
+    splats, _, tiles = binned(gaussians, cam)
+    depths = splats[0, :, 9].cpu()
+    for begin, end in tiles.ranges.tolist():
+        ids = tiles.splat_ids[begin:end].cpu().long()
+        keys = list(zip(depths[ids].tolist(), ids.tolist()))
+        assert keys == sorted(keys)
+
+
+def test_slots_are_a_permutation_with_neighbours_per_gaussian(device):
+    """Every instance owns one slot, and the slots of a Gaussian lie together where starts and counts say."""
+    gaussians, cam = cloud(200, torch.float32, device), camera(64, 48, cameras=2, dtype=torch.float32, device=device)
+    _, counts, tiles = binned(gaussians, cam)
+    assert torch.equal(tiles.slots.sort().values.cpu(), torch.arange(len(tiles.slots), dtype=torch.int32))
+    owner = torch.full((len(tiles.slots),), -1, dtype=torch.int32)
+    owner[tiles.slots.cpu().long()] = tiles.splat_ids.cpu()
+    for i, (start, count) in enumerate(zip(tiles.starts.tolist(), counts.view(-1).tolist())):
+        assert bool((owner[start : start + count] == i).all())
+
+
+def test_without_a_cut_every_tile_is_listed(device):
+    """A cut of 0 has no edge, so all visible Gaussians are in all tiles."""
+    gaussians, cam = cloud(5, torch.float32, device), camera(40, 40, cameras=1, dtype=torch.float32, device=device)
+    _, _, tiles = binned(gaussians, cam, SMOOTH)
+    assert tiles.ranges.cpu().tolist() == [[5 * i, 5 * i + 5] for i in range(9)]
+
+
+def test_nothing_visible(device):
+    """No Gaussians, and Gaussians behind the camera, give empty tiles."""
+    cam = camera(40, 30, cameras=1, dtype=torch.float32, device=device)
+    for gaussians in (cloud(0, device=device), cloud(3, device=device)):
+        gaussians.means[:, 2] = -4.0
+        _, _, tiles = binned(gaussians, cam)
+        assert len(tiles.splat_ids) == 0 and not bool(tiles.ranges.any())
+
+
+def test_budget_is_checked_in_64_bits_before_allocation(device):
+    """Three Gaussians of 1e9 tiles each are refused by number, a small budget by bytes; the message helps."""
+    gaussians, cam = cloud(3, torch.float32, device), camera(40, 30, cameras=1, dtype=torch.float32, device=device)
+    splats, counts, _ = binned(gaussians, cam)
+    with pytest.raises(ResourceError, match=r"3,000,000,000 \(Gaussian, tile\) instances.*far too large"):
+        bin_tiles(splats, torch.full_like(counts, 1_000_000_000), width=40, height=30, rule=EXACT)
+    with pytest.raises(ResourceError, match="the limit is 0.00 GiB"):
+        binned(gaussians, cam, budget_bytes=10)
+
+
+def test_bad_input_names_the_argument():
+    """Counts of another shape or type are refused."""
+    gaussians, cam = cloud(3), camera(40, 30, cameras=1, dtype=torch.float32)
+    splats, counts, _ = binned(gaussians, cam)
+    with pytest.raises(ValueError, match="tile_counts"):
+        bin_tiles(splats, counts[:, :2], width=40, height=30, rule=EXACT)
+    with pytest.raises(ValueError, match="tile_counts"):
+        bin_tiles(splats, counts.long(), width=40, height=30, rule=EXACT)
+    with pytest.raises(ValueError, match="splats"):
+        bin_tiles(splats[..., :9], counts, width=40, height=30, rule=EXACT)

@@ -1,0 +1,29 @@
+"""Spherical harmonics as harmonic polynomials, differentiable; checked against scipy in tests/kernels/test_sh.py."""
+
+from math import pi, sqrt
+
+import torch
+
+
+def colors_reference(sh: torch.Tensor, dirs: torch.Tensor, degree: int) -> torch.Tensor:
+    """Colours [N, 3] of coefficients [N, K, 3] at unit directions [N, 3]."""
+    x, y, z = dirs.unbind(-1)
+    one = torch.ones_like(x)
+    rows = [
+        [(1 / sqrt(4 * pi), one)],
+        [(-sqrt(3 / (4 * pi)), y), (sqrt(3 / (4 * pi)), z), (-sqrt(3 / (4 * pi)), x)],
+        [
+            (sqrt(15 / (4 * pi)), x * y), (-sqrt(15 / (4 * pi)), y * z),
+            (sqrt(5 / (16 * pi)), 2 * z**2 - x**2 - y**2),
+            (-sqrt(15 / (4 * pi)), x * z), (sqrt(15 / (16 * pi)), x**2 - y**2),
+        ],
+        [
+            (-sqrt(35 / (32 * pi)), y * (3 * x**2 - y**2)), (sqrt(105 / (4 * pi)), x * y * z),
+            (-sqrt(21 / (32 * pi)), y * (4 * z**2 - x**2 - y**2)),
+            (sqrt(7 / (16 * pi)), z * (2 * z**2 - 3 * x**2 - 3 * y**2)),
+            (-sqrt(21 / (32 * pi)), x * (4 * z**2 - x**2 - y**2)), (sqrt(105 / (16 * pi)), z * (x**2 - y**2)),
+            (-sqrt(35 / (32 * pi)), x * (x**2 - 3 * y**2)),
+        ],
+    ]  # fmt: skip
+    basis = torch.stack([c * p for row in rows[: degree + 1] for c, p in row], -1)
+    return torch.einsum("nk,nkc->nc", basis, sh[:, : basis.shape[1]])

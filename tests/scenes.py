@@ -1,0 +1,50 @@
+"""A tiny scene that Gaussians can fit exactly: three coloured ones, photographed by the rasterizer itself."""
+
+import math
+
+import numpy as np
+import torch
+
+from warpgs.geometry import look_at
+from warpgs.kernels.sh import C0
+from warpgs.rasterizer import rasterize
+from warpgs.scene import Camera, Gaussians, PointCloud, View
+
+
+def three_gaussians() -> Gaussians:
+    """Red, green and blue, at three depths, on nothing."""
+    colors = torch.tensor([[0.9, 0.2, 0.1], [0.15, 0.8, 0.2], [0.2, 0.3, 0.95]])
+    return Gaussians(
+        means=torch.tensor([[-0.35, 0.0, 0.1], [0.3, -0.2, -0.2], [0.1, 0.3, 0.3]]),
+        quats=torch.tensor([[1.0, 0, 0, 0], [0.9, 0.2, 0.1, 0.0], [0.8, 0, 0.3, 0.4]]),
+        log_scales=torch.log(torch.tensor([[0.2, 0.15, 0.2], [0.25, 0.1, 0.12], [0.15, 0.2, 0.1]])),
+        logit_opacities=torch.logit(torch.tensor([0.9, 0.85, 0.95])),
+        sh=((colors - 0.5) / C0)[:, None],
+    )
+
+
+def ring(count: int, width: int = 40, height: int = 32) -> list[Camera]:
+    """Cameras on an arc of 70 degrees that look at the origin from 2.2 u away."""
+    K = np.array([[1.3 * width, 0, 0.5 * width + 0.7], [0, 1.3 * width, 0.5 * height - 0.4], [0, 0, 1.0]])
+    cameras = []
+    for i, angle in enumerate(np.radians(np.linspace(-35, 35, count))):
+        center = 2.2 * np.array([math.sin(angle), 0.15 * (-1) ** i, -math.cos(angle)])
+        cameras.append(Camera(look_at(center, np.zeros(3), np.array([0.0, -1, 0])), K, width, height))
+    return cameras
+
+
+def photographs(count: int = 6, width: int = 40, height: int = 32) -> list[View]:
+    """Views of the three Gaussians."""
+    gaussians = three_gaussians()
+    return [
+        View(f"{i:02d}.png", camera, rasterize(gaussians, camera).rgb.clamp(0, 1).numpy())
+        for i, camera in enumerate(ring(count, width, height))
+    ]
+
+
+def seeds(count: int = 60) -> PointCloud:
+    """Gray points around the three means."""
+    generator = np.random.default_rng(0)
+    means = three_gaussians().means.numpy().astype(np.float64)
+    points = means[generator.integers(3, size=count)] + 0.12 * generator.standard_normal((count, 3))
+    return PointCloud(points, np.full((count, 3), 0.5, np.float32))
