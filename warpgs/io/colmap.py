@@ -1,17 +1,23 @@
-"""COLMAP reconstructions, binary and text: cameras, images, points (colmap.github.io, "Output Format")."""
+"""COLMAP reconstructions, binary and text: cameras, images, points (colmap.github.io, "Output Format").
+
+Other files of a reconstruction (rigs, frames, project.ini) say nothing that a pinhole scene needs and are not read.
+"""
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.io.images import Lens, find_mask, image_folder, load_photo
+from warpgs.io.folders import ViewList, child, find_mask, image_folder, view_name
+from warpgs.io.images import Lens, list_images, load_photo
 from warpgs.io.poses import quat_rotation, rigid
-from warpgs.scene import Camera, PointCloud, View
+from warpgs.scene import PointCloud, View
 
 MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}
 """Model number to name and number of parameters."""
@@ -19,6 +25,7 @@ OTHER_MODELS = {
     5: "OPENCV_FISHEYE", 6: "FULL_OPENCV", 7: "FOV", 8: "SIMPLE_RADIAL_FISHEYE", 9: "RADIAL_FISHEYE",
     10: "THIN_PRISM_FISHEYE",
 }  # fmt: skip
+STEMS = ("cameras", "images", "points3D")
 
 
 @dataclass(frozen=True)
@@ -26,9 +33,13 @@ class Pose:
     """One row of the images file."""
 
     name: str
+    """Path below the image folder, POSIX style, as in the file."""
     camera_id: int
+    """Number of its camera."""
     quat: tuple[float, ...]
+    """Rotation of camera_from_world, wxyz."""
     translation: tuple[float, ...]
+    """Translation of camera_from_world [file units]."""
 
 
 class _Reader:
@@ -39,55 +50,100 @@ class _Reader:
         try:
             self.data = path.read_bytes()
         except OSError as e:
-            raise DataError(f"{path}: cannot be read ({e.strerror})") from e
+            raise DataError(f"{path}: cannot be read ({e.strerror}); mend its permissions or copy it again") from e
+
+    def _need(self, size: int) -> None:
+        if size > len(self.data) - self.at:
+            raise DataError(
+                f"{self.path}: the file ends in the middle of a record, at byte {len(self.data)}; "
+                "it is truncated. Copy it again"
+            )
 
     def take(self, layout: str) -> tuple:
+        """The next values, little endian."""
         size = struct.calcsize("<" + layout)
-        if self.at + size > len(self.data):
-            raise DataError(f"{self.path}: the file ends in the middle of a record, at byte {len(self.data)}; copy it again")
-        values = struct.unpack_from("<" + layout, self.data, self.at)
+        self._need(size)
         self.at += size
-        return values
+        return struct.unpack_from("<" + layout, self.data, self.at - size)
 
     def skip(self, size: int) -> bytes:
-        if self.at + size > len(self.data):
-            raise DataError(f"{self.path}: the file ends in the middle of a record, at byte {len(self.data)}; copy it again")
+        """The next bytes as they are."""
+        self._need(size)
         self.at += size
         return self.data[self.at - size : self.at]
 
     def count(self, smallest: int) -> int:
-        """A record count, held against the bytes that are left."""
+        """A record count, held against the bytes that are left before anything is allocated."""
         (count,) = self.take("Q")
-        if count * smallest > len(self.data) - self.at:
+        room = (len(self.data) - self.at) // smallest
+        if count > room:
             raise DataError(
-                f"{self.path}: announces {count:,} records but holds bytes for at most {(len(self.data) - self.at) // smallest:,}; "
-                "it is truncated or no COLMAP file. Copy it again"
+                f"{self.path}: announces {count:,} records but holds bytes for at most {room:,}; it is truncated or no "
+                "COLMAP file. Copy it again"
             )
         return count
 
     def text(self) -> str:
+        """A name that ends in a zero byte, UTF-8."""
         end = self.data.find(b"\0", self.at)
         if end < 0:
             raise DataError(f"{self.path}: a name has no end, so the file is truncated; copy it again")
-        name = self.data[self.at : end].decode("utf-8", "surrogateescape")
-        self.at = end + 1
-        return name
+        raw, self.at = self.data[self.at : end], end + 1
+        try:
+            return raw.decode("utf-8")
+        except UnicodeDecodeError as e:
+            raise DataError(f"{self.path}: the name {raw[:80]!r} is not UTF-8; rename the image, run COLMAP again") from e
+
+    def end(self) -> None:
+        """Nothing may follow the last record: leftover bytes mean a wrong count."""
+        if self.at != len(self.data):
+            raise DataError(
+                f"{self.path}: {len(self.data) - self.at} bytes follow the last record, so its count "
+                "of records is wrong. Copy it again"
+            )
 
 
-def _lens(path: Path, model: str, width: int, height: int, p: tuple[float, ...]) -> Lens:
-    if width < 1 or height < 1 or not np.isfinite(p).all():
-        raise DataError(f"{path}: a camera has size {width} x {height} and parameters {p}; they must be positive and finite")
-    if model == "SIMPLE_PINHOLE":
-        fx, fy, cx, cy, distortion = p[0], p[0], p[1], p[2], ()
-    elif model == "PINHOLE":
-        fx, fy, cx, cy, distortion = *p, ()
-    elif model in ("SIMPLE_RADIAL", "RADIAL"):
-        fx, fy, cx, cy, distortion = p[0], p[0], p[1], p[2], (p[3], p[4] if model == "RADIAL" else 0.0, 0.0, 0.0)
+def _lines(path: Path) -> list[tuple[int, str]]:
+    """Numbered lines of a text file; only line feeds end a line, since names may hold other separators."""
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({e.strerror}); mend its permissions or copy it again") from e
+    except UnicodeDecodeError as e:
+        raise DataError(f"{path}: is not UTF-8 text ({e.reason} at byte {e.start}); write it again") from e
+    return list(enumerate(text.replace("\r\n", "\n").split("\n"), 1))
+
+
+def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    for number, line in _lines(path):
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield number, line.split()
+
+
+@contextmanager
+def _understood(path: Path, line: int):
+    """Turn what parsing a line may raise into an error that names file and line."""
+    try:
+        yield
+    except (ValueError, IndexError, OverflowError) as e:
+        raise DataError(f"{path}, line {line}: cannot be understood ({e}); write the file again") from e
+
+
+def _store(table: dict, key: int, value: object, where: str) -> None:
+    if key in table:
+        raise DataError(f"{where}: number {key} is given twice; write the file again")
+    table[key] = value
+
+
+def _lens(where: str, model: str, width: int, height: int, p: tuple[float, ...]) -> Lens:
+    if model in ("PINHOLE", "OPENCV"):
+        (fx, fy, cx, cy), distortion = p[:4], p[4:]
     else:
-        fx, fy, cx, cy, distortion = p[0], p[1], p[2], p[3], tuple(p[4:8])
-    if not (fx > 0 and fy > 0):
-        raise DataError(f"{path}: a camera has focal lengths {fx}, {fy}; they must be positive")
-    return Lens(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), width, height, distortion, model)
+        fx, cx, cy = p[:3]
+        fy, distortion = fx, p[3:]
+        if distortion:  # SIMPLE_RADIAL has k1, RADIAL k1 and k2
+            distortion = (*distortion, *[0.0] * (4 - len(distortion)))
+    return Lens(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), width, height, tuple(distortion), model).checked(where)
 
 
 def _unknown_model(path: Path, model: object) -> DataError:
@@ -108,115 +164,146 @@ def read_cameras(path: Path) -> dict[int, Lens]:
             if model not in MODELS:
                 raise _unknown_model(path, OTHER_MODELS.get(model, model))
             name, count = MODELS[model]
-            cameras[number] = _lens(path, name, width, height, r.take(f"{count}d"))
+            where = f"{path}, camera {number}"
+            _store(cameras, number, _lens(where, name, width, height, r.take(f"{count}d")), where)
+        r.end()
         return cameras
-    counts = {name: count for name, count in MODELS.values()}
-    for line_number, words in _lines(path):
-        with _line_errors(path, line_number):
-            model, parameters = words[1], tuple(float(w) for w in words[4:])
+    counts = dict(MODELS.values())
+    for line, words in _rows(path):
+        with _understood(path, line):
+            number, model, parameters = int(words[0]), words[1], tuple(float(w) for w in words[4:])
             if model not in counts:
                 raise _unknown_model(path, model)
             if len(parameters) != counts[model]:
                 raise ValueError(f"{model} has {counts[model]} parameters, not {len(parameters)}")
-            cameras[int(words[0])] = _lens(path, model, int(words[2]), int(words[3]), parameters)
+            where = f"{path}, line {line}, camera {number}"
+            _store(cameras, number, _lens(where, model, int(words[2]), int(words[3]), parameters), where)
     return cameras
 
 
-def _lines(path: Path):
-    try:
-        text = path.read_text("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as e:
-        raise DataError(f"{path}: cannot be read as text ({e})") from e
-    for number, line in enumerate(text.splitlines(), 1):
-        if line.strip() and not line.startswith("#"):
-            yield number, line.split()
-
-
-class _line_errors:
-    """Turn what parsing a line may raise into an error that names file and line."""
-
-    def __init__(self, path: Path, line: int):
-        self.path, self.line = path, line
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, kind, error, trace):
-        if kind is not None and issubclass(kind, (ValueError, IndexError, KeyError)):
-            raise DataError(f"{self.path}, line {self.line}: cannot be understood ({error}); write the file again") from error
-
-
-def read_poses(path: Path) -> tuple[dict[int, Pose], dict[int, str]]:
-    """Poses by image number, and names by image number, from images.bin or images.txt; DataError where malformed."""
+def read_poses(path: Path) -> dict[int, Pose]:
+    """Poses by image number from images.bin or images.txt; DataError where the file is malformed."""
     poses: dict[int, Pose] = {}
     if path.suffix == ".bin":
         r = _Reader(path)
         for _ in range(r.count(73)):
-            number, *rest = r.take("i7di")
-            name = r.text()
+            number, *values, camera = r.take("i7di")
+            pose = Pose(r.text(), camera, tuple(values[:4]), tuple(values[4:]))
             (observed,) = r.take("Q")
             r.skip(24 * observed)
-            poses[number] = Pose(name, rest[7], tuple(rest[:4]), tuple(rest[4:7]))
-    else:
-        try:
-            text = path.read_text("utf-8-sig")
-        except (OSError, UnicodeDecodeError) as e:
-            raise DataError(f"{path}: cannot be read as text ({e})") from e
-        # two lines an image; the second lists observations and may be empty
-        rows = [(n, line) for n, line in enumerate(text.splitlines(), 1) if not line.startswith("#")]
-        while rows and not rows[-1][1].strip():
-            rows.pop()
-        for line_number, line in rows[::2]:
-            with _line_errors(path, line_number):
-                words = line.split(maxsplit=9)
-                values = [float(w) for w in words[1:8]]
-                poses[int(words[0])] = Pose(words[9].strip(), int(words[8]), tuple(values[:4]), tuple(values[4:7]))
-    return poses, {n: p.name for n, p in poses.items()}
+            _store(poses, number, pose, str(path))
+        r.end()
+        return poses
+    lines = iter(_lines(path))
+    for line, text in lines:
+        if not text.strip() or text.lstrip().startswith("#"):
+            continue
+        with _understood(path, line):
+            words = text.split(maxsplit=9)
+            values = tuple(float(w) for w in words[1:8])
+            pose = Pose(words[9].rstrip(), int(words[8]), values[:4], values[4:])
+            _store(poses, int(words[0]), pose, f"{path}, line {line}")
+        # the line of observations always follows, but may be empty
+        line, text = next(lines, (0, ""))
+        if len(text.split()) % 3:
+            raise DataError(
+                f"{path}, line {line}: must list the observations of image {pose.name!r} as X Y POINT, and may be empty but "
+                "not left out; write the file again"
+            )
+    return poses
 
 
 def read_points(path: Path, names: dict[int, str]) -> PointCloud:
-    """Points with the views that saw them from points3D.bin or points3D.txt; DataError where malformed."""
-    points, colors, tracks = [], [], []
+    """Points with the views that saw them from points3D.bin or points3D.txt.
+
+    Args:
+        path: The file; an empty one gives no points.
+        names: View names by image number; numbers that are not in it are left out of the tracks.
+
+    Raises:
+        DataError: The file is malformed, or a point is not finite.
+    """
+    points: list[tuple[float, ...]] = []
+    colors: list[tuple[int, ...]] = []
+    tracks: list[frozenset[str]] = []
     if path.suffix == ".bin":
         r = _Reader(path)
         for _ in range(r.count(51)):
-            _, x, y, z, red, green, blue, _ = r.take("Q3d3Bd")
-            (length,) = r.take("Q")
+            _, x, y, z, red, green, blue, _, length = r.take("Q3d3BdQ")
             track = np.frombuffer(r.skip(8 * length), "<i4")[::2]
             points.append((x, y, z))
             colors.append((red, green, blue))
             tracks.append(frozenset(names[i] for i in track.tolist() if i in names))
+        r.end()
     else:
-        for line_number, words in _lines(path):
-            with _line_errors(path, line_number):
+        for line, words in _rows(path):
+            with _understood(path, line):
+                if len(words) < 8 or len(words) % 2:
+                    raise ValueError("a point has 8 numbers, then pairs IMAGE OBSERVATION")
                 points.append(tuple(float(w) for w in words[1:4]))
-                colors.append(tuple(int(w) for w in words[4:7]))
-                tracks.append(frozenset(names[int(i)] for i in words[8::2] if int(i) in names))
+                colors.append(tuple(min(max(int(w), 0), 255) for w in words[4:7]))
+                tracks.append(frozenset(names[i] for w in words[8::2] if (i := int(w)) in names))
     positions = np.array(points, np.float64).reshape(-1, 3)
-    if not np.isfinite(positions).all():
-        bad = int((~np.isfinite(positions).all(1)).sum())
+    bad = int((~np.isfinite(positions).all(axis=1)).sum())
+    if bad:
         raise DataError(f"{path}: {bad} of {len(positions)} points are not finite; reconstruct again, or remove them")
     return PointCloud(positions, np.array(colors, np.float32).reshape(-1, 3) / 255, tuple(tracks))
 
 
-def model_folder(root: Path) -> Path | None:
-    """The folder of a reconstruction that holds any COLMAP file: sparse/0, sparse, or the root; None if none does."""
-    for folder in (root / "sparse" / "0", root / "sparse", root):
-        if any((folder / f"{stem}.{kind}").is_file() for stem in ("cameras", "images", "points3D") for kind in ("bin", "txt")):
-            return folder
+def complete_kind(folder: Path) -> str | None:
+    """The kind of files, bin before txt, of which cameras and images are there; None where neither is complete."""
+    for kind in ("bin", "txt"):
+        if not _missing(folder, kind):
+            return kind
     return None
+
+
+def _missing(folder: Path, kind: str) -> list[str]:
+    return [f"{stem}.{kind}" for stem in STEMS[:2] if not (folder / f"{stem}.{kind}").is_file()]
 
 
 def missing_parts(folder: Path) -> list[str]:
     """Names of the files that a complete reconstruction needs and this folder lacks."""
-    for kind in ("bin", "txt"):
-        if (folder / f"images.{kind}").is_file() and (folder / f"cameras.{kind}").is_file():
-            return []
-    kind = "txt" if (folder / "cameras.txt").is_file() or (folder / "images.txt").is_file() else "bin"
-    return [f"{stem}.{kind}" for stem in ("cameras", "images") if not (folder / f"{stem}.{kind}").is_file()]
+    if complete_kind(folder):
+        return []
+    return min((_missing(folder, kind) for kind in ("bin", "txt")), key=len)
 
 
-def load(root: Path, *, downscale: int, invert_masks: bool, **_) -> tuple[list[View], PointCloud | None, list[str]]:
+def model_folder(root: Path) -> Path | None:
+    """The folder of the reconstruction: sparse/0, sparse, or the root; None if none holds any COLMAP file.
+
+    The first complete one is taken, else the first that holds anything, for the error message.
+    """
+    folders = (root / "sparse" / "0", root / "sparse", root)
+    partial = [f for f in folders if any((f / f"{s}.{k}").is_file() for s in STEMS for k in ("bin", "txt"))]
+    return next((f for f in partial if complete_kind(f)), partial[0] if partial else None)
+
+
+def _photo_paths(images: Path, names: list[str], where: str, allow_outside: bool) -> tuple[dict[str, Path], str]:
+    """The file of each view, and a note.
+
+    Ready-made small folders often hold other suffixes (image_8/a.png for a.JPG) or names of their own (LLFF's image000.png);
+    the former are matched by stem, the latter by sorted order where the counts agree.
+    """
+    paths = {n: child(images, n, where, allow_outside=allow_outside) for n in names}
+    lost = [n for n in names if not paths[n].is_file()]
+    if not lost or images.name == "images":
+        return paths, ""
+    files = list_images(images)
+    stems = {p.relative_to(images).with_suffix("").as_posix(): p for p in files}
+    found = {n: stems.get(str(PurePosixPath(n).with_suffix(""))) for n in lost}
+    if len(stems) == len(files) and all(found.values()):
+        return paths | found, f"{len(lost)} images of {images.name} matched by their names without suffix"
+    if len(lost) == len(names) == len(files):
+        pairs = dict(zip(sorted(names), files))
+        first = min(names)
+        return pairs, f"images of {images.name} have other names, matched in sorted order ({first} is {pairs[first].name})"
+    return paths, ""  # the missing file is named when it is read
+
+
+def load(
+    root: Path, *, downscale: int, allow_outside: bool, invert_masks: bool, **_
+) -> tuple[list[View], PointCloud | None, list[str]]:
     """Read a scene folder with a COLMAP reconstruction.
 
     Returns:
@@ -226,40 +313,37 @@ def load(root: Path, *, downscale: int, invert_masks: bool, **_) -> tuple[list[V
         DataError: A file is missing or malformed, an image lacks, or a size does not fit.
     """
     folder = model_folder(root)
-    if folder is None or (missing := missing_parts(folder)):
-        raise DataError(f"{folder or root}: the COLMAP reconstruction lacks {' and '.join(missing)}; copy the whole folder")
-    kind = "bin" if not missing_parts_of(folder, "bin") else "txt"
+    kind = None if folder is None else complete_kind(folder)
+    if folder is None or kind is None:
+        lacks = "cameras and images" if folder is None else " and ".join(missing_parts(folder))
+        raise DataError(f"{folder or root}: the COLMAP reconstruction lacks {lacks}; copy the whole folder")
     lenses = read_cameras(folder / f"cameras.{kind}")
-    poses, names = read_poses(folder / f"images.{kind}")
-    notes: list[str] = []
+    file = folder / f"images.{kind}"
+    poses = read_poses(file)
     images, factor, note = image_folder(root, downscale)
+    notes = [note] if note else []
+    paths, note = _photo_paths(images, [p.name for p in poses.values()], str(file), allow_outside)
     notes += [note] if note else []
-    views, models = [], set()
+    views = ViewList()
     for pose in sorted(poses.values(), key=lambda p: p.name):
-        lens = lenses.get(pose.camera_id)
-        if lens is None:
-            raise DataError(f"{folder}/images.{kind}: image {pose.name!r} names camera {pose.camera_id}, which does not exist")
-        path = images / pose.name
-        photo = load_photo(path, lens, downscale=factor, mask=find_mask(path, images, invert_masks))
+        where = f"{file}, image {pose.name!r}"
+        if pose.camera_id not in lenses:
+            raise DataError(f"{where}: names camera {pose.camera_id}, which cameras.{kind} does not have; write both again")
         viewmat = np.eye(4)
-        viewmat[:3, :3] = quat_rotation(pose.quat, f"{folder}/images.{kind}, image {pose.name!r}")
+        viewmat[:3, :3] = quat_rotation(pose.quat, where)
         viewmat[:3, 3] = pose.translation
-        viewmat = rigid(viewmat, f"{folder}/images.{kind}, image {pose.name!r}")
-        height, width = photo.image.shape[:2]
-        views.append(View(pose.name, Camera(viewmat, photo.K, width, height), photo.image, photo.mask))
-        if any(lens.distortion):
-            models.add(lens.model)
-    notes += [f"lens distortion ({m}) undone" for m in sorted(models)]
+        path = paths[pose.name]
+        mask = find_mask(path, images, invert_masks)
+        photo = load_photo(path, lenses[pose.camera_id], downscale=factor, mask=mask)
+        views.add(view_name(pose.name), rigid(viewmat, where), photo)
+    unposed = len(set(list_images(images)) - set(paths.values()))
+    if unposed:
+        notes.append(f"{unposed} images of {images.name} have no pose in the reconstruction and are left out")
+    notes += views.notes()
     points_path = folder / f"points3D.{kind}"
     if not points_path.is_file():
-        notes.append(f"{points_path.name} is missing, so there are no points to start from")
-        return views, None, notes
-    points = read_points(points_path, names)
+        return views.views, None, [*notes, f"{points_path.name} is missing, so there are no points to start from"]
+    points = read_points(points_path, {n: view_name(p.name) for n, p in poses.items()})
     if len(points) == 0:
         notes.append(f"{points_path.name} holds no points")
-    return views, points, notes
-
-
-def missing_parts_of(folder: Path, kind: str) -> list[str]:
-    """Like `missing_parts` for one kind of file, bin or txt."""
-    return [f"{stem}.{kind}" for stem in ("cameras", "images") if not (folder / f"{stem}.{kind}").is_file()]
+    return views.views, points, notes

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from warpgs.errors import DataError
+from warpgs.errors import DataError, UsageError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 EXIF_ORIENTATION = 0x0112
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+LARGEST_DEFLATE_RATIO = 1032
+"""No deflate stream unpacks to more than this many times its size (zlib's technical notes)."""
+SMALLEST_SIDE = 4
+"""Images whose shorter side falls below this [px] hold nothing to fit."""
+LARGEST_INTRINSIC = 1e9
+LARGEST_DISTORTION = 1e4
+"""Beyond these a number is taken for a broken file; real lenses stay orders of magnitude below."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +38,19 @@ class Lens:
     model: str = "PINHOLE"
     """Name of the camera model, for notes."""
 
+    def checked(self, where: str) -> Lens:
+        """This lens; DataError where a number is not finite, not positive or absurd (``where`` names file and image)."""
+        f, c = self.K[[0, 1], [0, 1]], self.K[:2, 2]
+        if not (1 <= self.width <= LARGEST_INTRINSIC and 1 <= self.height <= LARGEST_INTRINSIC):
+            raise DataError(f"{where}: the camera's image size {self.width} x {self.height} px is impossible; mend the file")
+        if not ((f > 0) & (f < LARGEST_INTRINSIC)).all():
+            raise DataError(f"{where}: focal lengths {f.tolist()} px must be positive and finite; calibrate again")
+        if not (np.abs(c) < LARGEST_INTRINSIC).all():
+            raise DataError(f"{where}: the principal point {c.tolist()} px is not finite; calibrate again")
+        if not (np.abs(self.distortion) < LARGEST_DISTORTION).all():
+            raise DataError(f"{where}: distortion {self.distortion} of the {self.model} lens is impossible; calibrate again")
+        return self
+
 
 @dataclass(frozen=True)
 class Photo:
@@ -39,12 +62,25 @@ class Photo:
     """True where the pixel counts, bool, shape [H, W]; None for everywhere."""
     K: np.ndarray
     """Intrinsics [px], shape [3, 3]."""
+    done: tuple[str, ...] = ()
+    """What was done to the pixels and a user should know of, in words that fit "1 image ..."."""
 
 
 def list_images(folder: Path) -> list[Path]:
     """Image files below a folder, sorted by relative POSIX path."""
-    files = [p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file()]
+    # hidden files are leavings of file managers ("._photo.jpg"), not photographs
+    files = [p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.name[0] != "." and p.is_file()]
     return sorted(files, key=lambda p: p.relative_to(folder).as_posix())
+
+
+def _announces_too_much(data: np.ndarray) -> bool:
+    """Whether a PNG's header promises more than its bytes can unpack to; OpenCV would take gigabytes before it noticed."""
+    header = data[:26].tobytes()
+    if len(header) < 26 or header[:8] != PNG_SIGNATURE:
+        return False
+    width, height, depth, color = struct.unpack(">IIBB", header[16:26])
+    channels = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(color, 4)
+    return height * (width * channels * depth // 8 + 1) > LARGEST_DEFLATE_RATIO * data.size
 
 
 def decode(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
@@ -59,10 +95,12 @@ def decode(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
     if not path.is_file():
         raise DataError(f"{path}: the image file is missing; restore it, or remove its camera from the scene")
-    data = np.fromfile(path, np.uint8)  # not cv2.imread: that fails on non-ASCII paths on some systems
-    flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        raw = cv2.imdecode(data, cv2.IMREAD_UNCHANGED if flags < 0 else flags) if data.size else None
+        data = np.fromfile(path, np.uint8)  # not cv2.imread: that fails on non-ASCII paths on some systems
+        # IMREAD_UNCHANGED also leaves the EXIF orientation alone: the camera, not the tag, says how the raster lies
+        raw = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size and not _announces_too_much(data) else None
+    except OSError as e:
+        raise DataError(f"{path}: the image cannot be read ({e.strerror}); mend its permissions or copy it again") from e
     except cv2.error:
         raw = None
     if raw is None:
@@ -73,11 +111,15 @@ def decode(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         values = raw.astype(np.float32) / 65535
     elif raw.dtype == np.float32:
         values = np.clip(raw, 0, 1)
+        if not np.isfinite(raw).all():
+            raise DataError(f"{path}: some pixels are not finite; save it as 8- or 16-bit PNG")
     else:
         raise DataError(f"{path}: pixels of type {raw.dtype} are not supported; save it as 8- or 16-bit PNG")
     if values.ndim == 2:
         values = values[..., None]
     channels = values.shape[2]
+    if channels > 4:
+        raise DataError(f"{path}: has {channels} channels; save it as gray, RGB or RGBA")
     alpha = values[..., -1] if channels in (2, 4) else None
     color = np.repeat(values[..., :1], 3, axis=2) if channels <= 2 else values[..., 2::-1]
     return np.ascontiguousarray(color), alpha
@@ -90,7 +132,7 @@ def exif_orientation(path: Path) -> int:
     try:
         with Image.open(path) as image:
             value = image.getexif().get(EXIF_ORIENTATION, 1)
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError):
+    except (OSError, UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError):
         return 1  # decode() has the last word on whether the file is an image
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
@@ -117,41 +159,78 @@ def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
 
 
-def _undistort(photo: Photo, distortion: tuple[float, ...]) -> Photo:
+def _fold_radius2(distortion: tuple[float, ...]) -> float:
+    """Squared radius in the image plane beyond which the radial polynomial turns back; infinity where it never does."""
+    k1, k2, k3 = distortion[0], distortion[1], distortion[4] if len(distortion) > 4 else 0.0
+    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+    real = roots[np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots.real))].real
+    return float(min(real[real > 0], default=np.inf))
+
+
+def _undistort(photo: Photo, lens: Lens) -> Photo:
+    """Resample to a pinhole of the same K; pixels that the lens never saw leave the mask."""
     import cv2
 
     height, width = photo.image.shape[:2]
     K = photo.K.copy()
     K[:2, 2] -= 0.5  # OpenCV's pixel centres are at whole numbers
-    map_x, map_y = cv2.initUndistortRectifyMap(K, np.array(distortion), None, K, (width, height), cv2.CV_32FC1)
+    map_x, map_y = cv2.initUndistortRectifyMap(K, np.array(lens.distortion), None, K, (width, height), cv2.CV_32FC1)
     image = cv2.remap(photo.image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     inside = (map_x >= -0.5) & (map_x <= width - 0.5) & (map_y >= -0.5) & (map_y <= height - 0.5)
+    # where the polynomial turns back, the map leads into the image again but to a ray that the lens sent elsewhere
+    x2 = ((np.arange(width) - K[0, 2]) / K[0, 0]) ** 2
+    y2 = ((np.arange(height) - K[1, 2]) / K[1, 1]) ** 2
+    inside &= y2[:, None] + x2 < _fold_radius2(lens.distortion)
     if photo.mask is not None:
-        mask = cv2.remap(photo.mask.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR)
-        inside &= mask > 0.5
-    return Photo(image, None if inside.all() else inside, photo.K)
+        inside &= cv2.remap(photo.mask.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR) > 0.5
+    return Photo(image, None if inside.all() else inside, photo.K, (*photo.done, f"freed of lens distortion ({lens.model})"))
 
 
-def find_mask(image: Path, images_root: Path, invert: bool) -> np.ndarray | None:
-    """Mask [H, W] of an image from a folder `masks` beside the image folder: same name as .png, or name plus .png.
+def _shrink(path: Path, photo: Photo, downscale: int) -> Photo:
+    height, width = photo.image.shape[:2]
+    small_w, small_h = round(width / downscale), round(height / downscale)
+    if min(small_w, small_h) < SMALLEST_SIDE:
+        raise UsageError(
+            f"--downscale {downscale} leaves {small_w} x {small_h} px of {path} ({width} x {height} px); "
+            f"both sides must keep at least {SMALLEST_SIDE} px. Choose a smaller factor"
+        )
+    K = np.diag([small_w / width, small_h / height, 1.0]) @ photo.K
+    mask = None if photo.mask is None else _resize(photo.mask.astype(np.float32), small_w, small_h) > 0.5
+    return Photo(_resize(photo.image, small_w, small_h), mask, K, photo.done)
 
-    White keeps a pixel; ``invert`` turns that round.
 
-    Raises:
-        DataError: The mask file cannot be decoded.
-    """
-    relative = image.relative_to(images_root)
-    folder = images_root.parent / "masks"
-    for candidate in (folder / relative.with_suffix(".png"), folder / f"{relative.as_posix()}.png", folder / relative):
-        if candidate.is_file():
-            color, _ = decode(candidate)
-            return (color[..., 0] > 0.5) != invert
-    return None
+def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tuple[int, int], orientation: int) -> np.ndarray:
+    """The mask at the upright size (height, width); a mask that lies like the stored raster is turned with it."""
+    if stored != upright and mask.shape == stored:
+        mask = _turn(mask, orientation)
+    height, width = upright
+    if mask.shape == upright:
+        return mask
+    # one pixel of the smaller of the two rasters is what rounding a size may cost
+    if abs(mask.shape[1] * height - mask.shape[0] * width) > max(height, width, *mask.shape):
+        raise DataError(
+            f"{path}: its mask is {mask.shape[1]} x {mask.shape[0]} px, the image {width} x {height}: the aspects differ. "
+            "Give a mask made from this image"
+        )
+    return _resize(mask.astype(np.float32), width, height) > 0.5
+
+
+def _upright(path: Path, lens: Lens, image: np.ndarray) -> int:
+    """The EXIF orientation to apply: 1 (none) where the raster fits the camera as stored, the tag's where only that fits."""
+    if _fits(image.shape, lens):
+        return 1
+    orientation = exif_orientation(path)
+    if orientation not in (5, 6, 7, 8) or not _fits(image.shape[1::-1], lens):
+        raise DataError(
+            f"{path}: the image is {image.shape[1]} x {image.shape[0]} px, its camera {lens.width} x {lens.height}: the "
+            "aspects differ, so the intrinsics cannot belong to it. Give the images that the cameras were made from."
+        )
+    return orientation
 
 
 def load_photo(
     path: Path,
-    lens: Lens,
+    lens: Lens | Callable[[int, int], Lens],
     *,
     downscale: int = 1,
     mask: np.ndarray | None = None,
@@ -161,7 +240,8 @@ def load_photo(
 
     Args:
         path: The image file.
-        lens: Its intrinsics, at whatever size; they are scaled to the image.
+        lens: Its intrinsics, at whatever size; they are scaled to the image. Or what makes them from the width and height
+            [px] of the stored raster, for formats that leave the size to the image.
         downscale: Factor by which both sides shrink (area resampling).
         mask: True where a pixel counts, [H, W] at the size of the file or of the same aspect.
         background: Put behind transparent pixels; None turns transparency into the mask instead.
@@ -170,58 +250,36 @@ def load_photo(
         The photograph with intrinsics for its final size.
 
     Raises:
-        DataError: The file cannot be decoded, or its size does not fit its camera or its mask.
+        DataError: The file cannot be decoded, its size does not fit its camera or its mask, or no pixel counts.
+        UsageError: ``downscale`` leaves next to nothing.
     """
     image, alpha = decode(path)
-    if not _fits(image.shape, lens):
-        orientation = exif_orientation(path)
-        turned = _turn(image, orientation)
-        if orientation == 1 or not _fits(turned.shape, lens):
-            raise DataError(
-                f"{path}: the image is {image.shape[1]} x {image.shape[0]} px, its camera {lens.width} x {lens.height}: the "
-                "aspects differ, so the intrinsics cannot belong to it. Give the images that the cameras were made from."
-            )
-        image, alpha = turned, None if alpha is None else _turn(alpha, orientation)
+    stored, done = image.shape[:2], []
+    if not isinstance(lens, Lens):
+        lens = lens(stored[1], stored[0])
+    orientation = _upright(path, lens, image)
+    if orientation != 1:
+        image, alpha = _turn(image, orientation), None if alpha is None else _turn(alpha, orientation)
+        done.append("turned by the EXIF tag, as the camera asks")
     height, width = image.shape[:2]
     K = np.diag([width / lens.width, height / lens.height, 1.0]) @ lens.K
-    if mask is not None and mask.shape != (height, width):
-        if abs(mask.shape[1] * height - mask.shape[0] * width) > max(height, width):
-            raise DataError(f"{path}: its mask is {mask.shape[1]} x {mask.shape[0]} px, the image {width} x {height}")
-        mask = _resize(mask.astype(np.float32), width, height) > 0.5
+    if mask is not None:
+        mask = _fit_mask(path, mask, stored, (height, width), orientation)
+        done.append("masked by a mask file")
     if alpha is not None and alpha.min() < 1:
         if background is not None:
             image = image * alpha[..., None] + np.float32(background) * (1 - alpha[..., None])
+            done.append("put over the background where transparent")
         else:
             mask = (alpha > 0.5) if mask is None else mask & (alpha > 0.5)
-    photo = Photo(image, mask, K)
+            done.append("masked by its alpha channel")
+    if mask is not None and not mask.any():
+        raise DataError(f"{path}: its mask leaves no pixel; white keeps a pixel, so perhaps --invert-masks is wanted")
+    photo = Photo(image, mask, K, tuple(done))
     if any(lens.distortion):
-        photo = _undistort(photo, lens.distortion)
+        photo = _undistort(photo, lens)
     if downscale > 1:
-        small_w, small_h = max(1, round(width / downscale)), max(1, round(height / downscale))
-        K = np.diag([small_w / width, small_h / height, 1.0]) @ photo.K
-        mask = None if photo.mask is None else _resize(photo.mask.astype(np.float32), small_w, small_h) > 0.5
-        photo = Photo(_resize(photo.image, small_w, small_h), mask, K)
-    return Photo(np.ascontiguousarray(photo.image, np.float32), photo.mask, photo.K)
-
-
-def image_folder(root: Path, downscale: int, base: str = "images") -> tuple[Path, int, str]:
-    """Choose the image folder for a downscale factor: the ready-made `images_N`, else the full one, resampled.
-
-    Returns:
-        The folder, the factor left to resample by, and a note for the user (empty where nothing was chosen).
-
-    Raises:
-        DataError: There is no image folder.
-    """
-    ready = root / f"{base}_{downscale}"
-    if downscale > 1 and ready.is_dir() and list_images(ready):
-        return ready, 1, f"images taken from {ready.name}"
-    full = root / base
-    if full.is_dir() and list_images(full):
-        return full, downscale, f"images area-resampled by {downscale}" if downscale > 1 else ""
-    others = [p for p in root.glob(f"{base}_*") if p.name[len(base) + 1 :].isdigit() and list_images(p)]
-    if not others:
-        raise DataError(f"{root}: there is no folder '{base}' with images; put the photographs there")
-    largest = min(others, key=lambda p: int(p.name[len(base) + 1 :]))
-    how = f", area-resampled by {downscale}" if downscale > 1 else ""
-    return largest, downscale, f"there is no full-size folder '{base}': images taken from {largest.name}{how}"
+        photo = _shrink(path, photo, downscale)
+    if photo.mask is not None and not photo.mask.any():
+        raise DataError(f"{path}: no pixel is left after its mask, its lens distortion and --downscale; look at all three")
+    return Photo(np.ascontiguousarray(photo.image, np.float32), photo.mask, photo.K, photo.done)

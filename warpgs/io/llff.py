@@ -7,19 +7,24 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.io.images import Lens, find_mask, image_folder, list_images, load_photo
+from warpgs.io.folders import ViewList, find_mask, image_folder
+from warpgs.io.images import Lens, list_images, load_photo
 from warpgs.io.poses import from_camera_to_world
-from warpgs.scene import Camera, PointCloud, View
+from warpgs.scene import PointCloud, View
 
 
 def read_rows(path: Path) -> np.ndarray:
     """The array of poses_bounds.npy, float64 [n, 17]; DataError where it is anything else."""
     try:
-        rows = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as e:
-        raise DataError(f"{path}: cannot be read as a numpy array ({e}); copy it again") from e
-    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17:
-        raise DataError(f"{path}: must be an array [n, 17], not {getattr(rows, 'shape', 'an archive')}")
+        # mapped, because that holds the announced shape against the file's size before memory is taken
+        rows = np.load(path, mmap_mode="r", allow_pickle=False)
+    except Exception as e:  # numpy raises a dozen types on foreign bytes
+        raise DataError(f"{path}: cannot be read as a numpy array ({type(e).__name__}: {e}); copy it again") from e
+    if not isinstance(rows, np.ndarray):
+        rows.close()
+        raise DataError(f"{path}: is an archive of arrays, not one array [n, 17]; copy it again")
+    if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu":
+        raise DataError(f"{path}: must be an array [n, 17] of numbers, not {list(rows.shape)} of {rows.dtype}; make it again")
     return rows.astype(np.float64)
 
 
@@ -41,18 +46,18 @@ def load(root: Path, *, downscale: int, invert_masks: bool, **_) -> tuple[list[V
             f"{path}: has {len(rows)} poses, but {images} holds {len(files)} images. They are matched in sorted order, so one "
             "missing or extra file would give every photo the wrong pose: restore the set, or make the array again."
         )
-    views = []
+    views = ViewList()
     for file, row in zip(files, rows):
         name = file.relative_to(images).as_posix()
         where = f"{path}, image {name!r}"
         matrix = row[:15].reshape(3, 5)
-        height, width, focal = matrix[:, 4]
-        if not (np.isfinite(matrix).all() and height >= 1 and width >= 1 and focal > 0):
-            raise DataError(f"{where}: size {width} x {height} and focal length {focal} must be positive and finite")
+        height, width, focal = matrix[:, 4].tolist()
+        if not np.isfinite(matrix).all():
+            raise DataError(f"{where}: the pose is not finite; estimate it again, or remove row and image")
+        lens = Lens(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), int(width), int(height))
         # columns: down, right, back, centre
         pose = np.stack([matrix[:, 1], matrix[:, 0], -matrix[:, 2], matrix[:, 3]], axis=1)
-        lens = Lens(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), int(width), int(height))
-        photo = load_photo(file, lens, downscale=factor, mask=find_mask(file, images, invert_masks))
-        viewmat = from_camera_to_world(pose, where, opengl=False)
-        views.append(View(name, Camera(viewmat, photo.K, photo.image.shape[1], photo.image.shape[0]), photo.image, photo.mask))
-    return views, None, [note] if note else []
+        mask = find_mask(file, images, invert_masks)
+        photo = load_photo(file, lens.checked(where), downscale=factor, mask=mask)
+        views.add(name, from_camera_to_world(pose, where, opengl=False), photo)
+    return views.views, None, ([note] if note else []) + views.notes()

@@ -7,12 +7,43 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.io.images import Lens, decode, load_photo
+from warpgs.io.folders import ViewList, child, find_mask, view_name
+from warpgs.io.images import Lens, load_photo
 from warpgs.io.poses import rigid
-from warpgs.scene import Camera, PointCloud, View
+from warpgs.scene import PointCloud, View
 
 
-def load(root: Path, *, downscale: int, **_) -> tuple[list[View], PointCloud | None, list[str]]:
+def files_of(root: Path) -> list[Path]:
+    """The parameter files of a folder, sorted; a scene has one."""
+    return sorted(p for p in root.glob("*_par.txt") if p.is_file() and not p.name.startswith("."))
+
+
+def read_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
+    """Line number, image name and 21 numbers (K, R, t) of each camera; DataError where the file is malformed."""
+    try:
+        lines = path.read_bytes().decode("utf-8-sig").splitlines()
+        words = [(number, line.split()) for number, line in enumerate(lines, 1) if line.strip()]
+        count = int(words[0][1][0])
+        rows = [(number, w[0], np.array([float(x) for x in w[1:]])) for number, w in words[1:]]
+    except (OSError, ValueError, IndexError) as e:
+        raise DataError(
+            f"{path}: cannot be understood ({e}); its first line is a count, then come a name and 21 numbers a line. "
+            "Copy it again"
+        ) from e
+    if count != len(rows):
+        raise DataError(f"{path}: announces {count} images and lists {len(rows)}; it is truncated. Copy it again")
+    for number, name, values in rows:
+        if len(values) != 21 or not np.isfinite(values).all():
+            raise DataError(
+                f"{path}, line {number}, image {name!r}: needs 21 finite numbers (K, R, t), has "
+                f"{int(np.isfinite(values).sum())}. Copy the file again"
+            )
+    return rows
+
+
+def load(
+    root: Path, *, downscale: int, allow_outside: bool, invert_masks: bool, **_
+) -> tuple[list[View], PointCloud | None, list[str]]:
     """Read a Middlebury scene folder.
 
     Returns:
@@ -22,30 +53,29 @@ def load(root: Path, *, downscale: int, **_) -> tuple[list[View], PointCloud | N
         DataError: The file's lines do not hold a name and 21 numbers, their number differs from the count in its first
             line, or an image is missing.
     """
-    path = sorted(root.glob("*_par.txt"))[0]
-    try:
-        lines = [line.split() for line in path.read_text("utf-8-sig").splitlines() if line.strip()]
-        count, rows = int(lines[0][0]), [(w[0], np.array([float(x) for x in w[1:]])) for w in lines[1:]]
-    except (OSError, UnicodeDecodeError, ValueError, IndexError) as e:
-        raise DataError(
-            f"{path}: cannot be understood ({e}); its first line is a count, then a name and 21 numbers a line"
-        ) from e
-    if count != len(rows):
-        raise DataError(f"{path}: announces {count} images and lists {len(rows)}; it is truncated. Copy it again")
-    views = []
-    for number, (name, values) in enumerate(rows, 2):
+    path, *others = files_of(root)
+    notes = [f"cameras taken from {path.name}; {', '.join(p.name for p in others)} passed over"] if others else []
+    views = ViewList()
+    for number, name, values in read_rows(path):
         where = f"{path}, line {number}, image {name!r}"
-        if len(values) != 21 or not np.isfinite(values).all():
-            raise DataError(f"{where}: needs 21 finite numbers (K, R, t), has {len(values)}")
         K = values[:9].reshape(3, 3).copy()
-        if abs(K[0, 1]) > 1e-3 * K[0, 0]:
-            raise DataError(f"{where}: the camera is skewed by {K[0, 1]:.3g} px, which is not supported")
+        if abs(K[0, 1]) > 1e-3 * abs(K[0, 0]):
+            raise DataError(f"{where}: the camera is skewed by {K[0, 1]:.3g} px, which is not supported; rectify the images")
+        if not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], (0, 0, 0, 1)):
+            raise DataError(f"{where}: K is no matrix of intrinsics (its lower rows are not 0 fy cy, 0 0 1); calibrate again")
         K[0, 1] = 0.0
         K[:2, 2] += 0.5  # the file counts pixels from the centre of the first one
         viewmat = np.eye(4)
         viewmat[:3, :3], viewmat[:3, 3] = values[9:18].reshape(3, 3), values[18:21]
-        color, _ = decode(root / name)
-        photo = load_photo(root / name, Lens(K, color.shape[1], color.shape[0]), downscale=downscale)
-        camera = Camera(rigid(viewmat, where), photo.K, photo.image.shape[1], photo.image.shape[0])
-        views.append(View(name, camera, photo.image, photo.mask))
-    return views, None, [f"images area-resampled by {downscale}"] if downscale > 1 else []
+        viewmat = rigid(viewmat, where)
+        file = child(root, name, where, allow_outside=allow_outside)
+        photo = load_photo(
+            file,
+            lambda width, height: Lens(K, width, height).checked(where),  # noqa: B023 - called before the next round
+            downscale=downscale,
+            mask=find_mask(file, root, invert_masks, root / "masks"),
+        )
+        views.add(view_name(name), viewmat, photo)
+    if downscale > 1:
+        notes.append(f"images area-resampled by {downscale}")
+    return views.views, None, notes + views.notes()

@@ -19,7 +19,8 @@ def rigid(viewmat: np.ndarray, where: str) -> np.ndarray:
     if viewmat.shape != (4, 4) or not np.isfinite(viewmat).all():
         raise DataError(f"{where}: the pose is not finite; estimate it again, or remove the image")
     R = viewmat[:3, :3]
-    error = float(np.abs(R @ R.T - np.eye(3)).max())
+    # entries of a rotation are at most 1; the bound keeps the squares of wild ones from overflowing
+    error = float(np.abs(R @ R.T - np.eye(3)).max()) if np.abs(R).max() < 1e3 else np.inf
     if error > TOLERANCE:
         raise DataError(
             f"{where}: the pose is not rigid (R R^T is off by {error:.2g}): it scales or shears. Give pure rotations"
@@ -36,9 +37,9 @@ def rigid(viewmat: np.ndarray, where: str) -> np.ndarray:
 def quat_rotation(quat: tuple[float, ...], where: str) -> np.ndarray:
     """Rotation [3, 3] of a quaternion wxyz; DataError where it is zero or not finite."""
     q = np.array(quat, np.float64)
-    norm = float(np.linalg.norm(q))
-    if not (np.isfinite(norm) and norm > 1e-12):
-        raise DataError(f"{where}: the rotation quaternion {tuple(quat)} is zero or not finite")
+    norm = float(np.linalg.norm(q)) if (np.abs(q) < 1e100).all() else np.inf
+    if not 1e-12 < norm < np.inf:
+        raise DataError(f"{where}: the rotation quaternion {tuple(quat)} is zero or not finite; estimate the pose again")
     w, x, y, z = q / norm
     return np.array(
         [
@@ -62,6 +63,8 @@ def from_camera_to_world(matrix: np.ndarray, where: str, *, opengl: bool) -> np.
     """
     pose = np.eye(4)
     pose[: matrix.shape[0]] = matrix
+    if np.isfinite(pose).all() and not np.allclose(pose[3], (0, 0, 0, 1), atol=1e-6):
+        raise DataError(f"{where}: the last row of the pose is {pose[3].tolist()}, not 0 0 0 1; is the matrix transposed?")
     if opengl:
         pose[:3, 1:3] *= -1
     pose = rigid(pose, where)

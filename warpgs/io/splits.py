@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import re
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
@@ -14,6 +16,8 @@ from warpgs.scene import Scene
 DTU_TRAIN = (25, 22, 28, 40, 44, 48, 0, 8, 13)
 """Training ids of pixelNeRF's DTU protocol; the first 3, 6 or 9 are used."""
 DTU_TEST = (1, 2, 9, 10, 11, 12, 14, 15, 23, 24, 26, 27, 29, 30, 31, 32, 33, 34, 35, 41, 42, 43, 45, 46, 47)
+DTU_VIEWS = 49
+"""The ids count the first 49 views of a scan; some scans have 64."""
 BLENDER_TRAIN = (2, 16, 26, 55, 73, 76, 86, 93)
 """Training ids of DietNeRF's 8-view Blender protocol; tests are every 8th of the test frames."""
 
@@ -30,60 +34,85 @@ class Split:
     def __post_init__(self):
         both = set(self.train) & set(self.test)
         if both:
-            raise DataError(
-                f"views {', '.join(sorted(both)[:5])} are in training and in test; a score on them would mean nothing"
-            )
+            some = ", ".join(sorted(both)[:5])
+            raise DataError(f"views {some} are in training and in test; a score on them would mean nothing. Name each once")
         if not self.train:
-            raise DataError("the split leaves no training view")
+            raise DataError("the split leaves no training view; name at least one")
 
 
 def _every_8th(names: list[str], count: int, spec: str) -> Split:
     test = tuple(n for i, n in enumerate(names) if i % 8 == 0)
     pool = [n for i, n in enumerate(names) if i % 8]
     if not 1 <= count <= len(pool):
-        raise DataError(f"split {spec}: wants {count} training views, but {len(pool)} remain of {len(names)} after every 8th")
+        raise DataError(
+            f"split {spec}: wants {count} training views, but {len(pool)} remain of {len(names)} after every 8th is held out; "
+            "ask for fewer"
+        )
     # np.round goes half to even, as the published id tables do
     ids = np.round(np.linspace(0, len(pool) - 1, count)).astype(int)
     return Split(tuple(pool[i] for i in ids), test)
 
 
-def _numbered(names: list[str], count: int, spec: str) -> Split:
-    if spec.startswith("dtu"):
-        if count not in (3, 6, 9) or len(names) != 49:
-            raise DataError(f"split {spec}: the protocol has 3, 6 or 9 training views of 49; this scene has {len(names)} views")
-        return Split(tuple(names[i] for i in DTU_TRAIN[:count]), tuple(names[i] for i in DTU_TEST))
-    train = [n for n in names if n.split("/")[0] == "train"]
-    test = [n for n in names if n.split("/")[0] == "test"]
-    if count != 8 or len(train) != 100 or len(test) != 200:
-        raise DataError(f"split {spec}: the protocol needs 100 train and 200 test frames; found {len(train)} and {len(test)}")
+def _dtu(names: list[str], count: int, spec: str) -> Split:
+    if count not in (3, 6, 9):
+        raise UsageError(f"split {spec!r}: the DTU protocol has 3, 6 or 9 training views; use dtu:3, dtu:6 or dtu:9")
+    if len(names) < DTU_VIEWS:
+        raise DataError(
+            f"split {spec}: the DTU protocol picks from {DTU_VIEWS} views, this scene has {len(names)}; restore the scan, or "
+            "use llff:K or every:N"
+        )
+    return Split(tuple(names[i] for i in DTU_TRAIN[:count]), tuple(names[i] for i in DTU_TEST))
 
-    def number(name: str) -> int:
-        return int("".join(filter(str.isdigit, PurePosixPath(name).stem)) or 0)
 
-    train, test = sorted(train, key=number), sorted(test, key=number)
+def _frame_number(name: str) -> tuple[int, str]:
+    digits = re.findall(r"[0-9]{1,12}", PurePosixPath(name).stem)
+    return int(digits[-1]) if digits else -1, name
+
+
+def _blender(names: list[str], count: int, spec: str) -> Split:
+    if count != len(BLENDER_TRAIN):
+        raise UsageError(f"split {spec!r}: the Blender protocol has {len(BLENDER_TRAIN)} training views; use blender:8")
+    # r_10 sorts before r_2 by name; the ids count frames
+    train, test = (sorted((n for n in names if n.split("/")[0] == s), key=_frame_number) for s in ("train", "test"))
+    if len(train) <= max(BLENDER_TRAIN) or not test:
+        raise DataError(
+            f"split {spec}: the Blender protocol picks from 100 frames in train and 200 in test; found {len(train)} and "
+            f"{len(test)}. Restore the scene, or use llff:K or every:N"
+        )
     return Split(tuple(train[i] for i in BLENDER_TRAIN), tuple(test[::8]))
 
 
 def _find(names: list[str], wanted: str, spec: str) -> str:
-    matches = [n for n in names if n == wanted]
-    matches = matches or [
-        n for n in names if wanted in (PurePosixPath(n).name, PurePosixPath(n).stem, str(PurePosixPath(n).with_suffix("")))
-    ]
-    if len(matches) == 1:
-        return matches[0]
-    if matches:
-        raise DataError(f"split {spec}: {wanted!r} could be any of {', '.join(matches[:5])}; give the whole name")
-    near = difflib.get_close_matches(wanted, names, 3, 0.3)
+    """The view of a name, whole or its last parts, with suffix or without; the closest of these that fits decides."""
+    bare = {n: str(PurePosixPath(n).with_suffix("")) for n in names}
+    fits = (
+        lambda n: n == wanted,
+        lambda n: bare[n] == wanted,
+        lambda n: n.endswith("/" + wanted),
+        lambda n: bare[n].endswith("/" + wanted),
+    )
+    for fit in fits:
+        matches = [n for n in names if fit(n)]
+        if len(matches) == 1:
+            return matches[0]
+        if matches:
+            raise DataError(f"split {spec}: {wanted!r} could be any of {', '.join(matches[:5])}; give the whole name")
+    by_form = {form: n for n in names for form in (PurePosixPath(n).stem, PurePosixPath(n).name, bare[n], n)}
+    near = list(dict.fromkeys(by_form[f] for f in difflib.get_close_matches(wanted, by_form, 4, 0.3)))[:3]
     raise DataError(f"split {spec}: there is no view {wanted!r}; the nearest names are {', '.join(near or names[:3])}")
 
 
 def _explicit(names: list[str], spec: str) -> Split:
     parts: dict[str, tuple[str, ...]] = {}
-    for part in spec.split(";"):
-        key, sep, values = part.partition("=")
-        if key.strip() not in ("train", "test") or not sep:
-            raise UsageError(f"split {spec!r} is not understood; use {SPECS}")
-        parts[key.strip()] = tuple(_find(names, v.strip(), spec) for v in values.split(",") if v.strip())
+    for part in filter(str.strip, spec.split(";")):
+        key, sep, values = (x.strip() for x in part.partition("="))
+        if key not in ("train", "test") or not sep or key in parts:
+            raise UsageError(f"split {spec[:80]!r} is not understood; use {SPECS}")
+        found = [_find(names, v.strip(), spec) for v in values.split(",") if v.strip()]
+        twice = sorted(n for n, count in Counter(found).items() if count > 1)
+        if twice:
+            raise DataError(f"split {spec}: {key} names {twice[0]} twice; name every view once")
+        parts[key] = tuple(found)
     train = parts.get("train", tuple(n for n in names if n not in parts.get("test", ())))
     test = parts.get("test", tuple(n for n in names if n not in train))
     return Split(train, test)
@@ -105,16 +134,16 @@ def split_views(scene: Scene, spec: str) -> Split:
         return Split(tuple(names), ())
     if "=" in spec:
         return _explicit(names, spec)
-    kind, _, number = spec.partition(":")
-    if kind not in ("llff", "mip360", "dtu", "blender", "every") or not number.isdigit() or int(number) < 1:
-        raise UsageError(f"split {spec!r} is not understood; use {SPECS}")
-    count = int(number)
-    if kind in ("llff", "mip360"):
-        return _every_8th(names, count, spec)
-    if kind in ("dtu", "blender"):
-        return _numbered(names, count, spec)
-    test = tuple(n for i, n in enumerate(names) if i % count == 0)
-    return Split(tuple(n for n in names if n not in test), test)
+    match = re.fullmatch(r"(llff|mip360|dtu|blender|every):([1-9][0-9]{0,5})", spec)
+    if match is None:
+        raise UsageError(f"split {spec[:80]!r} is not understood; use {SPECS}")
+    kind, count = match[1], int(match[2])
+    if kind == "every":
+        if count == 1:
+            raise UsageError("split 'every:1' holds out every view and leaves none to train; use every:2 or more, or all")
+        test = tuple(n for i, n in enumerate(names) if i % count == 0)
+        return Split(tuple(n for i, n in enumerate(names) if i % count), test)
+    return {"llff": _every_8th, "mip360": _every_8th, "dtu": _dtu, "blender": _blender}[kind](names, count, spec)
 
 
 def default_split(scene: Scene) -> tuple[Split, str]:

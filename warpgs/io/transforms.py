@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.io.images import SUFFIXES, Lens, decode, find_mask, load_photo
+from warpgs.io.folders import ViewList, child, find_mask, read_mask, view_name_of
+from warpgs.io.images import SUFFIXES, Lens, load_photo
 from warpgs.io.poses import from_camera_to_world
-from warpgs.scene import Camera, PointCloud, View
+from warpgs.scene import PointCloud, View
 
 BLENDER_FILES = tuple(f"transforms_{split}.json" for split in ("train", "val", "test"))
+MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+UNSUPPORTED_TERMS = ("k4", "k5", "k6", "is_fisheye", "fisheye_crop_radius")
+"""Keys of lens models that OpenCV's five terms cannot express."""
 WHITE = (1.0, 1.0, 1.0)
 
 
@@ -23,6 +28,11 @@ def files_of(root: Path) -> list[Path]:
     return [single] if single.is_file() else [root / f for f in BLENDER_FILES if (root / f).is_file()]
 
 
+def is_blender(root: Path) -> bool:
+    """Whether the folder is in Blender's layout, where transparent pixels stand for a white background."""
+    return not (root / "transforms.json").is_file() and bool(files_of(root))
+
+
 def _reject_constant(name: str):
     raise ValueError(f"{name} is not a number that a camera can have")
 
@@ -30,81 +40,134 @@ def _reject_constant(name: str):
 def read_json(path: Path) -> dict:
     """Parsed file with a list of frames; DataError where it is malformed or holds NaN or Infinity."""
     try:
-        values = json.loads(path.read_text("utf-8-sig"), parse_constant=_reject_constant)
+        values = json.loads(path.read_bytes().decode("utf-8-sig"), parse_constant=_reject_constant)
     except (OSError, ValueError, RecursionError) as e:
-        raise DataError(f"{path}: cannot be read ({e})") from e
+        raise DataError(f"{path}: cannot be read as JSON ({e}); write it again") from e
     if not isinstance(values, dict) or not isinstance(values.get("frames"), list):
-        raise DataError(f"{path}: has no list 'frames'; it is no transforms file")
+        raise DataError(f"{path}: has no list 'frames', so it is no transforms file; write it again")
     return values
 
 
-def _resolve(root: Path, folder: Path, name: object, allow_outside: bool, where: str) -> Path:
-    if not isinstance(name, str) or not name:
-        raise DataError(f"{where}: a frame has no file_path")
-    base = folder / name
-    candidates = [base] if base.suffix.lower() in SUFFIXES else [base.with_name(base.name + s) for s in SUFFIXES]
-    path = next((c for c in candidates if c.is_file()), candidates[0])
-    if not allow_outside and not path.resolve().is_relative_to(root.resolve()):
-        raise DataError(f"{where}: {name!r} leads out of the scene folder; move the file inside, or pass --allow-outside")
-    return path
-
-
 def _number(frame: dict, shared: dict, key: str) -> float | None:
+    """A number of the frame, else of the file; None where neither has it. ValueError where it is no finite number."""
     value = frame.get(key, shared.get(key))
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise ValueError(f"{key} is {value!r}, not a finite number")
+    try:
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+            raise ValueError(f"{key} is {value!r}, not a finite number")
+    except OverflowError as e:
+        raise ValueError(f"{key} is too large") from e
     return float(value)
 
 
-def lens_of(frame: dict, shared: dict, raster: tuple[int, int], where: str) -> Lens:
-    """Intrinsics of a frame, its own before the shared ones; ``raster`` is the image's width and height [px].
+def lens_of(frame: dict, shared: dict, width: int, height: int, where: str) -> Lens:
+    """Intrinsics of a frame, its own before the shared ones.
+
+    Args:
+        frame: Of the list of frames.
+        shared: The whole file.
+        width: Width of the image [px], where the file does not say.
+        height: Height of the image [px], likewise.
+        where: Names file and frame in errors.
 
     Raises:
         DataError: There is no focal length, a number is not finite, or the lens model is not supported.
     """
     model = str(frame.get("camera_model", shared.get("camera_model", "OPENCV")))
-    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
-        raise DataError(f"{where}: camera model {model} is not supported; undistort the images to PINHOLE")
+    if model not in MODELS:
+        raise DataError(
+            f"{where}: camera model {model[:40]} is not supported (supported: {', '.join(MODELS)}). Undistort the images first"
+        )
     try:
-        width = _number(frame, shared, "w") or raster[0]
-        height = _number(frame, shared, "h") or raster[1]
-        fx, fy = _number(frame, shared, "fl_x"), _number(frame, shared, "fl_y")
-        angle_x, angle_y = _number(frame, shared, "camera_angle_x"), _number(frame, shared, "camera_angle_y")
-        cx, cy = _number(frame, shared, "cx"), _number(frame, shared, "cy")
+        size = [_number(frame, shared, "w"), _number(frame, shared, "h")]
+        width, height = (int(given) if given is not None else own for given, own in zip(size, (width, height)))
+        f, c = [], []
+        for axis, side in (("x", width), ("y", height)):
+            focal, angle = _number(frame, shared, f"fl_{axis}"), _number(frame, shared, f"camera_angle_{axis}")
+            if focal is None and angle is not None:
+                if not 0 < angle < math.pi:
+                    raise ValueError(f"camera_angle_{axis} is {angle} rad, not between 0 and pi")
+                focal = 0.5 * side / math.tan(0.5 * angle)
+            center = _number(frame, shared, f"c{axis}")
+            f.append(focal)
+            c.append(side / 2 if center is None else center)
         distortion = [_number(frame, shared, k) or 0.0 for k in ("k1", "k2", "p1", "p2", "k3")]
-        if _number(frame, shared, "k4"):
-            raise ValueError("k4 belongs to a fisheye or rational lens, which is not supported")
+        other = [k for k in UNSUPPORTED_TERMS if frame.get(k, shared.get(k))]
+        if other:
+            raise ValueError(f"{other[0]} belongs to a fisheye or rational lens, which is not supported. Undistort the images")
     except ValueError as e:
         raise DataError(f"{where}: {e}") from e
-    if fx is None and angle_x:
-        fx = 0.5 * width / math.tan(0.5 * angle_x)
+    fx = f[0] if f[0] is not None else f[1]
     if fx is None:
-        raise DataError(f"{where}: has neither fl_x nor camera_angle_x, so its focal length is unknown")
-    if fy is None:
-        fy = 0.5 * height / math.tan(0.5 * angle_y) if angle_y else fx
-    if not (fx > 0 and fy > 0):
-        raise DataError(f"{where}: focal lengths {fx}, {fy} must be positive")
-    K = np.array([[fx, 0, width / 2 if cx is None else cx], [0, fy, height / 2 if cy is None else cy], [0, 0, 1.0]])
-    return Lens(K, int(width), int(height), tuple(distortion) if any(distortion) else (), model)
+        raise DataError(f"{where}: has neither fl_x nor camera_angle_x, so its focal length is unknown; add one of them")
+    K = np.array([[fx, 0, c[0]], [0, fx if f[1] is None else f[1], c[1]], [0, 0, 1.0]])
+    return Lens(K, width, height, tuple(distortion) if any(distortion) else (), model).checked(where)
 
 
-def _frame_view(frame: dict, shared: dict, path: Path, name: str, where: str, options: dict) -> tuple[View, bool]:
-    color, _ = decode(path)
-    lens = lens_of(frame, shared, (color.shape[1], color.shape[0]), where)
-    matrix = np.array(frame.get("transform_matrix"), dtype=object)
+def _matrix(frame: dict, where: str) -> np.ndarray:
     try:
-        matrix = matrix.astype(np.float64)
-    except (TypeError, ValueError) as e:
-        raise DataError(f"{where}: transform_matrix is not made of numbers") from e
+        # through object, so that ragged rows and huge integers are caught here and strings are not parsed
+        rows = [[float(x) if not isinstance(x, (str, bool)) else math.nan for x in row] for row in frame["transform_matrix"]]
+        matrix = np.array(rows, np.float64)
+    except (KeyError, TypeError, ValueError, OverflowError) as e:
+        raise DataError(f"{where}: transform_matrix is missing or not made of rows of numbers; write the file again") from e
     if matrix.shape not in ((3, 4), (4, 4)):
-        raise DataError(f"{where}: transform_matrix must be [4, 4], not {list(matrix.shape)}")
-    mask = options["mask"](frame, path)
-    photo = load_photo(path, lens, downscale=options["downscale"], mask=mask, background=options["background"])
-    viewmat = from_camera_to_world(matrix, where, opengl=True)
-    camera = Camera(viewmat, photo.K, photo.image.shape[1], photo.image.shape[0])
-    return View(name, camera, photo.image, photo.mask), bool(lens.distortion)
+        raise DataError(f"{where}: transform_matrix must be [4, 4], not {list(matrix.shape)}; write the file again")
+    return matrix
+
+
+@dataclass
+class _Reading:
+    """A scene as it is read, frame by frame."""
+
+    root: Path
+    downscale: int
+    allow_outside: bool
+    invert_masks: bool
+    blender: bool
+    views: ViewList = field(default_factory=ViewList)
+    missing: list[str] = field(default_factory=list)
+    outside: int = 0
+    total: int = 0
+
+    def child(self, folder: Path, name: object, where: str) -> Path:
+        return child(folder, name, where, root=self.root, allow_outside=self.allow_outside)
+
+    def image_path(self, folder: Path, name: object, where: str) -> Path:
+        """The image of a frame; Blender leaves the suffix out."""
+        path = self.child(folder, name, where)
+        if path.suffix.lower() in SUFFIXES:
+            return path
+        candidates = [path.with_name(path.name + s) for s in SUFFIXES]
+        return next((c for c in candidates if c.is_file()), candidates[0])
+
+    def mask(self, file: Path, frame: dict, path: Path, where: str) -> np.ndarray | None:
+        if frame.get("mask_path"):
+            return read_mask(self.child(file.parent, frame["mask_path"], f"{where}, mask"), self.invert_masks)
+        return find_mask(path, self.root / "images", self.invert_masks)
+
+    def frame(self, file: Path, shared: dict, number: int, frame: object) -> None:
+        where = f"{file}, frame {number}"
+        if not isinstance(frame, dict):
+            raise DataError(f"{where}: is no object with file_path and transform_matrix; write the file again")
+        path = self.image_path(file.parent, frame.get("file_path"), where)
+        self.total += 1
+        if not path.is_file():
+            self.missing.append(str(frame["file_path"]))
+            return
+        name = view_name_of(path, self.root)
+        self.outside += name.startswith("outside/")
+        where = f"{where} ({name})"
+        viewmat = from_camera_to_world(_matrix(frame, where), where, opengl=True)
+        photo = load_photo(
+            path,
+            lambda width, height: lens_of(frame, shared, width, height, where),
+            downscale=self.downscale,
+            mask=self.mask(file, frame, path, where),
+            background=WHITE if self.blender else None,
+        )
+        self.views.add(name, viewmat, photo)
 
 
 def load(
@@ -121,45 +184,22 @@ def load(
     Raises:
         DataError: A file is malformed, a path leads out of the folder, or (strict) an image is missing.
     """
-    views, notes, missing, distorted, total = [], [], [], False, 0
-    files = files_of(root)
-    blender = files[0].name != "transforms.json"
-
-    def mask_of(frame: dict, path: Path) -> np.ndarray | None:
-        if "mask_path" in frame:
-            mask_path = _resolve(root, root, frame["mask_path"], allow_outside, str(files[0]))
-            return (decode(mask_path)[0][..., 0] > 0.5) != invert_masks
-        inside = path.resolve().is_relative_to((root / "images").resolve())
-        return find_mask(path, root / "images", invert_masks) if inside else None
-
-    options = {"downscale": downscale, "background": WHITE if blender else None, "mask": mask_of}
-    for file in files:
+    reading = _Reading(root, downscale, allow_outside, invert_masks, is_blender(root))
+    notes = []
+    for file in files_of(root):
         shared = read_json(file)
+        for number, frame in enumerate(shared["frames"]):
+            reading.frame(file, shared, number, frame)
         if shared.get("ply_file_path"):
-            notes.append(f"the points of {shared['ply_file_path']} are not read")
-        for i, frame in enumerate(shared["frames"]):
-            where = f"{file}, frame {i}"
-            if not isinstance(frame, dict):
-                raise DataError(f"{where}: is no object")
-            path = _resolve(root, file.parent, frame.get("file_path"), allow_outside, where)
-            total += 1
-            if not path.is_file():
-                missing.append(str(frame["file_path"]))
-                continue
-            relative = path.resolve().is_relative_to(root.resolve())
-            name = path.resolve().relative_to(root.resolve()).as_posix() if relative else path.as_posix()
-            view, bent = _frame_view(frame, shared, path, name, f"{where} ({name})", options)
-            views.append(view)
-            distorted |= bent
-    if missing:
-        text = (
-            f"{len(missing)} of {total} frames have no image file: {', '.join(missing[:5])}{' ...' if len(missing) > 5 else ''}"
-        )
+            notes.append(f"the points of {str(shared['ply_file_path'])[:80]} are not read")
+    if missing := reading.missing:
+        some = f"{', '.join(missing[:5])}{' ...' if len(missing) > 5 else ''}"
+        text = f"{len(missing)} of {reading.total} frames have no image file: {some}"
         if strict:
-            raise DataError(f"{files[0]}: {text}. Restore them, or leave out --strict to go on without them")
+            raise DataError(f"{files_of(root)[0]}: {text}. Restore them, or leave out --strict to go on without them")
         notes.append(f"skipped: {text}")
-    if distorted:
-        notes.append("lens distortion (OPENCV) undone")
+    if reading.outside:
+        notes.append(f"{reading.outside} images lie outside the scene folder; their views are named outside/...")
     if downscale > 1:
         notes.append(f"images area-resampled by {downscale}")
-    return sorted(views, key=lambda v: v.name), None, notes
+    return reading.views.views, None, notes + reading.views.notes()

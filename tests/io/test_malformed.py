@@ -1,0 +1,432 @@
+"""Broken scenes end in a message that names the file, the reason and the remedy, never in a traceback."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+
+from tests.io import scenes
+from warpgs.errors import DataError
+from warpgs.io import colmap
+from warpgs.io.detect import detect
+from warpgs.io.load import load_scene
+
+
+def refused(root, message, **options):
+    with pytest.raises(DataError, match=message):
+        load_scene(root, **options)
+
+
+# ---- detection -------------------------------------------------------------------------------------------------------
+
+
+def test_folders_that_hold_no_scene(tmp_path):
+    refused(tmp_path / "gone", "gone: there is no such folder")
+    refused(tmp_path, r"no scene format found. Looked for: sparse/0.*transforms.json.*poses_bounds.npy.*cameras.npz.*_par.txt")
+    (tmp_path / "a.txt").write_text("")
+    refused(tmp_path / "a.txt", "a.txt: is a file; give the folder")
+
+
+@pytest.mark.parametrize("kind", ["cameras", "images"])
+def test_a_lone_broken_colmap_names_what_is_missing(kind, tmp_path):
+    scenes.write_colmap(tmp_path)
+    (tmp_path / "sparse" / "0" / f"{kind}.bin").unlink()
+    refused(tmp_path, rf"the COLMAP reconstruction in sparse/0 lacks {kind}.bin, and there is no other format. Copy")
+
+
+def test_the_complete_format_is_taken_with_a_note(tmp_path):
+    scenes.write_colmap(tmp_path)
+    (tmp_path / "sparse" / "0" / "images.bin").unlink()
+    scenes.write_llff(tmp_path)
+    scene = load_scene(tmp_path)
+    assert scene.format == "llff"
+    assert scene.notes[0] == "the COLMAP reconstruction in sparse/0 lacks images.bin; passed over, llff is complete"
+
+
+def test_a_complete_reconstruction_elsewhere_is_found(tmp_path):
+    scenes.write_files(tmp_path / "sparse" / "0", {"points3D.bin": b""})
+    scenes.write_colmap_txt(tmp_path)
+    assert colmap.model_folder(tmp_path) == tmp_path / "sparse" and detect(tmp_path)[0] == "colmap"
+
+
+def test_the_folder_itself_may_be_the_reconstruction(tmp_path):
+    scenes.write_files(tmp_path, scenes.colmap_bin())
+    scenes.save_pictures(tmp_path / "images")
+    assert len(load_scene(tmp_path).views) == 5
+
+
+def test_formats_passed_over_are_noted(tmp_path):
+    scenes.write_transforms(scenes.write_colmap(tmp_path))
+    assert detect(tmp_path) == ("colmap", ["the folder also holds transforms: colmap is taken"])
+
+
+@pytest.mark.parametrize("kind,lack", [("colmap", "images"), ("llff", "images"), ("dtu", "image")])
+def test_scenes_without_photographs(kind, lack, tmp_path):
+    scenes.WRITERS[kind](tmp_path)
+    (tmp_path / lack).rename(tmp_path / "elsewhere")
+    refused(tmp_path, rf"lacks its photographs, a folder {lack}")
+
+
+# ---- COLMAP, binary --------------------------------------------------------------------------------------------------
+
+
+def read_all(folder, kind):
+    colmap.read_cameras(folder / f"cameras.{kind}")
+    poses = colmap.read_poses(folder / f"images.{kind}")
+    return colmap.read_points(folder / f"points3D.{kind}", {n: p.name for n, p in poses.items()})
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_every_truncation_is_noticed(name, tmp_path):
+    files = scenes.colmap_bin()
+    scenes.write_files(tmp_path, files)
+    for length in range(len(files[name])):
+        (tmp_path / name).write_bytes(files[name][:length])
+        with pytest.raises(DataError, match=rf"{name}: .*(truncated|ends in the middle)"):
+            read_all(tmp_path, "bin")
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+@pytest.mark.parametrize("count", [2, 100, 2**40, 2**64 - 1])
+def test_counts_that_the_file_cannot_hold(name, count, tmp_path):
+    files = scenes.colmap_bin()
+    files[name] = struct.pack("<Q", count + 5 if count == 2 else count) + files[name][8:]
+    scenes.write_files(tmp_path, files)
+    with pytest.raises(DataError, match=rf"{name}: .*(announces|ends in the middle|no end|camera model)"):
+        read_all(tmp_path, "bin")
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_counts_that_leave_bytes_over(name, tmp_path):
+    files = scenes.colmap_bin()
+    (count,) = struct.unpack_from("<Q", files[name])
+    files[name] = struct.pack("<Q", count - 1) + files[name][8:]
+    scenes.write_files(tmp_path, files)
+    with pytest.raises(DataError, match=rf"{name}: \d+ bytes follow the last record, so its count of records is wrong. Copy"):
+        read_all(tmp_path, "bin")
+
+
+def test_track_and_observation_lengths_are_bounded(tmp_path):
+    files = scenes.colmap_bin()
+    points = bytearray(files["points3D.bin"])
+    points[8 + 43 : 8 + 51] = struct.pack("<Q", 2**62)
+    scenes.write_files(tmp_path, files | {"points3D.bin": bytes(points)})
+    with pytest.raises(DataError, match=r"points3D.bin: the file ends in the middle of a record"):
+        read_all(tmp_path, "bin")
+
+
+@pytest.mark.parametrize("model,name", [(5, "OPENCV_FISHEYE"), (77, "77"), (-1, "-1")])
+def test_unknown_lens_models(model, name, tmp_path):
+    scenes.write_colmap(tmp_path)
+    path = tmp_path / "sparse" / "0" / "cameras.bin"
+    path.write_bytes(path.read_bytes()[:12] + struct.pack("<i", model) + path.read_bytes()[16:])
+    refused(tmp_path, rf"cameras.bin: camera model {name} is not supported \(supported: SIMPLE_PINHOLE.*image_undistorter")
+
+
+@pytest.mark.parametrize(
+    "parameters,size,message",
+    [
+        ((0, 20, 8, 6), (16, 12), "focal lengths"),
+        ((np.nan, 20, 8, 6), (16, 12), "focal lengths"),
+        ((20, -20, 8, 6), (16, 12), "focal lengths"),
+        ((20, 20, np.inf, 6), (16, 12), "principal point"),
+        ((20, 20, 8, 6), (0, 12), "image size 0 x 12"),
+        ((20, 20, 8, 6), (2**63, 12), "image size 9223372036854775808 x 12"),
+        ((20, 20, 8, 6), (12, 16), "the aspects differ"),
+    ],
+)
+@pytest.mark.parametrize("write", [scenes.write_colmap, scenes.write_colmap_txt])
+def test_impossible_cameras(write, parameters, size, message, tmp_path):
+    refused(write(tmp_path, parameters=parameters, size=size), rf"(cameras\.(bin|txt).*camera 1: .*|photo0.png: .*){message}")
+
+
+def test_impossible_distortion(tmp_path):
+    scenes.write_colmap(tmp_path, model="SIMPLE_RADIAL", parameters=(20, 8, 6, 1e300))
+    refused(tmp_path, r"camera 1: distortion .*1e\+300")
+
+
+def test_no_points_are_a_note(tmp_path):
+    scenes.write_colmap(tmp_path)
+    path = tmp_path / "sparse" / "0" / "points3D.bin"
+    path.write_bytes(struct.pack("<Q", 0))
+    scene = load_scene(tmp_path)
+    assert len(scene.points) == 0 and "points3D.bin holds no points" in scene.notes
+    path.unlink()
+    scene = load_scene(tmp_path)
+    assert scene.points is None and any("points3D.bin is missing" in n for n in scene.notes)
+
+
+def patched_pose(tmp_path, **changes):
+    """A scene whose second pose is changed: the value at an index of its seven numbers."""
+    scenes.write_colmap_txt(tmp_path)
+    path = tmp_path / "sparse" / "images.txt"
+    lines = path.read_text().split("\n")
+    words = lines[3].split()
+    for index, value in changes.items():
+        words[int(index[1:])] = value
+    lines[3] = " ".join(words)
+    path.write_text("\n".join(lines))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "changes,message",
+    [
+        ({"_5": "nan"}, r"images.txt, image 'photo1.png': the pose is not finite"),
+        ({"_5": "1e400"}, r"images.txt, image 'photo1.png': the pose is not finite"),
+        ({"_1": "0", "_2": "0", "_3": "0", "_4": "0"}, r"'photo1.png': the rotation quaternion .* is zero or not finite"),
+        ({"_1": "1e308"}, r"'photo1.png': the rotation quaternion .* is zero or not finite"),
+        ({"_2": "x"}, r"images.txt, line 4: cannot be understood \(could not convert"),
+        ({"_8": "9"}, r"'photo1.png': names camera 9, which cameras.txt does not have"),
+        ({"_0": "1"}, r"images.txt, line 4: number 1 is given twice"),
+        ({"_5": "1e100"}, r"image 'photo1.png': its camera centre .* is beyond 1e\+12 units"),
+        ({"_9": "photo0.png"}, r"the image 'photo0.png' is listed twice"),
+        ({"_9": "gone.png"}, r"images/gone.png: the image file is missing; restore it"),
+        ({"_9": "../images.png"}, r"'../images.png' leads out of the scene folder"),
+        ({"_9": "/etc/passwd"}, r"'/etc/passwd' leads out of the scene folder"),
+        ({"_9": ".."}, r"images.txt: '..' is no file name"),
+    ],
+)
+def test_broken_poses_in_text(changes, message, tmp_path):
+    refused(patched_pose(tmp_path, **changes), message)
+
+
+@pytest.mark.parametrize(
+    "name,content,message",
+    [
+        ("points3D.txt", "1 0 0\n", r"points3D.txt, line 1: cannot be understood \(a point has 8 numbers"),
+        ("points3D.txt", "1 0 0 nan 1 1 1 0\n", r"points3D.txt: 1 of 1 points are not finite"),
+        ("points3D.txt", "1 0 0 0 1 1 1 0 1\n", r"points3D.txt, line 1"),
+        ("cameras.txt", "1 PINHOLE 16 12 20 20 8\n", r"cameras.txt, line 1: .*PINHOLE has 4 parameters, not 3"),
+        ("cameras.txt", "1 THIN 16 12 20\n", r"cameras.txt: camera model THIN is not supported"),
+        ("cameras.txt", "1\n", r"cameras.txt, line 1: cannot be understood"),
+        ("cameras.txt", b"\xff\xfe", r"cameras.txt: is not UTF-8 text"),
+        ("images.txt", "1 1 0 0 0 0 0 3 1 photo0.png\n2 1 0 0 0 0 0 3 1 photo1.png\n", r"images.txt, line 2: must list"),
+        ("images.txt", "", r"has 0 usable views.*at least 2"),
+    ],
+)
+def test_broken_text_files(name, content, message, tmp_path):
+    scenes.write_colmap_txt(tmp_path)
+    (tmp_path / "sparse" / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    refused(tmp_path, message)
+
+
+def test_names_that_are_not_utf8(tmp_path):
+    scenes.write_colmap(tmp_path)
+    path = tmp_path / "sparse" / "0" / "images.bin"
+    path.write_bytes(path.read_bytes().replace(b"photo3", b"phot\xff3"))
+    refused(tmp_path, r"images.bin: the name b'phot\\xff3.png' is not UTF-8; rename the image")
+
+
+def test_one_view_is_too_few(tmp_path):
+    refused(scenes.write_colmap(tmp_path, names=scenes.NAMES[:1]), r"the scene has 1 usable view.*at least 2. Add photographs")
+
+
+# ---- transforms ------------------------------------------------------------------------------------------------------
+
+
+def broken_frame(tmp_path, **changes):
+    content = scenes.transforms_json()
+    content["frames"][1] |= changes
+    return scenes.write_transforms(tmp_path, content)
+
+
+MIRROR = (np.array(scenes.opengl(1)) @ np.diag([-1.0, 1, 1, 1])).tolist()
+SCALED = (np.array(scenes.opengl(1)) @ np.diag([2.0, 2, 2, 1])).tolist()
+
+
+@pytest.mark.parametrize(
+    "changes,message",
+    [
+        ({"transform_matrix": MIRROR}, r"transforms.json, frame 1 \(images/photo1.png\): the pose mirrors .*determinant -1"),
+        ({"transform_matrix": SCALED}, r"frame 1 \(images/photo1.png\): the pose is not rigid"),
+        ({"transform_matrix": np.array(scenes.opengl(1)).T.tolist()}, r"frame 1 .*the last row of the pose is .*transposed"),
+        ({"transform_matrix": [[1, 2], [3]]}, r"frame 1 .*: transform_matrix is missing or not made of rows"),
+        ({"transform_matrix": [[10**400] * 4] * 4}, r"frame 1 .*: transform_matrix is missing or not made of rows"),
+        ({"transform_matrix": [["1"] * 4] * 4}, r"frame 1 .*not finite"),
+        ({"transform_matrix": [[1e200] * 4] * 3}, r"frame 1 .*not rigid"),
+        ({"transform_matrix": None}, r"frame 1 .*: transform_matrix is missing"),
+        ({"transform_matrix": [[1.0]]}, r"frame 1 .*: transform_matrix must be \[4, 4\], not \[1, 1\]"),
+        ({"file_path": None}, r"frame 1: 'None' is no file name"),
+        ({"file_path": ""}, r"frame 1: '' is no file name"),
+        ({"file_path": "a\0b"}, r"frame 1: .* is no file name"),
+        ({"file_path": "\ud800.png"}, r"frame 1: .* is no file name"),
+        ({"file_path": "/"}, r"frame 1: '/' is no file name"),
+        ({"file_path": "images/../../x.png"}, r"frame 1: .* leads out of the scene folder; .*--allow-outside"),
+        ({"mask_path": "../m.png"}, r"frame 1 .*, mask: '../m.png' leads out of the scene folder"),
+        ({"mask_path": "m.png"}, r"m.png: the image file is missing"),
+        ({"file_path": "images/photo0.png"}, r"the image 'images/photo0.png' is listed twice"),
+        ({"fl_x": -1}, r"frame 1 .*: focal lengths \[-1.0, 20.0\] px must be positive"),
+        ({"fl_x": True}, r"frame 1 .*: fl_x is True, not a finite number"),
+        ({"fl_x": 10**400}, r"frame 1 .*: fl_x is too large"),
+        ({"cx": "8"}, r"frame 1 .*: cx is '8', not a finite number"),
+        ({"w": 0}, r"frame 1 .*: the camera's image size 0 x 12 px is impossible"),
+        ({"w": 30}, r"photo1.png: the image is 16 x 12 px, its camera 30 x 12"),
+        ({"k4": 0.1}, r"frame 1 .*: k4 belongs to a fisheye"),
+        ({"camera_model": "OPENCV_FISHEYE"}, r"frame 1 .*: camera model OPENCV_FISHEYE is not supported"),
+    ],
+)
+def test_broken_frames(changes, message, tmp_path):
+    refused(broken_frame(tmp_path, **changes), message)
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])
+def test_json_numbers_that_are_none(number, tmp_path):
+    scenes.write_transforms(tmp_path)
+    path = tmp_path / "transforms.json"
+    path.write_text(path.read_text().replace('"fl_x": 20.0', f'"fl_x": {number}'))
+    refused(tmp_path, r"transforms.json.*(is not a number that a camera can have|not a finite number)")
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "{}", '{"frames": 3}', "[" * 100000, '{"frames": [1]}', "\xff", '{"frames": []}']
+)
+def test_json_that_is_no_scene(text, tmp_path):
+    (tmp_path / "transforms.json").write_bytes(text.encode("latin-1"))
+    refused(tmp_path, r"transforms.json|0 usable views")
+
+
+def test_no_focal_length(tmp_path):
+    scenes.write_transforms(tmp_path, scenes.transforms_json(fl_x=None, fl_y=None))
+    refused(tmp_path, r"frame 0 .*has neither fl_x nor camera_angle_x")
+    scenes.write_transforms(tmp_path, scenes.transforms_json(fl_x=None, fl_y=None, camera_angle_x=4.0))
+    refused(tmp_path, r"frame 0 .*camera_angle_x is 4.0 rad, not between 0 and pi")
+
+
+def test_names_too_long_for_the_file_system(tmp_path):
+    refused(broken_frame(tmp_path, file_path="x" * 300 + ".png"), r"cannot be read|usable views|no image file")
+
+
+# ---- LLFF, DTU, Middlebury -------------------------------------------------------------------------------------------
+
+
+def test_llff_counts_must_agree(tmp_path):
+    scenes.write_llff(tmp_path)
+    (tmp_path / "images" / "photo4.png").unlink()
+    refused(tmp_path, r"poses_bounds.npy: has 5 poses, but .*images holds 4 images.*restore the set")
+
+
+def llff_with(tmp_path, row, column, value):
+    scenes.write_llff(tmp_path)
+    rows = scenes.llff_rows()
+    rows[row, column] = value
+    np.save(tmp_path / "poses_bounds.npy", rows)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "column,value,message",
+    [
+        (3, np.nan, r"poses_bounds.npy, image 'photo2.png': the pose is not finite"),
+        (0, 5.0, r"poses_bounds.npy, image 'photo2.png': the pose is not rigid"),
+        (14, 0.0, r"'photo2.png': focal lengths"),
+        (4, -12.0, r"'photo2.png': the camera's image size"),
+        (9, 99.0, r"photo2.png: the image is 16 x 12 px, its camera 99 x 12"),
+    ],
+)
+def test_llff_rows(column, value, message, tmp_path):
+    refused(llff_with(tmp_path, 2, column, value), message)
+
+
+def test_llff_mirrored(tmp_path):
+    scenes.write_llff(tmp_path)
+    rows = scenes.llff_rows()
+    rows[:, [0, 5, 10]] *= -1
+    np.save(tmp_path / "poses_bounds.npy", rows)
+    refused(tmp_path, r"image 'photo0.png': the pose mirrors the scene \(determinant -1\); two axes are probably swapped")
+
+
+@pytest.mark.parametrize("array", [np.zeros((5, 16)), np.zeros(17), np.array([["a"] * 17] * 5), np.zeros((5, 17), complex)])
+def test_llff_arrays_of_another_kind(array, tmp_path):
+    scenes.write_llff(tmp_path)
+    np.save(tmp_path / "poses_bounds.npy", array)
+    refused(tmp_path, r"poses_bounds.npy: must be an array \[n, 17\] of numbers")
+
+
+@pytest.mark.parametrize("name,write", [("poses_bounds.npy", scenes.write_llff), ("cameras.npz", scenes.write_dtu)])
+def test_numpy_files_that_are_none(name, write, tmp_path):
+    write(tmp_path)
+    data = (tmp_path / name).read_bytes()
+    pickled = np.array([{"a": 1}] * 5, dtype=object)
+    for broken in (b"", b"x", data[:40], data[:-30], data[:10] + b"{" * 118, b"PK\x03\x04" + b"\0" * 50):
+        (tmp_path / name).write_bytes(broken)
+        refused(tmp_path, rf"{name}: cannot be read as")
+    with (tmp_path / name).open("wb") as f:
+        np.save(f, pickled)  # would run code if it were unpickled
+    refused(tmp_path, rf"{name}: cannot be read as")
+    if name.endswith("npy"):
+        with (tmp_path / name).open("wb") as f:
+            np.savez(f, a=np.zeros(3))
+        refused(tmp_path, "is an archive of arrays, not one array")
+
+
+def test_numpy_headers_that_announce_more_than_there_is(tmp_path):
+    scenes.write_llff(tmp_path)
+    with (tmp_path / "poses_bounds.npy").open("wb") as f:
+        np.lib.format.write_array_header_1_0(f, {"descr": "<f8", "fortran_order": False, "shape": (10**13, 17)})
+        f.write(b"\0" * 64)
+    refused(tmp_path, r"poses_bounds.npy: cannot be read as a numpy array")
+
+
+def dtu_with(tmp_path, **changes):
+    scenes.write_dtu(tmp_path)
+    matrices = {k: v for k, v in (scenes.dtu_matrices() | changes).items() if v is not None}
+    np.savez(tmp_path / "cameras.npz", **matrices)
+    return tmp_path
+
+
+SKEW = np.block([[np.array([[20, 5, 8], [0, 20, 6], [0, 0, 1.0]]), np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+@pytest.mark.parametrize(
+    "changes,message",
+    [
+        ({"world_mat_4": None}, r"cameras.npz: has 4 cameras, but .*image holds 5 images"),
+        ({"world_mat_4": None, "world_mat_7": np.eye(4)}, r"image '000004.png': world_mat_4 is missing"),
+        ({"world_mat_1": np.zeros((4, 4))}, r"image '000001.png': the projection matrix is not finite or not invertible"),
+        ({"world_mat_1": np.full((4, 4), np.nan)}, r"cameras.npz: world_mat_1 is not a finite \[4, 4\] matrix"),
+        ({"scale_mat_1": np.eye(3)}, r"cameras.npz: scale_mat_1 is not a finite \[4, 4\] matrix but \[3, 3\]"),
+        ({"world_mat_1": SKEW}, r"image '000001.png': the camera is skewed by 5 px"),
+    ],
+)
+def test_dtu_archives(changes, message, tmp_path):
+    refused(dtu_with(tmp_path, **changes), message)
+
+
+@pytest.mark.parametrize(
+    "old,new,message",
+    [
+        ("5\n", "6\n", r"tiny_par.txt: announces 6 images and lists 5; it is truncated"),
+        ("5\n", "x\n", r"tiny_par.txt: cannot be understood"),
+        ("photo1.png 20.0", "photo1.png nan", r"tiny_par.txt, line 3, image 'photo1.png': needs 21 finite numbers .*has 20"),
+        ("photo1.png 20.0", "photo1.png", r"line 3, image 'photo1.png': needs 21 finite numbers .*has 20"),
+        ("photo1.png 20.0 0.0", "photo1.png 20.0 3.0", r"line 3, image 'photo1.png': the camera is skewed by 3 px"),
+        ("photo1.png 20.0", "photo1.png -20.0", r"line 3, image 'photo1.png': focal lengths"),
+        ("photo1.png 20.0", "photo9.png 20.0", r"photo9.png: the image file is missing"),
+        ("photo1.png 20.0", "../photo1.png 20.0", r"line 3, image '../photo1.png': '../photo1.png' leads out"),
+        ("5.5 0.0 0.0 1.0", "5.5 0.0 0.1 1.0", r"image 'photo0.png': K is no matrix of intrinsics"),
+    ],
+)
+def test_middlebury_files(old, new, message, tmp_path):
+    scenes.write_middlebury(tmp_path)
+    path = tmp_path / "tiny_par.txt"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    refused(tmp_path, message)
+
+
+@pytest.mark.parametrize("kind", scenes.WRITERS)
+def test_corrupt_photographs_are_named(kind, tmp_path):
+    scenes.WRITERS[kind](tmp_path)
+    path = sorted(tmp_path.rglob("*.png"))[2]
+    path.write_bytes(path.read_bytes()[:60])
+    refused(tmp_path, rf"{path.name}: the image cannot be decoded; it is empty, truncated or no image. Restore it")
+
+
+def test_messages_are_json_safe(tmp_path):
+    with pytest.raises(DataError) as caught:
+        load_scene(broken_frame(tmp_path, file_path="\ud800.png"))
+    json.dumps(str(caught.value)).encode()
+    str(caught.value).encode("utf-8")

@@ -1,0 +1,135 @@
+"""Published splits, id by id, and splits of one's own."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from tests.io import scenes
+from warpgs.errors import DataError, UsageError
+from warpgs.io.load import load_scene
+from warpgs.io.splits import Split, default_split, split_views
+
+
+def scene_of(names):
+    """A stand-in: a split only looks at names."""
+    return SimpleNamespace(views=[SimpleNamespace(name=n) for n in names])
+
+
+def numbered(count):
+    return scene_of([f"{i:03d}.png" for i in range(count)])
+
+
+def ids(names):
+    return [int(n[:3]) for n in names]
+
+
+@pytest.mark.parametrize("kind", ["llff", "mip360"])
+@pytest.mark.parametrize(
+    "views,k,train",
+    [
+        (20, 3, [1, 10, 19]),  # fern
+        (62, 3, [1, 30, 61]),  # horns
+        (26, 3, [1, 12, 25]),  # leaves
+        (20, 1, [1]),
+        (20, 2, [1, 19]),
+        (9, 7, [1, 2, 3, 4, 5, 6, 7]),
+    ],
+)
+def test_llff_protocol(kind, views, k, train):
+    split = split_views(numbered(views), f"{kind}:{k}")
+    assert ids(split.train) == train
+    assert ids(split.test) == list(range(0, views, 8))
+
+
+def test_llff_rounds_half_to_even():
+    # pool of 6 (1..6 of 7 views): linspace(0, 5, 3) has 2.5 in the middle, which goes to 2, the third of the pool
+    assert ids(split_views(numbered(7), "llff:3").train) == [1, 3, 6]
+
+
+def test_llff_sorts_by_name_whatever_the_order_of_the_views():
+    names = [f"{i:03d}.png" for i in range(20)]
+    assert split_views(scene_of(names[::-1]), "llff:3") == split_views(scene_of(names), "llff:3")
+
+
+@pytest.mark.parametrize("views", [49, 64])
+def test_dtu_protocol(views):
+    train = [25, 22, 28, 40, 44, 48, 0, 8, 13]
+    test = [1, 2, 9, 10, 11, 12, 14, 15, 23, 24, 26, 27, 29, 30, 31, 32, 33, 34, 35, 41, 42, 43, 45, 46, 47]
+    for k in (3, 6, 9):
+        split = split_views(numbered(views), f"dtu:{k}")
+        assert ids(split.train) == train[:k] and ids(split.test) == test
+
+
+def test_blender_protocol_counts_frames_not_names():
+    names = [f"{part}/r_{i}.png" for part, n in (("train", 100), ("val", 100), ("test", 200)) for i in range(n)]
+    split = split_views(scene_of(names), "blender:8")
+    assert split.train == tuple(f"train/r_{i}.png" for i in (2, 16, 26, 55, 73, 76, 86, 93))
+    assert split.test == tuple(f"test/r_{i}.png" for i in range(0, 200, 8))
+
+
+def test_every_and_all():
+    split = split_views(numbered(7), "every:3")
+    assert ids(split.test) == [0, 3, 6] and ids(split.train) == [1, 2, 4, 5]
+    assert split_views(numbered(3), "all") == Split(("000.png", "001.png", "002.png"), ())
+
+
+NAMES = ["a/x.png", "b/x.png", "b/y.png", "z.jpg"]
+
+
+@pytest.mark.parametrize(
+    "spec,train,test",
+    [
+        ("train=a/x.png,z.jpg;test=b/y.png", ("a/x.png", "z.jpg"), ("b/y.png",)),
+        ("train=z,y", ("z.jpg", "b/y.png"), ("a/x.png", "b/x.png")),
+        ("test=a/x", ("b/x.png", "b/y.png", "z.jpg"), ("a/x.png",)),
+        (" test = z ; train = y.png, a/x ;", ("b/y.png", "a/x.png"), ("z.jpg",)),
+    ],
+)
+def test_explicit_names(spec, train, test):
+    assert split_views(scene_of(NAMES), spec) == Split(train, test)
+
+
+@pytest.mark.parametrize(
+    "spec,message",
+    [
+        ("train=x", r"'x' could be any of a/x.png, b/x.png; give the whole name"),
+        ("train=q/yy.png", r"there is no view 'q/yy.png'; the nearest names are b/y.png"),
+        ("train=zz", r"there is no view 'zz'; the nearest names are z.jpg"),
+        ("train=z,z.jpg", r"train names z.jpg twice"),
+        ("train=z;test=z", r"views z.jpg are in training and in test"),
+        ("train=;test=z", r"leaves no training view"),
+        ("llff:4", r"wants 4 training views, but 3 remain of 4"),
+        ("dtu:3", r"picks from 49 views, this scene has 4"),
+        ("blender:8", r"found 0 and 0"),
+    ],
+)
+def test_splits_that_the_scene_cannot_give(spec, message):
+    with pytest.raises(DataError, match=message):
+        split_views(scene_of(NAMES), spec)
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        "", "llff", "llff:", "llff:0", "llff:-1", "llff:1.5", "llff:²", "llff:" + "9" * 5000, "LLFF:3", "dtu:4", "blender:7",
+        "every:0", "every:1", "all:3", "train:a", "valid=a", "train=z;train=y", "train=z;nonsense", "../x",
+    ],
+)  # fmt: skip
+def test_splits_that_make_no_sense(spec):
+    with pytest.raises(UsageError, match="split"):
+        split_views(scene_of(NAMES), spec)
+
+
+def test_default_split():
+    split, note = default_split(numbered(9))
+    assert ids(split.test) == [0, 8] and "every 8th" in note
+    split, note = default_split(numbered(8))
+    assert ids(split.test) == [4] and len(split.train) == 7 and "004.png" in note
+    assert ids(default_split(numbered(3))[0].test) == [1]
+    split, note = default_split(numbered(2))
+    assert len(split.train) == 2 and split.test == () and "none is held out" in note
+
+
+def test_a_split_of_a_real_folder(tmp_path):
+    scene = load_scene(scenes.write_llff(tmp_path))
+    assert split_views(scene, "llff:3") == Split(("photo1.png", "photo3.png", "photo4.png"), ("photo0.png",))

@@ -1,0 +1,124 @@
+"""Finding the files of a scene: names that stay inside the folder, image folders, masks; and the list of views read."""
+
+from __future__ import annotations
+
+import posixpath
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from warpgs.errors import DataError
+from warpgs.io.images import Photo, decode, list_images
+from warpgs.scene import Camera, View
+
+LONGEST_NAME = 4096
+
+
+def child(folder: Path, name: object, where: str, *, root: Path | None = None, allow_outside: bool = False) -> Path:
+    """The path that a scene file names, relative to ``folder``.
+
+    Args:
+        folder: What the name is relative to.
+        name: As found in the file.
+        where: Names the file in errors.
+        root: The folder that must not be left, links followed; ``folder`` where None.
+        allow_outside: Let the name lead elsewhere.
+
+    Returns:
+        The path; the file may not exist.
+
+    Raises:
+        DataError: The name is none, or leads out of the scene folder.
+    """
+    usable = isinstance(name, str) and name.strip("/\\. ") and "\0" not in name and len(name) < LONGEST_NAME
+    if usable:
+        try:
+            name.encode("utf-8")
+        except UnicodeEncodeError:
+            usable = False
+    if not usable:
+        raise DataError(f"{where}: {str(name)[:80]!r} is no file name; name an image file, in UTF-8")
+    path = folder / name
+    if "\\" in name and not path.is_file():
+        path = folder / name.replace("\\", "/")  # written on Windows
+    if not allow_outside and not path.resolve().is_relative_to((root or folder).resolve()):
+        raise DataError(f"{where}: {name!r} leads out of the scene folder; move the file inside, or pass --allow-outside")
+    return path
+
+
+def view_name(name: str) -> str:
+    """Key of the view of a file name: its plainest form ("./a//b.png" is "a/b.png"); one that climbs goes below `outside`.
+
+    Renderings are stored under these names, so none may be absolute or climb.
+    """
+    plain = posixpath.normpath(name)
+    kept = [part for part in plain.split("/") if part not in ("", "..")]
+    return "/".join(["outside", *kept] if plain.startswith(("/", "../")) else kept)
+
+
+def view_name_of(path: Path, root: Path) -> str:
+    """Key of the view of a file: its path below ``root``, links not followed; of a file elsewhere one below `outside`."""
+    plain, base = (posixpath.normpath(p.absolute().as_posix()) for p in (path, root))
+    return view_name(plain[len(base) + 1 :] if Path(plain).is_relative_to(base) else plain)
+
+
+def read_mask(path: Path, invert: bool) -> np.ndarray:
+    """Mask file, bool [H, W]: white keeps a pixel; ``invert`` turns that round. DataError where it cannot be decoded."""
+    return (decode(path)[0][..., 0] > 0.5) != invert
+
+
+def find_mask(image: Path, images_root: Path, invert: bool, folder: Path | None = None) -> np.ndarray | None:
+    """Mask [H, W] of an image, None where it has none.
+
+    Looked for in ``folder``, by default `masks` beside the image folder: same name as .png, name plus .png, or same name.
+    """
+    folder = folder or images_root.parent / "masks"
+    if not image.is_relative_to(images_root) or not folder.is_dir():
+        return None
+    relative = image.relative_to(images_root)
+    for candidate in (folder / relative.with_suffix(".png"), folder / f"{relative.as_posix()}.png", folder / relative):
+        if candidate.is_file():
+            return read_mask(candidate, invert)
+    return None
+
+
+def image_folder(root: Path, downscale: int, base: str = "images") -> tuple[Path, int, str]:
+    """Choose the image folder for a downscale factor: the ready-made `images_N`, else the full one, resampled.
+
+    Returns:
+        The folder, the factor left to resample by, and a note for the user (empty where nothing was chosen).
+
+    Raises:
+        DataError: There is no image folder.
+    """
+    ready = root / f"{base}_{downscale}"
+    if downscale > 1 and ready.is_dir() and list_images(ready):
+        return ready, 1, f"images taken from {ready.name}"
+    full = root / base
+    if full.is_dir() and list_images(full):
+        return full, downscale, f"images area-resampled by {downscale}" if downscale > 1 else ""
+    others = {int(n): p for p in root.glob(f"{base}_*") if (n := p.name[len(base) + 1 :]).isdecimal() and list_images(p)}
+    if not others:
+        raise DataError(f"{root}: there is no folder '{base}' with images; put the photographs there")
+    largest = others[min(others)]
+    how = f", area-resampled by {downscale}" if downscale > 1 else ""
+    return largest, downscale, f"there is no full-size folder '{base}': images taken from {largest.name}{how}"
+
+
+class ViewList:
+    """The views of a scene as they are read, and a count of what was done to them."""
+
+    def __init__(self) -> None:
+        self.views: list[View] = []
+        self._done: Counter[str] = Counter()
+
+    def add(self, name: str, viewmat: np.ndarray, photo: Photo) -> None:
+        """Append a view: ``viewmat`` is camera_from_world [4, 4] in file units, checked to be rigid."""
+        height, width = photo.image.shape[:2]
+        self.views.append(View(name, Camera(viewmat, photo.K, width, height), photo.image, photo.mask))
+        self._done.update(photo.done)
+
+    def notes(self) -> list[str]:
+        """What was done to the pixels, a sentence each."""
+        return [f"{n} image{'s' if n != 1 else ''} {what}" for what, n in sorted(self._done.items())]
