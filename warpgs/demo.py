@@ -240,9 +240,7 @@ def colmap_text(cameras: list[Camera], x: np.ndarray, colors: np.ndarray, seen: 
 def _check(folder: Path, views: int, width: int, height: int) -> None:
     """Refuse what cannot be written, before anything is."""
     if views < MIN_VIEWS:
-        raise UsageError(
-            f"a demo needs at least {MIN_VIEWS} views ({TRAIN_VIEWS} to fit, the rest held out), not {views}"
-        )
+        raise UsageError(f"a demo needs at least {MIN_VIEWS} views ({TRAIN_VIEWS} to fit, the rest held out), not {views}")
     if min(width, height) < MIN_SIDE:
         raise UsageError(f"a demo image must be at least {MIN_SIDE} px on each side, not {width} x {height}")
     try:
@@ -251,9 +249,7 @@ def _check(folder: Path, views: int, width: int, height: int) -> None:
         if folder.exists() and any(folder.iterdir()):
             raise UsageError(f"{folder} is not empty, and the demo overwrites nothing; name a new or an empty folder")
     except OSError as e:
-        raise ResourceError(
-            f"cannot look into {folder} ({e.strerror or e}); name a folder that you may write to"
-        ) from e
+        raise ResourceError(f"cannot look into {folder} ({e.strerror or e}); name a folder that you may write to") from e
 
 
 def _files(views: int, width: int, height: int, seed: int) -> dict[str, bytes]:

@@ -6,6 +6,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
+
+from warpgs.errors import DataError
+from warpgs.io.load import load_scene
 
 VIEWS, WIDTH, HEIGHT, FOCAL = 5, 16, 12, 20.0
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1.0]])
@@ -218,3 +222,9 @@ WRITERS = {
     "dtu": write_dtu,
     "middlebury": write_middlebury,
 }
+
+
+def refused(root: Path, message: str, **options) -> None:
+    """The scene must end in a DataError whose text matches."""
+    with pytest.raises(DataError, match=message):
+        load_scene(root, **options)

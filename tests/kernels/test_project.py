@@ -16,7 +16,9 @@ EXACT = RULES["exact"]
 
 
 def run(gaussians, cam, rule=EXACT, degree=3):
-    return project(*gaussians.tensors().values(), cam.viewmat, cam.K, width=cam.width, height=cam.height, degree=degree, rule=rule)
+    return project(
+        *gaussians.tensors().values(), cam.viewmat, cam.K, width=cam.width, height=cam.height, degree=degree, rule=rule
+    )
 
 
 def twin(gaussians, cam, degree=3):
@@ -52,9 +54,7 @@ def test_gradients_equal_reference(device, dtype):
     """Gradients of a random projection of the record, for Gaussians, poses and intrinsics."""
     gaussians, cam = leaves(hand_placed(dtype, device)), camera(cameras=2, dtype=dtype, device=device)
     views, Ks = cam.viewmat.clone().requires_grad_(), cam.K.clone().requires_grad_()
-    splats, _ = project(
-        *gaussians.tensors().values(), views, Ks, width=cam.width, height=cam.height, degree=3, rule=SMOOTH
-    )
+    splats, _ = project(*gaussians.tensors().values(), views, Ks, width=cam.width, height=cam.height, degree=3, rule=SMOOTH)
     upstream = torch.randn(splats.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     upstream[..., 10:] = 0
     (splats * upstream.to(splats)).sum().backward()
@@ -117,7 +117,7 @@ def test_poisoned_gaussian_is_no_op(device, slot, poison):
         bad[slot].view(8, -1)[3, column] = poison
         bad = leaves(Gaussians(**bad))
         splats, counts = run(bad, cam, degree=1)
-        if slot == "logit_opacities" and poison == math.inf or slot == "log_scales" and poison == -math.inf:
+        if (slot == "logit_opacities" and poison == math.inf) or (slot == "log_scales" and poison == -math.inf):
             assert bool(torch.isfinite(splats).all())  # an opaque Gaussian, or a flat one: extreme, but it has a picture
             continue
         assert int(counts[0, 3]) == 0 and not bool(splats[0, 3].any())
@@ -219,7 +219,7 @@ def test_empty_and_bad_input():
         broken = Gaussians(**{**gaussians.tensors(), name: t[:3]})
         with pytest.raises(ValueError, match=name if name != "means" else "quats"):
             run(broken, cam, degree=1)
-    with pytest.raises(TypeError, match="log_scales is torch.float64"):
+    with pytest.raises(TypeError, match=r"log_scales is torch\.float64"):
         run(Gaussians(**{**gaussians.tensors(), "log_scales": gaussians.log_scales.double()}), cam, degree=1)
     with pytest.raises(ValueError, match="degree 3 needs 16"):
         run(gaussians, cam, degree=3)

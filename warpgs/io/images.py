@@ -73,14 +73,22 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(files, key=lambda p: p.relative_to(folder).as_posix())
 
 
-def _announces_too_much(data: np.ndarray) -> bool:
-    """Whether a PNG's header promises more than its bytes can unpack to; OpenCV would take gigabytes before it noticed."""
-    header = data[:26].tobytes()
-    if len(header) < 26 or header[:8] != PNG_SIGNATURE:
+def _png_is_plausible(data: np.ndarray) -> bool:
+    """Whether a PNG's header and chunk lengths fit its size; any other file is left to the decoder.
+
+    OpenCV reserves what they announce, gigabytes for a few damaged bytes, before it notices.
+    """
+    if data[:8].tobytes() != PNG_SIGNATURE:
+        return True
+    at, whole = 8, False
+    while not whole and at + 12 <= data.size:
+        length, kind = struct.unpack(">I4s", data[at : at + 8].tobytes())
+        at, whole = at + 12 + length, kind == b"IEND"
+    if not whole or at > data.size or data.size < 26:
         return False
-    width, height, depth, color = struct.unpack(">IIBB", header[16:26])
+    width, height, depth, color = struct.unpack(">IIBB", data[16:26].tobytes())
     channels = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(color, 4)
-    return height * (width * channels * depth // 8 + 1) > LARGEST_DEFLATE_RATIO * data.size
+    return height * (width * channels * depth // 8 + 1) <= LARGEST_DEFLATE_RATIO * data.size
 
 
 def decode(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
@@ -98,7 +106,7 @@ def decode(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     try:
         data = np.fromfile(path, np.uint8)  # not cv2.imread: that fails on non-ASCII paths on some systems
         # IMREAD_UNCHANGED also leaves the EXIF orientation alone: the camera, not the tag, says how the raster lies
-        raw = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size and not _announces_too_much(data) else None
+        raw = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size and _png_is_plausible(data) else None
     except OSError as e:
         raise DataError(f"{path}: the image cannot be read ({e.strerror}); mend its permissions or copy it again") from e
     except cv2.error:

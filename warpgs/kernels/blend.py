@@ -94,7 +94,8 @@ def _forward(splats, tiles, backgrounds, width, height, rule):
         inputs = [
             *_tile_inputs(splats, tiles, real), bridge.view(backgrounds, real), *_frame(width, height, tiles.size),
             rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), rule.transmittance_stop, int(rule.inclusive_stop),
-            bridge.view(rgb.view(-1, 3), real), *(bridge.view(t.view(-1), real) for t in (alpha, depth, transmittances, weights)),
+            bridge.view(rgb.view(-1, 3), real),
+            *(bridge.view(t.view(-1), real) for t in (alpha, depth, transmittances, weights)),
             bridge.view(ends.view(-1), wp.int32),
         ]  # fmt: skip
         launch(k.forward, len(tiles.ranges), inputs)
@@ -120,17 +121,14 @@ class _Blend(torch.autograd.Function):
         _, height, width = depth.shape
         v_splats = torch.zeros_like(splats)
         v_slots = splats.new_zeros(len(tiles.slots), VALUES)
-        pixels = [transmittances, weights, depth, ends, v_rgb.contiguous(), v_alpha.contiguous(), v_depth.contiguous()]
-        flat = [bridge.view(t.view(-1), real) for t in (transmittances, weights, depth)]
-        upstream = [
-            bridge.view(pixels[4].view(-1, 3), real), bridge.view(pixels[5].view(-1), real),
-            bridge.view(pixels[6].view(-1), real),
-        ]  # fmt: skip
+        pixels = [bridge.view(t.view(-1), real) for t in (transmittances, weights, depth)]
+        upstream = [bridge.view(v_rgb.contiguous().view(-1, 3), real)]
+        upstream += [bridge.view(v.contiguous().view(-1), real) for v in (v_alpha, v_depth)]
         with bridge.stream_of(device):
             inputs = [
                 *_tile_inputs(splats, tiles, real), bridge.view(tiles.slots, wp.int32), bridge.view(backgrounds, real),
                 *_frame(width, height, tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
-                *flat, bridge.view(ends.view(-1), wp.int32), *upstream, bridge.view(v_slots, real),
+                *pixels, bridge.view(ends.view(-1), wp.int32), *upstream, bridge.view(v_slots, real),
             ]  # fmt: skip
             launch(k.backward, len(tiles.ranges), inputs)
             inputs = [

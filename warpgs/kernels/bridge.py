@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
 import os
 import sys
 from collections.abc import Sequence
@@ -107,7 +108,7 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
     def run(begin: int, end: int) -> None:
         wp.launch(kernel, end - begin, inputs=[begin, *inputs], device="cpu", record_tape=False)
 
-    for done in [_pool(threads).submit(run, a, b) for a, b in zip(bounds, bounds[1:])]:
+    for done in [_pool(threads).submit(run, a, b) for a, b in itertools.pairwise(bounds)]:
         done.result()
 
 

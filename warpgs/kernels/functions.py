@@ -1,9 +1,11 @@
-"""Warp functions that several ops share, by scalar type: rotations, the factor of the 2D covariance, tile spans."""
+"""Warp functions by scalar type that kernels share: rotations, the projected ellipse, tile spans."""
 
 import functools
 from types import SimpleNamespace
 
 import warp as wp
+
+from warpgs.constants import FRUSTUM_MARGIN
 
 
 @functools.cache
@@ -59,6 +61,146 @@ def make_rotations(real):
         return vec4(v_w, v_x, v_y, v_z)
 
     return SimpleNamespace(quat_length=quat_length, rotation=rotation, rotation_backward=rotation_backward)
+
+
+@functools.cache
+def make_projection(real):
+    """The steps of the projection that forward and backward share (docs/project.md has the derivation)."""
+    r = make_rotations(real)
+    vec2 = wp.types.vector(2, real)
+    vec3 = wp.types.vector(3, real)
+    vec4 = wp.types.vector(4, real)
+    mat33 = wp.types.matrix((3, 3), real)
+    mat44 = wp.types.matrix((4, 4), real)
+
+    @wp.struct
+    class Ellipse:
+        """What is left of one Gaussian in one camera, before colour."""
+
+        valid: wp.int32
+        position: vec3  # in the camera [u]
+        pixel: vec2  # [px]
+        clamped: vec2  # pixel that the Jacobian is taken at [px]
+        quat: vec4  # unit
+        quat_length: real
+        scales: vec3  # [u]
+        axes: mat33  # camera rotation times Gaussian rotation times scales [u]
+        m1: vec3  # rows of Jacobian times axes, times shrink
+        m2: vec3
+        shrink: real  # power of two that keeps the squares in range
+        a: real  # covariance times shrink^2: xx, xy, yy, determinant
+        b: real
+        c: real
+        det: real
+
+    @wp.func
+    def finite3(v: vec3) -> wp.bool:
+        return wp.isfinite(v[0]) and wp.isfinite(v[1]) and wp.isfinite(v[2])
+
+    @wp.func
+    def ellipse(
+        mean: vec3, q: vec4, log_scale: vec3, view: mat44, K: mat33,
+        width: real, height: real, near: real, low_pass: real,
+    ) -> Ellipse:  # fmt: skip
+        e = Ellipse()
+        e.valid = 0
+        rotation = mat33(
+            view[0, 0], view[0, 1], view[0, 2], view[1, 0], view[1, 1], view[1, 2], view[2, 0], view[2, 1], view[2, 2]
+        )
+        e.position = rotation * mean + vec3(view[0, 3], view[1, 3], view[2, 3])
+        x = e.position[0]
+        y = e.position[1]
+        z = e.position[2]
+        # Guards are phrased so that a NaN fails them.
+        if not (z >= near and wp.isfinite(z)):
+            return e
+        px = K[0, 0] * x / z + K[0, 2]
+        py = K[1, 1] * y / z + K[1, 2]
+        if not (wp.isfinite(px) and wp.isfinite(py)):
+            return e
+        if not (wp.isfinite(q[0]) and wp.isfinite(q[1]) and wp.isfinite(q[2]) and wp.isfinite(q[3])):
+            return e
+        e.quat_length = r.quat_length(q)
+        if not (e.quat_length > real(1.0e-30) and wp.isfinite(e.quat_length)):
+            return e
+        e.quat = q / e.quat_length
+        e.scales = vec3(wp.exp(log_scale[0]), wp.exp(log_scale[1]), wp.exp(log_scale[2]))
+        if not finite3(e.scales):
+            return e
+
+        e.pixel = vec2(px, py)
+        margin = real(FRUSTUM_MARGIN)
+        e.clamped = vec2(
+            wp.clamp(px, -margin * width, width + margin * width),
+            wp.clamp(py, -margin * height, height + margin * height),
+        )
+        e.axes = rotation * r.rotation(e.quat) * wp.diag(e.scales)
+        jx = K[0, 0] / z
+        jy = K[1, 1] / z
+        jxz = (K[0, 2] - e.clamped[0]) / z
+        jyz = (K[1, 2] - e.clamped[1]) / z
+        m1 = vec3(
+            jx * e.axes[0, 0] + jxz * e.axes[2, 0],
+            jx * e.axes[0, 1] + jxz * e.axes[2, 1],
+            jx * e.axes[0, 2] + jxz * e.axes[2, 2],
+        )
+        m2 = vec3(
+            jy * e.axes[1, 0] + jyz * e.axes[2, 0],
+            jy * e.axes[1, 1] + jyz * e.axes[2, 1],
+            jy * e.axes[1, 2] + jyz * e.axes[2, 2],
+        )
+        if not (finite3(m1) and finite3(m2)):
+            return e
+        # det grows with the fourth power of the axes: shrink them below 2^16 px by exact powers of two.
+        largest = wp.max(wp.max(wp.abs(m1)), wp.max(wp.abs(m2)))
+        shrink = real(1.0)
+        while largest > real(65536.0):
+            largest *= real(1.0 / 65536.0)
+            shrink *= real(1.0 / 65536.0)
+        e.shrink = shrink
+        e.m1 = m1 * shrink
+        e.m2 = m2 * shrink
+        blur = low_pass * shrink * shrink
+        normal = wp.cross(e.m1, e.m2)
+        aa = wp.dot(e.m1, e.m1)
+        cc = wp.dot(e.m2, e.m2)
+        # Cauchy-Binet: only positive terms, where a c - b^2 would cancel
+        e.det = wp.dot(normal, normal) + blur * (aa + cc) + blur * blur
+        e.a = aa + blur
+        e.b = wp.dot(e.m1, e.m2)
+        e.c = cc + blur
+        if e.det > real(0.0) and e.c > real(0.0):
+            e.valid = 1
+        return e
+
+    @wp.func
+    def sigmoid(x: real) -> real:
+        if x >= real(0.0):
+            return real(1.0) / (real(1.0) + wp.exp(-x))
+        t = wp.exp(x)
+        return t / (real(1.0) + t)
+
+    @wp.func
+    def direction(mean: vec3, view: mat44) -> vec4:
+        """Unit vector from the camera centre to the mean, and the distance; zero where they coincide."""
+        centered = mean + vec3(
+            view[0, 0] * view[0, 3] + view[1, 0] * view[1, 3] + view[2, 0] * view[2, 3],
+            view[0, 1] * view[0, 3] + view[1, 1] * view[1, 3] + view[2, 1] * view[2, 3],
+            view[0, 2] * view[0, 3] + view[1, 2] * view[1, 3] + view[2, 2] * view[2, 3],
+        )
+        largest = wp.max(wp.abs(centered))
+        if not (largest > real(0.0) and wp.isfinite(largest)):
+            return vec4()
+        d = centered / largest
+        length = wp.sqrt(wp.dot(d, d))
+        d = d / length
+        return vec4(d[0], d[1], d[2], length * largest)
+
+    return SimpleNamespace(
+        Ellipse=Ellipse, ellipse=ellipse, sigmoid=sigmoid, direction=direction, finite3=finite3,
+        rotation=r.rotation, rotation_backward=r.rotation_backward,
+        vec3=vec3, vec4=vec4, mat33=mat33, mat44=mat44,
+    )  # fmt: skip
 
 
 @functools.cache

@@ -1,15 +1,14 @@
 """Project 3D Gaussians to image-space ellipses: activations, EWA covariance, its factor, colour, and tile counts."""
 
 import functools
-from types import SimpleNamespace
 
 import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from warpgs.constants import FRUSTUM_MARGIN, Rule
+from warpgs.constants import Rule
 from warpgs.kernels import bridge, sh
-from warpgs.kernels.functions import make_rotations, make_spans
+from warpgs.kernels.functions import make_projection, make_spans
 
 RECORD = 12
 """Floats of a projected Gaussian ("splat"), 16-byte aligned in float32:
@@ -18,153 +17,12 @@ RECORD = 12
 
 
 @functools.cache
-def make_math(real):
-    """The steps of the projection that forward and backward share (docs/project.md has the derivation)."""
-    r = make_rotations(real)
-    vec2 = wp.types.vector(2, real)
-    vec3 = wp.types.vector(3, real)
-    vec4 = wp.types.vector(4, real)
-    mat33 = wp.types.matrix((3, 3), real)
-    mat44 = wp.types.matrix((4, 4), real)
-
-    @wp.struct
-    class Ellipse:
-        """What is left of one Gaussian in one camera, before colour."""
-
-        valid: wp.int32
-        position: vec3  # in the camera [u]
-        pixel: vec2  # [px]
-        clamped: vec2  # pixel that the Jacobian is taken at [px]
-        quat: vec4  # unit
-        quat_length: real
-        scales: vec3  # [u]
-        axes: mat33  # camera rotation times Gaussian rotation times scales [u]
-        m1: vec3  # rows of Jacobian times axes, times shrink
-        m2: vec3
-        shrink: real  # power of two that keeps the squares in range
-        a: real  # covariance times shrink^2: xx, xy, yy, determinant
-        b: real
-        c: real
-        det: real
-
-    @wp.func
-    def finite3(v: vec3) -> wp.bool:
-        return wp.isfinite(v[0]) and wp.isfinite(v[1]) and wp.isfinite(v[2])
-
-    @wp.func
-    def ellipse(
-        mean: vec3, q: vec4, log_scale: vec3, view: mat44, K: mat33,
-        width: real, height: real, near: real, low_pass: real,
-    ) -> Ellipse:  # fmt: skip
-        e = Ellipse()
-        e.valid = 0
-        rotation = mat33(
-            view[0, 0], view[0, 1], view[0, 2], view[1, 0], view[1, 1], view[1, 2], view[2, 0], view[2, 1], view[2, 2]
-        )
-        e.position = rotation * mean + vec3(view[0, 3], view[1, 3], view[2, 3])
-        x = e.position[0]
-        y = e.position[1]
-        z = e.position[2]
-        # Guards are phrased so that a NaN fails them.
-        if not (z >= near and wp.isfinite(z)):
-            return e
-        px = K[0, 0] * x / z + K[0, 2]
-        py = K[1, 1] * y / z + K[1, 2]
-        if not (wp.isfinite(px) and wp.isfinite(py)):
-            return e
-        if not (wp.isfinite(q[0]) and wp.isfinite(q[1]) and wp.isfinite(q[2]) and wp.isfinite(q[3])):
-            return e
-        e.quat_length = r.quat_length(q)
-        if not (e.quat_length > real(1.0e-30) and wp.isfinite(e.quat_length)):
-            return e
-        e.quat = q / e.quat_length
-        e.scales = vec3(wp.exp(log_scale[0]), wp.exp(log_scale[1]), wp.exp(log_scale[2]))
-        if not finite3(e.scales):
-            return e
-
-        e.pixel = vec2(px, py)
-        margin = real(FRUSTUM_MARGIN)
-        e.clamped = vec2(
-            wp.clamp(px, -margin * width, width + margin * width),
-            wp.clamp(py, -margin * height, height + margin * height),
-        )
-        e.axes = rotation * r.rotation(e.quat) * wp.diag(e.scales)
-        jx = K[0, 0] / z
-        jy = K[1, 1] / z
-        jxz = (K[0, 2] - e.clamped[0]) / z
-        jyz = (K[1, 2] - e.clamped[1]) / z
-        m1 = vec3(
-            jx * e.axes[0, 0] + jxz * e.axes[2, 0],
-            jx * e.axes[0, 1] + jxz * e.axes[2, 1],
-            jx * e.axes[0, 2] + jxz * e.axes[2, 2],
-        )
-        m2 = vec3(
-            jy * e.axes[1, 0] + jyz * e.axes[2, 0],
-            jy * e.axes[1, 1] + jyz * e.axes[2, 1],
-            jy * e.axes[1, 2] + jyz * e.axes[2, 2],
-        )
-        if not (finite3(m1) and finite3(m2)):
-            return e
-        # det grows with the fourth power of the axes: shrink them below 2^16 px by exact powers of two.
-        largest = wp.max(wp.max(wp.abs(m1)), wp.max(wp.abs(m2)))
-        shrink = real(1.0)
-        while largest > real(65536.0):
-            largest *= real(1.0 / 65536.0)
-            shrink *= real(1.0 / 65536.0)
-        e.shrink = shrink
-        e.m1 = m1 * shrink
-        e.m2 = m2 * shrink
-        blur = low_pass * shrink * shrink
-        normal = wp.cross(e.m1, e.m2)
-        aa = wp.dot(e.m1, e.m1)
-        cc = wp.dot(e.m2, e.m2)
-        # Cauchy-Binet: only positive terms, where a c - b^2 would cancel
-        e.det = wp.dot(normal, normal) + blur * (aa + cc) + blur * blur
-        e.a = aa + blur
-        e.b = wp.dot(e.m1, e.m2)
-        e.c = cc + blur
-        if e.det > real(0.0) and e.c > real(0.0):
-            e.valid = 1
-        return e
-
-    @wp.func
-    def sigmoid(x: real) -> real:
-        if x >= real(0.0):
-            return real(1.0) / (real(1.0) + wp.exp(-x))
-        t = wp.exp(x)
-        return t / (real(1.0) + t)
-
-    @wp.func
-    def direction(mean: vec3, view: mat44) -> vec4:
-        """Unit vector from the camera centre to the mean, and the distance; zero where they coincide."""
-        centered = mean + vec3(
-            view[0, 0] * view[0, 3] + view[1, 0] * view[1, 3] + view[2, 0] * view[2, 3],
-            view[0, 1] * view[0, 3] + view[1, 1] * view[1, 3] + view[2, 1] * view[2, 3],
-            view[0, 2] * view[0, 3] + view[1, 2] * view[1, 3] + view[2, 2] * view[2, 3],
-        )
-        largest = wp.max(wp.abs(centered))
-        if not (largest > real(0.0) and wp.isfinite(largest)):
-            return vec4()
-        d = centered / largest
-        length = wp.sqrt(wp.dot(d, d))
-        d = d / length
-        return vec4(d[0], d[1], d[2], length * largest)
-
-    return SimpleNamespace(
-        Ellipse=Ellipse, ellipse=ellipse, sigmoid=sigmoid, direction=direction, finite3=finite3,
-        rotation=r.rotation, rotation_backward=r.rotation_backward,
-        vec3=vec3, vec4=vec4, mat33=mat33, mat44=mat44,
-    )  # fmt: skip
-
-
-@functools.cache
 def make_forward(real):
     """The forward kernel for one scalar type."""
-    m = make_math(real)
+    m = make_projection(real)
     s = make_spans(real)
     basis = sh.make_functions(real).basis
     vec3 = m.vec3
-    vec2i = s.vec2i
 
     @wp.kernel(enable_backward=False, module=f"warpgs.kernels.project.forward.{real.__name__}")
     def forward(
@@ -244,7 +102,7 @@ def make_forward(real):
 @functools.cache
 def make_backward(real):
     """The backward kernel for one scalar type: one thread per Gaussian, over all cameras, so no sum needs atomics."""
-    m = make_math(real)
+    m = make_projection(real)
     functions = sh.make_functions(real)
     vec3 = m.vec3
     vec4 = m.vec4
@@ -402,7 +260,7 @@ def make_backward(real):
 
 
 def _inputs(means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks) -> list[wp.array]:
-    m = make_math(bridge.real_of(means))
+    m = make_projection(bridge.real_of(means))
     types = (m.vec3, m.vec4, m.vec3, bridge.real_of(means), m.vec3, m.mat44, m.mat33)
     tensors = (means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks)
     return [bridge.view(t, dtype) for t, dtype in zip(tensors, types)]
@@ -433,7 +291,7 @@ class _Project(torch.autograd.Function):
     def backward(ctx, v_splats, _):
         *tensors, splats, tile_counts = ctx.saved_tensors
         real = bridge.real_of(splats)
-        m = make_math(real)
+        m = make_projection(real)
         device = splats.device
         v_splats = v_splats.contiguous().view(-1, RECORD)
         gradients = [torch.zeros_like(t) for t in tensors[:5]]

@@ -252,7 +252,8 @@ def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Structural similarity at every pixel and channel, the variant of the 3DGS papers.
 
     Gaussian window of 11 x 11 px with sigma 1.5, zeros outside the image, data range 1; it works for images of any size.
-    Differentiable in ``image`` only. A variance that rounding makes negative counts as 0, and so does the covariance then; neither passes a gradient.
+    Differentiable in ``image`` only. A variance that rounding makes negative counts as 0, and so does
+    the covariance then; neither passes a gradient.
     Derivation: docs/ssim.md.
 
     Args:

@@ -47,7 +47,7 @@ class InitConfig:
 
 
 def camera_depths(views: list[View]) -> tuple[float, float]:
-    """Near and far depth [u] where nothing else is known: a tenth of the distance to the cameras' focus point to ten times it."""
+    """Near and far depth [u] where nothing else is known: 0.1 and 10 times the distance to the cameras' focus point."""
     focus = geometry.focus_point([v.camera for v in views])
     distance = float(np.median([np.linalg.norm(v.camera.center - focus) for v in views]))
     return 0.1 * max(distance, 1e-3), 10 * max(distance, 1e-3)

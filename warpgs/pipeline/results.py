@@ -35,8 +35,9 @@ def file_stem(name: str) -> str:
 def evaluate_run(
     out: Path, gaussians: Gaussians, train: list[View], test: list[View], rule: str, background: tuple[float, float, float]
 ) -> dict:
-    """Score held-out and training views, and save a picture and a depth map of each held-out view (of each training view
-    where none is held out).
+    """Score held-out and training views, and save a picture and a depth map of each held-out view.
+
+    Where no view is held out, the pictures are of the training views.
 
     Returns:
         Means over held-out and over training views, a row per held-out view, and what guessing scores.

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from warpgs import __version__
-from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.errors import DataError, ResourceError, UsageError, WarpgsError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.load import load_scene
@@ -151,8 +151,13 @@ def fit_scene(request: FitRequest) -> dict:
     began = time.perf_counter()
     out = request.out
     _prepare_folder(out, request.resume)
-    device, where = choose_device(request.device)
-    scene, split, notes = read_scene(request.scene)
+    try:
+        device, where = choose_device(request.device)
+        scene, split, notes = read_scene(request.scene)
+    except WarpgsError:
+        if not request.resume:
+            out.rmdir()  # nothing is in it yet
+        raise
     train, test = train_views(scene, split.train), train_views(scene, split.test)
     record = _record(request, scene, split, notes, device)
     tensors, plain = {}, None

@@ -1,0 +1,90 @@
+"""Scores, what guessing would score, and camera paths."""
+
+import math
+
+import numpy as np
+import pytest
+
+from tests.scenes import photographs, ring
+from warpgs.errors import UsageError
+from warpgs.geometry import back_project, camera_extent, focus_point, in_image, project_points
+from warpgs.pipeline.evaluate import counted_region, guesses, psnr, score, summarize, to_8_bit
+from warpgs.pipeline.paths import camera_path
+from warpgs.scene import View
+
+
+def test_psnr_of_known_errors():
+    """An error of 0.1 everywhere is 20 dB; equal images are infinitely good; a region counts alone."""
+    a = np.full((8, 9, 3), 0.5, np.float32)
+    assert psnr(a + 0.1, a) == pytest.approx(20, abs=1e-4) and psnr(a, a) == math.inf
+    region = np.zeros((8, 9), bool)
+    region[:4] = True
+    b = a.copy()
+    b[4:] = 1
+    assert psnr(b, a, region) == math.inf and psnr(b, a) < 10
+
+
+def test_scores_are_of_the_saved_picture():
+    """Clamping and rounding to 8 bits happen before scoring."""
+    view = photographs(1)[0]
+    m = score(view, view.image + 1e-4)
+    assert m.psnr > 50 and m.ssim > 0.999 and m.ssim_skimage > 0.999
+    assert np.array_equal(to_8_bit(np.array([-1.0, 0.5, 2.0])), np.float32([0, 128 / 255, 1]))
+
+
+def test_counted_region():
+    """A mask counts first; an object on black counts by its bright pixels; an ordinary photo counts whole."""
+    view = photographs(1)[0]
+    bright = View("a", view.camera, np.full_like(view.image, 0.5))
+    assert counted_region(bright) == (None, "all")
+    dark = np.zeros_like(view.image)
+    dark[10:20, 10:20] = 0.7
+    region, name = counted_region(View("a", view.camera, dark))
+    assert name == "foreground" and int(region.sum()) == 100
+    mask = np.zeros(view.image.shape[:2], bool)
+    mask[0] = True
+    assert counted_region(View("a", view.camera, dark, mask))[1] == "mask"
+
+
+def test_guesses():
+    """The mean photo and the nearest photo are scored as predictions; other sizes are left out."""
+    views = photographs(3)
+    g = guesses([views[0], views[2]], [views[1]])
+    mean = to_8_bit((views[0].image + views[2].image) / 2)
+    region, _ = counted_region(views[1])
+    assert g["mean_photo"] == pytest.approx(psnr(mean, views[1].image, region))
+    assert guesses(photographs(2, 20, 16), [views[1]]) == {}
+    assert summarize([]) == {}
+
+
+def test_geometry_round_trip():
+    """Back-projection undoes projection; extent and focus are those of an arc around the origin."""
+    cameras = ring(5)
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (30, 3))
+    for c in cameras:
+        pixels, z = project_points(c, points)
+        assert np.allclose(back_project(c, pixels, z), points, atol=1e-12) and (z > 0).all()
+        assert in_image(c, np.zeros((1, 3)))[0] and not in_image(c, 3 * c.center[None])[0]
+    assert np.linalg.norm(focus_point(cameras)) < 1e-4
+    assert 1.0 < camera_extent(cameras) < 2.2 and camera_extent(cameras[:1]) == 0
+
+
+@pytest.mark.parametrize("kind", ["orbit", "spiral"])
+def test_paths_look_at_one_point_and_close(kind):
+    """All cameras see the middle of the scene, and the last is near the first."""
+    path = camera_path(kind, ring(5), 2.2, 40)
+    assert len(path) == 40
+    for c in path:
+        pixels, z = project_points(c, np.zeros((1, 3)))
+        assert z[0] > 0 and abs(pixels[0] - c.K[:2, 2]).max() < 0.5 * c.width
+        assert np.allclose(c.viewmat[:3, :3] @ c.viewmat[:3, :3].T, np.eye(3), atol=1e-12)
+    steps = [np.linalg.norm(a.center - b.center) for a, b in zip(path, path[1:] + path[:1])]
+    assert max(steps) < 0.5
+
+
+def test_unknown_path_is_refused():
+    """The message lists what there is."""
+    with pytest.raises(UsageError, match="views, orbit, spiral"):
+        camera_path("zigzag", ring(3), 1.0, 5)
+    with pytest.raises(UsageError, match="at least 1 frame"):
+        camera_path("orbit", ring(3), 1.0, 0)
