@@ -39,7 +39,8 @@ def garden_inputs(
     generator = torch.Generator().manual_seed(seed)
     count, coefficients = len(points), (sh_degree + 1) ** 2
     sh = torch.randn(count, coefficients, 3, generator=generator) * 0.1
-    sh[:, 0] = (torch.from_numpy(colors) - 0.5) / 0.28209479177387814
+    # Colours keep half a step of 8 bits from 0: exactly there the clamp of colours at 0 has no gradient to compare.
+    sh[:, 0] = (torch.from_numpy(colors).clamp_min(0.5 / 255) - 0.5) / 0.28209479177387814
     tensors = {
         "means": torch.from_numpy(points),
         "quats": torch.randn(count, 4, generator=generator),
