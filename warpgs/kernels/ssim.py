@@ -36,7 +36,7 @@ def make_kernels(real, lanes: int):
     """Kernels for one scalar type and task size.
 
     Images are flat [rows, columns] with columns = width * channels. Five sums run through the window: of a, b, a^2, b^2 and
-    a b; backward, three. Vertical passes write rows with zeros on both sides, so that horizontal ones need no border.
+    (a - b)^2; backward, three. Vertical passes write rows with zeros on both sides, so that horizontal ones need no border.
     """
     w0, w1, w2, w3, w4, w5 = (real(w) for w in WINDOW[: RADIUS + 1])
     vec6 = wp.types.vector(6, real)
@@ -81,7 +81,7 @@ def make_kernels(real, lanes: int):
                 s1[lane] = s1[lane] + w * q
                 s2[lane] = s2[lane] + w * p * p
                 s3[lane] = s3[lane] + w * q * q
-                s4[lane] = s4[lane] + w * p * q
+                s4[lane] = s4[lane] + w * (p - q) * (p - q)
         base = row * (columns + 2 * padding) + padding + x
         for lane in range(count):
             m0[base + lane] = s0[lane]
@@ -94,9 +94,9 @@ def make_kernels(real, lanes: int):
     def similarity(
         begin: int, m0: wp.array(dtype=real), m1: wp.array(dtype=real), m2: wp.array(dtype=real), m3: wp.array(dtype=real),
         m4: wp.array(dtype=real), channels: int, tasks: int, columns: int, padding: int,
-        # outputs: the similarity, and its partials by mean, variance and covariance
+        # outputs: the similarity, and its partials by mean, variance and gap
         result: wp.array(dtype=real), by_mean: wp.array(dtype=real), by_variance: wp.array(dtype=real),
-        by_covariance: wp.array(dtype=real),
+        by_gap: wp.array(dtype=real),
     ):  # fmt: skip
         task = begin + wp.tid()
         row = task // tasks
@@ -119,32 +119,30 @@ def make_kernels(real, lanes: int):
         for lane in range(count):
             ma = s0[lane]
             mb = s1[lane]
-            raw_a = s2[lane] - ma * ma
-            raw_b = s3[lane] - mb * mb
-            # Rounding can make a variance slightly negative. It is zero then, and so is the covariance, which Cauchy and
-            # Schwarz bound by the variances; else the similarity of two equal flat images would miss 1 by 3e-4.
-            va = wp.max(raw_a, real(0.0))
-            vb = wp.max(raw_b, real(0.0))
-            varies = wp.where(raw_a > real(0.0), wp.where(raw_b > real(0.0), 1, 0), 0)
-            cov = wp.where(varies == 1, s4[lane] - ma * mb, real(0.0))
+            # rounding can make these differences slightly negative
+            raw_va = s2[lane] - ma * ma
+            raw_gap = s4[lane] - (ma - mb) * (ma - mb)
+            va = wp.max(raw_va, real(0.0))
+            vb = wp.max(s3[lane] - mb * mb, real(0.0))
+            # variance of a - b: the covariance is (va + vb - gap) / 2, and equal images score 1 whatever is rounded
+            gap = wp.max(raw_gap, real(0.0))
             n1 = real(2.0) * ma * mb + real(C1)
-            n2 = real(2.0) * cov + real(C2)
-            d1 = ma * ma + mb * mb + real(C1)
+            d1 = n1 + (ma - mb) * (ma - mb)
             d2 = va + vb + real(C2)
-            inverse = real(1.0) / (d1 * d2)
-            s = n1 * n2 * inverse
-            v = wp.where(raw_a > real(0.0), -s / d2, real(0.0))
-            c = wp.where(varies == 1, real(2.0) * n1 * inverse, real(0.0))
-            result[base + lane] = s
-            # the mean also acts through the variance, -ma^2, and the covariance, -ma mb
-            by_mean[base + lane] = real(2.0) * (mb * n2 * inverse - ma * s / d1 - ma * v) - mb * c
+            luminance = n1 / d1
+            structure = real(1.0) - gap / d2
+            result[base + lane] = luminance * structure
+            v = wp.where(raw_va > real(0.0), luminance * gap / (d2 * d2), real(0.0))
+            g = wp.where(raw_gap > real(0.0), -luminance / d2, real(0.0))
+            # the mean also acts through the variance, -ma^2, and the gap, -(ma - mb)^2
+            by_mean[base + lane] = real(2.0) * (structure * (mb - luminance * ma) / d1 - ma * v - (ma - mb) * g)
             by_variance[base + lane] = v
-            by_covariance[base + lane] = c
+            by_gap[base + lane] = g
 
     @kernel
     def vertical_backward(
         begin: int, v_result: wp.array(dtype=real), by_mean: wp.array(dtype=real), by_variance: wp.array(dtype=real),
-        by_covariance: wp.array(dtype=real), height: int, tasks: int, columns: int, padding: int,
+        by_gap: wp.array(dtype=real), height: int, tasks: int, columns: int, padding: int,
         # outputs, zero on entry
         m0: wp.array(dtype=real), m1: wp.array(dtype=real), m2: wp.array(dtype=real),
     ):  # fmt: skip
@@ -162,7 +160,7 @@ def make_kernels(real, lanes: int):
                 v = w * v_result[base + lane]
                 s0[lane] = s0[lane] + v * by_mean[base + lane]
                 s1[lane] = s1[lane] + v * by_variance[base + lane]
-                s2[lane] = s2[lane] + v * by_covariance[base + lane]
+                s2[lane] = s2[lane] + v * by_gap[base + lane]
         base = row * (columns + 2 * padding) + padding + x
         for lane in range(count):
             m0[base + lane] = s0[lane]
@@ -191,7 +189,8 @@ def make_kernels(real, lanes: int):
                 s2[lane] = s2[lane] + w * m2[base + lane]
         base = row * columns + x
         for lane in range(count):
-            v_a[base + lane] = s0[lane] + real(2.0) * a[base + lane] * s1[lane] + b[base + lane] * s2[lane]
+            p = a[base + lane]
+            v_a[base + lane] = s0[lane] + real(2.0) * (p * s1[lane] + (p - b[base + lane]) * s2[lane])
 
     return SimpleNamespace(vertical=vertical, similarity=similarity, vertical_backward=vertical_backward, combine=combine)
 
@@ -252,8 +251,8 @@ def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Structural similarity at every pixel and channel, the variant of the 3DGS papers.
 
     Gaussian window of 11 x 11 px with sigma 1.5, zeros outside the image, data range 1; it works for images of any size.
-    Differentiable in ``image`` only. A variance that rounding makes negative counts as 0, and so does
-    the covariance then; neither passes a gradient.
+    Differentiable in ``image`` only. A variance that rounding makes negative counts as 0 and passes no
+    gradient. Equal images score exactly 1.
     Derivation: docs/ssim.md.
 
     Args:
