@@ -15,7 +15,7 @@ from warpgs.scene import Gaussians
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """Learning rates (Kerbl et al. 2023, reference implementation)."""
+    """Learning rates of the reference implementation of Kerbl et al. 2023, but for the scales."""
 
     means_lr: float = 1.6e-4
     """Of positions, times the scene's extent, at the start."""
@@ -23,8 +23,8 @@ class OptimizerConfig:
     """The same at the last step; log-linear between."""
     quats_lr: float = 1e-3
     """Of rotations."""
-    scales_lr: float = 5e-3
-    """Of log scales."""
+    scales_lr: float = 0.01
+    """Of log scales; 0.005 in the reference (docs/decisions/004-scale-rate.md)."""
     opacities_lr: float = 0.05
     """Of opacity logits."""
     sh_lr: float = 2.5e-3
