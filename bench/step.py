@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import statistics
-import time
 from pathlib import Path
 
 import torch
 
+from bench.harness import measure
 from warpgs import load_scene
 from warpgs.constants import RULES
 from warpgs.io.splits import split_views
@@ -24,24 +23,6 @@ from warpgs.pipeline.fit import Fit, train_views
 from warpgs.pipeline.init import InitConfig
 from warpgs.pipeline.loss import LossConfig, photometric_loss
 from warpgs.pipeline.run import choose_device
-
-REPEATS = 30
-
-
-def timed(work, device: torch.device) -> dict[str, float]:
-    """Median and quartiles [ms] of 30 calls after 5 for warm-up."""
-    samples = []
-    for i in range(5 + REPEATS):
-        if device.type == "cuda":
-            torch.cuda.synchronize()
-        begin = time.perf_counter()
-        work()
-        if device.type == "cuda":
-            torch.cuda.synchronize()
-        if i >= 5:
-            samples.append(1000 * (time.perf_counter() - begin))
-    low, middle, high = statistics.quantiles(samples, n=4)
-    return {"median_ms": round(middle, 3), "quartiles_ms": [round(low, 3), round(high, 3)]}
 
 
 def stages(fit: Fit) -> dict[str, dict[str, float]]:
@@ -75,16 +56,16 @@ def stages(fit: Fit) -> dict[str, dict[str, float]]:
         fit.optimizer.step(0.5)
 
     result = {
-        "project forward": timed(run_project, device),
-        "tiles": timed(lambda: bin_tiles(splats, counts, **size, rule=rule), device),
-        "blend forward": timed(lambda: blend(leaf, tiles, background, **size, rule=rule), device),
-        "loss forward": timed(lambda: photometric_loss(image, target, None, loss), device),
-        "loss backward": timed(backward_of(value, [image]), device),
-        "blend backward": timed(backward_of(rgb, [leaf], v_rgb), device),
-        "project backward": timed(backward_of(splats, params, v_splats), device),
-        "adam": timed(optimize, device),
+        "project forward": measure(run_project, device),
+        "tiles": measure(lambda: bin_tiles(splats, counts, **size, rule=rule), device),
+        "blend forward": measure(lambda: blend(leaf, tiles, background, **size, rule=rule), device),
+        "loss forward": measure(lambda: photometric_loss(image, target, None, loss), device),
+        "loss backward": measure(backward_of(value, [image]), device),
+        "blend backward": measure(backward_of(rgb, [leaf], v_rgb), device),
+        "project backward": measure(backward_of(splats, params, v_splats), device),
+        "adam": measure(optimize, device),
     }
-    result["whole step"] = timed(fit.advance, device)
+    result["whole step"] = measure(fit.advance, device)
     result["instances"] = {"count": len(tiles.slots)}
     return result
 
