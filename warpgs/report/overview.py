@@ -42,10 +42,14 @@ def _python(code: str, *arguments: str) -> tuple[bool, str]:
     return False, f"pyvista ended with code {done.returncode}" + (f" ({last[-1][:100]})" if last else "")
 
 
+def _remedy(why: str) -> str:
+    return "`pip install pyvista`" if "No module named" in why else REMEDY
+
+
 def probe_rendering() -> tuple[bool, str]:
     """Whether pyvista can draw here, and the reason with a remedy if not."""
     works, why = _python(PROBE)
-    return works, "off-screen through EGL" if works else f"{why}; {REMEDY}"
+    return works, "off-screen through EGL" if works else f"{why}; {_remedy(why)}"
 
 
 def _frusta(cameras: list[Camera], size: float) -> np.ndarray:
@@ -134,4 +138,4 @@ def render_overview(
         works, why = _python(DRAW, str(source), str(target))
         if works and target.is_file():
             return target.read_bytes(), ""
-    return None, f"no overview picture: {why}; {REMEDY}"
+    return None, f"no overview picture: {why}; {_remedy(why)}"
