@@ -1,5 +1,6 @@
 """The command line: parses, calls, prints; no logic."""
 
+import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -245,6 +246,9 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("warpgs: interrupted; --resume continues from the last checkpoint", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # the reader, `head` for one, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except Exception as e:
         return _internal_error(e, arguments)
 

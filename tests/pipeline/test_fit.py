@@ -188,6 +188,25 @@ def test_checkpoint_that_is_not_whole_is_refused(tmp_path):
     assert path.name == TENSORS
 
 
+def test_interrupted_fit_saves_the_step_in_progress(tmp_path):
+    """Ctrl-C ends with exit code 130 and a checkpoint of the last whole step, from which --resume goes on."""
+    write_demo(tmp_path / "scene", views=8, width=48, height=36)
+    command = [
+        sys.executable, "-m", "warpgs", "fit", str(tmp_path / "scene"), "--split", split_spec(8), "--steps", "100000",
+        "--device", "cpu", "--out", str(tmp_path / "run"),
+    ]  # fmt: skip
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    for line in process.stdout:
+        if line.startswith("step"):
+            break
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130 and "--resume" in errors and "Traceback" not in errors
+    _, state = load_checkpoint(tmp_path / "run")
+    steps = [json.loads(x)["step"] for x in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert state["step"] == steps[-1] >= 1
+
+
 def test_resume_after_kill_gives_the_same_ply(tmp_path):
     """SIGKILL in the middle, --resume, and the PLY equals that of a run left alone, byte for byte."""
     write_demo(tmp_path / "scene", views=8, width=64, height=48)

@@ -177,9 +177,16 @@ def train_views(scene: Scene, names: tuple[str, ...]) -> list[View]:
     return [scene.view(n) for n in names]
 
 
-def run(fit: Fit, on_step: Callable[[StepReport], None], save: Callable[[Fit], None]) -> None:
-    """Take all remaining steps, reporting each and saving now and then and at the end."""
+def run(fit: Fit, on_step: Callable[[StepReport], None], save: Callable[[Fit], None], stopped: Callable[[], bool]) -> None:
+    """Take all remaining steps, reporting each and saving now and then and at the end.
+
+    Raises:
+        KeyboardInterrupt: ``stopped`` said so after a step; the state after it is saved.
+    """
     while fit.step < fit.config.steps:
         on_step(fit.advance())
-        if fit.step % fit.config.checkpoint_every == 0 or fit.step == fit.config.steps:
+        stop = stopped()
+        if stop or fit.step % fit.config.checkpoint_every == 0 or fit.step == fit.config.steps:
             save(fit)
+        if stop:
+            raise KeyboardInterrupt

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import json
 import platform
+import signal
+import threading
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -197,6 +200,30 @@ def fit_scene(request: FitRequest) -> dict:
     return metrics
 
 
+@contextlib.contextmanager
+def _stop_signals():
+    """Let Ctrl-C and SIGTERM end the fit after the step in progress; a second one ends it at once.
+
+    Gives a function that says whether one came. Elsewhere than in the main thread signals cannot be caught and act as ever.
+    """
+    came = False
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: came
+        return
+
+    def note(*_) -> None:
+        nonlocal came
+        came = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: came
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def _train(fit: Fit, out: Path) -> None:
     log = EventLog(out / "metrics.jsonl", fit.step)
 
@@ -211,10 +238,8 @@ def _train(fit: Fit, out: Path) -> None:
             log.write(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=round(r.seconds, 6))
 
         try:
-            run(fit, on_step, save)
-        except KeyboardInterrupt:
-            save(fit)
-            raise
+            with _stop_signals() as stopped:
+                run(fit, on_step, save, stopped)
         finally:
             log.close()
 
