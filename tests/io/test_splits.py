@@ -2,12 +2,14 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from tests.io import scenes
 from warpgs.errors import DataError, UsageError
 from warpgs.io.load import load_scene
-from warpgs.io.splits import Split, default_split, split_views
+from warpgs.io.splits import Split, default_split, split_views, twins
+from warpgs.scene import Camera
 
 
 def scene_of(names):
@@ -133,3 +135,20 @@ def test_default_split():
 def test_a_split_of_a_real_folder(tmp_path):
     scene = load_scene(scenes.write_llff(tmp_path))
     assert split_views(scene, "llff:3") == Split(("photo1.png", "photo3.png", "photo4.png"), ("photo0.png",))
+
+
+def test_twins_are_views_from_one_place():
+    """Equal poses across the split count, in any unit; equal poses within training and turned cameras do not."""
+
+    def view(name, x, turned=False):
+        viewmat = np.eye(4)
+        if turned:
+            viewmat[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+        viewmat[0, 3] = -x
+        return SimpleNamespace(name=name, camera=Camera(viewmat, np.eye(3), 4, 4))
+
+    for unit in (1e-3, 1e3):
+        views = [view("a", 0), view("b", 5e-4 * unit), view("c", unit), view("d", unit), view("e", unit, turned=True)]
+        scene = SimpleNamespace(views=tuple(views))
+        assert twins(scene, Split(("b", "c", "e"), ("a", "d"))) == [("a", "b"), ("d", "c")]
+        assert twins(scene, Split(("c", "d", "e"), ("a", "b"))) == []

@@ -8,8 +8,9 @@ import pytest
 from tests.scenes import photographs, ring
 from warpgs.errors import UsageError
 from warpgs.geometry import back_project, camera_extent, focus_point, in_image, project_points
-from warpgs.pipeline.evaluate import counted_region, guesses, psnr, score, summarize, to_8_bit
+from warpgs.pipeline.evaluate import guesses, psnr, score, summarize, to_8_bit
 from warpgs.pipeline.paths import camera_path
+from warpgs.pipeline.region import counted_region
 from warpgs.scene import View
 
 

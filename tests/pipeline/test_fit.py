@@ -15,14 +15,16 @@ import torch
 from tests.scenes import photographs, seeds
 from warpgs.demo import split_spec, write_demo
 from warpgs.errors import DataError, UsageError
+from warpgs.geometry import look_at
 from warpgs.pipeline.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.config import PRESETS, FitConfig
 from warpgs.pipeline.density import DensityConfig
 from warpgs.pipeline.fit import Fit, NotFiniteError
-from warpgs.pipeline.init import InitConfig, initial_gaussians, initial_points
+from warpgs.pipeline.init import InitConfig, empty_votes, initial_gaussians, initial_points, random_points
 from warpgs.pipeline.loss import LossConfig, photometric_loss
+from warpgs.pipeline.region import counted_region
 from warpgs.pipeline.schedule import log_linear, sh_degree
-from warpgs.scene import PointCloud, View
+from warpgs.scene import Camera, PointCloud, View
 
 CPU = torch.device("cpu")
 BUSY = FitConfig(
@@ -35,6 +37,26 @@ def fitted(config: FitConfig, steps: int, background=(0.0, 0.0, 0.0)) -> Fit:
     for _ in range(steps):
         fit.advance()
     return fit
+
+
+def test_random_points_stand_on_an_object_on_black():
+    """A bright ball's silhouette in four views: points start inside its visual hull, not in the black before it."""
+    views = []
+    for angle in np.linspace(0, 2 * np.pi, 5)[:4]:
+        center = 4 * np.array([np.sin(angle), 0, -np.cos(angle)])
+        camera = Camera(
+            look_at(center, np.zeros(3), np.array([0, -1.0, 0])), np.array([[60.0, 0, 20], [0, 60, 20], [0, 0, 1]]), 40, 40
+        )
+        y, x = np.mgrid[:40, :40] + 0.5
+        ball = (x - 20) ** 2 + (y - 20) ** 2 < 6**2
+        views.append(View(f"{angle:.1f}", camera, np.where(ball[..., None], 0.8, 0).astype(np.float32).repeat(3, 2)))
+    regions = [counted_region(v) for v in views]
+    assert empty_votes(views, regions, np.array([[0.0, 0, 0], [1.2, 0, 0], [0, 1.2, 0]])).tolist() == [0, 2, 4]
+    cloud, how = random_points(views, 400, np.random.default_rng(0))
+    assert "object that 4 views show on black" in how
+    assert len(cloud) == 400 and (cloud.colors == np.float32(0.8)).all()
+    # without votes, one point in six stands before some view's black
+    assert (empty_votes(views, regions, cloud.points) == 0).all()
 
 
 def test_same_seed_same_bits_and_threads_do_not_matter():

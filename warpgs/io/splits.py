@@ -11,6 +11,7 @@ from pathlib import PurePosixPath
 import numpy as np
 
 from warpgs.errors import DataError, UsageError
+from warpgs.geometry import camera_extent
 from warpgs.scene import Scene
 
 DTU_TRAIN = (25, 22, 28, 40, 44, 48, 0, 8, 13)
@@ -158,3 +159,15 @@ def default_split(scene: Scene) -> tuple[Split, str]:
         return Split(tuple(names), ()), "no --split given: both views train, none is held out"
     middle = names[len(names) // 2]
     return Split(tuple(n for n in names if n != middle), (middle,)), f"no --split given: {middle} is held out"
+
+
+def twins(scene: Scene, split: Split) -> list[tuple[str, str]]:
+    """Held-out views whose camera is that of a training view, each with that view: what they score, copying would score.
+
+    The same means: the pose differs by less than a thousandth in every entry, lengths taken in extents of the camera set.
+    """
+    extent = max(camera_extent([v.camera for v in scene.views]), 1e-9)
+    unit = np.array([[1, 1, 1, 1 / extent]] * 3 + [[1] * 4])
+    poses = {v.name: v.camera.viewmat * unit for v in scene.views}
+    pairs = ((a, b) for a in split.test for b in split.train)
+    return [(a, b) for a, b in pairs if np.abs(poses[a] - poses[b]).max() < 1e-3]

@@ -8,13 +8,9 @@ import numpy as np
 import torch
 
 from warpgs.kernels.ssim import ssim
+from warpgs.pipeline.region import counted_region
 from warpgs.rasterizer import RasterizeOptions, rasterize
 from warpgs.scene import Gaussians, View
-
-DARK = 16 / 255
-"""A pixel whose brightest channel is below this belongs to a black background."""
-DARK_SHARE = 0.3
-"""A photograph with at least this share of such pixels, and a dark border, shows an object on black."""
 
 
 @dataclass(frozen=True)
@@ -35,21 +31,6 @@ class ViewMetrics:
 def to_8_bit(image: np.ndarray) -> np.ndarray:
     """Colours clamped to [0, 1] and rounded to multiples of 1/255, as a saved PNG holds them."""
     return np.round(np.clip(image, 0, 1) * 255).astype(np.float32) / 255
-
-
-def counted_region(view: View) -> tuple[np.ndarray | None, str]:
-    """Pixels that a view is scored on, bool [H, W], and their name; None for all.
-
-    The view's mask where it has one; else the bright pixels where it shows an object on black, because a black frame around
-    a small object would otherwise decide the score.
-    """
-    if view.mask is not None and not view.mask.all():
-        return view.mask, "mask"
-    dark = view.image.max(-1) < DARK
-    border = np.concatenate([dark[0], dark[-1], dark[:, 0], dark[:, -1]])
-    if dark.mean() >= DARK_SHARE and border.mean() >= 0.5 and not dark.all():
-        return ~dark, "foreground"
-    return None, "all"
 
 
 def psnr(image: np.ndarray, target: np.ndarray, region: np.ndarray | None = None) -> float:

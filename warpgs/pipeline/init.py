@@ -11,6 +11,7 @@ from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.sh import C0, coefficient_count
+from warpgs.pipeline.region import counted_region
 from warpgs.priors.matches import triangulate_matches
 from warpgs.scene import Gaussians, PointCloud, View
 
@@ -74,20 +75,36 @@ class _Depths:
         return self.known[chosen] * np.exp(generator.normal(0, DEPTH_SPREAD, count))
 
 
+def empty_votes(views: list[View], regions: list[tuple[np.ndarray | None, str]], points: np.ndarray) -> np.ndarray:
+    """How many views see each point [N, 3] before the black around an object, int [N]: the visual hull has none."""
+    votes = np.zeros(len(points), int)
+    for view, (region, name) in zip(views, regions):
+        if name != "foreground":
+            continue
+        seen = np.nonzero(geometry.in_image(view.camera, points))[0]
+        pixels, _ = geometry.project_points(view.camera, points[seen])
+        columns, rows = np.floor(pixels).astype(int).T
+        votes[seen] += ~region[rows, columns]
+    return votes
+
+
 def random_points(views: list[View], count: int, generator: np.random.Generator) -> tuple[PointCloud, str]:
     """Points behind random pixels of the training views, with those pixels' colours.
 
     A view in which at least 10 triangulated SIFT matches lie takes each depth from one of the 5 matches nearest to the pixel,
     spread by a tenth (docs/decisions/003-random-start.md); any other view draws inverse depths uniformly, and keeps points
-    that a second view sees where there are any. Returns the cloud and a sentence on how it was made.
+    that a second view sees where there are any. Where views show an object on black, points start on the object, and those
+    that fewest views see before black come first: nothing stands in empty space. Returns the cloud and a sentence on how it
+    was made.
     """
+    regions = [counted_region(v) for v in views]
     matched = triangulate_matches(views)
     bounds = camera_depths(views)
     sources = [_Depths(v, matched, bounds) for v in views]
     points, colors = [], []
     for i, (view, source) in enumerate(zip(views, sources)):
         wanted = (i + 1) * count // len(views) - i * count // len(views)
-        free = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask
+        free = np.ones(view.image.shape[:2], bool) if regions[i][0] is None else regions[i][0]
         rows, columns = np.nonzero(free)
         if len(rows) == 0:
             continue
@@ -95,16 +112,20 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
         rows, columns = rows[chosen], columns[chosen]
         pixels = np.stack([columns, rows], 1) + 0.5
         candidates = geometry.back_project(view.camera, pixels, source.draw(pixels, generator))
+        worse = empty_votes(views, regions, candidates)
         if source.tree is None and len(views) > 1:
-            shared = sum(geometry.in_image(v.camera, candidates).astype(int) for v in views) >= 2
-            order = np.argsort(~shared, kind="stable")  # points that two views see first
-            candidates, rows, columns = candidates[order], rows[order], columns[order]
+            worse += sum(geometry.in_image(v.camera, candidates).astype(int) for v in views) < 2
+        order = np.argsort(worse, kind="stable")
+        candidates, rows, columns = candidates[order], rows[order], columns[order]
         points.append(candidates[:wanted])
         colors.append(view.image[rows[:wanted], columns[:wanted]])
     if not points:
         raise DataError("no random start: every pixel of the training views is masked out; check the masks' polarity")
     guided = sum(s.tree is not None for s in sources)
     how = f"{count:,} random points, {guided} of {len(views)} views guided by {len(matched):,} matched points"
+    objects = sum(name == "foreground" for _, name in regions)
+    if objects:
+        how += f", on the object that {objects} views show on black"
     return PointCloud(np.concatenate(points), np.concatenate(colors)), how
 
 

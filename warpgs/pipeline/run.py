@@ -20,7 +20,7 @@ from warpgs.errors import DataError, ResourceError, UsageError, WarpgsError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.load import load_scene
-from warpgs.io.splits import Split, default_split, split_views
+from warpgs.io.splits import Split, default_split, split_views, twins
 from warpgs.pipeline.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.fit import Fit, StepReport, run, train_views
@@ -91,8 +91,12 @@ def read_scene(request: SceneRequest) -> tuple[Scene, Split, list[str]]:
     )  # fmt: skip
     if request.split is None:
         split, note = default_split(scene)
-        return scene, split, [*scene.notes, note]
-    return scene, split_views(scene, request.split), list(scene.notes)
+        notes = [*scene.notes, note]
+    else:
+        split, notes = split_views(scene, request.split), list(scene.notes)
+    for test, train in twins(scene, split):
+        notes.append(f"{test} is held out, but {train} was taken from the same place: its score says nothing of new views")
+    return scene, split, notes
 
 
 def _prepare_folder(out: Path, resume: bool) -> None:
