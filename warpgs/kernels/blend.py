@@ -52,25 +52,17 @@ def make_segments(real):
     return SimpleNamespace(sum_gradients=sum_gradients, gather_weights=gather_weights)
 
 
-def _kernels(real, device: torch.device, tile_size: int):
-    """The kernels for a device, and how to launch them over tiles."""
-    if device.type == "cuda" and real is wp.float32:
-        threads = tile_size * tile_size
-        k = blend_cuda.make_kernels(tile_size)
-
-        def launch(kernel, tiles: int, inputs: list) -> None:
-            bridge.launch(kernel, tiles * threads, inputs, device, block_dim=threads)
-
-    else:
-        k = blend_cpu.make_kernels(real, tile_size)
-
-        def launch(kernel, tiles: int, inputs: list) -> None:
-            bridge.launch(kernel, tiles, inputs, device, cost=10_000, block_dim=32)
-
-    return k, launch
+def _native(splats: torch.Tensor) -> bool:
+    """Whether the CUDA kernels apply; else the generic ones do."""
+    return splats.is_cuda and splats.dtype == torch.float32
 
 
-def _tile_inputs(splats: torch.Tensor, tiles: Tiles, real) -> list[wp.array]:
+def _launch(kernel, tiles: int, inputs: list, device: torch.device) -> None:
+    """One task per tile of the generic kernels."""
+    bridge.launch(kernel, tiles, inputs, device, cost=10_000, block_dim=32)
+
+
+def _tile_inputs(splats: torch.Tensor, tiles: Tiles, real) -> list[bridge.View]:
     return [
         bridge.view(splats.view(-1, splats.shape[-1]), real),
         bridge.view(tiles.ranges, wp.int32),
@@ -83,62 +75,75 @@ def _frame(width: int, height: int, tile_size: int) -> list[int]:
     return [width, height, columns, columns * rows]
 
 
-def _forward(splats, tiles, backgrounds, width, height, rule):
+def _forward(splats, tiles, backgrounds, width, height, rule, keep):
+    """Pictures, and what the backward pass needs: rgb, alpha, depth, transmittances, weights, ends, states (CUDA only)."""
+    if _native(splats):
+        return blend_cuda.forward(splats, tiles, backgrounds, width, height, rule, keep)
     real, device = bridge.real_of(splats), splats.device
-    k, launch = _kernels(real, device, tiles.size)
     shape = (len(backgrounds), height, width)
     rgb = splats.new_empty(*shape, 3)
     alpha, depth, transmittances, weights = (splats.new_empty(shape) for _ in range(4))
     ends = torch.empty(shape, dtype=torch.int32, device=device)
-    with bridge.stream_of(device):
-        inputs = [
-            *_tile_inputs(splats, tiles, real), bridge.view(backgrounds, real), *_frame(width, height, tiles.size),
-            rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), rule.transmittance_stop, int(rule.inclusive_stop),
-            bridge.view(rgb.view(-1, 3), real),
-            *(bridge.view(t.view(-1), real) for t in (alpha, depth, transmittances, weights)),
-            bridge.view(ends.view(-1), wp.int32),
-        ]  # fmt: skip
-        launch(k.forward, len(tiles.ranges), inputs)
-    return rgb, alpha, depth, transmittances, weights, ends
+    inputs = [
+        *_tile_inputs(splats, tiles, real), bridge.view(backgrounds, real), *_frame(width, height, tiles.size),
+        rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), rule.transmittance_stop, int(rule.inclusive_stop),
+        bridge.view(rgb.view(-1, 3), real),
+        *(bridge.view(t.view(-1), real) for t in (alpha, depth, transmittances, weights)),
+        bridge.view(ends.view(-1), wp.int32),
+    ]  # fmt: skip
+    _launch(blend_cpu.make_kernels(real, tiles.size).forward, len(tiles.ranges), inputs, device)
+    return rgb, alpha, depth, transmittances, weights, ends, splats.new_empty(0)
+
+
+def _backward(splats, tiles, backgrounds, width, height, rule, saved, v_rgb, v_alpha, v_depth):
+    """Gradient of the records by the generic kernels; ``saved`` as in blend_cuda.backward."""
+    _, depth, transmittances, weights, ends, _ = saved
+    real, device = bridge.real_of(splats), splats.device
+    v_splats = torch.zeros_like(splats)
+    v_slots = splats.new_zeros(len(tiles.slots), VALUES)
+    upstream = [bridge.view(v_rgb.contiguous().view(-1, 3), real)]
+    for v in (v_alpha, v_depth):
+        upstream.append(bridge.view((torch.zeros_like(depth) if v is None else v.contiguous()).view(-1), real))
+    inputs = [
+        *_tile_inputs(splats, tiles, real), bridge.view(tiles.slots, wp.int32), bridge.view(backgrounds, real),
+        *_frame(width, height, tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
+        *(bridge.view(t.view(-1), real) for t in (transmittances, weights, depth)), bridge.view(ends.view(-1), wp.int32),
+        *upstream, bridge.view(v_slots, real),
+    ]  # fmt: skip
+    _launch(blend_cpu.make_kernels(real, tiles.size).backward, len(tiles.ranges), inputs, device)
+    inputs = [
+        bridge.view(v_slots, real), bridge.view(tiles.starts, wp.int32), bridge.view(tiles.counts, wp.int32),
+        bridge.view(v_splats.view(-1, v_splats.shape[-1]), real),
+    ]  # fmt: skip
+    bridge.launch(make_segments(real).sum_gradients, len(tiles.counts), inputs, device, cost=5)
+    return v_splats
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx, splats, backgrounds, tiles, width, height, rule):
         splats, backgrounds = splats.contiguous(), backgrounds.contiguous()
-        rgb, alpha, depth, transmittances, weights, ends = _forward(splats, tiles, backgrounds, width, height, rule)
-        ctx.save_for_backward(splats, backgrounds, transmittances, weights, depth, ends)
-        ctx.tiles, ctx.rule = tiles, rule
+        keep = any(ctx.needs_input_grad)
+        rgb, alpha, depth, *rest = _forward(splats, tiles, backgrounds, width, height, rule, keep)
+        if keep:
+            # all of it as saved tensors: those are freed once the gradient is taken
+            ctx.save_for_backward(splats, backgrounds, rgb, depth, *rest, *tiles.tensors())
+            ctx.tile_size, ctx.size, ctx.rule = tiles.size, (width, height), rule
+        ctx.set_materialize_grads(False)
         return rgb, alpha, depth
 
     @staticmethod
     @once_differentiable
     def backward(ctx, v_rgb, v_alpha, v_depth):
-        splats, backgrounds, transmittances, weights, depth, ends = ctx.saved_tensors
-        tiles, rule = ctx.tiles, ctx.rule
-        real, device = bridge.real_of(splats), splats.device
-        k, launch = _kernels(real, device, tiles.size)
-        _, height, width = depth.shape
-        v_splats = torch.zeros_like(splats)
-        v_slots = splats.new_zeros(len(tiles.slots), VALUES)
-        pixels = [bridge.view(t.view(-1), real) for t in (transmittances, weights, depth)]
-        upstream = [bridge.view(v_rgb.contiguous().view(-1, 3), real)]
-        upstream += [bridge.view(v.contiguous().view(-1), real) for v in (v_alpha, v_depth)]
-        with bridge.stream_of(device):
-            inputs = [
-                *_tile_inputs(splats, tiles, real), bridge.view(tiles.slots, wp.int32), bridge.view(backgrounds, real),
-                *_frame(width, height, tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
-                *pixels, bridge.view(ends.view(-1), wp.int32), *upstream, bridge.view(v_slots, real),
-            ]  # fmt: skip
-            launch(k.backward, len(tiles.ranges), inputs)
-            inputs = [
-                bridge.view(v_slots, real), bridge.view(tiles.starts, wp.int32), bridge.view(tiles.counts, wp.int32),
-                bridge.view(v_splats.view(-1, v_splats.shape[-1]), real),
-            ]  # fmt: skip
-            bridge.launch(make_segments(real).sum_gradients, len(tiles.counts), inputs, device, cost=5)
+        splats, backgrounds, *tensors = ctx.saved_tensors
+        saved, tiles = tensors[:6], Tiles(ctx.tile_size, *tensors[6:])
+        if v_rgb is None:
+            v_rgb = torch.zeros_like(saved[0])
         v_backgrounds = None
         if ctx.needs_input_grad[1]:
-            v_backgrounds = torch.einsum("chw,chwk->ck", transmittances, v_rgb)
+            v_backgrounds = torch.einsum("chw,chwk->ck", saved[2], v_rgb)
+        work = blend_cuda.backward if _native(splats) else _backward
+        v_splats = work(splats, tiles, backgrounds, *ctx.size, ctx.rule, saved, v_rgb, v_alpha, v_depth)
         return v_splats, v_backgrounds, None, None, None, None
 
 
@@ -202,20 +207,21 @@ def contributions(
     _check(splats, tiles, width, height)
     splats = splats.detach().contiguous()
     real, device = bridge.real_of(splats), splats.device
-    k, launch = _kernels(real, device, tiles.size)
-    ends = _forward(splats, tiles, splats.new_zeros(len(splats), 3), width, height, rule)[-1]
-    weights = splats.new_zeros(len(tiles.slots), 2)
-    sums, maxima = splats.new_empty(splats.shape[:2]), splats.new_empty(splats.shape[:2])
-    with bridge.stream_of(device):
+    ends = _forward(splats, tiles, splats.new_zeros(len(splats), 3), width, height, rule, keep=False)[5]
+    if _native(splats):
+        weights = blend_cuda.instance_weights(splats, tiles, width, height, rule, ends)
+    else:
+        weights = splats.new_zeros(len(tiles.slots), 2)
         inputs = [
             *_tile_inputs(splats, tiles, real), bridge.view(tiles.slots, wp.int32), *_frame(width, height, tiles.size),
             rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), bridge.view(ends.view(-1), wp.int32),
             bridge.view(weights, real),
         ]  # fmt: skip
-        launch(k.contributions, len(tiles.ranges), inputs)
-        inputs = [
-            bridge.view(weights, real), bridge.view(tiles.starts, wp.int32), bridge.view(tiles.counts, wp.int32),
-            bridge.view(sums.view(-1), real), bridge.view(maxima.view(-1), real),
-        ]  # fmt: skip
-        bridge.launch(make_segments(real).gather_weights, len(tiles.counts), inputs, device)
+        _launch(blend_cpu.make_kernels(real, tiles.size).contributions, len(tiles.ranges), inputs, device)
+    sums, maxima = splats.new_empty(splats.shape[:2]), splats.new_empty(splats.shape[:2])
+    inputs = [
+        bridge.view(weights, real), bridge.view(tiles.starts, wp.int32), bridge.view(tiles.counts, wp.int32),
+        bridge.view(sums.view(-1), real), bridge.view(maxima.view(-1), real),
+    ]  # fmt: skip
+    bridge.launch(make_segments(real).gather_weights, len(tiles.counts), inputs, device)
     return sums, maxima

@@ -7,8 +7,10 @@ import functools
 import itertools
 import os
 import sys
+import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import torch
 import warp as wp
@@ -62,19 +64,101 @@ def _pool(count: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(count, thread_name_prefix="warpgs")
 
 
-def view(tensor: torch.Tensor, dtype) -> wp.array:
-    """The tensor's memory as a Warp array of that element type, without a copy and without gradient."""
-    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+class View(NamedTuple):
+    """A tensor as a kernel argument: its memory, read as elements of a Warp type."""
+
+    tensor: torch.Tensor
+    dtype: object
+
+    def array(self) -> wp.array:
+        """The same memory as a Warp array, without a copy and without gradient."""
+        return wp.from_torch(self.tensor.detach(), dtype=self.dtype, requires_grad=False)
+
+
+def view(tensor: torch.Tensor, dtype) -> View:
+    """A contiguous tensor as a kernel argument of that element type."""
+    return View(tensor, dtype)
+
+
+@functools.cache
+def _warp_stream(device: torch.device, pointer: int) -> wp.Stream:
+    return wp.Stream(wp.device_from_torch(device), cuda_stream=pointer)
+
+
+def _current_stream(device: torch.device) -> wp.Stream:
+    # torch.cuda.current_stream makes a Python object each time, which takes ten times as long
+    return _warp_stream(device, torch._C._cuda_getCurrentRawStream(device.index))
 
 
 @contextlib.contextmanager
 def stream_of(device: torch.device):
-    """Run Warp's work on torch's current stream of that device; nothing to do on a CPU."""
-    if device.type == "cuda":
-        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False):
-            yield
-    else:
+    """Run Warp's own work (sorts, scans) on torch's current stream of that device; nothing to do on a CPU.
+
+    Our kernels need no such block: `launch` hands them the stream.
+    """
+    if device.type != "cuda":
         yield
+        return
+    wanted, warp_device = _current_stream(device), wp.device_from_torch(device)
+    before = warp_device.stream
+    warp_device.set_stream(wanted, sync=False)
+    try:
+        yield
+    finally:
+        warp_device.set_stream(before, sync=False)
+
+
+class _Recorded:
+    """One CUDA kernel whose launch is recorded once and then only patched.
+
+    ``wp.launch`` packs and checks every argument anew, which was measured at 47 us on an H200's host, more than most of our
+    kernels take. The recorded launch keeps the packed arguments; a call writes pointers, sizes and scalars into them.
+    """
+
+    def __init__(self, kernel, device: torch.device, block_dim: int):
+        self.kernel, self.device, self.block_dim = kernel, wp.device_from_torch(device), block_dim
+        self.command, self.known = None, []
+        self.lock = threading.Lock()  # autograd launches from a thread of its own
+
+    def launch(self, count: int, inputs: Sequence, stream: wp.Stream) -> None:
+        with self.lock:
+            if self.command is None:
+                arrays = [a.array() if isinstance(a, View) else a for a in inputs]
+                self.command = wp.launch(
+                    self.kernel, count, inputs=[0, *arrays], device=self.device, block_dim=self.block_dim, record_cmd=True
+                )
+                self.command.fwd_args = None  # else the first call's arrays would stay in memory
+                self.known = [None] * len(inputs)
+            else:
+                self._patch(count, inputs)
+            self.command.launch(stream)
+
+    def _patch(self, count: int, inputs: Sequence) -> None:
+        command, known = self.command, self.known
+        if command.bounds.size != count:
+            command.set_dim(count)
+        for i, value in enumerate(inputs):
+            # In a loop most arguments are those of the call before, memory addresses included.
+            if type(value) is View:
+                tensor = value.tensor
+                now = (tensor.data_ptr(), tensor.shape)
+                if known[i] == now:
+                    continue
+                packed = command.params[i + 2]  # after the bounds and ``begin``
+                packed.data = now[0]
+                for axis in range(packed.ndim):
+                    packed.shape[axis] = now[1][axis]
+                if packed.ndim == 2:
+                    packed.strides[0] = tensor.stride(0) * tensor.element_size()
+                known[i] = now
+            elif known[i] != value:
+                command.params[i + 2].value = value
+                known[i] = value
+
+
+@functools.cache
+def _recorded(kernel, device: torch.device, block_dim: int) -> _Recorded:
+    return _Recorded(kernel, device, block_dim)
 
 
 def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: int = 1, block_dim: int = 256) -> None:
@@ -94,8 +178,9 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
     if count == 0:
         return
     if device.type == "cuda":
-        wp.launch(kernel, count, inputs=[0, *inputs], device=wp.device_from_torch(device), block_dim=block_dim)
+        _recorded(kernel, device, block_dim).launch(count, inputs, _current_stream(device))
         return
+    inputs = [a.array() if isinstance(a, View) else a for a in inputs]
     threads = torch.get_num_threads()
     if threads == 1 or count == 1 or count * cost < SERIAL_WORK:
         wp.launch(kernel, count, inputs=[0, *inputs], device="cpu", record_tape=False)

@@ -9,6 +9,8 @@ from torch.autograd.function import once_differentiable
 from warpgs.constants import Rule
 from warpgs.kernels import bridge, sh
 from warpgs.kernels.functions import make_projection, make_spans
+from warpgs.kernels.native import BLOCK
+from warpgs.kernels.native import make_functions as make_native
 
 RECORD = 12
 """Floats of a projected Gaussian ("splat"), 16-byte aligned in float32:
@@ -17,14 +19,15 @@ RECORD = 12
 
 
 @functools.cache
-def make_forward(real):
-    """The forward kernel for one scalar type."""
+def make_forward(real, native: bool):
+    """The forward kernel for one scalar type; ``native`` for CUDA and float32."""
     m = make_projection(real)
     s = make_spans(real)
     basis = sh.make_functions(real).basis
     vec3 = m.vec3
+    color_of = make_native().color if native else None
 
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.project.forward.{real.__name__}")
+    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.project.forward.{real.__name__}.{int(native)}")
     def forward(
         begin: int,
         means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
@@ -51,9 +54,15 @@ def make_forward(real):
         d = m.direction(means[n], view)
         y = basis(vec3(d[0], d[1], d[2]))
         color = vec3(real(0.5), real(0.5), real(0.5))
-        for k in range(16):
-            if k < sh_count:
-                color += y[k] * coefficients[n, k]
+        if wp.static(native):
+            for k in range(16):
+                if k >= sh_count:
+                    y[k] = real(0.0)
+            color += color_of(coefficients, n, sh_count, y)
+        else:
+            for k in range(16):
+                if k < sh_count:
+                    color += y[k] * coefficients[n, k]
         if not m.finite3(color):
             return
 
@@ -100,16 +109,21 @@ def make_forward(real):
 
 
 @functools.cache
-def make_backward(real):
-    """The backward kernel for one scalar type: one thread per Gaussian, over all cameras, so no sum needs atomics."""
+def make_backward(real, native: bool):
+    """The backward kernel for one scalar type: one thread per Gaussian, over all cameras, so no sum needs atomics.
+
+    ``native`` is for CUDA and float32: the Gaussians that some camera sees are dealt to the first threads of each block.
+    """
     m = make_projection(real)
     functions = sh.make_functions(real)
     vec3 = m.vec3
     vec4 = m.vec4
     vec16 = functions.vec16
     mat33 = m.mat33
+    compact = make_native().compact if native else None
+    color_backward = make_native().color_backward if native else None
 
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.project.backward.{real.__name__}")
+    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.project.backward.{real.__name__}.{int(native)}")
     def backward(
         begin: int,
         means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
@@ -125,6 +139,14 @@ def make_backward(real):
     ):  # fmt: skip
         n = begin + wp.tid()
         count = means.shape[0]
+        if wp.static(native):
+            seen = int(0)
+            if n < count:
+                for camera in range(viewmats.shape[0]):
+                    seen += tile_counts[camera * count + n]
+            n = compact(n, seen)
+            if n < 0:
+                return
         v_mean = vec3()
         v_quat = vec4()
         v_log_scale = vec3()
@@ -223,10 +245,16 @@ def make_backward(real):
                     if not (splats[i, 6 + channel] > real(0.0)):  # clamped at zero
                         v_color[channel] = real(0.0)
                 w = vec16()
-                for k in range(16):
-                    if k < sh_count:
-                        v_coefficients[n, k] = v_coefficients[n, k] + basis[k] * v_color
-                        w[k] = wp.dot(coefficients[n, k], v_color)
+                if wp.static(native):
+                    for k in range(16):
+                        if k >= sh_count:
+                            basis[k] = real(0.0)
+                    w = color_backward(coefficients, n, sh_count, basis, v_color, camera, v_coefficients)
+                else:
+                    for k in range(16):
+                        if k < sh_count:
+                            v_coefficients[n, k] = v_coefficients[n, k] + basis[k] * v_color
+                            w[k] = wp.dot(coefficients[n, k], v_color)
                 v_centered = vec3()
                 if d[3] > real(0.0):
                     v_unit_direction = functions.basis_backward(unit, w)
@@ -266,21 +294,27 @@ def _inputs(means, quats, log_scales, logit_opacities, coefficients, viewmats, K
     return [bridge.view(t, dtype) for t, dtype in zip(tensors, types)]
 
 
+def _native(tensor: torch.Tensor) -> bool:
+    return tensor.is_cuda and tensor.dtype == torch.float32
+
+
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks, size, sh_count, rule, tile):
         real = bridge.real_of(means)
         tensors = [t.contiguous() for t in (means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks)]
         count = len(viewmats) * len(means)
-        splats = means.new_zeros(count, RECORD)
-        tile_counts = torch.zeros(count, dtype=torch.int32, device=means.device)
-        with bridge.stream_of(means.device):
-            inputs = [
-                *_inputs(*tensors), *size, tile, sh_count,
-                rule.near, rule.low_pass, rule.alpha_cut, rule.square_sigma,
-                bridge.view(splats, real), bridge.view(tile_counts, wp.int32),
-            ]  # fmt: skip
-            bridge.launch(make_forward(real), count, inputs, means.device, cost=5)
+        zeros = torch.zeros((RECORD + 1) * count, dtype=torch.int32, device=means.device)
+        if real is wp.float32:  # one allocation for both
+            splats, tile_counts = zeros[: RECORD * count].view(means.dtype).view(count, RECORD), zeros[RECORD * count :]
+        else:
+            splats, tile_counts = means.new_zeros(count, RECORD), zeros[:count]
+        inputs = [
+            *_inputs(*tensors), *size, tile, sh_count,
+            rule.near, rule.low_pass, rule.alpha_cut, rule.square_sigma,
+            bridge.view(splats, real), bridge.view(tile_counts, wp.int32),
+        ]  # fmt: skip
+        bridge.launch(make_forward(real, _native(means)), count, inputs, means.device, cost=5)
         ctx.save_for_backward(*tensors, splats, tile_counts)
         ctx.size, ctx.sh_count, ctx.rule = size, sh_count, rule
         ctx.mark_non_differentiable(tile_counts)
@@ -294,19 +328,24 @@ class _Project(torch.autograd.Function):
         m = make_projection(real)
         device = splats.device
         v_splats = v_splats.contiguous().view(-1, RECORD)
-        gradients = [torch.zeros_like(t) for t in tensors[:5]]
+        # One allocation for the five, coefficients first: their rows are written in aligned pieces.
+        order = (4, 0, 1, 2, 3)
+        flat = splats.new_zeros(sum(t.numel() for t in tensors[:5])).split([tensors[i].numel() for i in order])
+        gradients = [flat[order.index(i)].view(tensors[i].shape) for i in range(5)]
         cameras, count = len(tensors[5]), len(tensors[0])
         wants_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
         rows = (cameras, count) if wants_camera else (0, 0)
-        v_viewmats, v_Ks = splats.new_zeros(*rows, 4, 4), splats.new_zeros(*rows, 3, 3)
-        with bridge.stream_of(device):
-            outputs = [bridge.view(g, t) for g, t in zip(gradients, (m.vec3, m.vec4, m.vec3, real, m.vec3))]
-            inputs = [
-                *_inputs(*tensors), *ctx.size, ctx.sh_count, ctx.rule.near, ctx.rule.low_pass,
-                bridge.view(splats, real), bridge.view(tile_counts, wp.int32), bridge.view(v_splats, real),
-                int(wants_camera), *outputs, bridge.view(v_viewmats, m.mat44), bridge.view(v_Ks, m.mat33),
-            ]  # fmt: skip
-            bridge.launch(make_backward(real), count, inputs, device, cost=10 * cameras)
+        make = splats.new_zeros if wants_camera else splats.new_empty
+        v_viewmats, v_Ks = make(*rows, 4, 4), make(*rows, 3, 3)
+        outputs = [bridge.view(g, t) for g, t in zip(gradients, (m.vec3, m.vec4, m.vec3, real, m.vec3))]
+        inputs = [
+            *_inputs(*tensors), *ctx.size, ctx.sh_count, ctx.rule.near, ctx.rule.low_pass,
+            bridge.view(splats, real), bridge.view(tile_counts, wp.int32), bridge.view(v_splats, real),
+            int(wants_camera), *outputs, bridge.view(v_viewmats, m.mat44), bridge.view(v_Ks, m.mat33),
+        ]  # fmt: skip
+        native = _native(splats)
+        threads = -(-count // BLOCK) * BLOCK if native else count
+        bridge.launch(make_backward(real, native), threads, inputs, device, cost=10 * cameras, block_dim=BLOCK)
         camera_gradients = (v_viewmats.sum(1), v_Ks.sum(1)) if wants_camera else (None, None)
         return *gradients, *camera_gradients, None, None, None, None
 

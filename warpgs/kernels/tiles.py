@@ -12,9 +12,14 @@ from warpgs.constants import Rule
 from warpgs.errors import ResourceError
 from warpgs.kernels import bridge
 from warpgs.kernels.functions import make_spans
+from warpgs.kernels.native import make_functions as make_native
 
-BYTES_PER_INSTANCE = 24 + 40
-"""Two sort buffers of (key, slot), owner and sorted id; and the gradient slot of the backward pass in float32."""
+BYTES_PER_INSTANCE = 24 + 48 + 80
+"""Two sort buffers of (key, slot), owner and sorted id; of the backward pass on CUDA, the gradient slot and the share of
+the states that blending leaves (blend_cuda.CHUNK)."""
+
+SMALL = 32
+"""Tiles of a Gaussian that one CUDA thread lists alone."""
 
 MAX_INSTANCES = 2**31 - 1
 """Warp's array sizes and thread numbers are signed 32-bit."""
@@ -40,6 +45,14 @@ class Tiles:
     """First slot of each Gaussian, int32, shape [C * N]."""
     counts: torch.Tensor
     """Number of slots of each Gaussian, int32, shape [C * N]."""
+    tile_ids: torch.Tensor
+    """Tile of each instance, int32, shape [M]; the number of tiles where none was found after all."""
+    total: torch.Tensor
+    """M, int64, shape [1], where kernels can read it."""
+
+    def tensors(self) -> tuple[torch.Tensor, ...]:
+        """All but the size, in the order in which the constructor takes them."""
+        return self.ranges, self.splat_ids, self.slots, self.starts, self.counts, self.tile_ids, self.total
 
 
 def grid(width: int, height: int, tile_size: int) -> tuple[int, int]:
@@ -50,8 +63,6 @@ def grid(width: int, height: int, tile_size: int) -> tuple[int, int]:
 @functools.cache
 def make_kernels(real):
     """Kernels for one scalar type."""
-    s = make_spans(real)
-    vec3 = wp.types.vector(3, real)
 
     @wp.kernel(enable_backward=False, module=f"warpgs.kernels.tiles.{real.__name__}")
     def depth_keys(
@@ -67,38 +78,13 @@ def make_kernels(real):
             keys[i] = real(wp.inf)
 
     @wp.kernel(enable_backward=False, module=f"warpgs.kernels.tiles.{real.__name__}")
-    def emit(
-        begin: int, splats: wp.array2d(dtype=real), order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
-        starts: wp.array(dtype=int), per_camera: int, width: int, height: int, tile_size: int,
-        alpha_cut: real, square_sigma: real, columns: int, tiles: int, no_tile: int,
+    def ordered_counts(
+        begin: int, order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
         # outputs
-        keys: wp.array(dtype=int), slots: wp.array(dtype=int), owners: wp.array(dtype=int),
+        counts: wp.array(dtype=wp.int64),
     ):  # fmt: skip
-        i = order[begin + wp.tid()]
-        if tile_counts[i] == 0:
-            return
-        slot = starts[i]
-        end = slot + tile_counts[i]
-        base = (i // per_camera) * tiles
-        factor = vec3(splats[i, 2], splats[i, 3], splats[i, 4])
-        reach = s.reach_of(splats[i, 5], alpha_cut, square_sigma)
-        rows = s.tile_rows(splats[i, 1], splats[i, 11], height, tile_size)
-        for row in range(rows[0], rows[1]):
-            span = s.tile_columns(
-                splats[i, 0], splats[i, 1], factor, reach, splats[i, 10], splats[i, 11], row, width, tile_size
-            )
-            for column in range(span[0], span[1]):
-                if slot < end:
-                    keys[slot] = base + row * columns + column
-                    slots[slot] = slot
-                    owners[slot] = i
-                    slot += 1
-        # Two compilations of one formula may round apart, and then a margin tile is counted but not found again.
-        while slot < end:
-            keys[slot] = no_tile
-            slots[slot] = slot
-            owners[slot] = i
-            slot += 1
+        j = begin + wp.tid()
+        counts[j] = wp.int64(tile_counts[order[j]])
 
     @wp.kernel(enable_backward=False, module="warpgs.kernels.tiles.ranges")
     def find_ranges(
@@ -117,7 +103,100 @@ def make_kernels(real):
         if i == count - 1 or keys[wp.min(i + 1, count - 1)] != tile:
             ranges[tile, 1] = i + 1
 
-    return SimpleNamespace(depth_keys=depth_keys, emit=emit, find_ranges=find_ranges)
+    return SimpleNamespace(depth_keys=depth_keys, ordered_counts=ordered_counts, find_ranges=find_ranges)
+
+
+@functools.cache
+def make_emit(real, native: bool):
+    """The kernel that writes the instances of each Gaussian, row by row of tiles.
+
+    ``native`` is for CUDA: a Gaussian of more than SMALL tiles is written by its whole warp, a lane a row.
+    """
+    s = make_spans(real)
+    vec3 = wp.types.vector(3, real)
+    vec2i = s.vec2i
+    lanes = make_native() if native else None
+
+    @wp.func
+    def span_of(
+        splats: wp.array2d(dtype=real), i: int, row: int, alpha_cut: real, square_sigma: real, width: int, tile_size: int
+    ) -> vec2i:
+        factor = vec3(splats[i, 2], splats[i, 3], splats[i, 4])
+        reach = s.reach_of(splats[i, 5], alpha_cut, square_sigma)
+        return s.tile_columns(splats[i, 0], splats[i, 1], factor, reach, splats[i, 10], splats[i, 11], row, width, tile_size)
+
+    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.tiles.emit.{real.__name__}.{int(native)}")
+    def emit(
+        begin: int, splats: wp.array2d(dtype=real), order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
+        ends: wp.array(dtype=wp.int64), count: int, per_camera: int, width: int, height: int, tile_size: int,
+        alpha_cut: real, square_sigma: real, columns: int, tiles: int, no_tile: int,
+        # outputs
+        starts: wp.array(dtype=int), keys: wp.array(dtype=int), slots: wp.array(dtype=int), owners: wp.array(dtype=int),
+    ):  # fmt: skip
+        j = begin + wp.tid()
+        i = int(0)
+        touched = int(0)
+        slot = int(0)
+        end = int(0)
+        if j < count:
+            i = order[j]
+            touched = tile_counts[i]
+            end = int(ends[j])
+            slot = end - touched
+            starts[i] = slot
+        if touched > 0 and wp.static(SMALL if native else 2**31 - 1) >= touched:
+            rows = s.tile_rows(splats[i, 1], splats[i, 11], height, tile_size)
+            base = (i // per_camera) * tiles
+            for row in range(rows[0], rows[1]):
+                span = span_of(splats, i, row, alpha_cut, square_sigma, width, tile_size)
+                for column in range(span[0], span[1]):
+                    if slot < end:
+                        keys[slot] = base + row * columns + column
+                        slots[slot] = slot
+                        owners[slot] = i
+                        slot += 1
+            # Two compilations of one formula may round apart, and then a margin tile is counted but not found again.
+            while slot < end:
+                keys[slot] = no_tile
+                slots[slot] = slot
+                owners[slot] = i
+                slot += 1
+        if wp.static(native):
+            heavy = lanes.ballot(wp.where(touched > SMALL, 1, 0))
+            lane = wp.tid() % 32
+            while heavy != 0:
+                owner = lanes.lowest(heavy)
+                heavy = heavy & (heavy - 1)
+                g = lanes.broadcast(i, owner)
+                at = lanes.broadcast(slot, owner)
+                last = lanes.broadcast(end, owner)
+                base = (g // per_camera) * tiles
+                rows = s.tile_rows(splats[g, 1], splats[g, 11], height, tile_size)
+                first = rows[0]
+                while first < rows[1]:
+                    row = first + lane
+                    span = vec2i(0, 0)
+                    if row < rows[1]:
+                        span = span_of(splats, g, row, alpha_cut, square_sigma, width, tile_size)
+                    wide = span[1] - span[0]
+                    sum = lanes.running_sum(wide)
+                    to = at + sum - wide
+                    for column in range(span[0], span[1]):
+                        if to < last:
+                            keys[to] = base + row * columns + column
+                            slots[to] = to
+                            owners[to] = g
+                            to += 1
+                    at += lanes.broadcast(sum, 31)
+                    first += 32
+                at += lane
+                while at < last:
+                    keys[at] = no_tile
+                    slots[at] = at
+                    owners[at] = g
+                    at += 32
+
+    return emit
 
 
 def available_bytes(device: torch.device) -> int:
@@ -128,12 +207,22 @@ def available_bytes(device: torch.device) -> int:
     return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
+@functools.cache
+def installed_bytes(device: torch.device) -> int:
+    """Memory of a device [bytes]."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_properties(device).total_memory
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
 def _checked_total(counts: torch.Tensor, ends: torch.Tensor, tiles: int, budget_bytes: int | None) -> int:
     total = int(ends[-1])
-    budget = available_bytes(counts.device) * 4 // 5 if budget_bytes is None else budget_bytes
     needed = total * BYTES_PER_INSTANCE
-    # below 16 MB the question is not worth asking the system
-    if total <= MAX_INSTANCES and (needed <= budget or (budget_bytes is None and needed < 2**24)):
+    # asking what is free costs 0.1 ms or more: not worth it for a twentieth of the machine
+    if total <= MAX_INSTANCES and budget_bytes is None and needed < installed_bytes(counts.device) // 20:
+        return total
+    budget = available_bytes(counts.device) * 4 // 5 if budget_bytes is None else budget_bytes
+    if total <= MAX_INSTANCES and needed <= budget:
         return total
     visible = int((counts > 0).sum())
     limit = f"{MAX_INSTANCES:,} instances" if total > MAX_INSTANCES else f"{budget / 2**30:.2f} GiB"
@@ -184,36 +273,37 @@ def bin_tiles(
     no_tile = sizes["C"] * tiles
     counts = tile_counts.contiguous().view(-1)
     ranges = torch.zeros(no_tile, 2, dtype=torch.int32, device=device)
-    empty = torch.zeros(0, dtype=torch.int32, device=device)
+    ints = functools.partial(torch.empty, dtype=torch.int32, device=device)
     if count == 0:
-        return Tiles(tile_size, ranges, empty, empty, empty, counts)
+        return Tiles(
+            tile_size, ranges, *(ints(0) for _ in range(3)), counts, ints(0), torch.zeros(1, dtype=torch.int64, device=device)
+        )
 
     splats = splats.detach().contiguous().view(count, -1)
-    ints = functools.partial(torch.empty, dtype=torch.int32, device=device)
+    splats_view, counts_view = bridge.view(splats, real), bridge.view(counts, wp.int32)
     with bridge.stream_of(device):
         depths, order = torch.empty(2 * count, dtype=splats.dtype, device=device), ints(2 * count)
         depths_view, order_view = bridge.view(depths, real), bridge.view(order, wp.int32)
-        splats_view, counts_view = bridge.view(splats, real), bridge.view(counts, wp.int32)
         bridge.launch(k.depth_keys, count, [splats_view, counts_view, depths_view, order_view], device)
-        wp.utils.radix_sort_pairs(depths_view, order_view, count)
-        order = order[:count]
-        sorted_counts = counts[order]
-        ends = torch.cumsum(sorted_counts, 0, dtype=torch.int64)
+        wp.utils.radix_sort_pairs(depths_view.array(), order_view.array(), count)
+        ends = torch.empty(count, dtype=torch.int64, device=device)
+        ends_view = bridge.view(ends, wp.int64)
+        bridge.launch(k.ordered_counts, count, [order_view, counts_view, ends_view], device)
+        torch.cumsum(ends, 0, out=ends)
         total = _checked_total(counts, ends, tiles, budget_bytes)
-        starts = ints(count)
-        starts[order] = (ends - sorted_counts).to(torch.int32)
-        if total == 0:
-            return Tiles(tile_size, ranges, empty, empty, starts, counts)
-
-        keys, slots, owners, ids = ints(2 * total), ints(2 * total), ints(total), ints(total)
+        starts, keys, slots, owners = ints(count), ints(2 * total), ints(2 * total), ints(total)
         keys_view, slots_view, owners_view = (bridge.view(t, wp.int32) for t in (keys, slots, owners))
         inputs = [
-            splats_view, bridge.view(order, wp.int32), counts_view, bridge.view(starts, wp.int32), sizes["N"],
+            splats_view, order_view, counts_view, ends_view, count, sizes["N"],
             width, height, tile_size, rule.alpha_cut, rule.square_sigma, columns, tiles, no_tile,
-            keys_view, slots_view, owners_view,
+            bridge.view(starts, wp.int32), keys_view, slots_view, owners_view,
         ]  # fmt: skip
-        bridge.launch(k.emit, count, inputs, device, cost=10)
-        wp.utils.radix_sort_pairs(keys_view, slots_view, total, end_bit=no_tile.bit_length())
+        threads = -(-count // 256) * 256 if device.type == "cuda" else count
+        bridge.launch(make_emit(real, device.type == "cuda"), threads, inputs, device, cost=10)
+        if total > 0:
+            wp.utils.radix_sort_pairs(keys_view.array(), slots_view.array(), total, end_bit=no_tile.bit_length())
+        # the second half of the sorted buffers is free again
+        ids = slots[total:]
         inputs = [keys_view, slots_view, owners_view, total, no_tile, bridge.view(ids, wp.int32), bridge.view(ranges, wp.int32)]
         bridge.launch(k.find_ranges, total, inputs, device)
-    return Tiles(tile_size, ranges, ids, slots[:total].clone(), starts, counts)
+    return Tiles(tile_size, ranges, ids, slots[:total], starts, counts, keys[:total], ends[-1:])

@@ -1,0 +1,200 @@
+// One warp takes CHUNK instances back to front, for all pixels of their tiles: item = number of the chunk.
+__shared__ float4 s_a[WARPS][32], s_b[WARPS][32], s_c[WARPS][32];
+const int warp = threadIdx.x / 32;
+constexpr bool with_depth = WITH_DEPTH;
+const int total = (int)totals.data[0];
+const int floor = item * CHUNK;
+constexpr int values = with_depth ? 10 : 9;
+// which of the sums this lane holds after the reduction below
+int held = 0;
+{
+    int n = values, size = values;
+    #pragma unroll
+    for (int distance = 16; distance > 0; distance /= 2) {
+        const int half = (n + 1) / 2;
+        if (n > 1 && (lane & distance)) {
+            held += half;
+            size -= half;
+        } else
+            size = min(size, half);
+        n = half;
+    }
+    held = size > 0 && !(lane & 1) ? held : -1;
+}
+int top_instance = min(floor + CHUNK, total);
+while (top_instance > floor) {
+    // the part of this chunk that belongs to one tile
+    const int tile = keys.data[top_instance - 1];
+    int first = top_instance - 1, tile_begin = first;
+    if (tile != no_tile) {
+        tile_begin = ranges.data[2 * tile];
+        first = max(floor, tile_begin);
+    }
+    const int stop_at = top_instance;
+    top_instance = first;
+    const int camera = tile / tiles, in_camera = tile - camera * tiles;
+    const int left = (in_camera % columns) * SIDE, top = (in_camera / columns) * SIDE;
+    const float px = left + lane % 8 + 0.5f, py = top + lane / 8 + 0.5f;  // of the pixel in the first block
+    const float* background = backgrounds.data + 3 * camera;
+    float T[BLOCKS], behind[BLOCKS], g0[BLOCKS], g1[BLOCKS], g2[BLOCKS], vz[BLOCKS], vw[BLOCKS];
+    int last[BLOCKS];
+    int part_last = 0;
+    #pragma unroll
+    for (int k = 0; k < BLOCKS; ++k) {
+        const int x = left + (k % WIDE) * 8 + lane % 8, y = top + (k / WIDE) * 4 + lane / 8;
+        T[k] = 1.0f;
+        behind[k] = g0[k] = g1[k] = g2[k] = vz[k] = vw[k] = 0.0f;
+        last[k] = 0;
+        if (tile != no_tile && x < width && y < height) {
+            const long long o = ((long long)camera * height + y) * width + x;
+            last[k] = ends.data[o];
+        }
+        part_last = max(part_last, last[k]);
+    }
+    part_last = __reduce_max_sync(ALL, part_last);
+    if (part_last > first) {
+        #pragma unroll
+        for (int k = 0; k < BLOCKS; ++k) {
+            const int x = left + (k % WIDE) * 8 + lane % 8, y = top + (k / WIDE) * 4 + lane / 8;
+            if (last[k] > first) {
+                const long long o = ((long long)camera * height + y) * width + x;
+                const float T_end = transmittances.data[o];
+                T[k] = T_end;
+                g0[k] = v_rgb.data[3 * o];
+                g1[k] = v_rgb.data[3 * o + 1];
+                g2[k] = v_rgb.data[3 * o + 2];
+                float z_end = 0.0f;
+                if (with_depth) {
+                    const float W = weights.data[o];
+                    if (W > 0.0f) {
+                        vz[k] = v_depth.data[o] / W;
+                        vw[k] = -vz[k] * depth.data[o];
+                        z_end = depth.data[o] * W;
+                    }
+                    vw[k] += v_alpha.data[o];
+                }
+                behind[k] = T_end * (background[0] * g0[k] + background[1] * g1[k] + background[2] * g2[k]);
+                if (last[k] > stop_at) {
+                    // something was blended behind this chunk: all of the picture less what lies up to here
+                    const float* state = states.data + (long long)(stop_at / CHUNK) * (STATE * PIXELS) + k * 32 + lane;
+                    T[k] = state[0];
+                    behind[k] = (rgb.data[3 * o] - state[PIXELS]) * g0[k]
+                        + (rgb.data[3 * o + 1] - state[2 * PIXELS]) * g1[k]
+                        + (rgb.data[3 * o + 2] - state[3 * PIXELS]) * g2[k];
+                    if (with_depth)
+                        behind[k] += (z_end - state[4 * PIXELS]) * vz[k] + (state[0] - T_end) * vw[k];
+                }
+            }
+        }
+    }
+    for (int batch = (stop_at - 1) & ~31; batch + 32 > first; batch -= 32) {
+        const int i = batch + lane;
+        const bool mine = i >= first && i < stop_at;
+        unsigned mask = 0;
+        int slot = 0;
+        __syncwarp();
+        if (mine) {
+            slot = slots.data[i];
+            if (i < part_last) {
+                Splat s;
+                s.load(splats.data, splat_ids.data[i]);
+                s.rescale();
+                const float limit = limit_of(s.b.y, alpha_cut);
+                #pragma unroll
+                for (int k = 0; k < BLOCKS; ++k)
+                    if (whole_tiles || s.touches((float)(left + (k % WIDE) * 8), (float)(top + (k / WIDE) * 4), limit))
+                        mask |= 1u << k;
+                s_a[warp][lane] = s.a;
+                s_b[warp][lane] = s.b;
+                s_c[warp][lane] = s.c;
+            }
+        }
+        __syncwarp();
+        unsigned todo = __ballot_sync(ALL, mask != 0);
+        unsigned written = 0;
+        while (todo) {
+            const int j = 31 - __clz(todo);
+            todo &= ~(1u << j);
+            const unsigned blocks = __shfl_sync(ALL, mask, j);
+            const float4 a = s_a[warp][j], b = s_b[warp][j], c = s_c[warp][j];
+            float v[VALUES] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+            bool any = false;
+            float dx[WIDE], p[WIDE];
+            #pragma unroll
+            for (int k = 0; k < WIDE; ++k) {
+                dx[k] = __fsub_rn(px + 8 * k, a.x);
+                p[k] = __fmul_rn(a.z, dx[k]);
+            }
+            #pragma unroll
+            for (int row = 0; row < BLOCKS / WIDE; ++row) {
+                if (!(blocks >> (row * WIDE) & ((1u << WIDE) - 1u)))
+                    continue;
+                const float dy = __fsub_rn(py + 4 * row, a.y);
+                const float e2 = __fmul_rn(b.x, dy);
+                #pragma unroll
+                for (int column = 0; column < WIDE; ++column) {
+                    const int k = row * WIDE + column;
+                    if (!(blocks >> k & 1u))
+                        continue;
+                    const float e1 = __fmaf_rn(a.w, dy, p[column]);
+                    const float g = falloff(e1, e2);
+                    const float raw = __fmul_rn(b.y, g), alpha = fminf(alpha_max, raw);
+                    const bool drawn = alpha >= alpha_cut && batch + j < last[k];
+                    if (!__any_sync(ALL, drawn))
+                        continue;
+                    any = true;
+                    if (drawn) {
+                        const float inverse = __fdividef(1.0f, 1.0f - alpha);
+                        T[k] *= inverse;
+                        const float w = alpha * T[k];
+                        float d = b.z * g0[k] + b.w * g1[k] + c.x * g2[k];
+                        if (with_depth)
+                            d += c.y * vz[k] + vw[k];
+                        const float v_a = raw <= alpha_max ? T[k] * d - behind[k] * inverse : 0.0f;
+                        behind[k] += w * d;
+                        const float v_q = -raw * v_a;
+                        const float v_e1 = v_q * e1, v_e2 = v_q * e2;
+                        v[0] += v_e1;
+                        v[1] += v_e2;
+                        v[2] += v_e1 * dx[column];
+                        v[3] += v_e1 * dy;
+                        v[4] += v_e2 * dy;
+                        v[5] += v_a * g;
+                        v[6] += w * g0[k];
+                        v[7] += w * g1[k];
+                        v[8] += w * g2[k];
+                        if (with_depth)
+                            v[9] += w * vz[k];
+                    }
+                }
+            }
+            if (!any)
+                continue;
+            written |= 1u << j;
+            // Each step halves the sums a lane holds instead of adding all of them: 12 shuffles for 9 sums, not 45.
+            int n = values;
+            #pragma unroll
+            for (int distance = 16; distance > 0; distance /= 2) {
+                const int half = (n + 1) / 2;
+                const bool upper = lane & distance;
+                if (n == 1)
+                    v[0] += __shfl_xor_sync(ALL, v[0], distance);
+                else {
+                    #pragma unroll
+                    for (int h = 0; h < half; ++h) {
+                        const float low = v[h], high = h + half < n ? v[h + half] : 0.0f;
+                        v[h] = (upper ? high : low) + __shfl_xor_sync(ALL, upper ? low : high, distance);
+                    }
+                }
+                n = half;
+            }
+            const int target = __shfl_sync(ALL, slot, j);
+            if (held >= 0)
+                v_slots.data[(long long)STRIDE * target + held] = v[0];
+        }
+        if (mine && !(written >> lane & 1u)) {
+            float4* row = reinterpret_cast<float4*>(v_slots.data + (long long)STRIDE * slot);
+            row[0] = row[1] = row[2] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+        }
+    }
+}

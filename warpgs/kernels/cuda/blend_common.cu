@@ -1,0 +1,45 @@
+// What the blending bodies share. Upper-case names are replaced by numbers before compilation (blend_cuda.py).
+// A tile is cut into blocks of 8 x 4 pixels, one pixel a lane. Products and sums that decide alpha are spelled with their
+// rounding: the compiler's choice of fused operations may differ between kernels, and both passes must see one alpha.
+constexpr unsigned ALL = 0xffffffffu;
+constexpr int WIDE = SIDE / 8, BLOCKS = WIDE * (SIDE / 4), PIXELS = SIDE * SIDE;
+const int lane = threadIdx.x % 32;
+struct Splat {
+    float4 a, b, c;  // the record; u11 = a.z, u12 = a.w, u22 = b.x in units where the falloff is 2^-|U d|^2
+    __device__ void load(const float* splats, int i) {
+        const float4* record = reinterpret_cast<const float4*>(splats) + 3ll * i;
+        a = record[0];
+        b = record[1];
+        c = record[2];
+    }
+    __device__ void rescale() {
+        a.z *= SCALE;
+        a.w *= SCALE;
+        b.x *= SCALE;
+    }
+    // Whether some pixel centre of the 8 x 4 block at (left, top) may have alpha at or above the cut, where 2^-limit
+    // does: the least |U d|^2 over the block lies on one of the two edges that face the mean. Distances are
+    // widened by what rounding can take from them. A NaN is kept; it draws nothing.
+    __device__ bool touches(float left, float top, float limit) const {
+        const float slack_x = 0.01f + 2e-6f * (fabsf(a.x) + c.z), slack_y = 0.01f + 2e-6f * (fabsf(a.y) + c.w);
+        const float x0 = left + 0.5f - a.x - slack_x, x1 = left + 7.5f - a.x + slack_x;
+        const float y0 = top + 0.5f - a.y - slack_y, y1 = top + 3.5f - a.y + slack_y;
+        const float near_x = fminf(fmaxf(0.0f, x0), x1), near_y = fminf(fmaxf(0.0f, y0), y1);
+        const float y = fminf(fmaxf(-__fdividef(a.w * a.z * near_x, a.w * a.w + b.x * b.x), y0), y1);
+        const float x = fminf(fmaxf(-__fdividef(a.w * near_y, a.z), x0), x1);
+        return !(near_x > c.z || -near_x > c.z || near_y > c.w || -near_y > c.w
+                 || (below(near_x, y) > limit && below(x, near_y) > limit));
+    }
+    __device__ float below(float dx, float dy) const {
+        const float p = a.z * dx, r = a.w * dy, e2 = b.x * dy;
+        const float e1 = fmaxf(fabsf(p + r) - 1e-6f * (fabsf(p) + fabsf(r)), 0.0f);
+        return (e1 * e1 + e2 * e2) * 0.99999f;
+    }
+};
+// 2^-limit of the opacity is the cut; a cut of 0 has no limit
+auto limit_of = [](float opacity, float alpha_cut) { return __log2f(opacity / alpha_cut) * 1.00001f + 1e-4f; };
+auto falloff = [](float e1, float e2) {
+    float g;
+    asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(g) : "f"(__fmaf_rn(-e1, e1, __fmul_rn(-e2, e2))));
+    return g;
+};

@@ -1,0 +1,53 @@
+// Gradient of one record from the sums of its instances. Their slots are neighbours: a thread sums a short list, the warp
+// shares a long one. The factors common to all pixels are applied here, once.
+constexpr unsigned ALL = 0xffffffffu;
+constexpr int SHORT = 32;
+constexpr bool with_depth = WITH_DEPTH;
+constexpr int values = with_depth ? 10 : 9;
+const int lane = threadIdx.x % 32;
+const bool valid = i < counts.shape[0];
+const int count = valid ? counts.data[i] : 0;
+const long long start = count > 0 ? starts.data[i] : 0;
+float v[VALUES] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+if (count <= SHORT)
+    for (int s = 0; s < count; ++s) {
+        const float4* row = reinterpret_cast<const float4*>(v_slots.data + STRIDE * (start + s));
+        const float4 p = row[0], q = row[1];
+        v[0] += p.x; v[1] += p.y; v[2] += p.z; v[3] += p.w;
+        v[4] += q.x; v[5] += q.y; v[6] += q.z; v[7] += q.w;
+        const float* rest = reinterpret_cast<const float*>(row + 2);
+        v[8] += rest[0];
+        if (with_depth)
+            v[9] += rest[1];
+    }
+unsigned heavy = __ballot_sync(ALL, count > SHORT);
+while (heavy) {
+    const int owner = __ffs(heavy) - 1;
+    heavy &= heavy - 1u;
+    const int many = __shfl_sync(ALL, count, owner);
+    const long long from = __shfl_sync(ALL, start, owner);
+    float u[VALUES] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+    for (int s = lane; s < many; s += 32)
+        for (int k = 0; k < values; ++k)
+            u[k] += v_slots.data[STRIDE * (from + s) + k];
+    #pragma unroll
+    for (int k = 0; k < VALUES; ++k) {
+        for (int distance = 16; distance > 0; distance /= 2)
+            u[k] += __shfl_xor_sync(ALL, u[k], distance);
+        if (lane == owner)
+            v[k] = u[k];
+    }
+}
+if (valid) {
+    float4* row = reinterpret_cast<float4*>(v_splats.data) + 3ll * i;
+    if (count > 0) {
+        const float4* record = reinterpret_cast<const float4*>(splats.data) + 3ll * i;
+        const float4 a = record[0], b = record[1];
+        constexpr float back = 1.0f / SCALE;
+        const float s1 = back * v[0], s2 = back * v[1];
+        row[0] = make_float4(-a.z * s1, -(a.w * s1 + b.x * s2), back * v[2], back * v[3]);
+        row[1] = make_float4(back * v[4], v[5], v[6], v[7]);
+        row[2] = make_float4(v[8], v[9], 0.0f, 0.0f);
+    } else
+        row[0] = row[1] = row[2] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+}

@@ -1,0 +1,147 @@
+"""CUDA functions where plain Warp has no means: between the threads of a warp or block, and loads of 16 bytes."""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+BLOCK = 256
+"""Threads of a block that `compact` works in."""
+
+_COMPACT = """
+    __shared__ int s_counts[BLOCK / 32], s_items[BLOCK];
+    const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
+    const unsigned mask = __ballot_sync(0xffffffffu, wanted != 0);
+    if (lane == 0)
+        s_counts[warp] = __popc(mask);
+    __syncthreads();
+    int before = 0, all = 0;
+    for (int w = 0; w < BLOCK / 32; ++w) {
+        before += w < warp ? s_counts[w] : 0;
+        all += s_counts[w];
+    }
+    if (wanted)
+        s_items[before + __popc(mask & ((1u << lane) - 1u))] = item;
+    __syncthreads();
+    return (int)threadIdx.x < all ? s_items[threadIdx.x] : -1;
+"""
+
+# Rows of K x 3 floats are a multiple of 16 bytes for K = 4 and 16. Weights past the count are zero.
+_COLOR = """
+    const int size = sh.shape[1];
+    const float* row = reinterpret_cast<const float*>(sh.data) + 3ll * size * n;
+    float sum[3] = {0.0f, 0.0f, 0.0f};
+    if (size % 4 == 0) {
+        #pragma unroll
+        for (int q = 0; q < 12; ++q)
+            if (4 * q < 3 * count) {
+                const float4 v = reinterpret_cast<const float4*>(row)[q];
+                sum[(4 * q) % 3] += weights[(4 * q) / 3] * v.x;
+                sum[(4 * q + 1) % 3] += weights[(4 * q + 1) / 3] * v.y;
+                sum[(4 * q + 2) % 3] += weights[(4 * q + 2) / 3] * v.z;
+                sum[(4 * q + 3) % 3] += weights[(4 * q + 3) / 3] * v.w;
+            }
+    } else {
+        #pragma unroll
+        for (int k = 0; k < 16; ++k)
+            if (k < count)
+                for (int channel = 0; channel < 3; ++channel)
+                    sum[channel] += weights[k] * row[3 * k + channel];
+    }
+    return wp::vec3(sum[0], sum[1], sum[2]);
+"""
+
+_COLOR_BACKWARD = """
+    const int size = sh.shape[1];
+    const float* row = reinterpret_cast<const float*>(sh.data) + 3ll * size * n;
+    float* v_row = reinterpret_cast<float*>(v_sh.data) + 3ll * size * n;
+    wp::vec_t<16, float> w;
+    if (size % 4 == 0) {
+        #pragma unroll
+        for (int q = 0; q < 12; ++q)
+            if (4 * q < 3 * count) {
+                const float4 c = reinterpret_cast<const float4*>(row)[q];
+                w[(4 * q) / 3] += c.x * v[(4 * q) % 3];
+                w[(4 * q + 1) / 3] += c.y * v[(4 * q + 1) % 3];
+                w[(4 * q + 2) / 3] += c.z * v[(4 * q + 2) % 3];
+                w[(4 * q + 3) / 3] += c.w * v[(4 * q + 3) % 3];
+                float4* to = reinterpret_cast<float4*>(v_row) + q;
+                float4 sum = add ? *to : make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+                sum.x += weights[(4 * q) / 3] * v[(4 * q) % 3];
+                sum.y += weights[(4 * q + 1) / 3] * v[(4 * q + 1) % 3];
+                sum.z += weights[(4 * q + 2) / 3] * v[(4 * q + 2) % 3];
+                sum.w += weights[(4 * q + 3) / 3] * v[(4 * q + 3) % 3];
+                *to = sum;
+            }
+    } else {
+        #pragma unroll
+        for (int k = 0; k < 16; ++k)
+            if (k < count)
+                for (int channel = 0; channel < 3; ++channel) {
+                    w[k] += row[3 * k + channel] * v[channel];
+                    v_row[3 * k + channel] = (add ? v_row[3 * k + channel] : 0.0f) + weights[k] * v[channel];
+                }
+    }
+    return w;
+"""
+
+
+@functools.cache
+def make_functions():
+    """The functions, for CUDA; those on colours for float32."""
+    vec16 = wp.types.vector(16, wp.float32)
+
+    @wp.func_native(_COMPACT.replace("BLOCK", str(BLOCK)))
+    def compact(item: int, wanted: int) -> int:
+        """The items of the block's threads that are wanted, dealt to its first threads in order; -1 for the others.
+
+        All BLOCK threads of the block must call it.
+        """
+        ...
+
+    @wp.func_native("return (int)__ballot_sync(0xffffffffu, wanted != 0);")
+    def ballot(wanted: int) -> int:
+        """Bit l is set where lane l of the warp wants; all 32 lanes must call it, as with the next two."""
+        ...
+
+    @wp.func_native("return __shfl_sync(0xffffffffu, value, lane);")
+    def broadcast(value: int, lane: int) -> int:
+        """The value that a lane of the warp holds."""
+        ...
+
+    @wp.func_native(
+        """
+        int sum = value;
+        for (int distance = 1; distance < 32; distance *= 2) {
+            const int other = __shfl_up_sync(0xffffffffu, sum, distance);
+            sum += (threadIdx.x % 32 >= distance) ? other : 0;
+        }
+        return sum;
+        """
+    )
+    def running_sum(value: int) -> int:
+        """Sum over this lane of the warp and those before it."""
+        ...
+
+    @wp.func_native("return __ffs(mask) - 1;")
+    def lowest(mask: int) -> int:
+        """Position of the lowest bit set, -1 for none."""
+        ...
+
+    @wp.func_native(_COLOR)
+    def color(sh: wp.array2d(dtype=wp.vec3), n: int, count: int, weights: vec16) -> wp.vec3:
+        """Weighted sum of the first ``count`` coefficients of row n; the other weights must be 0."""
+        ...
+
+    @wp.func_native(_COLOR_BACKWARD)
+    def color_backward(
+        sh: wp.array2d(dtype=wp.vec3), n: int, count: int, weights: vec16, v: wp.vec3, add: int,
+        v_sh: wp.array2d(dtype=wp.vec3),
+    ) -> vec16:  # fmt: skip
+        """Gradients of `color` for an upstream ``v``: those of the row are stored or added, those of the weights returned."""
+        ...
+
+    return SimpleNamespace(
+        compact=compact, ballot=ballot, broadcast=broadcast, running_sum=running_sum, lowest=lowest,
+        color=color, color_backward=color_backward,
+    )  # fmt: skip
