@@ -5,7 +5,7 @@ import torch
 
 from tests.reference.ssim import ssim_reference
 from tests.tolerances import close
-from warpgs.kernels.ssim import ssim
+from warpgs.kernels.ssim import differences, ssim
 
 SIZES = [(1, 1), (1, 17), (17, 1), (5, 7), (10, 11), (33, 47)]
 
@@ -35,6 +35,29 @@ def test_gradcheck(device):
     assert torch.autograd.gradcheck(lambda a: ssim(a, target), [image.requires_grad_()], eps=1e-6, atol=1e-8, rtol=1e-5)
 
 
+@pytest.mark.parametrize(("height", "width"), SIZES)
+def test_summed_differences_equal_the_maps(device, dtype, height, width):
+    """The two sums and their gradient are those of the dense maps; some pixels are equal, where |a - b| has no slope."""
+    image, target = images(height, width, dtype, device)
+    image[:2] = target[:2]
+    leaf, twin = image.requires_grad_(), image.detach().cpu().double().requires_grad_()
+    target64 = target.cpu().double()
+    found = differences(leaf, target)
+    wanted = torch.stack([(1 - ssim_reference(twin, target64)).sum(), (twin - target64).abs().sum()])
+    if bool(wanted.detach().any()):
+        close("ssim", found, wanted)
+    (0.2 * found[0] + 0.8 * found[1]).backward()
+    (0.2 * wanted[0] + 0.8 * wanted[1]).backward()
+    if bool((twin.grad.abs() > 1e-12).any()):
+        close("gradient", leaf.grad, twin.grad)
+
+
+def test_gradcheck_of_the_sums(device):
+    """Finite differences agree with the gradient of both sums, over a batch."""
+    image, target = (torch.stack([t, t.flip(0)]) for t in images(10, 9, device=device))
+    assert torch.autograd.gradcheck(lambda a: differences(a, target), [image.requires_grad_()], eps=1e-6, atol=1e-7, rtol=1e-5)
+
+
 @pytest.mark.parametrize("value", [0.0, 0.5, 0.6, 1.0])
 def test_identical_constant_images_are_alike(device, dtype, value):
     """Rounding must not push a similarity above 1, nor make its gradient anything but finite."""
@@ -56,9 +79,9 @@ def test_threads_do_not_change_the_bits():
     """One thread and two give the same map."""
     a, b = images(200, 150, torch.float32)
     torch.set_num_threads(1)
-    one = ssim(a, b)
+    one, sums = ssim(a, b), differences(a, b)
     torch.set_num_threads(2)
-    assert torch.equal(one, ssim(a, b))
+    assert torch.equal(one, ssim(a, b)) and torch.equal(sums, differences(a, b))
 
 
 def test_bad_input_names_the_argument():

@@ -6,19 +6,23 @@ import torch
 import warp as wp
 
 from warpgs.kernels import bridge
+from warpgs.kernels.compiler import ROLLED
 
+LANES = 16
+"""Elements that are updated together on a CPU: a loop that vectorises."""
 SEGMENT = 4096
-"""Elements that one task updates on a CPU."""
+"""Elements that one task updates on a CPU, a multiple of `LANES`."""
 
 
 @functools.cache
-def make_kernel(real, split: bool):
-    """The update kernel for one scalar type; a task updates a segment of the flat parameter.
+def make_kernel(real, split: bool, lanes: int):
+    """The update kernel for one scalar type; a task updates a segment of the flat parameter, some lanes at a time.
 
-    ``split`` says whether the head of each row has a rate of its own: finding it costs a division that does not vectorise.
+    ``split`` says whether the head of each row has a rate of its own, which costs some arithmetic.
     """
+    values = wp.types.vector(lanes, real)
 
-    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def update(
         begin: int, gradient: wp.array(dtype=real), length: int, row: int, head: int, head_rate: real, rate: real,
         beta1: real, beta2: real, rest1: real, rest2: real, root_correction2: real, eps: real,
@@ -27,16 +31,39 @@ def make_kernel(real, split: bool):
     ):  # fmt: skip
         task = begin + wp.tid()
         first = task * length
-        for i in range(first, wp.min(first + length, parameter.shape[0])):
-            g = gradient[i]
-            m = beta1 * mean[i] + rest1 * g
-            s = beta2 * square[i] + rest2 * g * g
-            mean[i] = m
-            square[i] = s
-            step = rate
-            if wp.static(split):
-                step = wp.where(i % row < head, head_rate, rate)
-            parameter[i] = parameter[i] - step * m / (wp.sqrt(s) / root_correction2 + eps)
+        end = wp.min(first + length, parameter.shape[0])
+        p = values()
+        m = values()
+        s = values()
+        for start in range(first, end, lanes):
+            # Warp counts negative indices from the end; only where the compiler sees that there are none, does it vectorise
+            base = wp.max(start, 0)
+            phase = real(base % row) + real(0.5)
+            if base + lanes <= end:
+                for lane in range(lanes):
+                    i = base + lane
+                    g = gradient[i]
+                    m[lane] = beta1 * mean[i] + rest1 * g
+                    s[lane] = beta2 * square[i] + rest2 * g * g
+                    step = rate
+                    if wp.static(split):
+                        # place in the row, from its middle, so that no rounding moves it to another
+                        place = (phase + real(lane)) / real(row)
+                        step = wp.where((place - wp.floor(place)) * real(row) < real(head), head_rate, rate)
+                    p[lane] = parameter[i] - step * m[lane] / (wp.sqrt(s[lane]) / root_correction2 + eps)
+                for lane in range(lanes):
+                    parameter[base + lane] = p[lane]
+                    mean[base + lane] = m[lane]
+                    square[base + lane] = s[lane]
+            else:
+                for i in range(base, end):
+                    g = gradient[i]
+                    mean[i] = beta1 * mean[i] + rest1 * g
+                    square[i] = beta2 * square[i] + rest2 * g * g
+                    step = rate
+                    if wp.static(split):
+                        step = wp.where(i % row < head, head_rate, rate)
+                    parameter[i] = parameter[i] - step * mean[i] / (wp.sqrt(square[i]) / root_correction2 + eps)
 
     return update
 
@@ -84,7 +111,7 @@ def adam_step(
     beta1, beta2 = betas
     correction1, correction2 = 1 - beta1**step, 1 - beta2**step
     row = param[0].numel()
-    length = SEGMENT if device.type == "cpu" else 1
+    length, lanes = (SEGMENT, LANES) if device.type == "cpu" else (1, 1)
     flat = [bridge.view(t.view(-1), real) for t in (param, exp_avg, exp_avg_sq)]
     with bridge.stream_of(device):
         inputs = [
@@ -92,4 +119,6 @@ def adam_step(
             (lr if head_lr is None else head_lr) / correction1, lr / correction1,
             beta1, beta2, 1 - beta1, 1 - beta2, correction2**0.5, eps, *flat,
         ]  # fmt: skip
-        bridge.launch(make_kernel(real, head > 0), -(-param.numel() // length), inputs, device, cost=max(1, length // 10))
+        bridge.launch(
+            make_kernel(real, head > 0, lanes), -(-param.numel() // length), inputs, device, cost=max(1, length // 16)
+        )

@@ -1,221 +1,121 @@
-"""Structural similarity with an 11 x 11 Gaussian window (Wang et al. 2004), separable, forward and backward."""
+"""Structural similarity with an 11 x 11 Gaussian window (Wang et al. 2004), separable, forward and backward.
+
+Five sums run through the window: of a, b, a^2, b^2 and (a - b)^2; backward, three. Images are flat rows of width * channels.
+"""
 
 import functools
-import math
 from types import SimpleNamespace
 
 import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from warpgs.kernels import bridge
-
-RADIUS = 5
-"""Half size of the window [px]."""
-SIGMA = 1.5
-"""Standard deviation of the window [px]."""
-C1 = 0.01**2
-C2 = 0.03**2
-"""(K1 L)^2 and (K2 L)^2 of Wang et al. 2004 for a data range L of 1."""
-
-
-def _window() -> list[float]:
-    weights = [math.exp(-0.5 * (k / SIGMA) ** 2) for k in range(-RADIUS, RADIUS + 1)]
-    return [w / sum(weights) for w in weights]
-
-
-WINDOW = _window()
-
-
-LANES = 16
-"""Neighbouring elements that one task works on, on a CPU: a loop that vectorises. On CUDA a task has one element."""
+from warpgs.kernels import bridge, ssim_cpu
+from warpgs.kernels.ssim_cpu import BLOCK, CHANNELS, LANES, PADDING, RADIUS, make_functions
 
 
 @functools.cache
-def make_kernels(real, lanes: int):
-    """Kernels for one scalar type and task size.
-
-    Images are flat [rows, columns] with columns = width * channels. Five sums run through the window: of a, b, a^2, b^2 and
-    (a - b)^2; backward, three. Vertical passes write rows with zeros on both sides, so that horizontal ones need no border.
-    """
-    w0, w1, w2, w3, w4, w5 = (real(w) for w in WINDOW[: RADIUS + 1])
-    vec6 = wp.types.vector(6, real)
-    values = wp.types.vector(lanes, real)
-    count = wp.constant(lanes)
-    # unrolled by Warp, the loops over lanes would not vectorise
-    kernel = functools.partial(wp.kernel, enable_backward=False, module="unique", module_options={"max_unroll": 0})
-
-    @wp.func
-    def tap(k: wp.int32) -> real:
-        w = vec6(w5, w4, w3, w2, w1, w0)
-        return w[wp.abs(k)]
-
-    @wp.func
-    def first_column(task: wp.int32, tasks: wp.int32, columns: wp.int32) -> wp.int32:
-        # the last task of a row starts early rather than run over the end; what it repeats comes out the same
-        return wp.min((task % tasks) * count, columns - count)
+def make_kernels(real):
+    """Kernels of one task per element, for CUDA: the vertical passes write to global memory, with zeros on both sides."""
+    f = make_functions(real)
+    kernel = functools.partial(wp.kernel, enable_backward=False, module=f"warpgs.kernels.ssim.{real.__name__}")
 
     @kernel
     def vertical(
-        begin: int, a: wp.array(dtype=real), b: wp.array(dtype=real), height: int, tasks: int, columns: int, padding: int,
+        begin: int, a: wp.array(dtype=real), b: wp.array(dtype=real), height: int, columns: int,
         # outputs, zero on entry
         m0: wp.array(dtype=real), m1: wp.array(dtype=real), m2: wp.array(dtype=real), m3: wp.array(dtype=real),
         m4: wp.array(dtype=real),
     ):  # fmt: skip
-        task = begin + wp.tid()
-        row = task // tasks
-        x = first_column(task, tasks, columns)
+        i = begin + wp.tid()
+        row = i // columns
         y = row % height
-        s0 = values()
-        s1 = values()
-        s2 = values()
-        s3 = values()
-        s4 = values()
+        s = f.vec5()
         for k in range(wp.max(-RADIUS, -y), wp.min(RADIUS + 1, height - y)):
-            w = tap(k)
-            base = (row + k) * columns + x
-            for lane in range(count):
-                p = a[base + lane]
-                q = b[base + lane]
-                s0[lane] = s0[lane] + w * p
-                s1[lane] = s1[lane] + w * q
-                s2[lane] = s2[lane] + w * p * p
-                s3[lane] = s3[lane] + w * q * q
-                s4[lane] = s4[lane] + w * (p - q) * (p - q)
-        base = row * (columns + 2 * padding) + padding + x
-        for lane in range(count):
-            m0[base + lane] = s0[lane]
-            m1[base + lane] = s1[lane]
-            m2[base + lane] = s2[lane]
-            m3[base + lane] = s3[lane]
-            m4[base + lane] = s4[lane]
+            s = f.add_pair(s, f.tap(k), a[i + k * columns], b[i + k * columns])
+        o = i + (2 * row + 1) * PADDING
+        m0[o] = s[0]
+        m1[o] = s[1]
+        m2[o] = s[2]
+        m3[o] = s[3]
+        m4[o] = s[4]
 
     @kernel
     def similarity(
         begin: int, m0: wp.array(dtype=real), m1: wp.array(dtype=real), m2: wp.array(dtype=real), m3: wp.array(dtype=real),
-        m4: wp.array(dtype=real), channels: int, tasks: int, columns: int, padding: int,
-        # outputs: the similarity, and its partials by mean, variance and gap
+        m4: wp.array(dtype=real), columns: int,
+        # outputs
         result: wp.array(dtype=real), by_mean: wp.array(dtype=real), by_variance: wp.array(dtype=real),
         by_gap: wp.array(dtype=real),
     ):  # fmt: skip
-        task = begin + wp.tid()
-        row = task // tasks
-        x = first_column(task, tasks, columns)
-        s0 = values()
-        s1 = values()
-        s2 = values()
-        s3 = values()
-        s4 = values()
-        for k in range(-RADIUS, RADIUS + 1):
-            w = tap(k)
-            base = row * (columns + 2 * padding) + padding + x + k * channels
-            for lane in range(count):
-                s0[lane] = s0[lane] + w * m0[base + lane]
-                s1[lane] = s1[lane] + w * m1[base + lane]
-                s2[lane] = s2[lane] + w * m2[base + lane]
-                s3[lane] = s3[lane] + w * m3[base + lane]
-                s4[lane] = s4[lane] + w * m4[base + lane]
-        base = row * columns + x
-        for lane in range(count):
-            ma = s0[lane]
-            mb = s1[lane]
-            # rounding can make these differences slightly negative
-            raw_va = s2[lane] - ma * ma
-            raw_gap = s4[lane] - (ma - mb) * (ma - mb)
-            va = wp.max(raw_va, real(0.0))
-            vb = wp.max(s3[lane] - mb * mb, real(0.0))
-            # variance of a - b: the covariance is (va + vb - gap) / 2, and equal images score 1 whatever is rounded
-            gap = wp.max(raw_gap, real(0.0))
-            n1 = real(2.0) * ma * mb + real(C1)
-            d1 = n1 + (ma - mb) * (ma - mb)
-            d2 = va + vb + real(C2)
-            luminance = n1 / d1
-            structure = real(1.0) - gap / d2
-            result[base + lane] = luminance * structure
-            v = wp.where(raw_va > real(0.0), luminance * gap / (d2 * d2), real(0.0))
-            g = wp.where(raw_gap > real(0.0), -luminance / d2, real(0.0))
-            # the mean also acts through the variance, -ma^2, and the gap, -(ma - mb)^2
-            by_mean[base + lane] = real(2.0) * (structure * (mb - luminance * ma) / d1 - ma * v - (ma - mb) * g)
-            by_variance[base + lane] = v
-            by_gap[base + lane] = g
+        i = begin + wp.tid()
+        row = i // columns
+        o = i + 2 * row * PADDING
+        s = f.score(f.across(m0, o, 0), f.across(m1, o, 0), f.across(m2, o, 0), f.across(m3, o, 0), f.across(m4, o, 0))
+        result[i] = s[0]
+        by_mean[i] = s[1]
+        by_variance[i] = s[2]
+        by_gap[i] = s[3]
 
     @kernel
     def vertical_backward(
         begin: int, v_result: wp.array(dtype=real), by_mean: wp.array(dtype=real), by_variance: wp.array(dtype=real),
-        by_gap: wp.array(dtype=real), height: int, tasks: int, columns: int, padding: int,
+        by_gap: wp.array(dtype=real), height: int, columns: int,
         # outputs, zero on entry
         m0: wp.array(dtype=real), m1: wp.array(dtype=real), m2: wp.array(dtype=real),
     ):  # fmt: skip
-        task = begin + wp.tid()
-        row = task // tasks
-        x = first_column(task, tasks, columns)
+        i = begin + wp.tid()
+        row = i // columns
         y = row % height
-        s0 = values()
-        s1 = values()
-        s2 = values()
+        s = f.vec3()
         for k in range(wp.max(-RADIUS, -y), wp.min(RADIUS + 1, height - y)):
-            w = tap(k)
-            base = (row + k) * columns + x
-            for lane in range(count):
-                v = w * v_result[base + lane]
-                s0[lane] = s0[lane] + v * by_mean[base + lane]
-                s1[lane] = s1[lane] + v * by_variance[base + lane]
-                s2[lane] = s2[lane] + v * by_gap[base + lane]
-        base = row * (columns + 2 * padding) + padding + x
-        for lane in range(count):
-            m0[base + lane] = s0[lane]
-            m1[base + lane] = s1[lane]
-            m2[base + lane] = s2[lane]
+            j = i + k * columns
+            s = f.add_partials(s, f.tap(k) * v_result[j], by_mean[j], by_variance[j], by_gap[j])
+        o = i + (2 * row + 1) * PADDING
+        m0[o] = s[0]
+        m1[o] = s[1]
+        m2[o] = s[2]
 
     @kernel
     def combine(
         begin: int, m0: wp.array(dtype=real), m1: wp.array(dtype=real), m2: wp.array(dtype=real),
-        a: wp.array(dtype=real), b: wp.array(dtype=real), channels: int, tasks: int, columns: int, padding: int,
+        a: wp.array(dtype=real), b: wp.array(dtype=real), columns: int,
         # outputs
         v_a: wp.array(dtype=real),
     ):  # fmt: skip
-        task = begin + wp.tid()
-        row = task // tasks
-        x = first_column(task, tasks, columns)
-        s0 = values()
-        s1 = values()
-        s2 = values()
-        for k in range(-RADIUS, RADIUS + 1):
-            w = tap(k)
-            base = row * (columns + 2 * padding) + padding + x + k * channels
-            for lane in range(count):
-                s0[lane] = s0[lane] + w * m0[base + lane]
-                s1[lane] = s1[lane] + w * m1[base + lane]
-                s2[lane] = s2[lane] + w * m2[base + lane]
-        base = row * columns + x
-        for lane in range(count):
-            p = a[base + lane]
-            v_a[base + lane] = s0[lane] + real(2.0) * (p * s1[lane] + (p - b[base + lane]) * s2[lane])
+        i = begin + wp.tid()
+        row = i // columns
+        o = i + 2 * row * PADDING
+        v_a[i] = f.across(m0, o, 0) + real(2.0) * (a[i] * f.across(m1, o, 0) + (a[i] - b[i]) * f.across(m2, o, 0))
 
     return SimpleNamespace(vertical=vertical, similarity=similarity, vertical_backward=vertical_backward, combine=combine)
 
 
 class _Plan:
-    """Sizes and launches for one image shape [B, H, W, 3]."""
+    """Sizes, scratch memory and launches for one image shape [B, H, W, 3]."""
 
-    def __init__(self, image: torch.Tensor):
+    def __init__(self, image: torch.Tensor, summed: bool = False):
         self.device, self.real = image.device, bridge.real_of(image)
-        batch, self.height, width, self.channels = image.shape
-        self.rows, self.columns = batch * self.height, width * self.channels
-        self.padding = RADIUS * self.channels
-        lanes = LANES if self.device.type == "cpu" else 1
-        self.tasks = -(-self.columns // lanes)
-        self.kernels = make_kernels(self.real, lanes)
-
-    def padded(self, count: int, like: torch.Tensor) -> list[wp.array]:
-        return [self.flat(m) for m in like.new_zeros(count, self.rows * (self.columns + 2 * self.padding))]
+        batch, self.height, width, _ = image.shape
+        self.rows, self.columns = batch * self.height, width * CHANNELS
+        self.blocks = -(-self.height // BLOCK)
+        self.tasks = batch * self.blocks
+        self.blocked = self.device.type == "cpu"
+        self.kernels = ssim_cpu.make_kernels(self.real, summed) if self.blocked else make_kernels(self.real)
 
     def flat(self, tensor: torch.Tensor) -> wp.array:
         return bridge.view(tensor.view(-1), self.real)
 
+    def padded(self, count: int, like: torch.Tensor) -> list[wp.array]:
+        return [self.flat(m) for m in like.new_zeros(count, self.rows * (self.columns + 2 * PADDING))]
+
     def launch(self, kernel, inputs: list, outputs: list) -> None:
-        inputs = [*inputs, self.tasks, self.columns, self.padding, *outputs]
-        bridge.launch(kernel, self.rows * self.tasks, inputs, self.device, cost=30)
+        bridge.launch(kernel, self.rows * self.columns, [*inputs, self.columns, *outputs], self.device)
+
+    def launch_blocks(self, kernel, inputs: list, sums: int, outputs: list, like: torch.Tensor) -> None:
+        scratch = like.new_empty(self.tasks * sums * (self.columns + 2 * PADDING))
+        inputs = [*inputs, self.height, self.blocks, self.columns, self.flat(scratch), *map(self.flat, outputs)]
+        bridge.launch(kernel, self.tasks, inputs, self.device, cost=BLOCK * self.columns)
 
 
 class _Ssim(torch.autograd.Function):
@@ -225,11 +125,14 @@ class _Ssim(torch.autograd.Function):
         plan = _Plan(image)
         result = torch.empty_like(image)
         partials = [torch.empty_like(image) for _ in range(3)]
-        moments = plan.padded(5, image)
-        with bridge.stream_of(plan.device):
-            plan.launch(plan.kernels.vertical, [plan.flat(image), plan.flat(target), plan.height], moments)
-            outputs = [plan.flat(t) for t in (result, *partials)]
-            plan.launch(plan.kernels.similarity, [*moments, plan.channels], outputs)
+        pair = [plan.flat(image), plan.flat(target)]
+        if plan.blocked:
+            plan.launch_blocks(plan.kernels.forward, pair, 5, [result, *partials], image)
+        else:
+            moments = plan.padded(5, image)
+            with bridge.stream_of(plan.device):
+                plan.launch(plan.kernels.vertical, [*pair, plan.height], moments)
+                plan.launch(plan.kernels.similarity, moments, [plan.flat(t) for t in (result, *partials)])
         ctx.save_for_backward(image, target, *partials)
         return result
 
@@ -238,13 +141,46 @@ class _Ssim(torch.autograd.Function):
     def backward(ctx, v_result):
         image, target, *partials = ctx.saved_tensors
         plan = _Plan(image)
-        v_image, sums = torch.empty_like(image), plan.padded(3, image)
-        with bridge.stream_of(plan.device):
-            inputs = [plan.flat(t) for t in (v_result.contiguous(), *partials)]
-            plan.launch(plan.kernels.vertical_backward, [*inputs, plan.height], sums)
-            inputs = [*sums, plan.flat(image), plan.flat(target), plan.channels]
-            plan.launch(plan.kernels.combine, inputs, [plan.flat(v_image)])
+        v_image, pair = torch.empty_like(image), [plan.flat(image), plan.flat(target)]
+        if plan.blocked:
+            fields = [plan.flat(v_result * t) for t in partials]
+            inputs = [*pair, *fields, fields[0]]  # the last is read only where sums are wanted
+            plan.launch_blocks(plan.kernels.backward, inputs, 3, [v_image], image)
+        else:
+            sums = plan.padded(3, image)
+            with bridge.stream_of(plan.device):
+                inputs = [plan.flat(t) for t in (v_result.contiguous(), *partials)]
+                plan.launch(plan.kernels.vertical_backward, [*inputs, plan.height], sums)
+                plan.launch(plan.kernels.combine, [*sums, *pair], [plan.flat(v_image)])
         return v_image, None
+
+
+class _Differences(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, image, target):
+        image, target = image.contiguous(), target.contiguous()
+        plan = _Plan(image, summed=True)
+        sums = image.new_empty(plan.tasks, 2)
+        partials = [torch.empty_like(image) for _ in range(3)]
+        pair = [plan.flat(image), plan.flat(target)]
+        plan.launch_blocks(plan.kernels.forward, pair, 5, [sums, *partials], image)
+        ctx.save_for_backward(image, target, *partials)
+        return sums.sum(0)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, v_sums):
+        image, target, *partials = ctx.saved_tensors
+        plan = _Plan(image, summed=True)
+        v_image = torch.empty_like(image)
+        inputs = [plan.flat(t) for t in (image, target, *partials, v_sums.contiguous())]
+        plan.launch_blocks(plan.kernels.backward, inputs, 3, [v_image], image)
+        return v_image, None
+
+
+def _check(image: torch.Tensor, target: torch.Tensor) -> None:
+    pattern = "B H W 3" if isinstance(image, torch.Tensor) and image.ndim == 4 else "H W 3"
+    bridge.check(image=(image, pattern), target=(target, pattern))
 
 
 def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
@@ -266,12 +202,34 @@ def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
         ValueError: A shape or device disagrees.
     """
-    pattern = "B H W 3" if isinstance(image, torch.Tensor) and image.ndim == 4 else "H W 3"
-    bridge.check(image=(image, pattern), target=(target, pattern))
+    _check(image, target)
     target = target.detach()
     a, b = (image, target) if image.ndim == 4 else (image[None], target[None])
-    # A row must fill a task; columns of zeros beside the image are what the window finds there anyway.
-    missing = max(0, -(-LANES // 3) - a.shape[2])
+    # A row must fill a step; columns of zeros beside the image are what the window finds there anyway.
+    missing = max(0, -(-LANES // CHANNELS) - a.shape[2])
     if missing:
         a, b = (torch.nn.functional.pad(t, (0, 0, 0, missing)) for t in (a, b))
     return _Ssim.apply(a, b)[:, :, : image.shape[-2]].reshape(image.shape)
+
+
+def differences(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """Sums over all pixels and channels of 1 - `ssim` and of |image - target|, what a photometric loss is made of.
+
+    On a CPU one pass gives both, and the backward pass their gradient; on CUDA torch adds up the map of `ssim`.
+
+    Args:
+        image: Colours in [0, 1], shape [H, W, 3] or [B, H, W, 3].
+        target: The same for the image to compare with; no gradient.
+
+    Returns:
+        The two sums, shape [2]. The gradient of |image - target| is 0 where they are equal.
+
+    Raises:
+        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        ValueError: A shape or device disagrees.
+    """
+    _check(image, target)
+    target = target.detach()
+    if image.device.type != "cpu" or image.shape[-2] * CHANNELS < LANES:
+        return torch.stack([(1 - ssim(image, target)).sum(), (image - target).abs().sum()])
+    return _Differences.apply(*(t.reshape(-1, *t.shape[-3:]) for t in (image, target)))

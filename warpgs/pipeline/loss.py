@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from warpgs.errors import UsageError
-from warpgs.kernels.ssim import ssim
+from warpgs.kernels.ssim import differences, ssim
 
 
 @dataclass(frozen=True)
@@ -36,14 +36,16 @@ def photometric_loss(
     Returns:
         Loss and L1, shape []; both 0 where no pixel counts.
     """
+    share = config.ssim_weight
+    if mask is None and share > 0:
+        unlike, error = differences(rgb, target).unbind()
+        l1 = error / target.numel()
+        return (1 - share) * l1 + share * unlike / target.numel(), l1.detach()
     if mask is not None:
         rgb, target = rgb * mask[..., None], target * mask[..., None]
     pixels = target.shape[0] * target.shape[1] if mask is None else mask.sum().clamp_min(1)
     l1 = (rgb - target).abs().sum() / (3 * pixels)
-    if config.ssim_weight == 0:
+    if share == 0:
         return l1, l1.detach()
-    dissimilarity = 1 - ssim(rgb, target)
-    if mask is not None:
-        dissimilarity = dissimilarity * mask[..., None]
-    structural = dissimilarity.sum() / (3 * pixels)
-    return (1 - config.ssim_weight) * l1 + config.ssim_weight * structural, l1.detach()
+    structural = ((1 - ssim(rgb, target)) * mask[..., None]).sum() / (3 * pixels)
+    return (1 - share) * l1 + share * structural, l1.detach()

@@ -1,0 +1,312 @@
+"""The window and the score of SSIM, and its CPU kernels: one task per block of rows, whose sums stay in its cache."""
+
+import functools
+import math
+from types import SimpleNamespace
+
+import warp as wp
+
+from warpgs.kernels.compiler import ROLLED
+
+RADIUS = 5
+"""Half size of the window [px]."""
+SIGMA = 1.5
+"""Standard deviation of the window [px]."""
+C1 = 0.01**2
+C2 = 0.03**2
+"""(K1 L)^2 and (K2 L)^2 of Wang et al. 2004 for a data range L of 1."""
+
+
+def _window() -> list[float]:
+    weights = [math.exp(-0.5 * (k / SIGMA) ** 2) for k in range(-RADIUS, RADIUS + 1)]
+    return [w / sum(weights) for w in weights]
+
+
+WINDOW = _window()
+
+CHANNELS = 3
+"""Colours of a pixel, and so the distance between horizontal neighbours."""
+PADDING = RADIUS * CHANNELS
+"""Zeros beside a row of sums, so that a horizontal pass needs no border."""
+LANES = 16
+"""Neighbouring elements that are computed together on a CPU: a loop that vectorises."""
+BLOCK = 8
+"""Rows that one task computes on a CPU. The sums of a row stay in its cache between the vertical and the horizontal pass."""
+
+
+@functools.cache
+def make_functions(real):
+    """What the kernels for both kinds of device share, for one scalar type."""
+    vec3 = wp.types.vector(3, real)
+    vec4 = wp.types.vector(4, real)
+    vec5 = wp.types.vector(5, real)
+    w0, w1, w2, w3, w4, w5 = (real(w) for w in WINDOW[RADIUS:])
+    vec6 = wp.types.vector(6, real)
+    channels = wp.constant(CHANNELS)
+
+    @wp.func
+    def tap(k: wp.int32) -> real:
+        """Weight at a distance of |k| rows or columns, 0 beyond the window."""
+        w = vec6(w0, w1, w2, w3, w4, w5)
+        return wp.where(wp.abs(k) <= RADIUS, w[wp.min(wp.abs(k), RADIUS)], real(0.0))
+
+    @wp.func
+    def at(first: wp.int32, lane: wp.int32) -> wp.int32:
+        """An index that the compiler can see is not negative.
+
+        Warp counts negative ones from the end of the array. Where that cannot be ruled out, the loads of neighbouring lanes
+        are not known to be neighbours, and each lane is fetched on its own.
+        """
+        return wp.max(first, 0) + lane
+
+    @wp.func
+    def across(m: wp.array(dtype=real), first: wp.int32, lane: wp.int32) -> real:
+        """Weighted sum over the columns of the window; ``first`` + ``lane`` is its leftmost."""
+        o = at(first, lane)
+        s = w5 * (m[o] + m[o + 10 * channels])
+        s += w4 * (m[o + channels] + m[o + 9 * channels])
+        s += w3 * (m[o + 2 * channels] + m[o + 8 * channels])
+        s += w2 * (m[o + 3 * channels] + m[o + 7 * channels])
+        s += w1 * (m[o + 4 * channels] + m[o + 6 * channels])
+        s += w0 * m[o + 5 * channels]
+        return s
+
+    @wp.func
+    def add_pair(s: vec5, w: real, p: real, q: real) -> vec5:
+        """The five sums with one pixel more."""
+        d = p - q
+        u = w * p
+        v = w * q
+        return vec5(s[0] + u, s[1] + v, s[2] + u * p, s[3] + v * q, s[4] + w * d * d)
+
+    @wp.func
+    def add_partials(s: vec3, w: real, by_mean: real, by_variance: real, by_gap: real) -> vec3:
+        """The three sums with one pixel more."""
+        return vec3(s[0] + w * by_mean, s[1] + w * by_variance, s[2] + w * by_gap)
+
+    @wp.func
+    def score(s0: real, s1: real, s2: real, s3: real, s4: real) -> vec4:
+        """The similarity, and its partials by mean, variance and gap, from the five sums."""
+        ma = s0
+        mb = s1
+        # rounding can make these differences slightly negative
+        raw_va = s2 - ma * ma
+        raw_gap = s4 - (ma - mb) * (ma - mb)
+        va = wp.max(raw_va, real(0.0))
+        vb = wp.max(s3 - mb * mb, real(0.0))
+        # variance of a - b: the covariance is (va + vb - gap) / 2, and equal images score 1 whatever is rounded
+        gap = wp.max(raw_gap, real(0.0))
+        square = (ma - mb) * (ma - mb)
+        r1 = real(1.0) / (real(2.0) * ma * mb + real(C1) + square)
+        r2 = real(1.0) / (va + vb + real(C2))
+        luminance = real(1.0) - square * r1
+        structure = real(1.0) - gap * r2
+        v = wp.where(raw_va > real(0.0), luminance * gap * r2 * r2, real(0.0))
+        g = wp.where(raw_gap > real(0.0), -luminance * r2, real(0.0))
+        # the mean also acts through the variance, -ma^2, and the gap, -(ma - mb)^2
+        by_mean = real(2.0) * (structure * (mb - luminance * ma) * r1 - ma * v - (ma - mb) * g)
+        return vec4(luminance * structure, by_mean, v, g)
+
+    return SimpleNamespace(tap=tap, at=at, across=across, add_pair=add_pair, add_partials=add_partials, score=score,
+                           vec3=vec3, vec4=vec4, vec5=vec5)  # fmt: skip
+
+
+@functools.cache
+def make_kernels(real, summed: bool):
+    """Kernels of one task per block of rows, for a CPU, either for a map or, ``summed``, for sums over the image.
+
+    The sums of a row stand in ``scratch``, where each task has a few rows of its own. A row is walked in steps of `LANES`
+    elements; the last step starts early rather than run over the end, and what it repeats comes out the same.
+    """
+    f = make_functions(real)
+    vec11 = wp.types.vector(2 * RADIUS + 1, real)
+    vec11i = wp.types.vector(2 * RADIUS + 1, wp.int32)
+    values = wp.types.vector(LANES, real)
+    kernel = functools.partial(wp.kernel, enable_backward=False, module="unique", module_options=ROLLED)
+
+    @wp.func
+    def starts_of(y: wp.int32, height: wp.int32, image: wp.int32, columns: wp.int32) -> vec11i:
+        """First elements of the rows in the window of row y; rows outside the image are replaced, and then weigh 0."""
+        o = vec11i()
+        for k in range(2 * RADIUS + 1):
+            o[k] = (image * height + wp.clamp(y + k - RADIUS, 0, height - 1)) * columns
+        return o
+
+    @wp.func
+    def taps_of(y: wp.int32, height: wp.int32) -> vec11:
+        w = vec11()
+        for k in range(2 * RADIUS + 1):
+            inside = y + k >= RADIUS and y + k < height + RADIUS
+            w[k] = wp.where(inside, f.tap(k - RADIUS), real(0.0))
+        return w
+
+    @wp.func
+    def clear_padding(scratch: wp.array(dtype=real), o: wp.int32, columns: wp.int32):
+        for k in range(PADDING):
+            scratch[o + k] = real(0.0)
+            scratch[o + PADDING + columns + k] = real(0.0)
+
+    # The eleven rows are spelled out: a loop inside the loop over lanes would keep that from vectorising.
+
+    @wp.func
+    def down_pairs(
+        a: wp.array(dtype=real), b: wp.array(dtype=real), o: vec11i, w: vec11, x: wp.int32, lane: wp.int32
+    ) -> f.vec5:
+        s = f.vec5()
+        s = f.add_pair(s, w[0], a[f.at(o[0] + x, lane)], b[f.at(o[0] + x, lane)])
+        s = f.add_pair(s, w[1], a[f.at(o[1] + x, lane)], b[f.at(o[1] + x, lane)])
+        s = f.add_pair(s, w[2], a[f.at(o[2] + x, lane)], b[f.at(o[2] + x, lane)])
+        s = f.add_pair(s, w[3], a[f.at(o[3] + x, lane)], b[f.at(o[3] + x, lane)])
+        s = f.add_pair(s, w[4], a[f.at(o[4] + x, lane)], b[f.at(o[4] + x, lane)])
+        s = f.add_pair(s, w[5], a[f.at(o[5] + x, lane)], b[f.at(o[5] + x, lane)])
+        s = f.add_pair(s, w[6], a[f.at(o[6] + x, lane)], b[f.at(o[6] + x, lane)])
+        s = f.add_pair(s, w[7], a[f.at(o[7] + x, lane)], b[f.at(o[7] + x, lane)])
+        s = f.add_pair(s, w[8], a[f.at(o[8] + x, lane)], b[f.at(o[8] + x, lane)])
+        s = f.add_pair(s, w[9], a[f.at(o[9] + x, lane)], b[f.at(o[9] + x, lane)])
+        s = f.add_pair(s, w[10], a[f.at(o[10] + x, lane)], b[f.at(o[10] + x, lane)])
+        return s
+
+    @wp.func
+    def down(m: wp.array(dtype=real), o: vec11i, w: vec11, x: wp.int32, lane: wp.int32) -> real:
+        s = w[0] * m[f.at(o[0] + x, lane)]
+        s += w[1] * m[f.at(o[1] + x, lane)]
+        s += w[2] * m[f.at(o[2] + x, lane)]
+        s += w[3] * m[f.at(o[3] + x, lane)]
+        s += w[4] * m[f.at(o[4] + x, lane)]
+        s += w[5] * m[f.at(o[5] + x, lane)]
+        s += w[6] * m[f.at(o[6] + x, lane)]
+        s += w[7] * m[f.at(o[7] + x, lane)]
+        s += w[8] * m[f.at(o[8] + x, lane)]
+        s += w[9] * m[f.at(o[9] + x, lane)]
+        s += w[10] * m[f.at(o[10] + x, lane)]
+        return s
+
+    @kernel
+    def forward(
+        begin: int, a: wp.array(dtype=real), b: wp.array(dtype=real), height: int, blocks: int, columns: int,
+        scratch: wp.array(dtype=real),
+        # outputs: the similarity, or per task the sums of 1 - similarity and of |a - b|; the partials
+        result: wp.array(dtype=real), by_mean: wp.array(dtype=real), by_variance: wp.array(dtype=real),
+        by_gap: wp.array(dtype=real),
+    ):  # fmt: skip
+        task = begin + wp.tid()
+        image = task // blocks
+        top = (task - image * blocks) * BLOCK
+        stride = columns + 2 * PADDING
+        m0 = task * 5 * stride
+        m1 = m0 + stride
+        m2 = m1 + stride
+        m3 = m2 + stride
+        m4 = m3 + stride
+        clear_padding(scratch, m0, columns)
+        clear_padding(scratch, m1, columns)
+        clear_padding(scratch, m2, columns)
+        clear_padding(scratch, m3, columns)
+        clear_padding(scratch, m4, columns)
+        s0 = values()
+        s1 = values()
+        s2 = values()
+        s3 = values()
+        s4 = values()
+        unlike = values()
+        error = values()
+        for y in range(top, wp.min(top + BLOCK, height)):
+            o = starts_of(y, height, image, columns)
+            w = taps_of(y, height)
+            for step in range((columns + LANES - 1) // LANES):
+                x = wp.min(step * LANES, columns - LANES)
+                for lane in range(LANES):
+                    s = down_pairs(a, b, o, w, x, lane)
+                    s0[lane] = s[0]
+                    s1[lane] = s[1]
+                    s2[lane] = s[2]
+                    s3[lane] = s[3]
+                    s4[lane] = s[4]
+                for lane in range(LANES):
+                    scratch[f.at(m0 + PADDING + x, lane)] = s0[lane]
+                    scratch[f.at(m1 + PADDING + x, lane)] = s1[lane]
+                    scratch[f.at(m2 + PADDING + x, lane)] = s2[lane]
+                    scratch[f.at(m3 + PADDING + x, lane)] = s3[lane]
+                    scratch[f.at(m4 + PADDING + x, lane)] = s4[lane]
+            row = (image * height + y) * columns
+            for step in range((columns + LANES - 1) // LANES):
+                x = wp.min(step * LANES, columns - LANES)
+                fresh = step * LANES - x  # elements before this one were counted in the step before
+                for lane in range(LANES):
+                    t = f.score(
+                        f.across(scratch, m0 + x, lane), f.across(scratch, m1 + x, lane), f.across(scratch, m2 + x, lane),
+                        f.across(scratch, m3 + x, lane), f.across(scratch, m4 + x, lane),
+                    )  # fmt: skip
+                    s0[lane] = t[0]
+                    s1[lane] = t[1]
+                    s2[lane] = t[2]
+                    s3[lane] = t[3]
+                    if wp.static(summed):
+                        unlike[lane] = unlike[lane] + wp.where(lane >= fresh, real(1.0) - t[0], real(0.0))
+                        gap = wp.abs(a[f.at(row + x, lane)] - b[f.at(row + x, lane)])
+                        error[lane] = error[lane] + wp.where(lane >= fresh, gap, real(0.0))
+                for lane in range(LANES):
+                    if not wp.static(summed):
+                        result[f.at(row + x, lane)] = s0[lane]
+                    by_mean[f.at(row + x, lane)] = s1[lane]
+                    by_variance[f.at(row + x, lane)] = s2[lane]
+                    by_gap[f.at(row + x, lane)] = s3[lane]
+        if wp.static(summed):
+            unlike_sum = real(0.0)
+            error_sum = real(0.0)
+            for lane in range(LANES):
+                unlike_sum += unlike[lane]
+                error_sum += error[lane]
+            result[2 * task] = unlike_sum
+            result[2 * task + 1] = error_sum
+
+    @kernel
+    def backward(
+        begin: int, a: wp.array(dtype=real), b: wp.array(dtype=real), by_mean: wp.array(dtype=real),
+        by_variance: wp.array(dtype=real), by_gap: wp.array(dtype=real), v_result: wp.array(dtype=real),
+        height: int, blocks: int, columns: int, scratch: wp.array(dtype=real),
+        # outputs
+        v_a: wp.array(dtype=real),
+    ):  # fmt: skip
+        task = begin + wp.tid()
+        image = task // blocks
+        top = (task - image * blocks) * BLOCK
+        stride = columns + 2 * PADDING
+        m0 = task * 3 * stride
+        m1 = m0 + stride
+        m2 = m1 + stride
+        clear_padding(scratch, m0, columns)
+        clear_padding(scratch, m1, columns)
+        clear_padding(scratch, m2, columns)
+        s0 = values()
+        s1 = values()
+        s2 = values()
+        for y in range(top, wp.min(top + BLOCK, height)):
+            o = starts_of(y, height, image, columns)
+            w = taps_of(y, height)
+            for step in range((columns + LANES - 1) // LANES):
+                x = wp.min(step * LANES, columns - LANES)
+                for lane in range(LANES):
+                    s0[lane] = down(by_mean, o, w, x, lane)
+                    s1[lane] = down(by_variance, o, w, x, lane)
+                    s2[lane] = down(by_gap, o, w, x, lane)
+                for lane in range(LANES):
+                    scratch[f.at(m0 + PADDING + x, lane)] = s0[lane]
+                    scratch[f.at(m1 + PADDING + x, lane)] = s1[lane]
+                    scratch[f.at(m2 + PADDING + x, lane)] = s2[lane]
+            row = (image * height + y) * columns
+            for step in range((columns + LANES - 1) // LANES):
+                x = wp.min(step * LANES, columns - LANES)
+                for lane in range(LANES):
+                    p = a[f.at(row + x, lane)]
+                    d = p - b[f.at(row + x, lane)]
+                    v = f.across(scratch, m1 + x, lane) * p + f.across(scratch, m2 + x, lane) * d
+                    v = f.across(scratch, m0 + x, lane) + real(2.0) * v
+                    if wp.static(summed):
+                        sign = wp.where(d > real(0.0), v_result[1], wp.where(d < real(0.0), -v_result[1], real(0.0)))
+                        v = sign - v_result[0] * v
+                    s0[lane] = v
+                for lane in range(LANES):
+                    v_a[f.at(row + x, lane)] = s0[lane]
+
+    return SimpleNamespace(forward=forward, backward=backward)
