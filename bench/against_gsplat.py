@@ -19,6 +19,12 @@ import warp as wp
 
 from bench.garden import garden_inputs
 from warpgs import RasterizeOptions, rasterize
+from warpgs.constants import RULES
+from warpgs.kernels import bridge
+from warpgs.kernels.project import project
+from warpgs.pipeline.graph import BURST, Burst, StepGraph, Views
+from warpgs.pipeline.loss import LossConfig
+from warpgs.pipeline.optimizer import Optimizer, OptimizerConfig
 from warpgs.scene import Camera, Gaussians
 
 CONFIGURATIONS = {
@@ -36,12 +42,12 @@ def first_camera(camera: Camera) -> Camera:
     return Camera(camera.viewmat[:1], camera.K[:1], camera.width, camera.height)
 
 
-def ours(gaussians: Gaussians, camera: Camera, upstream: torch.Tensor):
+def ours(gaussians: Gaussians, camera: Camera, upstream: torch.Tensor, **choices):
     """Work: our rendering and the gradients of all five tensors."""
-    leaves = list(gaussians.tensors().values())
+    leaves, options = list(gaussians.tensors().values()), RasterizeOptions(rule="gsplat", **choices)
 
     def work():
-        return torch.autograd.grad(rasterize(gaussians, camera, RasterizeOptions(rule="gsplat")).rgb, leaves, upstream)
+        return torch.autograd.grad(rasterize(gaussians, camera, options).rgb, leaves, upstream)
 
     return work
 
@@ -58,6 +64,97 @@ def peer(gaussians: Gaussians, camera: Camera, upstream: torch.Tensor, packed: b
             camera.viewmat, camera.K, camera.width, camera.height, sh_degree=g.sh_degree, packed=packed,
         )  # fmt: skip
         return torch.autograd.grad(rgb, leaves, upstream)
+
+    return work
+
+
+def count_instances(gaussians: Gaussians, camera: Camera) -> int:
+    """(Gaussian, tile) instances of a picture."""
+    size = {"width": camera.width, "height": camera.height}
+    with torch.no_grad():
+        tensors = gaussians.tensors().values()
+        counts = project(*tensors, camera.viewmat, camera.K, **size, degree=0, rule=RULES["gsplat"])[1]
+    return int(counts.sum())
+
+
+def recorded(work):
+    """Work as one CUDA graph, replayed."""
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        for _ in range(3):
+            work()
+    torch.cuda.current_stream().wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph, stream=stream):
+        here = bridge.warp_stream(torch.device("cuda"))
+        wp.capture_begin(stream=here, external=True)
+        held = work()
+        lent = wp.capture_end(stream=here)
+
+    def replay():
+        graph.replay()
+        return held, lent
+
+    return replay
+
+
+def our_step(gaussians: Gaussians, camera: Camera, target: torch.Tensor):
+    """Work: render, L1 + SSIM, backward, Adam as the fit records them."""
+    device = target.device
+    optimizer, burst = Optimizer(gaussians, OptimizerConfig(), 1.0), Burst(device)
+    views = Views(camera.viewmat, camera.K, target[None], None)
+    graph = StepGraph(
+        views, optimizer, None, burst, degree=gaussians.sh_degree, rule="gsplat", loss=LossConfig(),
+        background=torch.zeros(3, device=device),
+    )  # fmt: skip
+    burst.load([0] * BURST, [optimizer.schedule(0.0, k + 1) for k in range(BURST)])
+
+    def work():
+        burst.counter.zero_()
+        graph.replay()
+        return graph
+
+    return work
+
+
+def torch_ssim(a: torch.Tensor, b: torch.Tensor, window: torch.Tensor) -> torch.Tensor:
+    """Mean structural similarity by grouped convolutions, as in 3DGS trainers; images [1, 3, H, W], window [3, 1, 11, 11]."""
+    from torch.nn.functional import conv2d
+
+    ma, mb = conv2d(a, window, padding=5, groups=3), conv2d(b, window, padding=5, groups=3)
+    va = conv2d(a * a, window, padding=5, groups=3) - ma * ma
+    vb = conv2d(b * b, window, padding=5, groups=3) - mb * mb
+    both = conv2d(a * b, window, padding=5, groups=3) - ma * mb
+    return ((2 * ma * mb + 1e-4) * (2 * both + 9e-4) / ((ma * ma + mb * mb + 1e-4) * (va + vb + 9e-4))).mean()
+
+
+def peer_step(gaussians: Gaussians, camera: Camera, target: torch.Tensor):
+    """Work: the same step in the manner of gsplat's trainer: coefficients in two tensors, its fused Adam, torch SSIM."""
+    from gsplat import rasterization
+    from gsplat.optimizers import SelectiveAdam
+
+    params = {n: t.detach().clone().requires_grad_() for n, t in gaussians.tensors().items()}
+    sh = params.pop("sh").detach()
+    params |= {"sh0": sh[:, :1].clone().requires_grad_(), "shN": sh[:, 1:].clone().requires_grad_()}
+    optimizers = [SelectiveAdam([{"params": [p], "lr": 1e-3}], eps=1e-15, betas=(0.9, 0.999)) for p in params.values()]
+    row = torch.exp(-0.5 * (torch.arange(-5, 6, device=target.device) / 1.5) ** 2)
+    window = torch.outer(row, row) / row.sum() ** 2
+    window, goal = window.expand(3, 1, 11, 11).contiguous(), target.permute(2, 0, 1)[None]
+
+    def work():
+        rgb, _, info = rasterization(
+            params["means"], params["quats"], params["log_scales"].exp(), params["logit_opacities"].sigmoid(),
+            torch.cat([params["sh0"], params["shN"]], 1), camera.viewmat, camera.K, camera.width, camera.height,
+            sh_degree=gaussians.sh_degree, packed=False,
+        )  # fmt: skip
+        image = rgb.permute(0, 3, 1, 2)
+        loss = 0.8 * (image - goal).abs().mean() + 0.2 * (1 - torch_ssim(image, goal, window))
+        loss.backward()
+        visible = (info["radii"] > 0).flatten(2).all(-1).any(0) if info["radii"].ndim == 3 else (info["radii"] > 0).any(0)
+        for optimizer in optimizers:
+            optimizer.step(visible)
+            optimizer.zero_grad(set_to_none=True)
 
     return work
 
@@ -124,18 +221,34 @@ def compare(path: str, name: str, kernels: bool) -> dict:
     gaussians, cameras = garden_inputs(path, tiles=tiles, sh_degree=3, width=width, height=height)
     camera = first_camera(cameras)
     upstream = torch.rand(1, height, width, 3, device="cuda", generator=torch.Generator("cuda").manual_seed(1))
-    works = {"warpgs": ours(gaussians, camera, upstream)}
+    room = int(1.3 * count_instances(gaussians, camera))
+    works = {
+        "warpgs": ours(gaussians, camera, upstream),
+        "warpgs atomic": ours(gaussians, camera, upstream, deterministic=False),
+        "warpgs graph": recorded(ours(gaussians, camera, upstream, capacity=room)),
+    }
     works |= {f"gsplat {kind}": peer(gaussians, camera, upstream, kind == "packed") for kind in ("dense", "packed")}
     row = {"configuration": name, "gaussians": len(gaussians), "wall_ms": wall_times(works), "gpu_ms": {}, "peak_mib": {}}
     for who, work in works.items():
         row["gpu_ms"][who], by_kernel = gpu_times(work)
-        row["peak_mib"][who] = round(peak_memory(work), 1)
+        if who != "warpgs graph":  # its memory is taken when it is recorded
+            row["peak_mib"][who] = round(peak_memory(work), 1)
         if kernels and who == "warpgs":
             row["kernels_us"] = {k: round(v, 1) for k, v in by_kernel.most_common(24)}
+    peers = [who for who in works if who.startswith("gsplat")]
     for measure in ("wall_ms", "gpu_ms"):
-        best = min(row[measure][who]["median"] for who in works if who != "warpgs")
-        row[f"{measure}_ratio"] = round(row[measure]["warpgs"]["median"] / best, 3)
-    row["peak_ratio"] = round(row["peak_mib"]["warpgs"] / min(v for k, v in row["peak_mib"].items() if k != "warpgs"), 3)
+        best = min(row[measure][who]["median"] for who in peers)
+        row[f"{measure}_ratio"] = {w: round(row[measure][w]["median"] / best, 3) for w in works if w not in peers}
+    least = min(row["peak_mib"][who] for who in peers)
+    row["peak_ratio"] = {who: round(row["peak_mib"][who] / least, 3) for who in ("warpgs", "warpgs atomic")}
+    del works, work
+    target = torch.rand(height, width, 3, device="cuda", generator=torch.Generator("cuda").manual_seed(2))
+    steps = {"warpgs graph": our_step(gaussians, camera, target), "gsplat": peer_step(gaussians, camera, target)}
+    row["step_wall_ms"] = wall_times(steps)
+    row["step_ratio"] = round(row["step_wall_ms"]["warpgs graph"]["median"] / row["step_wall_ms"]["gsplat"]["median"], 3)
+    if kernels:
+        row["step_gpu_ms"], by_kernel = gpu_times(steps["warpgs graph"])
+        row["step_kernels_us"] = {k: round(v, 1) for k, v in by_kernel.most_common(40)}
     return row
 
 
@@ -154,15 +267,16 @@ def main() -> None:
         row = compare(a.garden, name, a.kernels)
         rows.append(row)
         if a.kernels:
-            for kernel, microseconds in row["kernels_us"].items():
+            for kernel, microseconds in (row["kernels_us"] | {"step:": 0.0} | row["step_kernels_us"]).items():
                 print(f"    {microseconds:9.1f} us  {kernel[:100]}")
         for who in row["wall_ms"]:
             wall, gpu = row["wall_ms"][who], row["gpu_ms"][who]
             figures = f"wall {wall['median']:7.3f} {wall['quartiles']}  GPU {gpu['median']:7.3f} {gpu['spread']} ms"
-            print(f"{name:<18} {who:<14} {figures}  peak {row['peak_mib'][who]:7.1f} MiB")
-        print(
-            f"{name:<18} ratio: wall {row['wall_ms_ratio']}, GPU {row['gpu_ms_ratio']}, memory {row['peak_ratio']}", flush=True
-        )
+            print(f"{name:<18} {who:<14} {figures}  peak {row['peak_mib'].get(who, 0):7.1f} MiB")
+        for who, wall in row["step_wall_ms"].items():
+            print(f"{name:<18} {who:<14} step {wall['median']:7.3f} {wall['quartiles']} ms")
+        ratios = f"wall {row['wall_ms_ratio']}, GPU {row['gpu_ms_ratio']}, memory {row['peak_ratio']}, step {row['step_ratio']}"
+        print(f"{name:<18} ratios: {ratios}", flush=True)
         torch.cuda.empty_cache()
     if a.out:
         result = {"device": torch.cuda.get_device_name(), "torch": torch.__version__, "warp": wp.config.version, "rows": rows}

@@ -84,6 +84,51 @@ def test_sh_degree_limits_the_colour(device):
     assert not torch.equal(rasterize(gaussians, cam).rgb, rasterize(plain, cam).rgb)
 
 
+def test_capacity_changes_nothing_but_says_when_it_is_too_small(device):
+    """Room to spare: the same pictures and gradients, bit for bit. Too little: overflow says so, and nothing else breaks."""
+    gaussians, cam = leaves(cloud(200, device=device)), camera(70, 50, dtype=torch.float32, device=device)
+    results = []
+    for capacity in (None, 5000):
+        r = rasterize(gaussians, cam, RasterizeOptions(capacity=capacity))
+        gradients = torch.autograd.grad(r.rgb.square().sum() + r.depth.sum(), list(gaussians.tensors().values()))
+        results.append((r.rgb, r.depth, *gradients))
+        assert (r.overflow is None) if capacity is None else int(r.overflow) == 0
+    assert all(torch.equal(a, b) for a, b in zip(*results))
+    cut = rasterize(gaussians, cam, RasterizeOptions(capacity=40))
+    assert int(cut.overflow) == 1
+    torch.autograd.grad(cut.rgb.sum(), list(gaussians.tensors().values()))
+
+
+def test_atomic_sums_agree_with_ordered_ones(device):
+    """Without a fixed order gradients differ by rounding only; on a CPU, where there are no atomics, not at all."""
+    gaussians, cam = leaves(cloud(300, device=device)), camera(70, 50, dtype=torch.float32, device=device)
+    gradients = []
+    for deterministic in (True, False):
+        r = rasterize(gaussians, cam, RasterizeOptions(deterministic=deterministic))
+        loss = r.rgb.square().sum() + r.depth.sum() + r.alpha.sum()
+        gradients.append(torch.autograd.grad(loss, list(gaussians.tensors().values())))
+    for a, b in zip(*gradients):
+        assert torch.equal(a, b) if device.type == "cpu" else float((a - b).norm()) <= 1e-5 * float(a.norm())
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("size", [(96, 80), (1100, 1000)], ids=["small chunks", "large chunks"])
+def test_native_kernels_agree_with_generic_ones(size):
+    """Float32 bodies in CUDA against the generic kernels in float64, which pass gradcheck: each gradient within 1e-5."""
+    device = torch.device("cuda", 0)
+    gaussians, cam = leaves(cloud(2000, device=device)), camera(*size, dtype=torch.float32, device=device)
+    weights = torch.rand(size[1], size[0], 5, generator=torch.Generator().manual_seed(1)).to(device)
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        tensors = {n: t.detach().to(dtype).requires_grad_() for n, t in gaussians.tensors().items()}
+        view = Camera(cam.viewmat.to(dtype), cam.K.to(dtype), *size)
+        r = rasterize(warpgs.Gaussians(**tensors), view, RasterizeOptions(rule=SMOOTH))
+        pictures = torch.cat([r.rgb, r.alpha[..., None], r.depth[..., None]], -1)
+        results.append((pictures.detach(), *torch.autograd.grad((pictures * weights).sum(), list(tensors.values()))))
+    for a, b in zip(*results):
+        assert float((a.double() - b).norm()) <= 1e-5 * float(b.norm())
+
+
 def test_errors_name_the_cause(device):
     """Unknown rules and tile sizes, and a scene too large for its budget."""
     gaussians, cam = cloud(50, device=device), camera(20, 12, dtype=torch.float32, device=device)

@@ -32,6 +32,11 @@ class RasterizeOptions:
     """Also report each Gaussian's blending weight, summed and at its largest."""
     memory_budget: int | None = None
     """Bytes that the (Gaussian, tile) instances may take; None for four fifths of what is free."""
+    deterministic: bool = True
+    """Sum gradients in a fixed order, so that the same inputs give the same bits. False takes less memory on CUDA."""
+    capacity: int | None = None
+    """Room for this many (Gaussian, tile) instances instead of as many as there are. Nothing is then read back from the
+    device, so the call can be captured in a CUDA graph; look at `Render.overflow` before using the result."""
 
 
 def _as_batch(array, like: torch.Tensor, rows: int) -> torch.Tensor:
@@ -44,7 +49,8 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
 
     Differentiable in the five tensors of ``gaussians``, in ``camera.viewmat`` and ``camera.K`` where those are tensors that
     require gradients, and in ``options.background``. Float32 or float64, CPU or CUDA, as the tensors are; the same inputs
-    give the same bits every time. Cameras are moved to the type and device of ``gaussians.means``.
+    give the same bits every time, unless ``options.deterministic`` is False. Cameras are moved to the type and device of
+    ``gaussians.means``.
 
     Args:
         gaussians: The scene, N Gaussians.
@@ -77,11 +83,15 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
     splats, tile_counts = project(
         *gaussians.tensors().values(), viewmats, Ks, **size, degree=degree, rule=rule, tile_size=options.tile_size
     )
-    tiles = bin_tiles(splats, tile_counts, **size, tile_size=options.tile_size, rule=rule, budget_bytes=options.memory_budget)
-    rgb, alpha, depth = blend(splats, tiles, backgrounds, **size, rule=rule)
+    overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=means.device)
+    tiles = bin_tiles(
+        splats, tile_counts, **size, tile_size=options.tile_size, rule=rule,
+        budget_bytes=options.memory_budget, capacity=options.capacity, overflow=overflow,
+    )  # fmt: skip
+    rgb, alpha, depth = blend(splats, tiles, backgrounds, **size, rule=rule, deterministic=options.deterministic)
     sums = maxima = None
     if options.contributions:
         sums, maxima = contributions(splats, tiles, **size, rule=rule)
     if len(camera.viewmat.shape) == 2:
         rgb, alpha, depth = rgb[0], alpha[0], depth[0]
-    return Render(rgb, alpha, depth, splats, tile_counts > 0, sums, maxima)
+    return Render(rgb, alpha, depth, splats, tile_counts, sums, maxima, overflow)

@@ -158,9 +158,17 @@ class Render:
     """Expected z-depth [u], divided by alpha; 0 where alpha is 0. Shape [..., H, W]."""
     splats: torch.Tensor
     """Projected Gaussians in the record layout of kernels/project.py, shape [C, N, 12]; retains gradients on request."""
-    visible: torch.Tensor
-    """True where a Gaussian touches at least one tile, shape [C, N]."""
+    tile_counts: torch.Tensor
+    """Number of tiles that a Gaussian touches, int32, shape [C, N]; 0 where it is culled."""
     weight_sums: torch.Tensor | None = None
     """Sum over pixels of a Gaussian's blending weight, shape [C, N]; only where contributions were asked for."""
     weight_maxima: torch.Tensor | None = None
     """Largest blending weight of a Gaussian over the pixels, shape [C, N]; only where contributions were asked for."""
+    overflow: torch.Tensor | None = None
+    """1 where the instances did not fit into the capacity asked for, and the pictures must not be used; else 0. Int32,
+    shape [1]; only where a capacity was given."""
+
+    @property
+    def visible(self) -> torch.Tensor:
+        """True where a Gaussian touches at least one tile, shape [C, N]."""
+        return self.tile_counts > 0

@@ -8,6 +8,10 @@ import warp as wp
 from warpgs.kernels import bridge
 from warpgs.kernels.compiler import ROLLED
 
+BETAS = (0.9, 0.999)
+"""Decay of the two running means (Kingma and Ba 2015)."""
+EPS = 1e-15
+"""Added to the root; as in Kerbl et al. 2023, whose gradients are tiny."""
 LANES = 16
 """Elements that are updated together on a CPU: a loop that vectorises."""
 SEGMENT = 4096
@@ -68,6 +72,52 @@ def make_kernel(real, split: bool, lanes: int):
     return update
 
 
+@functools.cache
+def make_scheduled_kernel(split: bool):
+    """The update for CUDA in float32 with its rates in memory, so that it can be recorded once and replayed."""
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def update(
+        begin: int, gradient: wp.array(dtype=float), row: int, head: int, rates: wp.array(dtype=float),
+        beta1: float, beta2: float, rest1: float, rest2: float, eps: float, skip: wp.array(dtype=int),
+        # outputs
+        parameter: wp.array(dtype=float), mean: wp.array(dtype=float), square: wp.array(dtype=float),
+    ):  # fmt: skip
+        if skip[0] != 0:
+            return
+        i = begin + wp.tid()
+        g = gradient[i]
+        m = beta1 * mean[i] + rest1 * g
+        s = beta2 * square[i] + rest2 * g * g
+        mean[i] = m
+        square[i] = s
+        step = rates[1]
+        if wp.static(split):
+            step = wp.where(i % row < head, rates[0], rates[1])
+        parameter[i] = parameter[i] - step * m / (wp.sqrt(s) / rates[2] + eps)
+
+    return update
+
+
+def scheduled_rates(lr: float, step: int, betas: tuple[float, float] = BETAS, head_lr: float | None = None) -> list[float]:
+    """What `adam_scheduled` reads from memory at a step: both learning rates and the root of the second correction."""
+    correction1, correction2 = 1 - betas[0] ** step, 1 - betas[1] ** step
+    return [(lr if head_lr is None else head_lr) / correction1, lr / correction1, correction2**0.5]
+
+
+def adam_scheduled(
+    param: torch.Tensor, grad: torch.Tensor, exp_avg: torch.Tensor, exp_avg_sq: torch.Tensor, rates: torch.Tensor,
+    skip: torch.Tensor, *, betas: tuple[float, float] = BETAS, eps: float = EPS, head: int = 0,
+) -> None:  # fmt: skip
+    """`adam_step` on CUDA in float32, with ``rates`` [3] of `scheduled_rates`; nothing changes where ``skip`` [1] is not 0."""
+    inputs = [
+        bridge.view(grad.view(-1), wp.float32), param[0].numel(), head, bridge.view(rates, wp.float32),
+        *betas, 1 - betas[0], 1 - betas[1], eps, bridge.view(skip, wp.int32),
+        *(bridge.view(t.view(-1), wp.float32) for t in (param, exp_avg, exp_avg_sq)),
+    ]  # fmt: skip
+    bridge.launch(make_scheduled_kernel(head > 0), param.numel(), inputs, param.device)
+
+
 def adam_step(
     param: torch.Tensor,
     grad: torch.Tensor,
@@ -76,8 +126,8 @@ def adam_step(
     *,
     lr: float,
     step: int,
-    betas: tuple[float, float] = (0.9, 0.999),
-    eps: float = 1e-15,
+    betas: tuple[float, float] = BETAS,
+    eps: float = EPS,
     head_lr: float | None = None,
     head: int = 0,
 ) -> None:

@@ -75,10 +75,10 @@ def _frame(width: int, height: int, tile_size: int) -> list[int]:
     return [width, height, columns, columns * rows]
 
 
-def _forward(splats, tiles, backgrounds, width, height, rule, keep):
+def _forward(splats, tiles, backgrounds, width, height, rule, keep, deterministic=True):
     """Pictures, and what the backward pass needs: rgb, alpha, depth, transmittances, weights, ends, states (CUDA only)."""
     if _native(splats):
-        return blend_cuda.forward(splats, tiles, backgrounds, width, height, rule, keep)
+        return blend_cuda.forward(splats, tiles, backgrounds, width, height, rule, keep, deterministic)
     real, device = bridge.real_of(splats), splats.device
     shape = (len(backgrounds), height, width)
     rgb = splats.new_empty(*shape, 3)
@@ -95,7 +95,7 @@ def _forward(splats, tiles, backgrounds, width, height, rule, keep):
     return rgb, alpha, depth, transmittances, weights, ends, splats.new_empty(0)
 
 
-def _backward(splats, tiles, backgrounds, width, height, rule, saved, v_rgb, v_alpha, v_depth):
+def _backward(splats, tiles, backgrounds, width, height, rule, _, saved, v_rgb, v_alpha, v_depth):
     """Gradient of the records by the generic kernels; ``saved`` as in blend_cuda.backward."""
     _, depth, transmittances, weights, ends, _ = saved
     real, device = bridge.real_of(splats), splats.device
@@ -121,14 +121,14 @@ def _backward(splats, tiles, backgrounds, width, height, rule, saved, v_rgb, v_a
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, splats, backgrounds, tiles, width, height, rule):
+    def forward(ctx, splats, backgrounds, tiles, width, height, rule, deterministic):
         splats, backgrounds = splats.contiguous(), backgrounds.contiguous()
         keep = any(ctx.needs_input_grad)
-        rgb, alpha, depth, *rest = _forward(splats, tiles, backgrounds, width, height, rule, keep)
+        rgb, alpha, depth, *rest = _forward(splats, tiles, backgrounds, width, height, rule, keep, deterministic)
         if keep:
             # all of it as saved tensors: those are freed once the gradient is taken
             ctx.save_for_backward(splats, backgrounds, rgb, depth, *rest, *tiles.tensors())
-            ctx.tile_size, ctx.size, ctx.rule = tiles.size, (width, height), rule
+            ctx.tile_size, ctx.how = tiles.size, (width, height, rule, deterministic)
         ctx.set_materialize_grads(False)
         return rgb, alpha, depth
 
@@ -143,8 +143,8 @@ class _Blend(torch.autograd.Function):
         if ctx.needs_input_grad[1]:
             v_backgrounds = torch.einsum("chw,chwk->ck", saved[2], v_rgb)
         work = blend_cuda.backward if _native(splats) else _backward
-        v_splats = work(splats, tiles, backgrounds, *ctx.size, ctx.rule, saved, v_rgb, v_alpha, v_depth)
-        return v_splats, v_backgrounds, None, None, None, None
+        v_splats = work(splats, tiles, backgrounds, *ctx.how, saved, v_rgb, v_alpha, v_depth)
+        return v_splats, v_backgrounds, None, None, None, None, None
 
 
 def _check(splats: torch.Tensor, tiles: Tiles, width: int, height: int, **backgrounds) -> None:
@@ -158,7 +158,14 @@ def _check(splats: torch.Tensor, tiles: Tiles, width: int, height: int, **backgr
 
 
 def blend(
-    splats: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, *, width: int, height: int, rule: Rule
+    splats: torch.Tensor,
+    tiles: Tiles,
+    backgrounds: torch.Tensor,
+    *,
+    width: int,
+    height: int,
+    rule: Rule,
+    deterministic: bool = True,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Composite C images of H x W pixels (Kerbl et al. 2023, eq. 3; order and early stop as ``rule`` says).
 
@@ -172,6 +179,8 @@ def blend(
         width: Image width [px].
         height: Image height [px].
         rule: Cut-offs.
+        deterministic: Sum gradients in a fixed order. False adds them atomically on CUDA in float32, which takes less memory
+            and gives other bits each time; elsewhere it changes nothing.
 
     Returns:
         ``rgb`` [C, H, W, 3]; ``alpha`` [C, H, W], accumulated opacity; ``depth`` [C, H, W], the mean z-depth [u] under the
@@ -182,7 +191,7 @@ def blend(
         ValueError: A shape or device disagrees, or the tiles belong to another image size.
     """
     _check(splats, tiles, width, height, backgrounds=(backgrounds, "C 3"))
-    return _Blend.apply(splats, backgrounds, tiles, width, height, rule)
+    return _Blend.apply(splats, backgrounds, tiles, width, height, rule, deterministic)
 
 
 def contributions(

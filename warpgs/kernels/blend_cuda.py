@@ -5,8 +5,6 @@ blend_cpu.py compute (docs/blend.md); tests hold them against each other.
 """
 
 import functools
-import importlib.resources
-import re
 from types import SimpleNamespace
 
 import torch
@@ -14,14 +12,15 @@ import warp as wp
 
 from warpgs.constants import Rule
 from warpgs.kernels import bridge
+from warpgs.kernels.native import source
 from warpgs.kernels.tiles import Tiles, grid
 
-CHUNKS = (64, 256)
-"""Instances that one warp of the backward pass works through: the first up to MANY of them, to have enough warps, the
-second beyond, to load the pixels less often. The forward pass leaves the state of every pixel at each multiple of this, so
-that a long list is worked on in many places at once. Multiples of 32."""
-MANY = 2**20
-"""Instances from which on the larger chunk is the faster one (docs/decisions/005-cuda-blending.md)."""
+CHUNKS = (64, 128)
+"""Instances that one warp of the backward pass works through: the first in pictures of up to MANY tiles, to have enough
+warps, the second in larger ones, to load the pixels less often. The forward pass leaves the state of every pixel at each
+multiple of this, so that a long list is worked on in many places at once. Multiples of 32."""
+MANY = 4096
+"""Tiles beyond which the larger chunk is the faster one (docs/decisions/005-cuda-blending.md)."""
 STATE = 5
 """Floats of that state: transmittance, colour and depth sum so far."""
 VALUES = 10
@@ -36,13 +35,9 @@ SCALE = "0.84932180028801904272f"  # sqrt(log2(e) / 2)
 
 
 def _source(name: str, tile_size: int, **numbers) -> str:
-    """A body from the folder of CUDA sources, behind what all share, its upper-case names replaced."""
-    folder = importlib.resources.files("warpgs.kernels") / "cuda"
-    source = (folder / f"blend_{name}.cu").read_text()
-    if name != "gather":
-        source = (folder / "blend_common.cu").read_text() + source
+    """A body, behind what all bodies share."""
     numbers |= {"SIDE": tile_size, "STATE": STATE, "SCALE": SCALE, "WARPS": WARPS, "VALUES": VALUES, "STRIDE": STRIDE}
-    return re.sub(r"\b(" + "|".join(numbers) + r")\b", lambda m: str(numbers[m[0]]), source)
+    return source("blend_common.cu", f"blend_{name}.cu", **numbers)
 
 
 @functools.cache
@@ -51,13 +46,16 @@ def make_kernels(tile_size: int):
 
     @wp.func_native(_source("forward", tile_size))
     def forward_body(
-        item: int, splats: wp.array(dtype=float), ranges: wp.array(dtype=int), splat_ids: wp.array(dtype=int),
-        backgrounds: wp.array(dtype=float), width: int, height: int, columns: int, tiles: int,
+        item: int, splats: wp.array(dtype=float), order: wp.array(dtype=int), ranges: wp.array(dtype=int),
+        splat_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float), width: int, height: int, columns: int, tiles: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int, stop: float, inclusive: int, chunk: int,
         rgb: wp.array(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
         transmittances: wp.array(dtype=float), weights: wp.array(dtype=float), ends: wp.array(dtype=int),
         states: wp.array(dtype=float),
     ): ...  # fmt: skip
+
+    @wp.func_native(source("blend_order.cu"))
+    def order_body(ranges: wp.array(dtype=int), count: int, order: wp.array(dtype=int)): ...
 
     @wp.func_native(_source("contributions", tile_size))
     def contributions_body(
@@ -71,8 +69,8 @@ def make_kernels(tile_size: int):
 
     @wp.kernel(**options)
     def forward(
-        begin: int, splats: wp.array(dtype=float), ranges: wp.array(dtype=int), splat_ids: wp.array(dtype=int),
-        backgrounds: wp.array(dtype=float), width: int, height: int, columns: int, tiles: int,
+        begin: int, splats: wp.array(dtype=float), order: wp.array(dtype=int), ranges: wp.array(dtype=int),
+        splat_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float), width: int, height: int, columns: int, tiles: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int, stop: float, inclusive: int, chunk: int,
         # outputs
         rgb: wp.array(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
@@ -80,10 +78,18 @@ def make_kernels(tile_size: int):
         states: wp.array(dtype=float),
     ):  # fmt: skip
         forward_body(
-            wp.tid() // 32, splats, ranges, splat_ids, backgrounds, width, height, columns, tiles,
+            wp.tid() // 32, splats, order, ranges, splat_ids, backgrounds, width, height, columns, tiles,
             alpha_cut, alpha_max, whole_tiles, stop, inclusive, chunk,
             rgb, alpha_out, depth, transmittances, weights, ends, states,
         )  # fmt: skip
+
+    @wp.kernel(**options)
+    def order_tiles(
+        begin: int, ranges: wp.array(dtype=int), count: int,
+        # outputs
+        order: wp.array(dtype=int),
+    ):  # fmt: skip
+        order_body(ranges, count, order)
 
     @wp.kernel(**options)
     def contributions(
@@ -98,18 +104,21 @@ def make_kernels(tile_size: int):
             alpha_cut, alpha_max, ends, weights,
         )  # fmt: skip
 
-    return SimpleNamespace(forward=forward, contributions=contributions)
+    return SimpleNamespace(forward=forward, order_tiles=order_tiles, contributions=contributions)
 
 
 @functools.cache
-def make_backward(tile_size: int, with_depth: bool, chunk: int):
-    """Backward kernels: sums per instance, then per Gaussian; ``with_depth`` with gradients of depth and alpha."""
-    numbers = {"CHUNK": chunk, "WITH_DEPTH": str(with_depth).lower()}
+def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
+    """Backward kernels: sums per instance, then per Gaussian; ``with_depth`` with gradients of depth and alpha.
+
+    ``atomic``: sums are added to their Gaussian's without slots, in no fixed order.
+    """
+    numbers = {"CHUNK": chunk, "WITH_DEPTH": str(with_depth).lower(), "ATOMIC": str(atomic).lower()}
 
     @wp.func_native(_source("backward", tile_size, **numbers))
     def backward_body(
         item: int, splats: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        splat_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64),
+        splat_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
         backgrounds: wp.array(dtype=float), width: int, height: int, columns: int, tiles: int, no_tile: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int,
         rgb: wp.array(dtype=float), depth: wp.array(dtype=float), transmittances: wp.array(dtype=float),
@@ -124,7 +133,7 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int):
         v_slots: wp.array(dtype=float), v_splats: wp.array(dtype=float),
     ): ...  # fmt: skip
 
-    name = f"warpgs.kernels.blend_cuda.backward.{tile_size}.{int(with_depth)}.{chunk}"
+    name = f"warpgs.kernels.blend_cuda.backward.{tile_size}.{int(with_depth)}.{chunk}.{int(atomic)}"
     options = {"enable_backward": False, "grid_stride": False, "module": name}
     # many chunks want many warps at a time more than they want registers
     registers = {"cuda_max_registers": 80} if chunk == CHUNKS[1] and not with_depth else {"launch_bounds": 32 * WARPS}
@@ -132,7 +141,7 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int):
     @wp.kernel(**registers, **options)
     def backward(
         begin: int, splats: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        splat_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64),
+        splat_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
         backgrounds: wp.array(dtype=float), width: int, height: int, columns: int, tiles: int, no_tile: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int,
         rgb: wp.array(dtype=float), depth: wp.array(dtype=float), transmittances: wp.array(dtype=float),
@@ -142,8 +151,8 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int):
         v_slots: wp.array(dtype=float),
     ):  # fmt: skip
         backward_body(
-            wp.tid() // 32, splats, keys, ranges, splat_ids, slots, totals, backgrounds, width, height, columns, tiles, no_tile,
-            alpha_cut, alpha_max, whole_tiles, rgb, depth, transmittances, weights, ends, states,
+            wp.tid() // 32, splats, keys, ranges, splat_ids, slots, totals, capacity, backgrounds, width, height, columns,
+            tiles, no_tile, alpha_cut, alpha_max, whole_tiles, rgb, depth, transmittances, weights, ends, states,
             v_rgb, v_alpha, v_depth, v_slots,
         )  # fmt: skip
 
@@ -172,12 +181,12 @@ def _frame(width: int, height: int, tile_size: int) -> list[int]:
     return [width, height, columns, columns * rows]
 
 
-def chunk_of(tiles: Tiles) -> int:
-    """Instances per chunk of the backward pass."""
-    return CHUNKS[int(tiles.slots.shape[0] > MANY)]
+def chunk_of(tiles: Tiles, deterministic: bool) -> int:
+    """Instances per chunk of the backward pass; the larger one, which takes less memory, where memory is asked for."""
+    return CHUNKS[int(tiles.ranges.shape[0] > MANY or not deterministic)]
 
 
-def forward(splats, tiles: Tiles, backgrounds, width: int, height: int, rule: Rule, keep: bool):
+def forward(splats, tiles: Tiles, backgrounds, width: int, height: int, rule: Rule, keep: bool, deterministic: bool):
     """Pictures and what the backward pass needs of them: rgb, alpha, depth, transmittances, weights, ends, states."""
     device = splats.device
     shape = (backgrounds.shape[0], height, width)
@@ -185,37 +194,44 @@ def forward(splats, tiles: Tiles, backgrounds, width: int, height: int, rule: Ru
     alpha, depth, transmittances, weights = splats.new_empty(4, *shape).unbind()
     ends = torch.empty(shape, dtype=torch.int32, device=device)
     pixels = tiles.size * tiles.size
-    chunk = chunk_of(tiles) if keep else 0
+    chunk = chunk_of(tiles, deterministic) if keep else 0
     states = splats.new_empty((tiles.slots.shape[0] // chunk + 1) * STATE * pixels if keep else 0)
+    k, count = make_kernels(tiles.size), tiles.ranges.shape[0]
+    order = torch.empty(count, dtype=torch.int32, device=device)
+    bridge.launch(k.order_tiles, 1024, [*_ints(tiles.ranges), count, *_ints(order)], device, block_dim=1024)
     inputs = [
-        *_floats(splats), *_ints(tiles.ranges, tiles.splat_ids), *_floats(backgrounds), *_frame(width, height, tiles.size),
-        rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), rule.transmittance_stop, int(rule.inclusive_stop), chunk,
+        *_floats(splats), *_ints(order, tiles.ranges, tiles.splat_ids), *_floats(backgrounds),
+        *_frame(width, height, tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
+        rule.transmittance_stop, int(rule.inclusive_stop), chunk,
         *_floats(rgb, alpha, depth, transmittances, weights), *_ints(ends), *_floats(states),
     ]  # fmt: skip
-    bridge.launch(make_kernels(tiles.size).forward, tiles.ranges.shape[0] * pixels, inputs, device, block_dim=32 * WARPS)
+    bridge.launch(k.forward, count * pixels, inputs, device, block_dim=32 * WARPS)
     return rgb, alpha, depth, transmittances, weights, ends, states
 
 
-def backward(splats, tiles: Tiles, backgrounds, width: int, height: int, rule: Rule, saved, v_rgb, v_alpha, v_depth):
+def backward(
+    splats, tiles: Tiles, backgrounds, width: int, height: int, rule: Rule, deterministic: bool, saved, v_rgb, v_alpha, v_depth
+):
     """Gradient of the records, shape [C, N, 12], from what `forward` returned and the gradients of its pictures."""
     rgb, depth, transmittances, weights, ends, states = saved
     device, count = splats.device, tiles.slots.shape[0]
     with_depth = v_alpha is not None or v_depth is not None
-    k = make_backward(tiles.size, with_depth, chunk_of(tiles))
+    chunk = chunk_of(tiles, deterministic)
+    k = make_backward(tiles.size, with_depth, chunk, not deterministic)
     if with_depth:
         v_alpha, v_depth = (torch.zeros_like(depth) if v is None else v.contiguous() for v in (v_alpha, v_depth))
     else:
         v_alpha = v_depth = depth  # never read
-    v_splats = torch.empty_like(splats)
-    v_slots = splats.new_empty(count, STRIDE)
+    v_splats = torch.empty_like(splats) if deterministic else torch.zeros_like(splats)
+    v_slots = splats.new_empty(count, STRIDE) if deterministic else v_splats
     inputs = [
         *_floats(splats), *_ints(tiles.tile_ids, tiles.ranges, tiles.splat_ids, tiles.slots),
-        bridge.view(tiles.total, wp.int64), *_floats(backgrounds), *_frame(width, height, tiles.size), tiles.ranges.shape[0],
-        rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
+        bridge.view(tiles.total, wp.int64), count, *_floats(backgrounds), *_frame(width, height, tiles.size),
+        tiles.ranges.shape[0], rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
         *_floats(rgb, depth, transmittances, weights), *_ints(ends), *_floats(states),
         *_floats(v_rgb.contiguous(), v_alpha, v_depth, v_slots),
     ]  # fmt: skip
-    bridge.launch(k.backward, 32 * -(-count // chunk_of(tiles)), inputs, device, block_dim=32 * WARPS)
+    bridge.launch(k.backward, 32 * -(-count // chunk), inputs, device, block_dim=32 * WARPS)
     inputs = [*_floats(splats), *_ints(tiles.starts, tiles.counts), *_floats(v_slots, v_splats)]
     bridge.launch(k.gather, -(-tiles.counts.shape[0] // 256) * 256, inputs, device)
     return v_splats

@@ -80,14 +80,23 @@ def view(tensor: torch.Tensor, dtype) -> View:
     return View(tensor, dtype)
 
 
+def warp_device(device: torch.device) -> wp.Device:
+    """Warp's object for a torch device, also for one without a number."""
+    if device.type == "cuda" and device.index is None:
+        device = torch.device("cuda", torch.cuda.current_device())
+    return wp.device_from_torch(device)
+
+
 @functools.cache
 def _warp_stream(device: torch.device, pointer: int) -> wp.Stream:
-    return wp.Stream(wp.device_from_torch(device), cuda_stream=pointer)
+    return wp.Stream(warp_device(device), cuda_stream=pointer)
 
 
-def _current_stream(device: torch.device) -> wp.Stream:
+def warp_stream(device: torch.device) -> wp.Stream:
+    """Torch's current stream of a CUDA device as Warp's object."""
     # torch.cuda.current_stream makes a Python object each time, which takes ten times as long
-    return _warp_stream(device, torch._C._cuda_getCurrentRawStream(device.index))
+    index = torch.cuda.current_device() if device.index is None else device.index
+    return _warp_stream(device, torch._C._cuda_getCurrentRawStream(index))
 
 
 @contextlib.contextmanager
@@ -99,13 +108,13 @@ def stream_of(device: torch.device):
     if device.type != "cuda":
         yield
         return
-    wanted, warp_device = _current_stream(device), wp.device_from_torch(device)
-    before = warp_device.stream
-    warp_device.set_stream(wanted, sync=False)
+    wanted, where = warp_stream(device), warp_device(device)
+    before = where.stream
+    where.set_stream(wanted, sync=False)
     try:
         yield
     finally:
-        warp_device.set_stream(before, sync=False)
+        where.set_stream(before, sync=False)
 
 
 class _Recorded:
@@ -116,7 +125,7 @@ class _Recorded:
     """
 
     def __init__(self, kernel, device: torch.device, block_dim: int):
-        self.kernel, self.device, self.block_dim = kernel, wp.device_from_torch(device), block_dim
+        self.kernel, self.device, self.block_dim = kernel, warp_device(device), block_dim
         self.command, self.known = None, []
         self.lock = threading.Lock()  # autograd launches from a thread of its own
 
@@ -178,7 +187,7 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
     if count == 0:
         return
     if device.type == "cuda":
-        _recorded(kernel, device, block_dim).launch(count, inputs, _current_stream(device))
+        _recorded(kernel, device, block_dim).launch(count, inputs, warp_stream(device))
         return
     inputs = [a.array() if isinstance(a, View) else a for a in inputs]
     threads = torch.get_num_threads()

@@ -1,12 +1,24 @@
 """CUDA functions where plain Warp has no means: between the threads of a warp or block, and loads of 16 bytes."""
 
 import functools
+import importlib.resources
+import re
 from types import SimpleNamespace
 
 import warp as wp
 
 BLOCK = 256
 """Threads of a block that `compact` works in."""
+
+
+def source(*names: str, **numbers) -> str:
+    """CUDA text of the files of those names, one after the other, with names in capitals replaced by numbers."""
+    folder = importlib.resources.files("warpgs.kernels") / "cuda"
+    text = "".join((folder / name).read_text() for name in names)
+    for name, number in numbers.items():
+        text = re.sub(rf"\b{name}\b", str(number), text)
+    return text
+
 
 _COMPACT = """
     __shared__ int s_counts[BLOCK / 32], s_items[BLOCK];

@@ -10,13 +10,13 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from warpgs.kernels import bridge, ssim_cpu
+from warpgs.kernels import bridge, ssim_cpu, ssim_cuda
 from warpgs.kernels.ssim_cpu import BLOCK, CHANNELS, LANES, PADDING, RADIUS, make_functions
 
 
 @functools.cache
 def make_kernels(real):
-    """Kernels of one task per element, for CUDA: the vertical passes write to global memory, with zeros on both sides."""
+    """Kernels for float64 on CUDA, a task per element: vertical passes write to global memory, with zeros on both sides."""
     f = make_functions(real)
     kernel = functools.partial(wp.kernel, enable_backward=False, module=f"warpgs.kernels.ssim.{real.__name__}")
 
@@ -118,10 +118,18 @@ class _Plan:
         bridge.launch(kernel, self.tasks, inputs, self.device, cost=BLOCK * self.columns)
 
 
+def _native(image: torch.Tensor) -> bool:
+    return image.is_cuda and image.dtype == torch.float32
+
+
 class _Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image, target):
         image, target = image.contiguous(), target.contiguous()
+        if _native(image):
+            result, *partials = ssim_cuda.forward(image, target, summed=False)
+            ctx.save_for_backward(image, target, *partials)
+            return result
         plan = _Plan(image)
         result = torch.empty_like(image)
         partials = [torch.empty_like(image) for _ in range(3)]
@@ -140,6 +148,8 @@ class _Ssim(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, v_result):
         image, target, *partials = ctx.saved_tensors
+        if _native(image):
+            return ssim_cuda.backward(image, target, partials, v_result, summed=False), None
         plan = _Plan(image)
         v_image, pair = torch.empty_like(image), [plan.flat(image), plan.flat(target)]
         if plan.blocked:
@@ -159,6 +169,10 @@ class _Differences(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image, target):
         image, target = image.contiguous(), target.contiguous()
+        if _native(image):
+            sums, *partials = ssim_cuda.forward(image, target, summed=True)
+            ctx.save_for_backward(image, target, *partials)
+            return sums.sum(0)
         plan = _Plan(image, summed=True)
         sums = image.new_empty(plan.tasks, 2)
         partials = [torch.empty_like(image) for _ in range(3)]
@@ -171,6 +185,8 @@ class _Differences(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, v_sums):
         image, target, *partials = ctx.saved_tensors
+        if _native(image):
+            return ssim_cuda.backward(image, target, partials, v_sums, summed=True), None
         plan = _Plan(image, summed=True)
         v_image = torch.empty_like(image)
         inputs = [plan.flat(t) for t in (image, target, *partials, v_sums.contiguous())]
@@ -215,7 +231,8 @@ def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 def differences(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Sums over all pixels and channels of 1 - `ssim` and of |image - target|, what a photometric loss is made of.
 
-    On a CPU one pass gives both, and the backward pass their gradient; on CUDA torch adds up the map of `ssim`.
+    One pass gives both, and the backward pass their gradient; for tiny images, and for float64 on CUDA, torch adds up the
+    map of `ssim`.
 
     Args:
         image: Colours in [0, 1], shape [H, W, 3] or [B, H, W, 3].
@@ -230,6 +247,6 @@ def differences(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """
     _check(image, target)
     target = target.detach()
-    if image.device.type != "cpu" or image.shape[-2] * CHANNELS < LANES:
+    if not (_native(image) or (image.device.type == "cpu" and image.shape[-2] * CHANNELS >= LANES)):
         return torch.stack([(1 - ssim(image, target)).sum(), (image - target).abs().sum()])
     return _Differences.apply(*(t.reshape(-1, *t.shape[-3:]) for t in (image, target)))

@@ -18,6 +18,9 @@ BYTES_PER_INSTANCE = 24 + 48 + 80
 """Two sort buffers of (key, slot), owner and sorted id; of the backward pass on CUDA, the gradient slot and the share of
 the states that blending leaves (blend_cuda.CHUNK)."""
 
+VISIBLE = 2**36
+"""What a visible Gaussian adds to a running sum of tile counts, so that one sum has both; of either there are fewer."""
+
 SMALL = 32
 """Tiles of a Gaussian that one CUDA thread lists alone."""
 
@@ -42,7 +45,7 @@ class Tiles:
     """Where an instance stood before the tile sort, int32, shape [M]: there the instances of a Gaussian are neighbours,
     so each owns a row that gradients can be written to and then summed in a fixed order, without atomics."""
     starts: torch.Tensor
-    """First slot of each Gaussian, int32, shape [C * N]."""
+    """First slot of each Gaussian that has any, int32, shape [C * N]."""
     counts: torch.Tensor
     """Number of slots of each Gaussian, int32, shape [C * N]."""
     tile_ids: torch.Tensor
@@ -78,6 +81,27 @@ def make_kernels(real):
             keys[i] = real(wp.inf)
 
     @wp.kernel(enable_backward=False, module=f"warpgs.kernels.tiles.{real.__name__}")
+    def pack_counts(
+        begin: int, tile_counts: wp.array(dtype=int),
+        # outputs
+        packed: wp.array(dtype=wp.int64),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        packed[i] = wp.int64(tile_counts[i]) + wp.where(tile_counts[i] > 0, wp.int64(VISIBLE), wp.int64(0))
+
+    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.tiles.{real.__name__}")
+    def visible_keys(
+        begin: int, splats: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), packed: wp.array(dtype=wp.int64),
+        # outputs
+        keys: wp.array(dtype=real), ids: wp.array(dtype=int),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        if tile_counts[i] > 0:
+            j = int(packed[i] / wp.int64(VISIBLE)) - 1
+            keys[j] = splats[i, 9]
+            ids[j] = i
+
+    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.tiles.{real.__name__}")
     def ordered_counts(
         begin: int, order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
         # outputs
@@ -94,16 +118,23 @@ def make_kernels(real):
         ids: wp.array(dtype=int), ranges: wp.array2d(dtype=int),
     ):  # fmt: skip
         i = begin + wp.tid()
-        ids[i] = owners[slots[i]]
         tile = keys[i]
         if tile == no_tile:
+            ids[i] = 0
             return
+        ids[i] = owners[slots[i]]
         if i == 0 or keys[wp.max(i - 1, 0)] != tile:
             ranges[tile, 0] = i
         if i == count - 1 or keys[wp.min(i + 1, count - 1)] != tile:
             ranges[tile, 1] = i + 1
 
-    return SimpleNamespace(depth_keys=depth_keys, ordered_counts=ordered_counts, find_ranges=find_ranges)
+    return SimpleNamespace(
+        depth_keys=depth_keys,
+        pack_counts=pack_counts,
+        visible_keys=visible_keys,
+        ordered_counts=ordered_counts,
+        find_ranges=find_ranges,
+    )
 
 
 @functools.cache
@@ -129,9 +160,10 @@ def make_emit(real, native: bool):
     def emit(
         begin: int, splats: wp.array2d(dtype=real), order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
         ends: wp.array(dtype=wp.int64), count: int, per_camera: int, width: int, height: int, tile_size: int,
-        alpha_cut: real, square_sigma: real, columns: int, tiles: int, no_tile: int,
+        alpha_cut: real, square_sigma: real, columns: int, tiles: int, no_tile: int, capacity: int,
         # outputs
         starts: wp.array(dtype=int), keys: wp.array(dtype=int), slots: wp.array(dtype=int), owners: wp.array(dtype=int),
+        overflow: wp.array(dtype=int),
     ):  # fmt: skip
         j = begin + wp.tid()
         i = int(0)
@@ -141,7 +173,13 @@ def make_emit(real, native: bool):
         if j < count:
             i = order[j]
             touched = tile_counts[i]
-            end = int(ends[j])
+            last_slot = ends[j]
+            if last_slot > wp.int64(capacity):  # the lists are cut, and nobody may use them; see `bin_tiles`
+                overflow[0] = 1
+                touched = int(wp.max(wp.int64(touched) - (last_slot - wp.int64(capacity)), wp.int64(0)))
+                last_slot = wp.int64(capacity)
+                tile_counts[i] = touched
+            end = int(last_slot)
             slot = end - touched
             starts[i] = slot
         if touched > 0 and wp.static(SMALL if native else 2**31 - 1) >= touched:
@@ -215,16 +253,14 @@ def installed_bytes(device: torch.device) -> int:
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
-def _checked_total(counts: torch.Tensor, ends: torch.Tensor, tiles: int, budget_bytes: int | None) -> int:
-    total = int(ends[-1])
+def _check_total(total: int, visible: int, device: torch.device, tiles: int, budget_bytes: int | None) -> None:
     needed = total * BYTES_PER_INSTANCE
     # asking what is free costs 0.1 ms or more: not worth it for a twentieth of the machine
-    if total <= MAX_INSTANCES and budget_bytes is None and needed < installed_bytes(counts.device) // 20:
-        return total
-    budget = available_bytes(counts.device) * 4 // 5 if budget_bytes is None else budget_bytes
+    if total <= MAX_INSTANCES and budget_bytes is None and needed < installed_bytes(device) // 20:
+        return
+    budget = available_bytes(device) * 4 // 5 if budget_bytes is None else budget_bytes
     if total <= MAX_INSTANCES and needed <= budget:
-        return total
-    visible = int((counts > 0).sum())
+        return
     limit = f"{MAX_INSTANCES:,} instances" if total > MAX_INSTANCES else f"{budget / 2**30:.2f} GiB"
     raise ResourceError(
         f"binning {visible:,} visible Gaussians into tiles makes {total:,} (Gaussian, tile) instances, "
@@ -243,6 +279,8 @@ def bin_tiles(
     tile_size: int = 16,
     rule: Rule,
     budget_bytes: int | None = None,
+    capacity: int | None = None,
+    overflow: torch.Tensor | None = None,
 ) -> Tiles:
     """List for every tile the Gaussians that touch it, front to back. Not differentiable.
 
@@ -254,9 +292,13 @@ def bin_tiles(
         tile_size: Side of a tile [px].
         rule: Cut-offs, the same as given to `project`.
         budget_bytes: Memory the instances may take; None for four fifths of what is free.
+        capacity: Make room for this many instances instead of asking the device how many there are, so that the work can be
+            recorded once and replayed. What is over is marked as no tile's.
+        overflow: Set to 1 where there are more instances than ``capacity``: the lists are then cut short and must not be
+            used. Int32, shape [1]; needed with ``capacity``.
 
     Returns:
-        The sorted instances.
+        The sorted instances; M is ``capacity`` where one is given.
 
     Raises:
         ResourceError: The instances, counted in 64 bits before anything is allocated, exceed the budget or 2^31 - 1.
@@ -281,24 +323,45 @@ def bin_tiles(
 
     splats = splats.detach().contiguous().view(count, -1)
     splats_view, counts_view = bridge.view(splats, real), bridge.view(counts, wp.int32)
+    longs = functools.partial(torch.empty, dtype=torch.int64, device=device)
+    fixed = capacity is not None
     with bridge.stream_of(device):
-        depths, order = torch.empty(2 * count, dtype=splats.dtype, device=device), ints(2 * count)
+        if fixed:
+            visible, total = count, capacity
+        else:
+            # One look at the device, before the sorts, tells how many are visible and how many tiles they touch.
+            packed = longs(count)
+            bridge.launch(k.pack_counts, count, [counts_view, bridge.view(packed, wp.int64)], device)
+            torch.cumsum(packed, 0, out=packed)
+            visible, total = divmod(int(packed[-1]), VISIBLE)
+            _check_total(total, visible, device, tiles, budget_bytes)
+        depths, order = torch.empty(2 * visible, dtype=splats.dtype, device=device), ints(2 * visible)
         depths_view, order_view = bridge.view(depths, real), bridge.view(order, wp.int32)
-        bridge.launch(k.depth_keys, count, [splats_view, counts_view, depths_view, order_view], device)
-        wp.utils.radix_sort_pairs(depths_view.array(), order_view.array(), count)
-        ends = torch.empty(count, dtype=torch.int64, device=device)
+        if fixed:
+            bridge.launch(k.depth_keys, count, [splats_view, counts_view, depths_view, order_view], device)
+        else:
+            inputs = [splats_view, counts_view, bridge.view(packed, wp.int64), depths_view, order_view]
+            bridge.launch(k.visible_keys, count, inputs, device)
+        if visible > 0:
+            wp.utils.radix_sort_pairs(depths_view.array(), order_view.array(), visible)
+        ends = longs(max(visible, 1))
         ends_view = bridge.view(ends, wp.int64)
-        bridge.launch(k.ordered_counts, count, [order_view, counts_view, ends_view], device)
-        torch.cumsum(ends, 0, out=ends)
-        total = _checked_total(counts, ends, tiles, budget_bytes)
+        bridge.launch(k.ordered_counts, visible, [order_view, counts_view, ends_view], device)
+        if visible > 0:
+            torch.cumsum(ends, 0, out=ends)
+        else:
+            ends.zero_()
         starts, keys, slots, owners = ints(count), ints(2 * total), ints(2 * total), ints(total)
+        if fixed:
+            keys[:total].fill_(no_tile)
         keys_view, slots_view, owners_view = (bridge.view(t, wp.int32) for t in (keys, slots, owners))
         inputs = [
-            splats_view, order_view, counts_view, ends_view, count, sizes["N"],
-            width, height, tile_size, rule.alpha_cut, rule.square_sigma, columns, tiles, no_tile,
+            splats_view, order_view, counts_view, ends_view, visible, sizes["N"],
+            width, height, tile_size, rule.alpha_cut, rule.square_sigma, columns, tiles, no_tile, total,
             bridge.view(starts, wp.int32), keys_view, slots_view, owners_view,
+            bridge.view(overflow if fixed else starts, wp.int32),
         ]  # fmt: skip
-        threads = -(-count // 256) * 256 if device.type == "cuda" else count
+        threads = -(-visible // 256) * 256 if device.type == "cuda" else visible
         bridge.launch(make_emit(real, device.type == "cuda"), threads, inputs, device, cost=10)
         if total > 0:
             wp.utils.radix_sort_pairs(keys_view.array(), slots_view.array(), total, end_bit=no_tile.bit_length())

@@ -30,6 +30,8 @@ class FitConfig:
     """Steps after which the spherical-harmonics degree in use rises by one."""
     checkpoint_every: int = 1000
     """Steps between checkpoints; one is written at the end in any case."""
+    cuda_graph: bool = True
+    """On CUDA, record a step once and replay it; the same kernels and the same bytes as without, in less time."""
     init: InitConfig = field(default_factory=InitConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)

@@ -69,10 +69,14 @@ class DensityStats:
     def add(self, render: Render) -> None:
         """Take in one backward pass; ``render.splats`` must have retained its gradient."""
         height, width = render.alpha.shape[-2:]
-        half = render.splats.new_tensor([0.5 * width, 0.5 * height])
-        norms = (render.splats.grad[..., :2] * half).norm(dim=-1)
-        self.gradient += torch.where(render.visible, norms, 0).sum(0)
-        self.seen += render.visible.sum(0)
+        self.add_gradient(render.splats.grad, render.visible, width, height)
+
+    def add_gradient(self, v_splats: torch.Tensor, visible: torch.Tensor, width: int, height: int, weight=1) -> None:
+        """The same from the gradient of the records [C, N, 12] and visibility [C, N]; ``weight`` 0 takes in nothing."""
+        # a product with a tensor of the two sizes would copy them to the device, which a recorded step must not
+        norms = torch.hypot(v_splats[..., 0] * (0.5 * width), v_splats[..., 1] * (0.5 * height))
+        self.gradient += torch.where(visible, norms, 0).sum(0) * weight
+        self.seen += visible.sum(0) * weight
 
     def state(self) -> dict[str, torch.Tensor]:
         """Both tensors by name, for the checkpoint."""

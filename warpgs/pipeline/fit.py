@@ -14,6 +14,7 @@ from warpgs import geometry
 from warpgs.errors import DataError, WarpgsError
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.density import DensityStats, refine
+from warpgs.pipeline.graph import BURST, NOT_FINITE, Burst, StepGraph, Views
 from warpgs.pipeline.init import initial_gaussians, initial_points
 from warpgs.pipeline.loss import photometric_loss
 from warpgs.pipeline.optimizer import Optimizer
@@ -76,7 +77,10 @@ class Fit:
         self.stats = DensityStats(len(cloud), device)
         self.step, self.reset_done = 0, False
         self.order: list[int] = []
+        self.graphs: dict[tuple, StepGraph] = {}
         self.views = [self._on_device(v) for v in train]
+        if device.type == "cuda" and config.cuda_graph:
+            self._stack()
 
     @staticmethod
     def _extent(cameras: list[Camera], cloud: PointCloud) -> float:
@@ -139,6 +143,82 @@ class Fit:
             psnr = -10 * math.log10(max(mse.item(), 1e-12))
         return StepReport(self.step, value, psnr, len(self.optimizer.gaussians), time.perf_counter() - begin)
 
+    def burst(self, limit: int) -> list[StepReport]:
+        """Take several steps: on CUDA as recorded graphs, which read nothing back in between; elsewhere one as `advance` does.
+
+        Ends before anything that needs the host: a change of the set of Gaussians or of the degree, or ``limit`` steps.
+
+        Raises:
+            NotFiniteError: A loss is not finite; the Gaussians are as before that step.
+            ResourceError: The instances would not fit into memory.
+        """
+        if self.device.type != "cuda" or not self.config.cuda_graph:
+            return [self.advance()]
+        begin = time.perf_counter()
+        c, first = self.config, self.step + 1
+        degree, densifying = self._phase(first)
+        start, every, _ = c.density.times(c.steps)
+        count = 1
+        while count < min(limit, BURST, c.steps - self.step) and self._phase(first + count) == (degree, densifying):
+            last = first + count - 1
+            if densifying and (
+                (last > start and last % every == 0) or (c.density.reset_every and last % c.density.reset_every == 0)
+            ):
+                break
+            count += 1
+        chosen = [self.next_view() for _ in range(count)]
+        graphs = [self._graph(self.places[i][0], degree, densifying) for i in chosen]
+        rates = [self.optimizer.schedule((s - 1) / max(1, c.steps - 1), s) for s in range(first, first + count)]
+        self.work.load([self.places[i][1] for i in chosen], rates)
+        for graph in graphs:
+            graph.replay()
+        done, stop, history = self.work.result()
+        self.order += reversed(chosen[done:])  # views of steps that were not taken come again
+        self.step += done
+        self.optimizer.step_count += done
+        if stop == NOT_FINITE:
+            raise NotFiniteError(
+                f"the loss became {history[done][0]} at step {self.step + 1}; the last checkpoint is the state before"
+            )
+        if stop:
+            self.graphs.clear()  # recorded anew with more room
+        counts = [len(self.optimizer.gaussians)] * done
+        if densifying and done == count:
+            self._refine()
+            counts[-1] = len(self.optimizer.gaussians)
+        seconds = (time.perf_counter() - begin) / max(1, done)
+        return [
+            StepReport(first + k, loss, -10 * math.log10(max(mse, 1e-12)), counts[k], seconds)
+            for k, (loss, mse) in enumerate(history[:done])
+        ]
+
+    def _phase(self, step: int) -> tuple[int, bool]:
+        """Degree in use at a step, and whether its gradients count for densification."""
+        c = self.config
+        return sh_degree(step, c.sh_every, c.init.max_sh_degree), step <= c.density.times(c.steps)[2]
+
+    def _graph(self, kind: tuple[int, int, bool], degree: int, densifying: bool) -> StepGraph:
+        key = (kind, degree, densifying)
+        if key not in self.graphs:
+            self.graphs = {k: g for k, g in self.graphs.items() if k[1:] == key[1:]}
+            self.graphs[key] = StepGraph(
+                self.stacks[kind], self.optimizer, self.stats if densifying else None, self.work,
+                degree=degree, rule=self.config.rule, loss=self.config.loss, background=self.background,
+            )  # fmt: skip
+        return self.graphs[key]
+
+    def _stack(self) -> None:
+        """Views by size and by whether they have a mask, as recorded steps take them."""
+        self.work, self.stacks = Burst(self.device), {}
+        kinds = [(camera.width, camera.height, mask is not None) for camera, _, mask in self.views]
+        for kind in dict.fromkeys(kinds):
+            cameras, targets, masks = zip(*(v for v, k in zip(self.views, kinds) if k == kind))
+            self.stacks[kind] = Views(
+                torch.stack([c.viewmat for c in cameras]), torch.stack([c.K for c in cameras]), torch.stack(targets),
+                torch.stack(masks) if kind[2] else None,
+            )  # fmt: skip
+        self.places = [(k, kinds[:i].count(k)) for i, k in enumerate(kinds)]
+
     def _refine(self) -> None:
         c = self.config.density
         start, every, _ = c.times(self.config.steps)
@@ -146,9 +226,11 @@ class Fit:
             change = refine(
                 self.gaussians, self.stats, c, extent=self.extent, after_reset=self.reset_done, generator=self.generator
             )
+            self.graphs.clear()
             self.optimizer.apply(change)
             self.stats = DensityStats(len(self.optimizer.gaussians), self.device)
         if c.reset_every and self.step % c.reset_every == 0:
+            self.graphs.clear()
             self.optimizer.cap_opacity(c.reset_opacity)
             self.reset_done = True
 
@@ -169,6 +251,7 @@ class Fit:
         self.optimizer.load(tensors, self.step)
         self.stats = DensityStats(len(self.optimizer.gaussians), self.device)
         self.stats.load(tensors)
+        self.graphs.clear()
         self.generator.set_state(tensors["generator"])
 
 
@@ -183,10 +266,12 @@ def run(fit: Fit, on_step: Callable[[StepReport], None], save: Callable[[Fit], N
     Raises:
         KeyboardInterrupt: ``stopped`` said so after a step; the state after it is saved.
     """
+    every = fit.config.checkpoint_every
     while fit.step < fit.config.steps:
-        on_step(fit.advance())
+        for report in fit.burst(every - fit.step % every):
+            on_step(report)
         stop = stopped()
-        if stop or fit.step % fit.config.checkpoint_every == 0 or fit.step == fit.config.steps:
+        if stop or fit.step % every == 0 or fit.step == fit.config.steps:
             save(fit)
         if stop:
             raise KeyboardInterrupt

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from warpgs.errors import UsageError
-from warpgs.kernels.adam import adam_step
+from warpgs.kernels.adam import adam_scheduled, adam_step, scheduled_rates
 from warpgs.pipeline.density import Refinement
 from warpgs.pipeline.schedule import log_linear
 from warpgs.scene import Gaussians
@@ -75,6 +75,19 @@ class Optimizer:
             state = (param.detach(), param.grad, self.means[name], self.squares[name])
             adam_step(*state, lr=rate, step=self.step_count, **head)
             param.grad = None
+
+    def schedule(self, progress: float, step: int) -> list[float]:
+        """Numbers that `step_scheduled` reads from memory: three for each tensor, in order."""
+        row = []
+        for name, rate in self.rates(progress).items():
+            row += scheduled_rates(rate, step, head_lr=self.config.sh_lr if name == "sh" else None)
+        return row
+
+    def step_scheduled(self, gradients: dict[str, torch.Tensor], rates: torch.Tensor, skip: torch.Tensor) -> None:
+        """`step` on CUDA with a row [15] of `schedule` in memory; nothing changes where ``skip`` [1] is not 0."""
+        for i, (name, gradient) in enumerate(gradients.items()):
+            state = (self.params[name].detach(), gradient, self.means[name], self.squares[name])
+            adam_scheduled(*state, rates[3 * i : 3 * i + 3], skip, head=3 if name == "sh" else 0)
 
     def apply(self, change: Refinement) -> None:
         """Keep the named rows with their moments and append new rows with zero moments."""

@@ -67,7 +67,7 @@ def choose_device(name: str) -> tuple[torch.device, str]:
     if name == "cuda" and not torch.cuda.is_available():
         raise ResourceError("--device cuda: torch sees no CUDA device here; `warpgs doctor` says why. Use --device cpu")
     if name != "cpu" and torch.cuda.is_available():
-        return torch.device("cuda"), f"on {torch.cuda.get_device_name()}"
+        return torch.device("cuda", torch.cuda.current_device()), f"on {torch.cuda.get_device_name()}"
     return torch.device("cpu"), f"on the CPU, {torch.get_num_threads()} threads"
 
 

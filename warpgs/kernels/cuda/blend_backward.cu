@@ -1,8 +1,9 @@
-// One warp takes CHUNK instances back to front, for all pixels of their tiles: item = number of the chunk.
+// One warp takes CHUNK instances back to front, for all pixels of their tiles: item = number of the chunk. The sums of an
+// instance go to its slot; if ATOMIC, they are added to its Gaussian's at once, in whatever order warps get there.
 __shared__ float4 s_a[WARPS][32], s_b[WARPS][32], s_c[WARPS][32];
 const int warp = threadIdx.x / 32;
-constexpr bool with_depth = WITH_DEPTH;
-const int total = (int)totals.data[0];
+constexpr bool with_depth = WITH_DEPTH, atomic = ATOMIC;
+const int total = (int)min(totals.data[0], (long long)capacity);  // of a cut list, what there is
 const int floor = item * CHUNK;
 constexpr int values = with_depth ? 10 : 9;
 // which of the sums this lane holds after the reduction below
@@ -91,10 +92,10 @@ while (top_instance > floor) {
         const int i = batch + lane;
         const bool mine = i >= first && i < stop_at;
         unsigned mask = 0;
-        int slot = 0;
+        int target = 0;
         __syncwarp();
         if (mine) {
-            slot = slots.data[i];
+            target = atomic ? splat_ids.data[i] : slots.data[i];
             if (i < part_last) {
                 Splat s;
                 s.load(splats.data, splat_ids.data[i]);
@@ -188,12 +189,16 @@ while (top_instance > floor) {
                 }
                 n = half;
             }
-            const int target = __shfl_sync(ALL, slot, j);
-            if (held >= 0)
-                v_slots.data[(long long)STRIDE * target + held] = v[0];
+            float* to = v_slots.data + (long long)STRIDE * __shfl_sync(ALL, target, j) + held;
+            if (held >= 0) {
+                if (atomic)
+                    atomicAdd(to, v[0]);
+                else
+                    *to = v[0];
+            }
         }
-        if (mine && !(written >> lane & 1u)) {
-            float4* row = reinterpret_cast<float4*>(v_slots.data + (long long)STRIDE * slot);
+        if (!atomic && mine && !(written >> lane & 1u)) {
+            float4* row = reinterpret_cast<float4*>(v_slots.data + (long long)STRIDE * target);
             row[0] = row[1] = row[2] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
         }
     }

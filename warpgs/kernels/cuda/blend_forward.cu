@@ -1,9 +1,9 @@
-// One warp composites one block of 8 x 4 pixels: item = tile * BLOCKS + block.
+// One warp composites one block of 8 x 4 pixels: item = place of the tile in the order * BLOCKS + block.
 constexpr int AHEAD = 4;  // alphas computed before they are blended: they do not wait for each other
 __shared__ float4 s_a[WARPS][32 + AHEAD], s_b[WARPS][32 + AHEAD], s_c[WARPS][32 + AHEAD];
 __shared__ int s_i[WARPS][32 + AHEAD];
 const int warp = threadIdx.x / 32;
-const int tile = item / BLOCKS, block = item % BLOCKS;
+const int tile = order.data[item / BLOCKS], block = item % BLOCKS;
 const int camera = tile / tiles, in_camera = tile - camera * tiles;
 const int left = (in_camera % columns) * SIDE + (block % WIDE) * 8, top = (in_camera / columns) * SIDE + (block / WIDE) * 4;
 const int x = left + lane % 8, y = top + lane / 8;

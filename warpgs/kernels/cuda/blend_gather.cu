@@ -1,13 +1,12 @@
 // Gradient of one record from the sums of its instances. Their slots are neighbours: a thread sums a short list, the warp
 // shares a long one. The factors common to all pixels are applied here, once.
-constexpr unsigned ALL = 0xffffffffu;
 constexpr int SHORT = 32;
-constexpr bool with_depth = WITH_DEPTH;
+constexpr bool with_depth = WITH_DEPTH, atomic = ATOMIC;
 constexpr int values = with_depth ? 10 : 9;
-const int lane = threadIdx.x % 32;
 const bool valid = i < counts.shape[0];
-const int count = valid ? counts.data[i] : 0;
-const long long start = count > 0 ? starts.data[i] : 0;
+const bool seen = valid && counts.data[i] > 0;
+const int count = atomic ? (int)seen : seen ? counts.data[i] : 0;
+const long long start = count == 0 ? 0 : atomic ? i : starts.data[i];  // atomic: the row of the Gaussian is its one slot
 float v[VALUES] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
 if (count <= SHORT)
     for (int s = 0; s < count; ++s) {

@@ -1,0 +1,79 @@
+"""Recorded steps on CUDA: the same bits as step by step, whatever happens on the way."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from tests.scenes import photographs, seeds
+from warpgs.pipeline import graph
+from warpgs.pipeline.config import FitConfig
+from warpgs.pipeline.density import DensityConfig
+from warpgs.pipeline.fit import Fit, NotFiniteError
+from warpgs.pipeline.init import InitConfig
+from warpgs.scene import View
+
+pytestmark = pytest.mark.cuda
+
+BUSY = FitConfig(
+    steps=60, sh_every=15, init=InitConfig(source="points"),
+    density=DensityConfig(start=8, every=9, gradient=1e-5, reset_every=25),
+)  # fmt: skip
+
+
+def fitted(views: list[View], recorded: bool, config: FitConfig = BUSY) -> tuple[Fit, list]:
+    """A fit of all steps on CUDA, and its reports."""
+    fit = Fit(views, seeds(), dataclasses.replace(config, cuda_graph=recorded), torch.device("cuda", 0))
+    reports = []
+    while fit.step < config.steps:
+        reports += fit.burst(100)
+    return fit, reports
+
+
+def sizes() -> list[View]:
+    """Views of two sizes, one of them with a mask."""
+    views = photographs(2) + photographs(2, 24, 20)
+    views = [View(f"{i}", v.camera, v.image) for i, v in enumerate(views)]
+    mask = np.ones(views[0].image.shape[:2], bool)
+    mask[:, :8] = False
+    return [View("masked", views[0].camera, views[0].image, mask), *views[1:]]
+
+
+@pytest.mark.parametrize("views", [photographs(4), sizes()], ids=["one size", "two sizes and a mask"])
+def test_recorded_steps_equal_single_steps(views):
+    """Through densification, opacity resets and changes of degree: the same Gaussians and the same reports, bit for bit."""
+    single, said = fitted(views, recorded=False)
+    recorded, reports = fitted(views, recorded=True)
+    a, b = single.state()[0], recorded.state()[0]
+    assert len(single.gaussians) != len(seeds())
+    assert all(torch.equal(a[k], b[k]) for k in a)
+    assert [(r.step, r.count) for r in said] == [(r.step, r.count) for r in reports]
+    assert np.allclose([r.loss for r in said], [r.loss for r in reports], rtol=1e-6)
+
+
+def test_too_little_room_is_found_and_mended(monkeypatch):
+    """Steps that would overflow change nothing; they are recorded anew and taken, and the result is the same."""
+    reference, _ = fitted(photographs(4), recorded=False)
+    honest, tries = graph.StepGraph._capacity, []
+
+    def scarce(self):
+        tries.append(honest(self))
+        return 16 if len(tries) % 2 else tries[-1]
+
+    monkeypatch.setattr(graph.StepGraph, "_capacity", scarce)
+    fit, reports = fitted(photographs(4), recorded=True)
+    assert len(tries) >= 4
+    a, b = reference.state()[0], fit.state()[0]
+    assert all(torch.equal(a[k], b[k]) for k in a) and [r.step for r in reports] == list(range(1, 61))
+
+
+def test_loss_that_is_no_number_stops_before_it_harms():
+    """A NaN in one photograph: the Gaussians are those of the step before."""
+    views = photographs(4)
+    bad = [*views[:3], View("bad", views[3].camera, np.full_like(views[3].image, np.nan))]
+    config = dataclasses.replace(BUSY, density=DensityConfig(start=1000))
+    fit = Fit(bad, seeds(), config, torch.device("cuda", 0))
+    with pytest.raises(NotFiniteError, match="became nan"):
+        fit.burst(100)
+    assert fit.step < 4 and all(bool(torch.isfinite(t).all()) for t in fit.gaussians.tensors().values())

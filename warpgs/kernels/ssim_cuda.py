@@ -1,0 +1,86 @@
+"""Kernels of structural similarity for CUDA in float32: both passes of the window in shared memory, one launch each way."""
+
+import functools
+from types import SimpleNamespace
+
+import torch
+import warp as wp
+
+from warpgs.kernels import bridge
+from warpgs.kernels.native import source
+from warpgs.kernels.ssim_cpu import C1, C2, WINDOW
+
+SIDE = 16
+"""Side [px] of the square that a thread block works on."""
+THREADS = 256
+"""Threads of a block."""
+
+
+@functools.cache
+def make_kernels():
+    """Forward and backward. ``summed``: of the two sums that a photometric loss is made of, else of the map."""
+    numbers = {"WINDOW": ", ".join(f"{w!r}f" for w in WINDOW), "C1": f"{C1!r}f", "C2": f"{C2!r}f"}
+
+    @wp.func_native(source("ssim_forward.cu", **numbers))
+    def forward_body(
+        block: int, a: wp.array(dtype=float), b: wp.array(dtype=float), height: int, columns: int, summed: int,
+        result: wp.array(dtype=float), by_mean: wp.array(dtype=float), by_variance: wp.array(dtype=float),
+        by_gap: wp.array(dtype=float),
+    ): ...  # fmt: skip
+
+    @wp.func_native(source("ssim_backward.cu", **numbers))
+    def backward_body(
+        block: int, a: wp.array(dtype=float), b: wp.array(dtype=float), v_result: wp.array(dtype=float),
+        by_mean: wp.array(dtype=float), by_variance: wp.array(dtype=float), by_gap: wp.array(dtype=float),
+        height: int, columns: int, summed: int, v_a: wp.array(dtype=float),
+    ): ...  # fmt: skip
+
+    kernel = functools.partial(wp.kernel, enable_backward=False, grid_stride=False, module="warpgs.kernels.ssim_cuda")
+
+    @kernel
+    def forward(
+        begin: int, a: wp.array(dtype=float), b: wp.array(dtype=float), height: int, columns: int, summed: int,
+        # outputs: the similarities, or two sums per block; and the partials by mean, variance and gap
+        result: wp.array(dtype=float), by_mean: wp.array(dtype=float), by_variance: wp.array(dtype=float),
+        by_gap: wp.array(dtype=float),
+    ):  # fmt: skip
+        forward_body(wp.tid() // THREADS, a, b, height, columns, summed, result, by_mean, by_variance, by_gap)
+
+    @kernel
+    def backward(
+        begin: int, a: wp.array(dtype=float), b: wp.array(dtype=float), v_result: wp.array(dtype=float),
+        by_mean: wp.array(dtype=float), by_variance: wp.array(dtype=float), by_gap: wp.array(dtype=float),
+        height: int, columns: int, summed: int,
+        # outputs
+        v_a: wp.array(dtype=float),
+    ):  # fmt: skip
+        backward_body(wp.tid() // THREADS, a, b, v_result, by_mean, by_variance, by_gap, height, columns, summed, v_a)
+
+    return SimpleNamespace(forward=forward, backward=backward)
+
+
+def _shape(image: torch.Tensor) -> tuple[int, int, int]:
+    """Number of blocks, and height and row length [elements] of a picture; image [B, H, W, 3]."""
+    batch, height, width, channels = image.shape
+    return batch * -(-height // SIDE) * -(-width // SIDE), height, width * channels
+
+
+def forward(image: torch.Tensor, target: torch.Tensor, summed: bool) -> tuple[torch.Tensor, ...]:
+    """The similarities [B, H, W, 3], or per block the sums of 1 - similarity and |image - target| [blocks, 2]; 3 partials."""
+    blocks, height, columns = _shape(image)
+    result = image.new_empty(blocks, 2) if summed else torch.empty_like(image)
+    partials = [torch.empty_like(image) for _ in range(3)]
+    arrays = [bridge.view(t.view(-1), wp.float32) for t in (image, target, result, *partials)]
+    inputs = [*arrays[:2], height, columns, int(summed), *arrays[2:]]
+    bridge.launch(make_kernels().forward, blocks * THREADS, inputs, image.device, block_dim=THREADS)
+    return result, *partials
+
+
+def backward(image: torch.Tensor, target: torch.Tensor, partials, v_result: torch.Tensor, summed: bool) -> torch.Tensor:
+    """Gradient of the image, from that of the similarities or of the two sums [2]."""
+    blocks, height, columns = _shape(image)
+    v_image = torch.empty_like(image)
+    arrays = [bridge.view(t.view(-1), wp.float32) for t in (image, target, v_result.contiguous(), *partials)]
+    inputs = [*arrays, height, columns, int(summed), bridge.view(v_image.view(-1), wp.float32)]
+    bridge.launch(make_kernels().backward, blocks * THREADS, inputs, image.device, block_dim=THREADS)
+    return v_image

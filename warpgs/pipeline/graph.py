@@ -1,0 +1,162 @@
+"""Training steps on CUDA as recorded graphs: the same kernels as step by step, without the host between them.
+
+At sparse-view sizes a step keeps a GPU busy for less time than Python needs to launch it. So one step is recorded, from the
+choice of the view to Adam, and replayed in bursts; rates and views of a burst are uploaded at once, losses read at its end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+
+from warpgs.constants import RULES
+from warpgs.errors import ResourceError
+from warpgs.kernels import bridge
+from warpgs.kernels.blend import blend
+from warpgs.kernels.project import project
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, available_bytes, bin_tiles
+from warpgs.pipeline.density import DensityStats
+from warpgs.pipeline.loss import LossConfig, photometric_loss
+from warpgs.pipeline.optimizer import Optimizer
+
+BURST = 100
+"""Most steps between two looks at the device."""
+ROOM = 1.3
+"""Instances that a recording has room for, as a multiple of the most that any view has when it is recorded."""
+NOT_FINITE = 2
+"""Value of the stop flag after a loss that is no number; 1 after more instances than there is room for."""
+
+
+@dataclass(frozen=True)
+class Views:
+    """Training views of one size on the device."""
+
+    viewmats: torch.Tensor
+    """camera_from_world, shape [V, 4, 4]."""
+    Ks: torch.Tensor
+    """Intrinsics [px], shape [V, 3, 3]."""
+    targets: torch.Tensor
+    """Colours in [0, 1], shape [V, H, W, 3]."""
+    masks: torch.Tensor | None
+    """1 where a pixel counts, else 0, shape [V, H, W]; None where all count."""
+
+
+class StepGraph:
+    """A recorded step for one set of Gaussians, one image size and one degree.
+
+    Views of a burst may have several sizes: then each size has a recording, and all share one `Burst`.
+    """
+
+    def __init__(
+        self, views: Views, optimizer: Optimizer, stats: DensityStats | None, burst: Burst, *,
+        degree: int, rule: str, loss: LossConfig, background: torch.Tensor,
+    ):  # fmt: skip
+        """Record. ``stats`` None where gradients need not be gathered.
+
+        Raises:
+            ResourceError: The instances would not fit into memory.
+        """
+        self.views, self.optimizer, self.stats, self.burst = views, optimizer, stats, burst
+        self.degree, self.rule, self.loss, self.background = degree, RULES[rule], loss, background[None]
+        self.height, self.width = views.targets.shape[1:3]
+        self.capacity = self._capacity()
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            # a first run loads kernels and makes room in caches, which may not happen while recording
+            burst.hold()
+            self._step()
+            burst.release()
+        torch.cuda.current_stream().wait_stream(stream)
+        self.graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self.graph, stream=stream):
+            warp_stream = bridge.warp_stream(burst.device)
+            wp.capture_begin(stream=warp_stream, external=True)
+            try:
+                self._step()
+            finally:
+                self.recorded = wp.capture_end(stream=warp_stream)  # holds what Warp lent to the graph
+
+    def _project(self, viewmat: torch.Tensor, K: torch.Tensor):
+        gaussians = self.optimizer.gaussians.tensors().values()
+        return project(*gaussians, viewmat, K, width=self.width, height=self.height, degree=self.degree, rule=self.rule)
+
+    def _capacity(self) -> int:
+        with torch.no_grad():
+            counts = [self._project(m[None], K[None])[1].sum() for m, K in zip(self.views.viewmats, self.views.Ks)]
+        wanted = int(ROOM * int(torch.stack(counts).max())) + 1024
+        budget = available_bytes(self.burst.device) * 4 // 5
+        if wanted > MAX_INSTANCES or wanted * BYTES_PER_INSTANCE > budget:
+            raise ResourceError(
+                f"a step would touch {wanted:,} tiles, which needs {wanted * BYTES_PER_INSTANCE / 2**30:.2f} GiB; "
+                f"{budget / 2**30:.2f} GiB may be used. Fit smaller images, or limit --density.max-gaussians."
+            )
+        return wanted
+
+    def _step(self) -> None:
+        burst, views, size = self.burst, self.views, {"width": self.width, "height": self.height}
+        view = burst.view_rows.index_select(0, burst.counter)
+        rates = burst.rate_rows.index_select(0, burst.counter)[0]
+        target = views.targets.index_select(0, view)[0]
+        mask = None if views.masks is None else views.masks.index_select(0, view)[0]
+        splats, counts = self._project(views.viewmats.index_select(0, view), views.Ks.index_select(0, view))
+        tiles = bin_tiles(splats, counts, **size, rule=self.rule, capacity=self.capacity, overflow=burst.stop)
+        rgb = blend(splats, tiles, self.background, **size, rule=self.rule)[0][0]
+        loss, _ = photometric_loss(rgb, target, mask, self.loss)
+        params = self.optimizer.params
+        *gradients, v_splats = torch.autograd.grad(loss, [*params.values(), splats])
+        with torch.no_grad():
+            burst.stop.masked_fill_((burst.stop == 0) & ~torch.isfinite(loss), NOT_FINITE)
+            self.optimizer.step_scheduled(dict(zip(params, gradients)), rates, burst.stop)
+            going = burst.stop == 0
+            if self.stats is not None:
+                self.stats.add_gradient(v_splats, counts > 0, self.width, self.height, weight=going)
+            error = (rgb.clamp(0, 1) - target) ** 2
+            mse = error.mean() if mask is None else (error * mask[..., None]).sum() / (3 * mask.sum().clamp_min(1))
+            burst.history.index_copy_(0, burst.counter, torch.stack([loss, mse])[None])
+            burst.counter += going
+
+    def replay(self) -> None:
+        """One step; the burst's counter says which."""
+        self.graph.replay()
+
+
+class Burst:
+    """What the steps between two looks at the device read and write: their views and rates, losses, and the stop flag."""
+
+    def __init__(self, device: torch.device):
+        self.device = device
+        self.view_rows = torch.zeros(BURST, dtype=torch.int64, device=device)
+        """Number of each step's view among those of its size."""
+        self.rate_rows = torch.ones(BURST, 15, device=device)
+        """Rates of each step (Optimizer.schedule)."""
+        self.counter = torch.zeros(1, dtype=torch.int64, device=device)
+        """Number of the step at hand. It stays once a step stops, and so do all Gaussians."""
+        self.stop = torch.zeros(1, dtype=torch.int32, device=device)
+        """0 while all is well, else why the burst stopped."""
+        self.history = torch.zeros(BURST, 2, device=device)
+        """Loss and mean squared error of each step."""
+
+    def hold(self) -> None:
+        """Until `release`, steps change nothing that lasts; they see the first view."""
+        self.stop.fill_(NOT_FINITE)
+        self.counter.zero_()
+        self.view_rows.zero_()
+
+    def release(self) -> None:
+        """Undo `hold`."""
+        self.stop.zero_()
+
+    def load(self, views: list[int], rates: list[list[float]]) -> None:
+        """Upload the views and rates of the next steps, at most BURST."""
+        self.counter.zero_()
+        self.stop.zero_()
+        self.view_rows[: len(views)] = torch.tensor(views).to(self.device)
+        self.rate_rows[: len(rates)] = torch.tensor(rates, dtype=torch.float32).to(self.device)
+
+    def result(self) -> tuple[int, int, list[list[float]]]:
+        """Steps taken, the stop flag, and loss and mean squared error of each step taken and of one that was not a number."""
+        done, stop = int(self.counter), int(self.stop)
+        return done, stop, self.history[: done + 1].tolist()
