@@ -72,29 +72,54 @@ def make_kernel(real, split: bool, lanes: int):
     return update
 
 
-@functools.cache
-def make_scheduled_kernel(split: bool):
-    """The update for CUDA in float32 with its rates in memory, so that it can be recorded once and replayed."""
+_UPDATE = """
+    if (skip.data[0] != 0)
+        return;
+    const float head_rate = rates.data[0], rate = rates.data[1], root_correction2 = rates.data[2];
+    const int size = parameter.shape[0];
+    auto one = [&](int i, float g, float& p, float& m, float& s) {
+        m = beta1 * m + rest1 * g;
+        s = beta2 * s + rest2 * g * g;
+        p -= (i % row < head ? head_rate : rate) * m / (sqrtf(s) / root_correction2 + eps);
+    };
+    if (4 * four + 4 <= size) {
+        float4 p = reinterpret_cast<float4*>(parameter.data)[four], m = reinterpret_cast<float4*>(mean.data)[four];
+        float4 s = reinterpret_cast<float4*>(square.data)[four];
+        const float4 g = reinterpret_cast<const float4*>(gradient.data)[four];
+        one(4 * four, g.x, p.x, m.x, s.x);
+        one(4 * four + 1, g.y, p.y, m.y, s.y);
+        one(4 * four + 2, g.z, p.z, m.z, s.z);
+        one(4 * four + 3, g.w, p.w, m.w, s.w);
+        reinterpret_cast<float4*>(parameter.data)[four] = p;
+        reinterpret_cast<float4*>(mean.data)[four] = m;
+        reinterpret_cast<float4*>(square.data)[four] = s;
+    } else
+        for (int i = 4 * four; i < size; ++i)
+            one(i, gradient.data[i], parameter.data[i], mean.data[i], square.data[i]);
+"""
 
-    @wp.kernel(enable_backward=False, module="unique")
+
+@functools.cache
+def make_scheduled_kernel():
+    """The update for CUDA in float32, four elements a thread, its rates in memory: it can be recorded once and replayed."""
+
+    @wp.func_native(_UPDATE)
+    def update_body(
+        four: int, gradient: wp.array(dtype=float), row: int, head: int, rates: wp.array(dtype=float),
+        beta1: float, beta2: float, rest1: float, rest2: float, eps: float, skip: wp.array(dtype=int),
+        parameter: wp.array(dtype=float), mean: wp.array(dtype=float), square: wp.array(dtype=float),
+    ): ...  # fmt: skip
+
+    @wp.kernel(enable_backward=False, grid_stride=False, module="warpgs.kernels.adam.scheduled")
     def update(
         begin: int, gradient: wp.array(dtype=float), row: int, head: int, rates: wp.array(dtype=float),
         beta1: float, beta2: float, rest1: float, rest2: float, eps: float, skip: wp.array(dtype=int),
         # outputs
         parameter: wp.array(dtype=float), mean: wp.array(dtype=float), square: wp.array(dtype=float),
     ):  # fmt: skip
-        if skip[0] != 0:
-            return
-        i = begin + wp.tid()
-        g = gradient[i]
-        m = beta1 * mean[i] + rest1 * g
-        s = beta2 * square[i] + rest2 * g * g
-        mean[i] = m
-        square[i] = s
-        step = rates[1]
-        if wp.static(split):
-            step = wp.where(i % row < head, rates[0], rates[1])
-        parameter[i] = parameter[i] - step * m / (wp.sqrt(s) / rates[2] + eps)
+        update_body(
+            wp.tid(), gradient, row, head, rates, beta1, beta2, rest1, rest2, eps, skip, parameter, mean, square
+        )  # fmt: skip
 
     return update
 
@@ -115,7 +140,7 @@ def adam_scheduled(
         *betas, 1 - betas[0], 1 - betas[1], eps, bridge.view(skip, wp.int32),
         *(bridge.view(t.view(-1), wp.float32) for t in (param, exp_avg, exp_avg_sq)),
     ]  # fmt: skip
-    bridge.launch(make_scheduled_kernel(head > 0), param.numel(), inputs, param.device)
+    bridge.launch(make_scheduled_kernel(), -(-param.numel() // 4), inputs, param.device)
 
 
 def adam_step(
@@ -158,6 +183,12 @@ def adam_step(
     if param.numel() == 0:
         return
     real, device = bridge.real_of(param), param.device
+    if device.type == "cuda" and real is wp.float32:
+        # one kernel for this and for recorded steps, so that both give the same bits
+        rates = torch.tensor(scheduled_rates(lr, step, betas, head_lr), device=device)
+        skip = torch.zeros(1, dtype=torch.int32, device=device)
+        adam_scheduled(param, grad.contiguous(), exp_avg, exp_avg_sq, rates, skip, betas=betas, eps=eps, head=head)
+        return
     beta1, beta2 = betas
     correction1, correction2 = 1 - beta1**step, 1 - beta2**step
     row = param[0].numel()

@@ -64,20 +64,26 @@ class StepGraph:
         self.capacity = self._capacity()
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
+        self.graph = torch.cuda.CUDAGraph()
         with torch.cuda.stream(stream):
             # a first run loads kernels and makes room in caches, which may not happen while recording
             burst.hold()
             self._step()
             burst.release()
+            stream.synchronize()
+            self._record()
         torch.cuda.current_stream().wait_stream(stream)
-        self.graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(self.graph, stream=stream):
-            warp_stream = bridge.warp_stream(burst.device)
-            wp.capture_begin(stream=warp_stream, external=True)
-            try:
-                self._step()
-            finally:
-                self.recorded = wp.capture_end(stream=warp_stream)  # holds what Warp lent to the graph
+
+    def _record(self) -> None:
+        # torch.cuda.graph would collect garbage and empty the cache each time, which takes 80 ms
+        here = bridge.warp_stream(self.burst.device)
+        self.graph.capture_begin()
+        wp.capture_begin(stream=here, external=True)
+        try:
+            self._step()
+        finally:
+            self.lent = wp.capture_end(stream=here)  # holds what Warp lends to the graph
+            self.graph.capture_end()
 
     def _project(self, viewmat: torch.Tensor, K: torch.Tensor):
         gaussians = self.optimizer.gaussians.tensors().values()
