@@ -16,15 +16,16 @@ from pathlib import Path
 
 import torch
 
-from bench import machine, predict, roofline
-from bench.harness import REPEATS, Task, measure_in_turn, peak_bytes
+from bench import machine, peers, predict, roofline
+from bench.harness import OURS, REPEATS, Task, measure_in_turn, peak_bytes
 from bench.pairs import instances_and_pairs
-from bench.points import Point, load, points
+from bench.points import Point, growth, load, points
 from warpgs.errors import ResourceError
 from warpgs.kernels import bridge
 
 OPS = ("project", "sh", "tiles", "blend", "ssim", "adam", "knn", "render", "step")
-FAILURES = (ResourceError, torch.cuda.OutOfMemoryError, MemoryError)
+FAILURES = (ResourceError, RuntimeError, MemoryError)
+"""What running out of memory looks like, in our code, torch's and Warp's; one failure must not cost the other results."""
 
 
 class Bench:
@@ -35,21 +36,30 @@ class Bench:
         self.deadline = None if budget is None else time.monotonic() + budget
         self.rows: list[dict] = []
         self.skipped: list[dict] = []
+        self.stopped: list[tuple[str, str, str, dict]] = []
 
     def _skip(self, head: dict, reason: str) -> None:
         self.skipped.append(head | {"reason": reason})
         self.echo(f"{_title(head)}  skipped: {reason}")
 
+    def _stop(self, op: str, program: str, direction: str, sizes: dict, reason: str) -> None:
+        """Note a task that was tried in vain, so that it is not tried at larger sizes."""
+        self.stopped.append((op, program, direction, sizes))
+        self._skip({"op": op, "program": program, "direction": direction, **sizes}, reason)
+
     def _chosen(self, op: str, module, point: Point, sizes: dict) -> set[tuple[str, str]]:
         """The tasks of an op at a point that can be expected to fit into time and memory; the others are noted."""
         chosen, predicted, free = set(), 0.0, predict.free_bytes(self.device)
         for program, directions in module.PROGRAMS.items():
+            largest = getattr(module, "LARGEST", {}).get(program, point.count)
+            if program in peers.absent(self.device) or point.count > largest:
+                continue
             for direction in directions:
                 head = {"op": op, "program": program, "direction": direction, **sizes}
                 reason = predict.reason_to_skip(self.rows, op, program, direction, point, sizes, free)
-                earlier = {(s["op"], s["program"], s["direction"]) for s in self.skipped if s.get("failed")}
-                if reason is None and (op, program, direction) in earlier:
-                    reason = "failed at a smaller size"
+                stopped = [s for o, p, d, s in self.stopped if (o, p, d) == (op, program, direction)]
+                if reason is None and any(growth(s, sizes) is not None for s in stopped):
+                    reason = "did not get through at a smaller size"
                 if reason:
                     self._skip(head, reason)
                     continue
@@ -65,41 +75,53 @@ class Bench:
         return chosen
 
     def measure(self, op: str, module, point: Point, roof: dict | None) -> None:
-        """All programs and directions of an op at one point, in turn."""
+        """All programs and directions of an op at one point, in turn; ours alone if it does not work together."""
         sizes = point.sizes(module.AXES)
         chosen = self._chosen(op, module, point, sizes)
+        ours = {task for task in chosen if task[0] == OURS}
+        for attempt in (chosen, ours) if chosen > ours else (ours,):
+            reason = self._attempt(op, module, point, sizes, attempt, None if point.threads else roof)
+            if reason is None:
+                return
+            for program, direction in sorted(attempt if attempt == ours else attempt - ours):
+                self._stop(op, program, direction, sizes, reason)
+
+    def _attempt(self, op: str, module, point: Point, sizes: dict, chosen: set, roof: dict | None) -> str | None:
+        """Measure the chosen tasks; the reason if that fails before any row is made."""
         if not chosen:
-            return
+            return None
         everything = torch.get_num_threads()
         if point.threads:
             bridge.set_threads(point.threads)
+        tasks: list[Task] = []
         try:
-            tasks = list(module.tasks(point, self.device, lambda p, d: (p, d) in chosen))
-            timings = measure_in_turn([t.run for t in tasks], self.device, self.repeats)
-            for task, timing in zip(tasks, timings):
-                self._add(op, task, sizes, timing, None if point.threads else roof)
+            tasks += module.tasks(point, self.device, lambda p, d: (p, d) in chosen)
+            timings = measure_in_turn([t.run for t in tasks], self.device, self.repeats, predict.LIMIT_MS)
+            rows = [self._row(op, task, sizes, timing, roof) for task, timing in zip(tasks, timings)]
         except FAILURES as e:
-            for program, direction in sorted(chosen):
-                self._skip(
-                    {"op": op, "program": program, "direction": direction, **sizes, "failed": True},
-                    " ".join(str(e).split())[:200] or type(e).__name__,
-                )
+            return " ".join(str(e).split())[:200] or type(e).__name__
         finally:
             bridge.set_threads(everything)
-            tasks = None
+            tasks.clear()
             gc.collect()
             if self.device.type == "cuda":
                 torch.cuda.empty_cache()
+        for row in rows:
+            if "median_ms" in row:
+                self.rows.append(row)
+                low, high = row["quartiles_ms"]
+                self.echo(f"{_title(row)} {row['median_ms']:>10.3f} ms  ({low:.3f} to {high:.3f})")
+            else:
+                self._stop(op, row["program"], row["direction"], sizes, f"took {row['warm_up_ms'] / 1000:.2g} s a repeat")
+        return None
 
-    def _add(self, op: str, task: Task, sizes: dict, timing: dict, roof: dict | None) -> None:
+    def _row(self, op: str, task: Task, sizes: dict, timing: dict, roof: dict | None) -> dict:
         row = {"op": op, "program": task.program, "direction": task.direction, **sizes, **task.facts, **timing}
-        if self.device.type == "cuda":
+        if "median_ms" in row and self.device.type == "cuda":
             row["peak_bytes"] = peak_bytes(task, self.device)
-        if roof and task.cost:
+        if "median_ms" in row and roof and task.cost:
             row |= roofline.against_roof(task.cost, row.get("gpu_ms", row["median_ms"]) / 1000, roof)
-        self.rows.append(row)
-        low, high = row["quartiles_ms"]
-        self.echo(f"{_title(row)} {row['median_ms']:>10.3f} ms  ({low:.3f} to {high:.3f})")
+        return row
 
 
 def _title(row: dict) -> str:
@@ -126,6 +148,7 @@ def run(
         note: Words about the machine that belong in the results.
         echo: Takes a line per task.
     """
+    record = machine.describe(device) | ({"note": note} if note else {})
     bench = Bench(device, 3 if tiny else REPEATS, budget, echo)
     roof = roofline.ceilings(device, tiny)
     echo(f"roof: {roof['bytes_per_s'] / 1e9:.4g} GB/s, {roof['operations_per_s'] / 1e9:.4g} Gop/s")
@@ -134,8 +157,8 @@ def run(
     for point, op in sorted(grid, key=lambda pair: load(pair[0])):
         bench.measure(op, modules[op], point, roof)
     instances_and_pairs.cache_clear()
-    record = machine.describe(device) | ({"note": note} if note else {})
-    return record | {"repeats": bench.repeats, "roofline": roof, "rows": bench.rows, "skipped": bench.skipped}
+    record |= {"repeats": bench.repeats, "absent": peers.absent(device), "roofline": roof}
+    return record | {"rows": bench.rows, "skipped": bench.skipped}
 
 
 def main() -> None:

@@ -1,11 +1,13 @@
 """How things are timed here: warm-up, then repeats that go round all programs, median and quartiles, one row per task.
 
-Programs that are compared run in turn, one repeat each, so that whatever else the machine does meets all of them alike.
+Programs that are compared run in turn, one repeat each, so that whatever else the machine does meets all of them alike;
+only programs far slower than the others run after them.
 """
 
 from __future__ import annotations
 
 import gc
+import math
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -22,6 +24,9 @@ WARM_UP_SECONDS = 0.1
 """Short work is repeated for this long before it counts, so that clocks and caches settle."""
 
 OURS = "warpgs"
+APART = 30
+"""A program this many times slower than another runs after it instead: pairing adds nothing to such a ratio, and what a long
+run leaves of caches and freed memory was seen to make its short neighbour several times slower."""
 IN_WARP = (OURS, "naive")
 """Programs whose scratch memory comes from Warp's pool."""
 
@@ -65,22 +70,42 @@ def _timed(work: Callable[[], object], device: torch.device) -> tuple[float, flo
     return wall, events[0].elapsed_time(events[1]) if events else None
 
 
-def measure_in_turn(works: Sequence[Callable[[], object]], device: torch.device, repeats: int = REPEATS) -> list[dict]:
-    """Median and quartiles of each work's wall time [ms], and on CUDA the median of its GPU time [ms]."""
-    for work in works:
-        begin, done = time.perf_counter(), 0
-        while done < WARM_UP or (time.perf_counter() - begin < WARM_UP_SECONDS and repeats >= REPEATS):
-            work()
-            _drain(device)
-            done += 1
+def _warm_up(work: Callable[[], object], device: torch.device, limit_ms: float, whole: bool) -> float:
+    """Run until things settle; the shortest time of one call [ms]. Stops after the second call if that is above the limit."""
+    begin, times = time.perf_counter(), []
+    while len(times) < WARM_UP or (whole and time.perf_counter() - begin < WARM_UP_SECONDS):
+        times.append(_timed(work, device)[0])
+        if len(times) > 1 and min(times) > limit_ms:
+            break
+    return min(times)
+
+
+def measure_in_turn(
+    works: Sequence[Callable[[], object]],
+    device: torch.device,
+    repeats: int = REPEATS,
+    limit_ms: float = math.inf,
+) -> list[dict]:
+    """Median, quartiles and least of each work's wall time [ms], and on CUDA the median of its GPU time [ms].
+
+    A work that turns out in the warm-up to take longer than ``limit_ms`` is left there: its row has ``warm_up_ms`` only.
+    """
+    shortest = [_warm_up(work, device, limit_ms, repeats >= REPEATS) for work in works]
     samples = [[] for _ in works]
-    for _ in range(repeats):
-        for work, own in zip(works, samples):
-            own.append(_timed(work, device))
+    in_turn = [i for i, least in enumerate(shortest) if least <= limit_ms]
+    apart = [i for i in in_turn if shortest[i] > APART * min(shortest)]
+    for group in ([i for i in in_turn if i not in apart], *([i] for i in apart)):
+        for _ in range(repeats):
+            for i in group:
+                samples[i].append(_timed(works[i], device))
     rows = []
-    for own in samples:
+    for own, least in zip(samples, shortest):
+        if not own:
+            rows.append({"warm_up_ms": least})
+            continue
         low, middle, high = statistics.quantiles([wall for wall, _ in own], n=4)
-        row = {"median_ms": round(middle, 4), "quartiles_ms": [round(low, 4), round(high, 4)], "repeats": repeats}
+        row = {"median_ms": round(middle, 4), "quartiles_ms": [round(low, 4), round(high, 4)]}
+        row |= {"least_ms": round(min(wall for wall, _ in own), 4), "repeats": repeats}
         if device.type == "cuda":
             row["gpu_ms"] = round(statistics.median(gpu for _, gpu in own), 4)
         rows.append(row)

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import functools
 import importlib
-import importlib.util
 import math
-from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
 from torch.utils.checkpoint import checkpoint
 
+from bench import inputs
 from warpgs.constants import RULES
 from warpgs.scene import Camera, Gaussians
 
 TORCH_SSIM = "torch conv2d"
 DENSE = "torch dense"
+NAIVE = "naive"
+GSPLAT = "gsplat"
+GSPLAT_STEP = "gsplat + torch"
 PIXELS_AT_ONCE = 4096
 """Pixels that the dense rasterizer composites in one go, so that memory stays bounded."""
 
@@ -83,8 +85,9 @@ def _projected(g: Gaussians, view: torch.Tensor, K: torch.Tensor, width: int, he
 def _composite(pixels, means, inverses, opacities, colors):
     """Colours [P, 3] of pixel centres [P, 2], every Gaussian looked at for every pixel."""
     rule = RULES["exact"]
-    d = pixels[:, None] - means
-    alpha = (opacities * torch.exp(-0.5 * torch.einsum("pni,nij,pnj->pn", d, inverses, d))).clamp(max=rule.alpha_max)
+    dx, dy = pixels[:, :1] - means[:, 0], pixels[:, 1:] - means[:, 1]
+    a, b, c = inverses[:, 0, 0], inverses[:, 0, 1], inverses[:, 1, 1]
+    alpha = (opacities * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)).clamp(max=rule.alpha_max)
     alpha = torch.where(alpha >= rule.alpha_cut, alpha, 0)
     after = torch.cumprod(1 - alpha, 1)
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
@@ -115,17 +118,26 @@ def gsplat_rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
     return rgb
 
 
-def _rasterizers() -> dict[str, Callable[[Gaussians, Camera], torch.Tensor]]:
-    """What is there on this machine, by name."""
-    found = {DENSE: dense_rasterize}
-    if importlib.util.find_spec("bench.naive"):
-        naive = importlib.import_module("bench.naive")
-        if hasattr(naive, "rasterize"):
-            found["naive"] = naive.rasterize
-    if torch.cuda.is_available() and importlib.util.find_spec("gsplat"):
-        found["gsplat"] = gsplat_rasterize
-    return found
+def naive_rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
+    """The same pictures by the straightforward kernel, one thread per pixel."""
+    return importlib.import_module("bench.naive").rasterize(gaussians, camera)
 
 
-RASTERIZERS = _rasterizers()
+RASTERIZERS = {DENSE: dense_rasterize, NAIVE: naive_rasterize, GSPLAT: gsplat_rasterize}
 """Peers that draw: Gaussians and a batch of cameras in, pictures [C, H, W, 3] out."""
+
+
+@functools.cache
+def absent(device: torch.device) -> dict[str, str]:
+    """Peers that cannot draw a picture and its gradient on a device, each with the reason."""
+    reasons = {}
+    for name, draw in RASTERIZERS.items():
+        try:
+            gaussians = inputs.gaussians(10, device)
+            picture = draw(gaussians, inputs.camera(32, 32, device))
+            torch.autograd.grad(picture.sum(), [gaussians.means])
+        except Exception as e:  # whatever a foreign program fails with, the bench goes on without it
+            reasons[name] = " ".join(f"{type(e).__name__}: {e}".split())[:200]
+    if GSPLAT in reasons:
+        reasons[GSPLAT_STEP] = reasons[GSPLAT]
+    return reasons

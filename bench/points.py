@@ -48,8 +48,11 @@ COUNTS = (1_000, 10_000, 100_000, 1_000_000, 10_000_000)
 IMAGES = ((256, 256), (504, 378), (1920, 1080), (3840, 2160), (7680, 4320))
 DEGREES = (0, 1, 2, 3)
 CAMERAS = (1, 4)
-DIAGONAL = ((1_000, 0), (10_000, 0), (100_000, 1), (1_000_000, 2), (10_000_000, 3))
-"""Numbers of Gaussians with the place in IMAGES of the image they are drawn into."""
+DIAGONAL = (
+    (100, 128, 128), (1_000, 256, 256), (10_000, 256, 256), (100_000, 504, 378), (1_000_000, 1920, 1080),
+    (10_000_000, 3840, 2160),
+)  # fmt: skip
+"""Numbers of Gaussians with the images they are drawn into. The first is there for peers that manage no more."""
 
 
 def points(axes: tuple[str, ...], device: torch.device, tiny: bool) -> list[Point]:
@@ -60,7 +63,7 @@ def points(axes: tuple[str, ...], device: torch.device, tiny: bool) -> list[Poin
     else:
         large = device.type == "cuda"
         base, counts, images = BASE, COUNTS[: 5 if large else 4], IMAGES[: 5 if large else 3]
-        diagonal, degrees, cameras = DIAGONAL[: 5 if large else 4], DEGREES, CAMERAS
+        diagonal, degrees, cameras = DIAGONAL[: 6 if large else 5], DEGREES, CAMERAS
     found = [base]
     if "count" in axes:
         found += [replace(base, count=n) for n in counts]
@@ -71,7 +74,7 @@ def points(axes: tuple[str, ...], device: torch.device, tiny: bool) -> list[Poin
     if "cameras" in axes:
         found += [replace(base, cameras=c) for c in cameras]
     if "count" in axes and "image" in axes:
-        found += [replace(base, count=n, width=IMAGES[i][0], height=IMAGES[i][1]) for n, i in diagonal]
+        found += [replace(base, count=n, width=w, height=h) for n, w, h in diagonal]
     if "threads" in axes and device.type == "cpu":
         found += [replace(base, threads=t) for t in range(1, (1 if tiny else torch.get_num_threads()) + 1)]
     return sorted(dict.fromkeys(found), key=lambda p: (load(p), p.threads))
@@ -94,7 +97,8 @@ def growth(small: dict, large: dict) -> float | None:
     if "width" in large:
         ratios.append(large["width"] * large["height"] / (small["width"] * small["height"]))
     if "degree" in large:
-        ratios.append((large["degree"] + 1) ** 2 / (small["degree"] + 1) ** 2)
+        # a lower degree is never dearer, and rows of a higher one may be all there is to go by
+        ratios.append(max(1.0, (large["degree"] + 1) ** 2 / (small["degree"] + 1) ** 2))
     if "threads" in large:
         ratios.append(small.get("threads", torch.get_num_threads()) / large["threads"])
     return None if min(ratios) < 1 else max(ratios)

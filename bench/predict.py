@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import torch
 
@@ -13,30 +14,42 @@ LIMIT_MS = 2000.0
 """Longest time of one repeat that is still measured [ms]."""
 
 
-def _series(rows: list[dict], op: str, program: str, direction: str, sizes: dict) -> list[tuple[float, dict]]:
-    """Rows of the same task at smaller sizes with the factor from there to ``sizes``, the nearest first."""
+def _smaller(rows: list[dict], op: str, program: str, direction: str, sizes: dict) -> list[tuple[float, dict]]:
+    """Rows of the same task at sizes that are nowhere larger, with the factor from there to ``sizes``, the least first.
+
+    Runs on few threads say nothing about runs on all.
+    """
     same = [r for r in rows if (r["op"], r["program"], r["direction"]) == (op, program, direction)]
+    same = [r for r in same if "threads" in sizes or "threads" not in r]
     factors = [(growth(r, sizes), r) for r in same]
     return sorted(((f, r) for f, r in factors if f is not None), key=lambda pair: pair[0])
+
+
+def _changed(small: dict, large: dict, names: Iterable[str]) -> set[str]:
+    """The sizes that differ between two rows; the image counts once."""
+    return {"width" if n == "height" else n for n in names if small.get(n) != large.get(n)}
 
 
 def time_ms(rows: list[dict], op: str, program: str, direction: str, sizes: dict) -> float | None:
     """Predicted time of a repeat [ms]; None where nothing smaller was measured.
 
-    From the nearest smaller row, linear at least: if the next smaller one shows a steeper growth, that goes on, up to
+    The least estimate from those smaller rows that have no other between them and ``sizes``. Growth is linear at least in
+    the size that grows most; if a still smaller row shows a steeper growth along the same axis, that goes on, up to
     quadratic. Small sizes are mostly overhead, so this errs on the high side there, where it does no harm.
     """
-    smaller = _series(rows, op, program, direction, sizes)
-    if not smaller:
-        return None
-    factor, nearest = smaller[0]
-    exponent = 1.0
-    for other_factor, other in smaller[1:]:
-        if other_factor > factor and growth(other, nearest) is not None:
-            slope = math.log(nearest["median_ms"] / other["median_ms"]) / math.log(other_factor / factor)
-            exponent = min(2.0, max(1.0, slope))
-            break
-    return nearest["median_ms"] * factor**exponent
+    smaller = _smaller(rows, op, program, direction, sizes)
+    estimates = []
+    for factor, near in smaller:
+        if any((growth(near, other) or 0) > 1 for _, other in smaller):
+            continue
+        slopes = [1.0]
+        for _, far in smaller:
+            step = growth(far, near) or 0
+            if step > 1 and _changed(far, near, sizes) == _changed(near, sizes, sizes):
+                slopes.append(math.log(near["median_ms"] / far["median_ms"]) / math.log(step))
+        # the nearest of the farther rows: smaller ones only show overhead
+        estimates.append(near["median_ms"] * factor ** min(2.0, max(1.0, slopes[min(1, len(slopes) - 1)])))
+    return min(estimates, default=None)
 
 
 def memory_bytes(rows: list[dict], op: str, program: str, direction: str, point: Point, sizes: dict) -> float:
@@ -44,7 +57,7 @@ def memory_bytes(rows: list[dict], op: str, program: str, direction: str, point:
 
     On paper: parameters, gradients and two moments; per view record, gradient and sort buffers; twenty numbers a pixel.
     """
-    for factor, row in _series(rows, op, program, direction, sizes):
+    for factor, row in _smaller(rows, op, program, direction, sizes):
         if "peak_bytes" in row:
             return row["peak_bytes"] * factor
     parameters = 16 * point.count * (11 + 3 * (point.degree + 1) ** 2) if "N" in sizes else 0

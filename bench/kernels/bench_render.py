@@ -10,6 +10,9 @@ from warpgs import rasterize
 AXES = ("count", "image", "degree", "cameras", "threads")
 PROGRAMS = {OURS: ("forward", "both"), **dict.fromkeys(peers.RASTERIZERS, ("forward", "both"))}
 
+LARGEST = {peers.DENSE: 1_000}
+"""Most Gaussians that a peer is given at all."""
+
 
 def costs(point, device) -> tuple[roofline.Cost, roofline.Cost]:
     """Forward and backward of projection, tiles and blending together."""

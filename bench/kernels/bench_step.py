@@ -15,8 +15,7 @@ from warpgs.pipeline.optimizer import Optimizer, OptimizerConfig
 from warpgs.scene import Camera
 
 AXES = ("count", "image", "degree", "threads")
-PEER = "gsplat + torch"
-PROGRAMS = {OURS: ("step",)} | ({PEER: ("step",)} if "gsplat" in peers.RASTERIZERS else {})
+PROGRAMS = {OURS: ("step",), peers.GSPLAT_STEP: ("step",)}
 RATE = 1e-12
 
 
@@ -46,14 +45,14 @@ def tasks(point, device, wanted):
 
         yield Task(OURS, "step", step, cost(point, device))
 
-    if PEER in PROGRAMS and wanted(PEER, "step"):
+    if wanted(peers.GSPLAT_STEP, "step"):
         adam = torch.optim.Adam(gaussians.tensors().values(), lr=RATE, eps=1e-15, fused=True)
 
         def peer_step():
-            picture = peers.RASTERIZERS["gsplat"](gaussians, batch)[0]
+            picture = peers.gsplat_rasterize(gaussians, batch)[0]
             structural = peers.torch_ssim(picture, target).mean()
             ((picture - target).abs().mean() * 0.8 + (1 - structural) * 0.2).backward()
             adam.step()
             adam.zero_grad(set_to_none=True)
 
-        yield Task(PEER, "step", peer_step)
+        yield Task(peers.GSPLAT_STEP, "step", peer_step)
