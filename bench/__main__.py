@@ -148,6 +148,8 @@ def run(
         note: Words about the machine that belong in the results.
         echo: Takes a line per task.
     """
+    if device.type == "cuda" and device.index is None:
+        device = torch.device("cuda", torch.cuda.current_device())  # Warp asks for the number
     record = machine.describe(device) | ({"note": note} if note else {})
     bench = Bench(device, 3 if tiny else REPEATS, budget, echo)
     roof = roofline.ceilings(device, tiny)

@@ -27,6 +27,8 @@ OURS = "warpgs"
 APART = 30
 """A program this many times slower than another runs after it instead: pairing adds nothing to such a ratio, and what a long
 run leaves of caches and freed memory was seen to make its short neighbour several times slower."""
+PASSES, DISTURBED = 3, 1.25
+"""A measurement whose median is this many times its least is made again, so many times in all."""
 IN_WARP = (OURS, "naive")
 """Programs whose scratch memory comes from Warp's pool."""
 
@@ -89,8 +91,24 @@ def measure_in_turn(
     """Median, quartiles and least of each work's wall time [ms], and on CUDA the median of its GPU time [ms].
 
     A work that turns out in the warm-up to take longer than ``limit_ms`` is left there: its row has ``warm_up_ms`` only.
+    Where a median lies far above the least, other programs were in the way, and all works are measured again, up to
+    ``PASSES`` times; the pass with the lowest medians counts, for all of them alike.
     """
     shortest = [_warm_up(work, device, limit_ms, repeats >= REPEATS) for work in works]
+    best: list[dict] = []
+    done = 0
+    while done < PASSES:
+        done += 1
+        rows = _one_pass(works, device, repeats, shortest, limit_ms)
+        timed = [row for row in rows if "median_ms" in row]
+        if not best or sum(r["median_ms"] for r in timed) < sum(r.get("median_ms", 0) for r in best):
+            best = rows
+        if repeats < REPEATS or all(r["median_ms"] <= DISTURBED * r["least_ms"] for r in timed):
+            break
+    return [row | {"passes": done} for row in best]
+
+
+def _one_pass(works: Sequence, device: torch.device, repeats: int, shortest: list[float], limit_ms: float) -> list[dict]:
     samples = [[] for _ in works]
     in_turn = [i for i, least in enumerate(shortest) if least <= limit_ms]
     apart = [i for i in in_turn if shortest[i] > APART * min(shortest)]

@@ -173,7 +173,7 @@ def ceilings(device: torch.device, tiny: bool = False) -> dict:
     b, c, a = (torch.ones(length, device=device) for _ in range(3))
     triad = _fastest(lambda: torch.add(b, c, alpha=0.5, out=a), device, 30)
     # on CUDA 2^20 threads fill the device; on a CPU few tasks of many steps
-    tasks, steps, lanes = (2**20, 2**10, 1) if cuda else (256, 2**10 if tiny else 2**15, 16)
+    tasks, steps, lanes = (2**20, 2**7 if tiny else 2**13, 1) if cuda else (256, 2**10 if tiny else 2**15, 16)
     out = torch.empty(tasks, device=device)
 
     def compute():
