@@ -55,14 +55,15 @@ def time_ms(rows: list[dict], op: str, program: str, direction: str, sizes: dict
 def memory_bytes(rows: list[dict], op: str, program: str, direction: str, point: Point, sizes: dict) -> float:
     """Predicted memory [bytes]: grown from the nearest smaller row where memory was measured, else counted on paper.
 
-    On paper: parameters, gradients and two moments; per view record, gradient and sort buffers; twenty numbers a pixel.
+    On paper: gradients and two moments; per view record, gradient and sort buffers; twenty numbers a pixel. The
+    parameters themselves come on top of both, because what was measured leaves the inputs out.
     """
+    parameters = 4 * point.count * (11 + 3 * (point.degree + 1) ** 2) if "N" in sizes else 0
     for factor, row in _smaller(rows, op, program, direction, sizes):
         if "peak_bytes" in row:
-            return row["peak_bytes"] * factor
-    parameters = 16 * point.count * (11 + 3 * (point.degree + 1) ** 2) if "N" in sizes else 0
+            return parameters + row["peak_bytes"] * factor
     views = 400 * point.count * point.cameras if "N" in sizes else 0
-    return parameters + views + 80 * point.pixels * point.cameras
+    return 4 * parameters + views + 80 * point.pixels * point.cameras
 
 
 def reason_to_skip(
