@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 
 from bench import machine, peers, predict, roofline
-from bench.harness import OURS, REPEATS, Task, measure_in_turn, peak_bytes
+from bench.harness import DISTURBED, OURS, REPEATS, Task, measure_in_turn, peak_bytes
 from bench.pairs import instances_and_pairs
 from bench.points import Point, growth, load, points
 from warpgs.errors import ResourceError
@@ -108,12 +108,31 @@ class Bench:
                 torch.cuda.empty_cache()
         for row in rows:
             if "median_ms" in row:
-                self.rows.append(row)
+                self._keep(row)
                 low, high = row["quartiles_ms"]
                 self.echo(f"{_title(row)} {row['median_ms']:>10.3f} ms  ({low:.3f} to {high:.3f})")
             else:
                 self._stop(op, row["program"], row["direction"], sizes, f"took {row['warm_up_ms'] / 1000:.2g} s a repeat")
         return None
+
+    def _keep(self, row: dict) -> None:
+        """Add a row, or let it take the place of a slower one for the same task and sizes."""
+        names = ("op", "program", "direction", "N", "width", "height", "degree", "cameras", "threads")
+        for i, old in enumerate(self.rows):
+            if all(old.get(n) == row.get(n) for n in names):
+                self.rows[i] = min(old, row, key=lambda r: r["median_ms"])
+                return
+        self.rows.append(row)
+
+    def disturbed(self, op: str, sizes: dict) -> bool:
+        """Whether other programs kept the cores busy while an op was measured at some sizes."""
+        return any(
+            r.get("others_cores", 0.0) > DISTURBED
+            for r in self.rows
+            if r["op"] == op
+            and all(r.get(n) == value for n, value in sizes.items())
+            and ("threads" in r) == ("threads" in sizes)
+        )
 
     def _row(self, op: str, task: Task, sizes: dict, timing: dict, roof: dict | None) -> dict:
         row = {"op": op, "program": task.program, "direction": task.direction, **sizes, **task.facts, **timing}
@@ -158,6 +177,12 @@ def run(
     grid = [(p, op) for op, module in modules.items() for p in points(module.AXES, device, tiny)]
     for point, op in sorted(grid, key=lambda pair: load(pair[0])):
         bench.measure(op, modules[op], point, roof)
+    # what met other programs gets a second chance; skips of that are no news
+    skipped = list(bench.skipped)
+    for point, op in sorted(grid, key=lambda pair: load(pair[0])):
+        if not tiny and bench.disturbed(op, point.sizes(modules[op].AXES)):
+            bench.measure(op, modules[op], point, roof)
+    bench.skipped = skipped
     instances_and_pairs.cache_clear()
     record |= {"repeats": bench.repeats, "absent": peers.absent(device), "roofline": roof}
     return record | {"rows": bench.rows, "skipped": bench.skipped}

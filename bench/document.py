@@ -8,12 +8,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from bench.harness import DISTURBED, OURS
 from bench.plot import Line, Panel, chart
 from bench.points import BASE
 from bench.series import SIZES, Series, along, diagonal, exponent, tasks
 
 ROOT = Path(__file__).parent.parent
-OURS = "warpgs"
 COLORS = {
     "project": 0, "sh": 1, "tiles": 2, "blend": 3, "ssim": 4, "adam": 5, "knn": 6,
     "render forward": 0, "render both": 1, "step step": 2,
@@ -31,8 +31,8 @@ python -m bench.document
 
 Times are wall times in ms of one call with its inputs loaded, from an idle device to an idle device: the median, and in
 brackets the quartiles. Programs that are compared run in turn, one repeat each, unless one is over 30 times slower. `both`
-is forward and backward together, `step` a training step: picture, loss, backward pass, Adam. Where a median was over 1.25
-times the fastest repeat, other programs were in the way and all was measured again, up to twice; the lowest pass counts.
+is forward and backward together, `step` a training step: picture, loss, backward pass, Adam. A star marks figures during
+which other programs kept more than 0.2 cores busy, also on a second try.
 
 The scene is a random cloud whose Gaussians shrink as their number grows, drawn under rule `exact`. One size varies at a time
 around 100,000 Gaussians, 504 x 378 px, degree 3, one camera; a few points let Gaussians and image grow together.
@@ -80,7 +80,8 @@ def _timing(row: dict | None) -> str:
     if row is None:
         return ""
     low, high = row["quartiles_ms"]
-    return f"{figure(row['median_ms'])} ({figure(low)} to {figure(high)})"
+    star = "*" if row.get("others_cores", 0.0) > DISTURBED else ""
+    return f"{figure(row['median_ms'])}{star} ({figure(low)} to {figure(high)})"
 
 
 def _name(program: str, direction: str) -> str:

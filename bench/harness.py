@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 import math
+import os
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -27,8 +28,8 @@ OURS = "warpgs"
 APART = 30
 """A program this many times slower than another runs after it instead: pairing adds nothing to such a ratio, and what a long
 run leaves of caches and freed memory was seen to make its short neighbour several times slower."""
-PASSES, DISTURBED = 3, 1.25
-"""A measurement whose median is this many times its least is made again, so many times in all."""
+DISTURBED = 0.2
+"""Cores kept busy by other programs from which on a measurement counts as disturbed."""
 IN_WARP = (OURS, "naive")
 """Programs whose scratch memory comes from Warp's pool."""
 
@@ -82,6 +83,17 @@ def _warm_up(work: Callable[[], object], device: torch.device, limit_ms: float, 
     return min(times)
 
 
+def others_seconds() -> float | None:
+    """CPU time that everything but this process has used since the machine started [s]; None where Linux does not say."""
+    try:
+        with open("/proc/stat") as f:
+            user, nice, system, _, _, irq, soft, steal = map(int, f.readline().split()[1:9])
+    except (OSError, ValueError):
+        return None
+    busy = user + nice + system + irq + soft + steal
+    return busy / os.sysconf("SC_CLK_TCK") - time.process_time()
+
+
 def measure_in_turn(
     works: Sequence[Callable[[], object]],
     device: torch.device,
@@ -91,24 +103,10 @@ def measure_in_turn(
     """Median, quartiles and least of each work's wall time [ms], and on CUDA the median of its GPU time [ms].
 
     A work that turns out in the warm-up to take longer than ``limit_ms`` is left there: its row has ``warm_up_ms`` only.
-    Where a median lies far above the least, other programs were in the way, and all works are measured again, up to
-    ``PASSES`` times; the pass with the lowest medians counts, for all of them alike.
+    ``others_cores`` says how many cores other programs kept busy meanwhile.
     """
+    begin, before = time.perf_counter(), others_seconds()
     shortest = [_warm_up(work, device, limit_ms, repeats >= REPEATS) for work in works]
-    best: list[dict] = []
-    done = 0
-    while done < PASSES:
-        done += 1
-        rows = _one_pass(works, device, repeats, shortest, limit_ms)
-        timed = [row for row in rows if "median_ms" in row]
-        if not best or sum(r["median_ms"] for r in timed) < sum(r.get("median_ms", 0) for r in best):
-            best = rows
-        if repeats < REPEATS or all(r["median_ms"] <= DISTURBED * r["least_ms"] for r in timed):
-            break
-    return [row | {"passes": done} for row in best]
-
-
-def _one_pass(works: Sequence, device: torch.device, repeats: int, shortest: list[float], limit_ms: float) -> list[dict]:
     samples = [[] for _ in works]
     in_turn = [i for i, least in enumerate(shortest) if least <= limit_ms]
     apart = [i for i in in_turn if shortest[i] > APART * min(shortest)]
@@ -127,6 +125,11 @@ def _one_pass(works: Sequence, device: torch.device, repeats: int, shortest: lis
         if device.type == "cuda":
             row["gpu_ms"] = round(statistics.median(gpu for _, gpu in own), 4)
         rows.append(row)
+    if before is not None:
+        used, wall = others_seconds() - before, time.perf_counter() - begin
+        # the clock ticks every 10 ms: less than a few ticks are no evidence
+        cores = round(max(0.0, used) / wall, 2) if used > 0.05 else 0.0
+        rows = [row | {"others_cores": cores} for row in rows]
     return rows
 
 

@@ -82,11 +82,7 @@ def _text(x: float, y: float, words: str, *, size: int = 12, anchor: str = "star
     return f"<text {place}>{escape(words)}</text>"
 
 
-def _panel(panel: Panel, left: float, y_range: tuple[int, int]) -> list[str]:
-    sizes = [math.log10(x) for line in panel.lines for x, _ in line.points]
-    # sizes fill the width, so that labels stand beside the lines' ends
-    x_range = (min(sizes) - 0.06, max(sizes) + 0.06)
-
+def _panel(panel: Panel, left: float, y_range: tuple[int, int], x_range: tuple[float, float]) -> list[str]:
     def px(x: float) -> float:
         return left + PLOT_WIDTH * (math.log10(x) - x_range[0]) / (x_range[1] - x_range[0])
 
@@ -131,7 +127,10 @@ def _panel(panel: Panel, left: float, y_range: tuple[int, int]) -> list[str]:
 
 
 def chart(title: str, panels: Sequence[Panel]) -> str:
-    """An SVG with a title and panels from left to right, all with the same range of y; panels without lines are left out."""
+    """An SVG with a title and panels from left to right; those without lines are left out.
+
+    All panels have the same range of y, and those with the same label the same range of x.
+    """
     panels = [p for p in panels if p.lines]
     y_range = decades([y for p in panels for line in p.lines for _, y in line.points])
     step = LEFT + PLOT_WIDTH + RIGHT
@@ -143,5 +142,8 @@ def chart(title: str, panels: Sequence[Panel]) -> str:
         _text(16, 28, title, size=16, color="#111111", bold=True),
     ]
     for i, panel in enumerate(panels):
-        out += _panel(panel, i * step + LEFT, y_range)
+        same = [p for p in panels if p.x_label == panel.x_label]
+        sizes = [math.log10(x) for p in same for line in p.lines for x, _ in line.points]
+        # sizes fill the width, so that labels stand beside the lines' ends
+        out += _panel(panel, i * step + LEFT, y_range, (min(sizes) - 0.06, max(sizes) + 0.06))
     return "\n".join([*out, "</svg>"]) + "\n"

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bench import document, harness, inputs, peers, predict
-from bench.__main__ import OPS, run
+from bench.__main__ import OPS, Bench, run
 from bench.plot import spread
 from bench.points import Point, growth, points
 from bench.series import exponent
@@ -96,14 +96,16 @@ def test_points_vary_one_axis_at_a_time_and_along_the_diagonal():
         assert sum(p.count != 100_000 and p.width != 504 for p in found) in (4, 5)
 
 
-def test_a_disturbed_measurement_is_made_again(monkeypatch):
-    """Slow first repeats that hide a fast one call for another pass, which then counts; a quiet one is done at once."""
-    waits = iter([5.0] * 31 + [1.0] * 2 + [1.1] * 30)
-    monkeypatch.setattr(harness, "_timed", lambda work, device: (work(), None))
-    monkeypatch.setattr(harness, "WARM_UP_SECONDS", 0.0)
-    row = harness.measure(lambda: next(waits), CPU)
-    assert row["passes"] == 2 and row["median_ms"] == 1.1
-    assert harness.measure(lambda: 2.0, CPU)["passes"] == 1
+def test_disturbed_rows_are_known_and_give_way_to_faster_ones():
+    """Per op and sizes; a second measurement takes the place of a slower one and of nothing else."""
+    bench = Bench(CPU, 3, None, print)
+    for r in (row(100, 2.0, others_cores=0.9), row(1000, 3.0, others_cores=0.1), row(100, 4.0, threads=1, others_cores=0.0)):
+        bench._keep(r)
+    assert bench.disturbed("adam", {"N": 100}) and not bench.disturbed("adam", {"N": 1000})
+    assert not bench.disturbed("adam", {"N": 100, "threads": 1})
+    bench._keep(row(100, 1.0, others_cores=0.0))
+    bench._keep(row(1000, 9.0, others_cores=0.0))
+    assert [r["median_ms"] for r in bench.rows] == [1.0, 3.0, 4.0] and not bench.disturbed("adam", {"N": 100})
 
 
 def test_work_beyond_the_limit_is_left_after_the_warm_up(monkeypatch):
