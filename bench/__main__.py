@@ -20,6 +20,7 @@ from bench import machine, peers, predict, roofline
 from bench.harness import DISTURBED, OURS, REPEATS, Task, measure_in_turn, peak_bytes
 from bench.pairs import instances_and_pairs
 from bench.points import Point, growth, load, points
+from bench.series import SIZES
 from warpgs.errors import ResourceError
 from warpgs.kernels import bridge
 
@@ -117,22 +118,16 @@ class Bench:
 
     def _keep(self, row: dict) -> None:
         """Add a row, or let it take the place of a slower one for the same task and sizes."""
-        names = ("op", "program", "direction", "N", "width", "height", "degree", "cameras", "threads")
         for i, old in enumerate(self.rows):
-            if all(old.get(n) == row.get(n) for n in names):
+            if _key(old) == _key(row):
                 self.rows[i] = min(old, row, key=lambda r: r["median_ms"])
                 return
         self.rows.append(row)
 
-    def disturbed(self, op: str, sizes: dict) -> bool:
-        """Whether other programs kept the cores busy while an op was measured at some sizes."""
-        return any(
-            r.get("others_cores", 0.0) > DISTURBED
-            for r in self.rows
-            if r["op"] == op
-            and all(r.get(n) == value for n, value in sizes.items())
-            and ("threads" in r) == ("threads" in sizes)
-        )
+    def open(self, op: str, sizes: dict) -> bool:
+        """Whether an op at some sizes has no row yet, or one during which other programs kept the cores busy."""
+        own = [r for r in self.rows if r["op"] == op and {s: r[s] for s in SIZES if s in r} == sizes]
+        return not own or any(r.get("others_cores", 0.0) > DISTURBED for r in own)
 
     def _row(self, op: str, task: Task, sizes: dict, timing: dict, roof: dict | None) -> dict:
         row = {"op": op, "program": task.program, "direction": task.direction, **sizes, **task.facts, **timing}
@@ -141,6 +136,10 @@ class Bench:
         if "median_ms" in row and roof and task.cost:
             row |= roofline.against_roof(task.cost, row.get("gpu_ms", row["median_ms"]) / 1000, roof)
         return row
+
+
+def _key(row: dict) -> tuple:
+    return tuple(row.get(n) for n in ("op", "program", "direction", *SIZES))
 
 
 def _title(row: dict) -> str:
@@ -155,6 +154,7 @@ def run(
     ops: tuple[str, ...] = OPS,
     budget: float | None = None,
     note: str = "",
+    earlier: dict | None = None,
     echo: Callable[[str], None] = lambda line: print(line, flush=True),
 ) -> dict:
     """Measure the ops named; returns the machine, its roofline, a row per task, and what was skipped and why.
@@ -165,27 +165,35 @@ def run(
         ops: Names out of `OPS`.
         budget: Time for all of it [s]; what is predicted not to fit is skipped. None for no limit.
         note: Words about the machine that belong in the results.
+        earlier: Results of the same code on the same machine; only what they lack or what was disturbed is measured.
         echo: Takes a line per task.
     """
     if device.type == "cuda" and device.index is None:
         device = torch.device("cuda", torch.cuda.current_device())  # Warp asks for the number
     record = machine.describe(device) | ({"note": note} if note else {})
     bench = Bench(device, 3 if tiny else REPEATS, budget, echo)
-    roof = roofline.ceilings(device, tiny)
+    if earlier:
+        record = {name: earlier[name] for name in (*record, "note") if name in earlier}
+        bench.rows = list(earlier["rows"])
+    roof = earlier["roofline"] if earlier else roofline.ceilings(device, tiny)
     echo(f"roof: {roof['bytes_per_s'] / 1e9:.4g} GB/s, {roof['operations_per_s'] / 1e9:.4g} Gop/s")
     modules = {op: importlib.import_module(f"bench.kernels.bench_{op}") for op in ops}
     grid = [(p, op) for op, module in modules.items() for p in points(module.AXES, device, tiny)]
-    for point, op in sorted(grid, key=lambda pair: load(pair[0])):
-        bench.measure(op, modules[op], point, roof)
-    # what met other programs gets a second chance; skips of that are no news
-    skipped = list(bench.skipped)
-    for point, op in sorted(grid, key=lambda pair: load(pair[0])):
-        if not tiny and bench.disturbed(op, point.sizes(modules[op].AXES)):
+    grid.sort(key=lambda pair: load(pair[0]))
+    for point, op in grid:
+        if bench.open(op, point.sizes(modules[op].AXES)):
             bench.measure(op, modules[op], point, roof)
-    bench.skipped = skipped
+    # what met other programs gets a second chance; what was skipped is not tried again
+    once = list(bench.skipped)
+    for point, op in grid:
+        sizes = point.sizes(modules[op].AXES)
+        if not tiny and bench.open(op, sizes) and any(r["op"] == op and r.items() >= sizes.items() for r in bench.rows):
+            bench.measure(op, modules[op], point, roof)
+    done = {_key(r) for r in bench.rows}
+    skipped = {_key(s): s for s in (*(earlier["skipped"] if earlier else ()), *once) if _key(s) not in done}
     instances_and_pairs.cache_clear()
     record |= {"repeats": bench.repeats, "absent": peers.absent(device), "roofline": roof}
-    return record | {"rows": bench.rows, "skipped": bench.skipped}
+    return record | {"rows": bench.rows, "skipped": list(skipped.values())}
 
 
 def main() -> None:
@@ -197,8 +205,10 @@ def main() -> None:
     parser.add_argument("--op", nargs="+", choices=OPS, default=OPS, metavar="NAME", help=f"some of {', '.join(OPS)}")
     parser.add_argument("--budget", type=float, help="seconds for all of it; what does not fit is skipped and listed")
     parser.add_argument("--note", default="", help="words about the machine that belong in the results")
+    parser.add_argument("--again", action="store_true", help="measure only what --out lacks, or what other programs disturbed")
     a = parser.parse_args()
-    result = run(torch.device(a.device), tiny=a.tiny, ops=tuple(a.op), budget=a.budget, note=a.note)
+    earlier = json.loads(a.out.read_text("utf-8")) if a.again and a.out and a.out.exists() else None
+    result = run(torch.device(a.device), tiny=a.tiny, ops=tuple(a.op), budget=a.budget, note=a.note, earlier=earlier)
     if a.out:
         a.out.parent.mkdir(parents=True, exist_ok=True)
         a.out.write_text(json.dumps(result, indent=1) + "\n")

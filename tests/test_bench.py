@@ -50,6 +50,16 @@ def test_a_budget_of_nothing_skips_everything():
     assert all("left of the time given" in s["reason"] for s in result["skipped"])
 
 
+def test_a_second_run_measures_only_what_the_first_lacks(result):
+    """All rows stay as they are but the one that was taken out."""
+    lacking = result | {"rows": [r for r in result["rows"] if (r["op"], r.get("N")) != ("adam", 100)]}
+    lines = []
+    again = run(CPU, tiny=True, ops=("adam", "knn"), earlier=lacking, echo=lines.append)
+    fresh = [r for r in again["rows"] if r not in result["rows"]]
+    assert [(r["op"], r["N"]) for r in fresh] == [("adam", 100)] and len(again["rows"]) == len(result["rows"])
+    assert again["roofline"] == result["roofline"] and len(lines) == 2
+
+
 def row(count: int, milliseconds: float, **more) -> dict:
     """A measured row of one op."""
     return {"op": "adam", "program": "warpgs", "direction": "forward", "N": count, "median_ms": milliseconds, **more}
@@ -101,11 +111,11 @@ def test_disturbed_rows_are_known_and_give_way_to_faster_ones():
     bench = Bench(CPU, 3, None, print)
     for r in (row(100, 2.0, others_cores=0.9), row(1000, 3.0, others_cores=0.1), row(100, 4.0, threads=1, others_cores=0.0)):
         bench._keep(r)
-    assert bench.disturbed("adam", {"N": 100}) and not bench.disturbed("adam", {"N": 1000})
-    assert not bench.disturbed("adam", {"N": 100, "threads": 1})
+    assert bench.open("adam", {"N": 100}) and not bench.open("adam", {"N": 1000}) and bench.open("adam", {"N": 7})
+    assert not bench.open("adam", {"N": 100, "threads": 1})
     bench._keep(row(100, 1.0, others_cores=0.0))
     bench._keep(row(1000, 9.0, others_cores=0.0))
-    assert [r["median_ms"] for r in bench.rows] == [1.0, 3.0, 4.0] and not bench.disturbed("adam", {"N": 100})
+    assert [r["median_ms"] for r in bench.rows] == [1.0, 3.0, 4.0] and not bench.open("adam", {"N": 100})
 
 
 def test_work_beyond_the_limit_is_left_after_the_warm_up(monkeypatch):
