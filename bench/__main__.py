@@ -107,22 +107,25 @@ class Bench:
             gc.collect()
             if self.device.type == "cuda":
                 torch.cuda.empty_cache()
+        self._keep([row for row in rows if "median_ms" in row])
         for row in rows:
             if "median_ms" in row:
-                self._keep(row)
                 low, high = row["quartiles_ms"]
                 self.echo(f"{_title(row)} {row['median_ms']:>10.3f} ms  ({low:.3f} to {high:.3f})")
             else:
                 self._stop(op, row["program"], row["direction"], sizes, f"took {row['warm_up_ms'] / 1000:.2g} s a repeat")
         return None
 
-    def _keep(self, row: dict) -> None:
-        """Add a row, or let it take the place of a slower one for the same task and sizes."""
-        for i, old in enumerate(self.rows):
-            if _key(old) == _key(row):
-                self.rows[i] = min(old, row, key=lambda r: r["median_ms"])
-                return
-        self.rows.append(row)
+    def _keep(self, rows: list[dict]) -> None:
+        """Add the rows of an op at one point; rows of an earlier try stay or go together, so that ratios are of one run."""
+        before = {_key(r): r for r in self.rows}
+        both = [r for r in rows if _key(r) in before]
+        faster = sum(r["median_ms"] for r in both) < sum(before[_key(r)]["median_ms"] for r in both)
+        for row in rows:
+            if _key(row) not in before:
+                self.rows.append(row)
+            elif faster:
+                self.rows[self.rows.index(before[_key(row)])] = row
 
     def open(self, op: str, sizes: dict) -> bool:
         """Whether an op at some sizes has no row yet, or one during which other programs kept the cores busy."""
