@@ -1,20 +1,10 @@
-"""Seeded inputs for the benches of single ops."""
+"""Seeded inputs for all benches."""
 
 from __future__ import annotations
 
 import torch
 
 from warpgs.scene import Camera, Gaussians
-
-
-def counts(device: torch.device, tiny: bool) -> list[int]:
-    """Numbers of Gaussians."""
-    return [100] if tiny else [1000, 10_000, 100_000] + ([1_000_000] if device.type == "cuda" else [])
-
-
-def sizes(device: torch.device, tiny: bool) -> list[tuple[int, int]]:
-    """Widths and heights [px]."""
-    return [(40, 30)] if tiny else [(256, 256), (504, 378)] + ([(1920, 1080)] if device.type == "cuda" else [])
 
 
 def gaussians(count: int, device: torch.device, degree: int = 3) -> Gaussians:
@@ -32,7 +22,14 @@ def gaussians(count: int, device: torch.device, degree: int = 3) -> Gaussians:
     return Gaussians(**{n: t.to(device).requires_grad_() for n, t in tensors.items()})
 
 
-def camera(width: int, height: int, device: torch.device) -> Camera:
-    """One camera at the origin, as a batch of one."""
-    K = torch.tensor([[[0.9 * width, 0, width / 2], [0, 0.9 * width, height / 2], [0, 0, 1]]])
-    return Camera(torch.eye(4)[None].to(device), K.to(device), width, height)
+def camera(width: int, height: int, device: torch.device, cameras: int = 1) -> Camera:
+    """A batch of cameras that look along +z: the first at the origin, each further one 0.1 u to the side."""
+    K = torch.tensor([[0.9 * width, 0, width / 2], [0, 0.9 * width, height / 2], [0, 0, 1]])
+    viewmats = torch.eye(4).repeat(cameras, 1, 1)
+    viewmats[:, 0, 3] = -0.1 * torch.arange(cameras)
+    return Camera(viewmats.to(device), K.repeat(cameras, 1, 1).to(device), width, height)
+
+
+def image(width: int, height: int, device: torch.device, seed: int = 0) -> torch.Tensor:
+    """Random colours in [0, 1], shape [H, W, 3]."""
+    return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(seed)).to(device)

@@ -1,15 +1,211 @@
-"""The benches run; what they measure is nobody's test."""
+"""The benches run and their arithmetic holds; how long things take is nobody's test."""
 
+import itertools
 import json
+from xml.etree import ElementTree
 
+import pytest
 import torch
 
-from bench.__main__ import OPS, bench
+from bench import document, harness, inputs, peers, predict
+from bench.__main__ import OPS, Bench, run
+from bench.plot import spread
+from bench.points import Point, growth, points
+from bench.series import exponent
+from warpgs import rasterize
+from warpgs.kernels.ssim import ssim
+
+CPU = torch.device("cpu")
 
 
-def test_every_op_gives_finite_rows():
-    """Tiny sizes on the CPU: a positive time for each op, backward where there is one, and JSON that parses."""
-    result = json.loads(json.dumps(bench(torch.device("cpu"), tiny=True)))
-    assert {row["op"] for row in result["rows"]} == set(OPS)
-    assert all(0 < row["median_ms"] < 1e5 for row in result["rows"])
-    assert {r["op"] for r in result["rows"] if r["direction"] == "backward"} == {"project", "sh", "blend", "ssim"}
+@pytest.fixture(scope="module")
+def result():
+    """A run over tiny sizes, as JSON. One thread: torch's spin where cores are shared, and that takes longer than the work."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    made = run(CPU, tiny=True, echo=lambda line: None)
+    torch.set_num_threads(before)
+    return json.loads(json.dumps(made))
+
+
+def test_every_op_gives_rows(result):
+    """A positive time for each op and direction, sizes, and a share of the roof for our own."""
+    rows = result["rows"]
+    assert not result["skipped"]
+    assert {r["op"] for r in rows} == set(OPS)
+    assert all(r["median_ms"] > 0 and r["quartiles_ms"][0] <= r["median_ms"] <= r["quartiles_ms"][1] for r in rows)
+    backward = {r["op"] for r in rows if r["direction"] in ("backward", "both")}
+    assert backward == {"project", "sh", "blend", "ssim", "render"}
+    ours = [r for r in rows if r["program"] == "warpgs" and not r.get("threads")]
+    assert all(r["share"] > 0 and r["bytes"] > 0 and r["roof_ms"] > 0 for r in ours)
+    assert result["roofline"]["bytes_per_s"] > 0 and result["roofline"]["operations_per_s"] > 0
+    assert {r["program"] for r in rows} >= {"warpgs", peers.TORCH_SSIM, peers.DENSE}
+
+
+def test_a_budget_of_nothing_skips_everything():
+    """All tasks are listed with the reason, none is measured."""
+    result = run(CPU, tiny=True, ops=("adam", "render"), budget=0, echo=lambda line: None)
+    assert not result["rows"]
+    assert {s["op"] for s in result["skipped"]} == {"adam", "render"}
+    assert all("left of the time given" in s["reason"] for s in result["skipped"])
+
+
+def test_a_second_run_measures_only_what_the_first_lacks(result):
+    """All rows stay as they are but the one that was taken out."""
+    lacking = result | {"rows": [r for r in result["rows"] if (r["op"], r.get("N")) != ("adam", 100)]}
+    lines = []
+    again = run(CPU, tiny=True, ops=("adam", "knn"), earlier=lacking, echo=lines.append)
+    fresh = [r for r in again["rows"] if r not in result["rows"]]
+    assert [(r["op"], r["N"]) for r in fresh] == [("adam", 100)] and len(again["rows"]) == len(result["rows"])
+    assert again["roofline"] == result["roofline"] and len(lines) == 2
+
+
+def row(count: int, milliseconds: float, **more) -> dict:
+    """A measured row of one op."""
+    return {"op": "adam", "program": "warpgs", "direction": "forward", "N": count, "median_ms": milliseconds, **more}
+
+
+def test_predictions_grow_linearly_at_least():
+    """Flat growth counts as linear, steeper growth goes on, and nothing is foretold for smaller sizes."""
+    task = ("adam", "warpgs", "forward")
+    flat, steep = [row(100, 1.0), row(1000, 1.1)], [row(100, 1.0), row(1000, 30.0)]
+    assert predict.time_ms(flat, *task, {"N": 10_000}) == pytest.approx(11.0)
+    assert predict.time_ms(steep, *task, {"N": 10_000}) == pytest.approx(900.0)
+    assert predict.time_ms(flat, *task, {"N": 50}) is None
+    assert predict.time_ms(flat, "knn", "warpgs", "forward", {"N": 10_000}) is None
+    assert predict.time_ms([row(1000, 1.0), row(1000, 9.0, threads=1)], *task, {"N": 2000}) == pytest.approx(2.0)
+
+
+def test_predictions_start_from_the_nearest_rows():
+    """Where Gaussians and pixels both grow, the row between counts, not the one before it, and the lower estimate holds."""
+    task, small, large = ("adam", "warpgs", "forward"), {"width": 10, "height": 10}, {"width": 10, "height": 100}
+    rows = [row(100, 1.0, **small), row(1000, 5.0, **small)]
+    assert predict.time_ms(rows, *task, {"N": 1000, **large}) == pytest.approx(50.0)
+    assert predict.time_ms([*rows, row(100, 2.0, **large)], *task, {"N": 1000, **large}) == pytest.approx(20.0)
+
+
+def test_hopeless_tasks_are_skipped():
+    """Too long, or too large for the free memory; anything else runs."""
+    task, point = ("adam", "warpgs", "forward"), Point(1_000_000)
+    sizes = point.sizes(("count",))
+    rows = [row(100_000, 150.0, peak_bytes=10_000_000)]
+    assert predict.reason_to_skip(rows, *task, point, sizes, free=1e12) is None
+    assert "a repeat" in predict.reason_to_skip([row(100_000, 250.0)], *task, point, sizes, free=1e12)
+    assert "GiB" in predict.reason_to_skip(rows, *task, point, sizes, free=5e7)
+    assert "GiB" in predict.reason_to_skip([], *task, point, sizes, free=5e7)
+
+
+def test_points_vary_one_axis_at_a_time_and_along_the_diagonal():
+    """No full cross product; the base point once; sizes as agreed for each device."""
+    axes = ("count", "image", "degree", "cameras")
+    for device, largest, widest in (("cpu", 10**6, 1920), ("cuda", 10**7, 7680)):
+        found = points(axes, torch.device(device), tiny=False)
+        assert len(found) == len(set(found)) < 25
+        assert max(p.count for p in found) == largest and max(p.width for p in found) == widest
+        assert {p.degree for p in found} == {0, 1, 2, 3} and {p.cameras for p in found} == {1, 4}
+        assert sum(p.count != 100_000 and p.width != 504 for p in found) in (4, 5)
+
+
+def test_disturbed_rows_are_known_and_give_way_to_faster_ones():
+    """Per op and sizes; all rows of a second try take the place of slower ones, and of nothing else."""
+    bench = Bench(CPU, 3, None, print)
+    peer = {"program": "peer"}
+    bench._keep([row(100, 2.0, others_cores=0.9), row(100, 6.0, **peer, others_cores=0.9)])
+    bench._keep([row(1000, 3.0, others_cores=0.1)])
+    bench._keep([row(100, 4.0, threads=1, others_cores=0.0)])
+    assert bench.open("adam", {"N": 100}) and not bench.open("adam", {"N": 1000}) and bench.open("adam", {"N": 7})
+    assert not bench.open("adam", {"N": 100, "threads": 1})
+    bench._keep([row(100, 2.1, others_cores=0.0), row(100, 4.0, **peer, others_cores=0.0)])
+    bench._keep([row(1000, 9.0, others_cores=0.0)])
+    assert [r["median_ms"] for r in bench.rows] == [2.1, 4.0, 3.0, 4.0] and not bench.open("adam", {"N": 100})
+
+
+def test_work_beyond_the_limit_is_left_after_the_warm_up(monkeypatch):
+    """Two calls and no more."""
+    calls = []
+    monkeypatch.setattr(harness, "_timed", lambda work, device: (calls.append(1) or 3000.0, None))
+    (row,) = harness.measure_in_turn([lambda: None], CPU, limit_ms=2000.0)
+    assert row["warm_up_ms"] == 3000.0 and "median_ms" not in row and len(calls) == 2
+
+
+def test_growth_is_that_of_the_axis_that_grows_most():
+    """Linear in Gaussians and pixels; more threads make less work; nothing is said about smaller sizes."""
+    small, large = Point(1000, 10, 10).sizes(("count", "image")), Point(4000, 30, 30).sizes(("count", "image"))
+    assert growth(small, large) == 9
+    assert growth(large, small) is None
+    assert growth({"N": 5, "threads": 2}, {"N": 5, "threads": 1}) == 2
+
+
+def test_peers_draw_and_score_the_same():
+    """What is compared for speed must agree in its result."""
+    gaussians, camera = inputs.gaussians(60, CPU), inputs.camera(40, 30, CPU, 2)
+    ours, dense = rasterize(gaussians, camera).rgb, peers.dense_rasterize(gaussians, camera)
+    assert (ours - dense).abs().max() < 1e-3
+    a, b = inputs.image(40, 30, CPU), inputs.image(40, 30, CPU, seed=1)
+    assert (ssim(a, b) - peers.torch_ssim(a, b)).abs().max() < 1e-4
+
+
+def test_the_exponent_of_a_power_law_is_found():
+    """Exactly, from the last decade alone; None where there is nothing to fit."""
+    points = [(10.0**k, 3 * 10.0 ** (1.4 * k)) for k in range(3, 8)]
+    assert exponent(points) == pytest.approx(1.4)
+    assert exponent([(1e3, 5.0), (1e4, 5.0), (1e5, 5.0), (1e6, 50.0)]) == pytest.approx(1.0)
+    assert exponent([(504 * 378, 1.0), (1920 * 1080, 10.0)]) is not None
+    assert exponent([(1e3, 1.0)]) is None and exponent([(1e3, 1.0), (1e6, 2.0)]) is None
+
+
+def hand_made(device: str) -> dict:
+    """A result as `run` makes it, small enough to read."""
+    size = {"width": 504, "height": 378}
+    cuda = {"gpu_ms": 0.5, "peak_bytes": 2**20} if device == "cuda" else {}
+    common = {"quartiles_ms": [0.5, 2.0], "repeats": 30, **cuda}
+    roof = {"bytes": 1e6, "operations": 1e6, "roof_ms": 0.25, "bound": "bytes", "share": 0.25}
+    rows = [
+        {"op": "render", "program": program, "direction": "both", "N": n, **size, "median_ms": n / scale, **common}
+        | (roof if program == "warpgs" else {})
+        for n in (1000, 10_000, 100_000)
+        for program, scale in (("warpgs", 1000), ("gsplat", 500))
+    ]
+    rows += [{"op": "ssim", "program": "warpgs", "direction": d, "width": 16 * k, "height": 9 * k, "median_ms": k * k / 1e3}
+             | common | roof for d in ("forward", "backward") for k in (40, 80, 120)]  # fmt: skip
+    skipped = [{"op": "render", "program": "gsplat", "direction": "both", "N": 10**6, **size, "reason": "predicted 9 s"}]
+    return {
+        "device": device, "name": "Device <A & B>", "processor": "P", "cores": 2, "threads": 2, "memory_gib": 8.0,
+        "device_memory_gib": 9.0, "versions": {"torch": "2"}, "commit": "abc", "date": "2026-01-02", "repeats": 30,
+        "note": "Words about it.", "absent": {"naive": "not there"}, "rows": rows, "skipped": skipped,
+        "roofline": {"bytes_per_s": 1e10, "operations_per_s": 1e11, "how": "measured"},
+    }  # fmt: skip
+
+
+def test_the_document_says_what_the_results_say():
+    """Tables, ratios, exponents, reasons; charts are well-formed; the same results give the same bytes."""
+    results = {"b": hand_made("cuda"), "a": hand_made("cpu")}
+    files = document.generate(results)
+    assert files == document.generate(json.loads(json.dumps(dict(reversed(results.items())))))
+    text = files["performance.md"]
+    assert text.index("(a)\n") < text.index("(b)\n")
+    assert "| 100,000 | 504 x 378 | 100 (0.5 to 2) | 200 (0.5 to 2) |" in text
+    assert "| 100,000 | 504 x 378 | gsplat | 200 (0.5 to 2) | 100 (0.5 to 2) | 2 |" in text
+    assert "| render | warpgs | both | 1.00 | 100,000 |" in text
+    assert "| ssim | warpgs | forward |  |  | 1.00 |" in text
+    assert "predicted 9 s" in text and "naive: not there" in text and "0.5 / 1 |" in text
+    svgs = {path: svg for path, svg in files.items() if path.endswith(".svg")}
+    assert {"plots/a_pixels.svg", "plots/a_whole.svg", "plots/b_whole.svg"} <= set(svgs)
+    for path, svg in svgs.items():
+        assert ElementTree.fromstring(svg).tag.endswith("svg") and path.removeprefix("plots/") in text
+
+
+def test_labels_keep_their_distance():
+    """In order, apart, inside."""
+    placed = spread([50.0, 51.0, 52.0, 200.0, 299.0], 14, 0, 300)
+    assert placed == sorted(placed) and min(b - a for a, b in itertools.pairwise(placed)) >= 14 - 1e-9
+    assert placed[3] == 200 and placed[0] >= 0 and placed[-1] <= 300
+
+
+def test_the_document_is_that_of_the_committed_results():
+    """docs/performance.md and its charts are what `python -m bench.document` writes, and nothing else lies there."""
+    files = document.generate(document.committed())
+    docs = document.ROOT / "docs"
+    for path, text in files.items():
+        assert (docs / path).read_text("utf-8") == text, f"{path} is stale: run python -m bench.document"
+    assert {f"plots/{p.name}" for p in (docs / "plots").glob("*.svg")} == set(files) - {"performance.md"}

@@ -1,35 +1,31 @@
-"""Time of compositing N binned Gaussians.
-
-usage: python -m bench.kernels.bench_blend
-"""
+"""Time of compositing N binned Gaussians."""
 
 import torch
 
-from bench import inputs
-from bench.harness import Case, backward_of, main
+from bench import inputs, roofline
+from bench.harness import OURS, passes
+from bench.pairs import instances_and_pairs
 from warpgs.constants import RULES
 from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
 
-
-def cases(device, tiny):
-    rule = RULES["exact"]
-    for width, height in inputs.sizes(device, tiny):
-        for count in inputs.counts(device, tiny):
-            tensors = inputs.gaussians(count, device).tensors().values()
-            camera, size = inputs.camera(width, height, device), {"width": width, "height": height}
-            splats, tile_counts = project(*tensors, camera.viewmat, camera.K, **size, degree=0, rule=rule)
-            tiles = bin_tiles(splats, tile_counts, **size, rule=rule)
-            leaf, background = splats.detach().requires_grad_(), torch.zeros(1, 3, device=device)
-
-            def work(leaf=leaf, tiles=tiles, background=background, size=size):
-                return blend(leaf, tiles, background, **size, rule=rule)[0]
-
-            parameters = {"N": count, "image": f"{width}x{height}", "instances": len(tiles.slots)}
-            yield Case("blend", "forward", parameters, work)
-            yield Case("blend", "backward", parameters, backward_of(work(), [leaf]))
+AXES = ("count", "image", "cameras")
+PROGRAMS = {OURS: ("forward", "backward")}
 
 
-if __name__ == "__main__":
-    main(cases)
+def tasks(point, device, wanted):
+    rule, size = RULES["exact"], {"width": point.width, "height": point.height}
+    with torch.no_grad():
+        tensors = inputs.gaussians(point.count, device, 0).tensors().values()
+        camera = inputs.camera(point.width, point.height, device, point.cameras)
+        splats, tile_counts = project(*tensors, camera.viewmat, camera.K, **size, degree=0, rule=rule)
+        tiles = bin_tiles(splats, tile_counts, **size, rule=rule)
+    leaf, backgrounds = splats.detach().requires_grad_(), torch.zeros(point.cameras, 3, device=device)
+    instances, pairs = instances_and_pairs(point, device)
+    costs = roofline.blend(point.count, point.cameras, point.pixels, instances, pairs)
+
+    def work():
+        return blend(leaf, tiles, backgrounds, **size, rule=rule)[0]
+
+    yield from passes(OURS, work, [leaf], wanted, costs, {"instances": instances, "pairs": pairs})

@@ -1,24 +1,15 @@
-"""Time of finding the three nearest neighbours of N points.
-
-usage: python -m bench.kernels.bench_knn
-"""
+"""Time of finding the three nearest neighbours of N points."""
 
 import torch
 
-from bench import inputs
-from bench.harness import Case, main
+from bench import roofline
+from bench.harness import OURS, Task
 from warpgs.kernels.knn import mean_square_distances
 
-
-def cases(device, tiny):
-    for count in inputs.counts(device, tiny):
-        points = torch.randn(count, 3, generator=torch.Generator().manual_seed(0)).to(device)
-
-        def work(points=points):
-            return mean_square_distances(points)
-
-        yield Case("knn", "forward", {"N": count}, work)
+AXES = ("count",)
+PROGRAMS = {OURS: ("forward",)}
 
 
-if __name__ == "__main__":
-    main(cases)
+def tasks(point, device, wanted):
+    points = torch.randn(point.count, 3, generator=torch.Generator().manual_seed(0)).to(device)
+    yield Task(OURS, "forward", lambda: mean_square_distances(points), roofline.knn(point.count))

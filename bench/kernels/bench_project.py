@@ -1,26 +1,20 @@
-"""Time of projecting N Gaussians into one camera, SH degree 3.
+"""Time of projecting N Gaussians into cameras."""
 
-usage: python -m bench.kernels.bench_project
-"""
-
-from bench import inputs
-from bench.harness import Case, backward_of, main
+from bench import inputs, roofline
+from bench.harness import OURS, passes
 from warpgs.constants import RULES
 from warpgs.kernels.project import project
 
-
-def cases(device, tiny):
-    for count in inputs.counts(device, tiny):
-        tensors = list(inputs.gaussians(count, device).tensors().values())
-        camera = inputs.camera(504, 378, device)
-
-        def work(tensors=tensors, camera=camera):
-            size = {"width": camera.width, "height": camera.height}
-            return project(*tensors, camera.viewmat, camera.K, **size, degree=3, rule=RULES["exact"])[0]
-
-        yield Case("project", "forward", {"N": count}, work)
-        yield Case("project", "backward", {"N": count}, backward_of(work(), tensors))
+AXES = ("count", "degree", "cameras")
+PROGRAMS = {OURS: ("forward", "backward")}
 
 
-if __name__ == "__main__":
-    main(cases)
+def tasks(point, device, wanted):
+    tensors = list(inputs.gaussians(point.count, device, point.degree).tensors().values())
+    camera = inputs.camera(point.width, point.height, device, point.cameras)
+    size = {"width": point.width, "height": point.height}
+
+    def work():
+        return project(*tensors, camera.viewmat, camera.K, **size, degree=point.degree, rule=RULES["exact"])[0]
+
+    yield from passes(OURS, work, tensors, wanted, roofline.project(point.count, point.cameras, point.degree))

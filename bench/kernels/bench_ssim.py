@@ -1,26 +1,15 @@
-"""Time of structural similarity.
+"""Time of structural similarity, beside plain torch convolutions."""
 
-usage: python -m bench.kernels.bench_ssim
-"""
-
-import torch
-
-from bench import inputs
-from bench.harness import Case, backward_of, main
+from bench import inputs, peers, roofline
+from bench.harness import OURS, passes
 from warpgs.kernels.ssim import ssim
 
-
-def cases(device, tiny):
-    for width, height in inputs.sizes(device, tiny):
-        pair = torch.rand(2, height, width, 3, generator=torch.Generator().manual_seed(0)).to(device)
-        image, target = pair[0].clone().requires_grad_(), pair[1]
-
-        def work(image=image, target=target):
-            return ssim(image, target)
-
-        yield Case("ssim", "forward", {"image": f"{width}x{height}"}, work)
-        yield Case("ssim", "backward", {"image": f"{width}x{height}"}, backward_of(work(), [image]))
+AXES = ("image",)
+PROGRAMS = {OURS: ("forward", "backward"), peers.TORCH_SSIM: ("forward", "backward")}
 
 
-if __name__ == "__main__":
-    main(cases)
+def tasks(point, device, wanted):
+    image = inputs.image(point.width, point.height, device).requires_grad_()
+    target = inputs.image(point.width, point.height, device, seed=1)
+    yield from passes(OURS, lambda: ssim(image, target), [image], wanted, roofline.ssim(point.pixels))
+    yield from passes(peers.TORCH_SSIM, lambda: peers.torch_ssim(image, target), [image], wanted)

@@ -1,32 +1,27 @@
-"""Time of binning N Gaussians into tiles, both sorts included.
-
-usage: python -m bench.kernels.bench_tiles
-"""
+"""Time of binning N Gaussians into tiles, both sorts included."""
 
 import torch
 
-from bench import inputs
-from bench.harness import Case, main
+from bench import inputs, roofline
+from bench.harness import OURS, Task
 from warpgs.constants import RULES
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
 
-
-@torch.no_grad()
-def cases(device, tiny):
-    rule = RULES["exact"]
-    for width, height in inputs.sizes(device, tiny):
-        for count in inputs.counts(device, tiny):
-            tensors = inputs.gaussians(count, device).tensors().values()
-            camera, size = inputs.camera(width, height, device), {"width": width, "height": height}
-            splats, tile_counts = project(*tensors, camera.viewmat, camera.K, **size, degree=0, rule=rule)
-
-            def work(splats=splats, tile_counts=tile_counts, size=size):
-                return bin_tiles(splats, tile_counts, **size, rule=rule)
-
-            parameters = {"N": count, "image": f"{width}x{height}", "instances": int(tile_counts.sum())}
-            yield Case("tiles", "forward", parameters, work)
+AXES = ("count", "image", "cameras")
+PROGRAMS = {OURS: ("forward",)}
 
 
-if __name__ == "__main__":
-    main(cases)
+def tasks(point, device, wanted):
+    rule, size = RULES["exact"], {"width": point.width, "height": point.height}
+    with torch.no_grad():
+        tensors = inputs.gaussians(point.count, device, 0).tensors().values()
+        camera = inputs.camera(point.width, point.height, device, point.cameras)
+        splats, tile_counts = project(*tensors, camera.viewmat, camera.K, **size, degree=0, rule=rule)
+    tiles = bin_tiles(splats, tile_counts, **size, rule=rule)
+    cost = roofline.tiles(point.count, point.cameras, len(tiles.slots), len(tiles.ranges))
+
+    def work():
+        return bin_tiles(splats, tile_counts, **size, rule=rule)
+
+    yield Task(OURS, "forward", work, cost, {"instances": len(tiles.slots)})

@@ -1,0 +1,283 @@
+"""Write docs/performance.md and its charts from bench/results/ops_*.json; the same results give the same bytes.
+
+usage: python -m bench.document
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from bench.harness import DISTURBED, OURS
+from bench.plot import Line, Panel, chart
+from bench.points import BASE
+from bench.series import SIZES, Series, along, diagonal, exponent, tasks
+
+ROOT = Path(__file__).parent.parent
+COLORS = {
+    "project": 0, "sh": 1, "tiles": 2, "blend": 3, "ssim": 4, "adam": 5, "knn": 6,
+    "render forward": 0, "render both": 1, "step step": 2,
+}  # fmt: skip
+WORDS = ("op", "program", "direction", "peer", "bound by", "reason")
+"""Columns that hold words."""
+INTRODUCTION = """# Performance
+
+Written by `python -m bench.document` from `bench/results/ops_*.json`; do not edit. To measure a machine:
+
+```bash
+python -m bench --out bench/results/ops_MACHINE.json   # CUDA where there is a device; --device cpu, --budget SECONDS
+python -m bench.document
+```
+
+Times are wall times in ms of one call with its inputs loaded, from an idle device to an idle device: the median, and in
+brackets the quartiles. Programs that are compared run in turn, one repeat each, unless one is over 30 times slower. `both`
+is forward and backward together, `step` a training step: picture, loss, backward pass, Adam. A star marks figures during
+which other programs kept more than 0.2 cores busy, also on a second try.
+
+The scene is a random cloud whose Gaussians shrink as their number grows, drawn under rule `exact`. One size varies at a time
+around 100,000 Gaussians, 504 x 378 px, degree 3, one camera; a few points let Gaussians and image grow together.
+
+Other programs: `torch conv2d` is SSIM as most trainers write it, `torch dense` a rasterizer without tiles in plain torch, up
+to 1,000 Gaussians, `naive` a kernel with one thread per pixel, `gsplat` that package with `packed=False`, `gsplat + torch` a
+step made of its picture, the loss in plain torch and torch's fused Adam.
+"""
+
+
+def figure(value: float) -> str:
+    """Three significant digits, never with an exponent."""
+    if value >= 999.5:
+        return f"{value:,.0f}"
+    return f"{float(f'{value:.3g}'):.10f}".rstrip("0").rstrip(".")
+
+
+def table(head: list[str], rows: list[list[str]]) -> str:
+    """A Markdown table: words to the left, figures to the right."""
+    lines = [head, ["---" if name in WORDS else "---:" for name in head], *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def _sizes(row: dict, names: list[str]) -> list[str]:
+    cells = []
+    for name in names:
+        if name == "image":
+            cells.append(f"{row['width']} x {row['height']}" if "width" in row else "")
+        else:
+            cells.append(f"{row[name]:,}" if name in row else "")
+    return cells
+
+
+def _columns(rows: list[dict]) -> list[str]:
+    return [
+        n for n in ("N", "image", "degree", "cameras", "threads") if any((n if n != "image" else "width") in r for r in rows)
+    ]
+
+
+def _key(row: dict) -> tuple:
+    return tuple(row.get(s, 0) for s in SIZES)
+
+
+def _timing(row: dict | None) -> str:
+    if row is None:
+        return ""
+    low, high = row["quartiles_ms"]
+    star = "*" if row.get("others_cores", 0.0) > DISTURBED else ""
+    return f"{figure(row['median_ms'])}{star} ({figure(low)} to {figure(high)})"
+
+
+def _name(program: str, direction: str) -> str:
+    return direction if program == OURS else f"{program}, {direction}"
+
+
+def op_tables(rows: list[dict]) -> str:
+    """Per op a table of sizes by programs and directions; on CUDA a second one with GPU time and memory."""
+    parts = []
+    for op in dict.fromkeys(r["op"] for r in rows):
+        own = [r for r in rows if r["op"] == op]
+        by_task = {(r["program"], r["direction"], _key(r)): r for r in own}
+        sizes, columns = {_key(r): r for r in sorted(own, key=_key)}, _columns(own)
+        done = [(program, direction) for _, program, direction in tasks(own)]
+        head = [*columns, *(_name(*t) for t in done)]
+        body = [[*_sizes(r, columns), *(_timing(by_task.get((*t, key))) for t in done)] for key, r in sizes.items()]
+        parts.append(f"#### {op}\n\n{table(head, body)}")
+        if any("peak_bytes" in r for r in own):
+            body = [[*_sizes(r, columns), *(_device(by_task.get((*t, key))) for t in done)] for key, r in sizes.items()]
+            parts.append(f"{op}: GPU time [ms] / peak memory above the inputs [MiB]\n\n{table(head, body)}")
+    return "\n".join(parts)
+
+
+def _device(row: dict | None) -> str:
+    return "" if row is None else f"{figure(row['gpu_ms'])} / {figure(row['peak_bytes'] / 2**20)}"
+
+
+def peer_table(rows: list[dict]) -> str:
+    """Every size at which another program did the same work."""
+    ours = {(r["op"], r["direction"], _key(r)): r for r in rows if r["program"] == OURS}
+    body, peers = [], [r for r in rows if r["program"] != OURS]
+    columns = _columns(peers)
+    for r in sorted(peers, key=lambda r: (r["op"], r["direction"], r["program"], _key(r))):
+        own = ours.get((r["op"], r["direction"], _key(r)))
+        if own:
+            ratio = f"{figure(r['median_ms'] / own['median_ms'])}"
+            body.append([r["op"], r["direction"], *_sizes(r, columns), r["program"], _timing(r), _timing(own), ratio])
+    return table(["op", "direction", *columns, "peer", "peer [ms]", "warpgs [ms]", "peer / warpgs"], body) if body else ""
+
+
+def roof_table(rows: list[dict]) -> str:
+    """Our own tasks against the roof: at the base point, and where each was measured at its heaviest."""
+    body = []
+    for op, program, direction in tasks(rows):
+        own = [r for r in rows if (r["op"], r["program"], r["direction"]) == (op, program, direction) and "roof_ms" in r]
+        base = {**BASE.sizes(("count", "image", "degree", "cameras"))}
+        chosen = [r for r in own if all(r[s] == base[s] for s in base if s in r)]
+        chosen += sorted(own, key=lambda r: r["roof_ms"])[-1:]
+        for r in {_key(r): r for r in chosen}.values():
+            cells = [op, direction, *_sizes(r, ["N", "image", "degree", "cameras"])]
+            cells += [figure(r["bytes"] / 1e6), figure(r["operations"] / 1e6), figure(r["roof_ms"]), r["bound"]]
+            body.append([*cells, figure(r.get("gpu_ms", r["median_ms"])), f"{figure(100 * r['share'])} %"])
+    head = [
+        "op",
+        "direction",
+        "N",
+        "image",
+        "degree",
+        "cameras",
+        "MB",
+        "Mop",
+        "roof [ms]",
+        "bound by",
+        "measured [ms]",
+        "share",
+    ]
+    return table(head, body)
+
+
+def exponent_table(rows: list[dict]) -> str:
+    """Local exponents of time over the last decade of N and of pixels."""
+    over = {axis: {(s.op, s.program, s.direction): s for s in along(rows, axis)} for axis in ("N", "pixels")}
+    body = []
+    for task in tasks(rows):
+        cells = []
+        for axis in ("N", "pixels"):
+            series = over[axis].get(task)
+            value = exponent(series.points) if series else None
+            cells += ["", ""] if value is None else [f"{value:.2f}", f"{series.points[-1][0]:,.0f}"]
+        if any(cells):
+            body.append([*task, *cells])
+    return table(["op", "program", "direction", "over N", "up to N", "over pixels", "up to pixels"], body)
+
+
+def skipped_table(skipped: list[dict]) -> str:
+    """What was not measured, and why."""
+    columns = _columns(skipped)
+    body = [[s["op"], s["program"], s["direction"], *_sizes(s, columns), s["reason"]] for s in skipped]
+    return table(["op", "program", "direction", *columns, "reason"], body)
+
+
+def _lines(series: list[Series], name) -> tuple[Line, ...]:
+    lines = []
+    for s in series:
+        color = COLORS.get(f"{s.op} {s.direction}", COLORS.get(s.op, 7))
+        lines.append(Line(name(s), s.points, color, dashed=s.program != OURS))
+    return tuple(lines)
+
+
+def charts(title: str, rows: list[dict]) -> dict[str, str]:
+    """Charts of one machine by the end of their names: over N, over pixels, and of the whole picture and step."""
+
+    def op_name(s: Series) -> str:
+        return s.op if s.program == OURS else s.program
+
+    def whole_name(s: Series) -> str:
+        own = {"forward": "picture", "both": "picture + gradients", "step": "training step"}[s.direction]
+        return own if s.program == OURS else {"forward": s.program, "both": f"{s.program} + gr."}.get(s.direction, s.program)
+
+    whole = ("render", "step")
+    over_n, over_pixels, both = along(rows, "N"), along(rows, "pixels"), diagonal(rows)
+    made = {}
+    for name, series, label, what in (
+        ("gaussians", over_n, "Gaussians", "ops over the number of Gaussians"),
+        ("pixels", over_pixels, "pixels of the image", "ops over the number of pixels"),
+    ):
+        panels = [
+            Panel(direction, label, "time of one call [ms]", _lines(chosen, op_name))
+            for direction in ("forward", "backward")
+            if (chosen := [s for s in series if s.op not in whole and s.direction == direction])
+        ]
+        if panels:
+            made[name] = chart(f"{title}: {what}", panels)
+    panels = [
+        Panel("Gaussians into 504 x 378 px", "Gaussians", "time of one call [ms]", _lines(
+            [s for s in over_n if s.op in whole], whole_name)),
+        Panel("Gaussians and image grow together", "Gaussians", "time of one call [ms]", _lines(
+            [s for s in both if s.op in whole], whole_name)),
+    ]  # fmt: skip
+    if any(p.lines for p in panels):
+        made["whole"] = chart(f"{title}: picture and training step", panels)
+    return made
+
+
+def machine_text(stem: str, result: dict, plots: list[str]) -> str:
+    """The section of one machine."""
+    versions = ", ".join(f"{k} {v}" for k, v in result["versions"].items())
+    facts = f"{result['processor']}, {result['cores']} cores, {result['threads']} threads, {result['memory_gib']} GiB"
+    if result["device"] == "cuda":
+        facts = f"{result['name']} ({result['device_memory_gib']} GiB) beside {facts}"
+    roof, rows = result["roofline"], result["rows"]
+    parts = [
+        f"## {result['name']} ({stem})\n",
+        f"{facts}. {versions}. Commit {result['commit']}, {result['date']}, {result['repeats']} repeats."
+        + (f" {result['note'].rstrip('.')}." if result.get("note") else "")
+        + f" Results: `bench/results/ops_{stem}.json`.\n",
+        *(f"![{name} of {stem}](plots/{stem}_{name}.svg)\n" for name in plots),
+        "### Ops\n",
+        op_tables(rows),
+    ]
+    if peers := peer_table(rows):
+        parts += ["### Beside other programs\n", peers]
+    if result.get("absent"):
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in sorted(result["absent"].items()))
+        parts.append(f"Not measured, because not there or not working: {reasons}.\n")
+    parts += [
+        "### How steeply time grows\n",
+        "Slope of log time over log size through the last decade of sizes: 1 is linear, below 1 overhead still counts.\n",
+        exponent_table(rows),
+        "### Roofline\n",
+        f"Ceilings measured at the start: {roof['bytes_per_s'] / 1e9:,.1f} GB/s and {roof['operations_per_s'] / 1e9:,.0f} "
+        f"Gop/s ({roof['how']}). Bytes and operations are the least a stage has to do, counted as `bench/roofline.py` says; "
+        "the share is the time at the roof over the time measured"
+        + (" by GPU events" if result["device"] == "cuda" else "")
+        + ". Data that fits into caches can exceed 100 %.\n",
+        roof_table(rows),
+    ]
+    if result["skipped"]:
+        parts += ["### Skipped\n", skipped_table(result["skipped"])]
+    return "\n".join(parts)
+
+
+def generate(results: dict[str, dict]) -> dict[str, str]:
+    """All files, by path under docs/, from results by machine."""
+    files, sections = {}, [INTRODUCTION]
+    for stem, result in sorted(results.items()):
+        name = result["name"] if result["device"] == "cuda" else f"{result['name']}, {result['threads']} threads"
+        plots = charts(name, result["rows"])
+        files |= {f"plots/{stem}_{kind}.svg": svg for kind, svg in plots.items()}
+        sections.append(machine_text(stem, result, list(plots)))
+    return files | {"performance.md": "\n".join(sections)}
+
+
+def committed() -> dict[str, dict]:
+    """The results in bench/results, by machine."""
+    paths = sorted((ROOT / "bench/results").glob("ops_*.json"))
+    return {p.stem.removeprefix("ops_"): json.loads(p.read_text("utf-8")) for p in paths}
+
+
+def main() -> None:
+    """Write the files."""
+    for path, text in generate(committed()).items():
+        target = ROOT / "docs" / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(text, "utf-8", newline="\n")
+
+
+if __name__ == "__main__":
+    main()

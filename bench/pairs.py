@@ -1,0 +1,68 @@
+"""How many (Gaussian, pixel) pairs a picture is made of: the work that no way of blending can avoid."""
+
+from __future__ import annotations
+
+import functools
+
+import torch
+import warp as wp
+
+from bench import inputs
+from bench.points import Point
+from warpgs.constants import RULES, Rule
+from warpgs.kernels import bridge
+from warpgs.kernels.blend import blend
+from warpgs.kernels.project import project
+from warpgs.kernels.tiles import Tiles, bin_tiles
+
+
+@wp.kernel(enable_backward=False)
+def count_drawn(
+    begin: int, splats: wp.array2d(dtype=float), ranges: wp.array2d(dtype=int), ids: wp.array(dtype=int),
+    ends: wp.array(dtype=int), width: int, height: int, columns: int, tiles: int, side: int, alpha_cut: float,
+    # outputs
+    drawn: wp.array(dtype=int),
+):  # fmt: skip
+    pixel = begin + wp.tid()
+    x = pixel % width
+    y = (pixel // width) % height
+    tile = (pixel // (width * height)) * tiles + (y // side) * columns + x // side
+    count = int(0)
+    for instance in range(ranges[tile, 0], ends[pixel]):
+        i = ids[instance]
+        dx = float(x) + 0.5 - splats[i, 0]
+        dy = float(y) + 0.5 - splats[i, 1]
+        e1 = splats[i, 2] * dx + splats[i, 3] * dy
+        e2 = splats[i, 4] * dy
+        if splats[i, 5] * wp.exp(-0.5 * (e1 * e1 + e2 * e2)) >= alpha_cut:
+            count += 1
+    drawn[pixel] = count
+
+
+def drawn_pairs(splats: torch.Tensor, tiles: Tiles, width: int, height: int, rule: Rule) -> int:
+    """Pairs blended into the pictures of records [C, N, 12]: alpha at or above the cut, pixel not yet finished."""
+    background = splats.new_zeros(len(splats), 3)
+    rgb = blend(splats.detach().requires_grad_(), tiles, background, width=width, height=height, rule=rule)[0]
+    ends = rgb.grad_fn.saved_tensors[-1]  # one past the last instance each pixel blended
+    columns, rows = -(-width // tiles.size), -(-height // tiles.size)
+    drawn = torch.empty(ends.numel(), dtype=torch.int32, device=splats.device)
+    with bridge.stream_of(splats.device):
+        arguments = [
+            bridge.view(splats.reshape(-1, splats.shape[-1]), wp.float32), bridge.view(tiles.ranges, wp.int32),
+            bridge.view(tiles.splat_ids, wp.int32), bridge.view(ends.reshape(-1), wp.int32),
+            width, height, columns, columns * rows, tiles.size, rule.alpha_cut, bridge.view(drawn, wp.int32),
+        ]  # fmt: skip
+        bridge.launch(count_drawn, len(drawn), arguments, splats.device, cost=100)
+    return int(drawn.sum(dtype=torch.int64))
+
+
+@functools.lru_cache(maxsize=64)
+def instances_and_pairs(point: Point, device: torch.device) -> tuple[int, int]:
+    """(Gaussian, tile) instances and drawn pairs of the bench's cloud at a point, rule `exact`."""
+    rule, size = RULES["exact"], {"width": point.width, "height": point.height}
+    with torch.no_grad():
+        tensors = inputs.gaussians(point.count, device, 0).tensors().values()
+        camera = inputs.camera(point.width, point.height, device, point.cameras)
+        splats, counts = project(*tensors, camera.viewmat, camera.K, **size, degree=0, rule=rule)
+        tiles = bin_tiles(splats, counts, **size, rule=rule)
+    return len(tiles.slots), drawn_pairs(splats, tiles, point.width, point.height, rule)
