@@ -10,70 +10,32 @@ from types import SimpleNamespace
 import warp as wp
 
 from warpgs.kernels.compiler import ROLLED
+from warpgs.kernels.falloff import make_functions
 
 VALUES = 10
 """Gradient values of an instance."""
-STOP_CHECK = 8
-"""Gaussians between two looks at whether any pixel of the tile is still open."""
-
-
-@functools.cache
-def make_falloff(real):
-    """exp(-x / 2) for x >= 0. In float32 by a polynomial, because a call to the C library would not vectorise."""
-    if real is wp.float64:
-
-        @wp.func
-        def falloff64(x: real) -> real:
-            return wp.exp(real(-0.5) * x)
-
-        return falloff64
-
-    @wp.func
-    def falloff32(x: real) -> real:
-        # exp(-x / 2) = 2^n 2^f, |f| <= 1/2. Adding 1.5 * 2^23 rounds to an integer and leaves it in the low bits.
-        # The bound keeps the result, times any opacity that can be seen, a normal number: others are slow.
-        y = wp.max(x * real(-0.7213475204444817), real(-110.0))
-        shifted = y + real(12582912.0)
-        f = y - (shifted - real(12582912.0))
-        # minimax polynomial of 2^f by relative error, 9.2e-8, with constant term 1
-        p = real(1.3264726641879386e-3)
-        p = p * f + real(9.671512958571476e-3)
-        p = p * f + real(5.550733747694458e-2)
-        p = p * f + real(2.4022242080135733e-1)
-        p = p * f + real(6.931469775948987e-1)
-        p = p * f + real(1.0)
-        # 2^n by adding n to the exponent bits
-        return wp.cast(wp.cast(p, wp.int32) + (wp.cast(shifted, wp.int32) << 23), wp.float32)
-
-    return falloff32
+BATCH = 32
+"""Gaussians that the forward pass takes at a time, row by row; between batches it looks for pixels still open."""
 
 
 @functools.cache
 def make_kernels(real, tile_size: int):
     """Forward, backward and contribution kernels for one scalar type and tile size."""
-    falloff = make_falloff(real)
-    vec2i = wp.types.vector(2, wp.int32)
-    # Vectors rather than local arrays: the compiler must see that they do not overlap.
-    tile_reals = wp.types.vector(tile_size * tile_size, real)
-    tile_ints = wp.types.vector(tile_size * tile_size, wp.int32)
+    f = make_functions(real, tile_size)
+    # Vectors rather than local arrays: the compiler must see that they do not overlap. One row longer than the tile, so that
+    # they do not lie 4096 bytes apart, where a load is taken to wait for a store to the other.
+    tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
+    tile_ints = wp.types.vector(tile_size * (tile_size + 1), wp.int32)
     row_reals = wp.types.vector(tile_size, real)
+    row_ints = wp.types.vector(tile_size, wp.int32)
+    batch_values = wp.types.vector(10 * BATCH, real)
+    batch_ints = wp.types.vector(BATCH, wp.int32)
     side_sums = wp.types.vector(VALUES * tile_size, real)
     half_sums = wp.types.vector(VALUES * (tile_size // 2), real)
     value_reals = wp.types.vector(VALUES, real)
     half = wp.constant(tile_size // 2)
     side = wp.constant(tile_size)
     pixels = wp.constant(tile_size * tile_size)
-
-    @wp.func
-    def rows_of(my: real, half_height: real, whole_tiles: wp.int32, top: wp.int32) -> vec2i:
-        """Rows of the tile, counted from its top, whose pixel centres may lie in the Gaussian's box."""
-        if whole_tiles != 0:
-            return vec2i(0, side)
-        margin = real(0.01) + real(2.0e-6) * (wp.abs(my) + half_height)
-        center = my - real(top) - real(0.5)
-        first = wp.ceil(wp.clamp(center - half_height - margin, real(0.0), real(side)))
-        last = wp.floor(wp.clamp(center + half_height + margin, real(-1.0), real(side) - real(1.0)))
-        return vec2i(int(first), int(last) + 1)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def forward(
@@ -90,70 +52,114 @@ def make_kernels(real, tile_size: int):
         top = (in_camera // columns) * side
         left = (in_camera - (in_camera // columns) * columns) * side
 
-        t = tile_reals()  # transmittance
+        # The state of the tile: transmittance, below ``stop`` once the pixel is finished, negative where it was finished
+        # before a Gaussian instead of by one; sums; one past the last instance blended.
+        t = tile_reals()
         red = tile_reals()
         green = tile_reals()
         blue = tile_reals()
         z = tile_reals()
         total = tile_reals()
-        ux = row_reals()  # u11 dx
-        end = tile_ints()  # one past the last instance blended
+        end = tile_ints()
         for p in range(pixels):
             # pixels outside the image are finished before they begin
             inside = top + p // side < height and left + p - (p // side) * side < width
             t[p] = wp.where(inside, real(1.0), real(-1.0))
+        # The same for one row, in registers, and the Gaussians of a batch: values, u11 dx, and by row which of them reach it.
+        row_t = row_reals()
+        row_red = row_reals()
+        row_green = row_reals()
+        row_blue = row_reals()
+        row_z = row_reals()
+        row_total = row_reals()
+        row_end = row_ints()
+        values = batch_values()
+        tops = batch_ints()
+        bottoms = batch_ints()
+        list = batch_ints()
 
         # inclusive: blend, then stop; exclusive: stop instead of blending
         leave = wp.where(inclusive != 0, real(-1.0), stop)
-        first = ranges[tile, 0]
         last = ranges[tile, 1]
-        instance = first
-        while instance < last:
-            i = splat_ids[instance]
-            mx = splats[i, 0]
-            my = splats[i, 1]
-            u11 = splats[i, 2]
-            u12 = splats[i, 3]
-            u22 = splats[i, 4]
-            opacity = splats[i, 5]
-            c0 = splats[i, 6]
-            c1 = splats[i, 7]
-            c2 = splats[i, 8]
-            distance = splats[i, 9]
-            rows = rows_of(my, splats[i, 11], whole_tiles, top)
-            x0 = real(left) + real(0.5) - mx
-            for lane in range(side):
-                ux[lane] = u11 * (x0 + real(lane))
-            for row in range(rows[0], rows[1]):
-                dy = real(top + row) + real(0.5) - my
-                e12 = u12 * dy
-                e2 = u22 * dy
-                e22 = e2 * e2
+        first = ranges[tile, 0]
+        while first < last:
+            for j in range(BATCH):
+                tops[j] = side  # reaches no row
+            j = int(0)
+            while j < wp.min(BATCH, last - first):
+                i = splat_ids[wp.max(first + j, 0)]
+                if i < 0:
+                    break  # never; but a loop that may end early is not vectorised, which here would mean slow gathers
+                for k in range(10):
+                    values[j * 10 + k] = splats[i, k]
+                rows = f.rows_of(splats[i, 1], splats[i, 11], whole_tiles, top)
+                tops[j] = rows[0]
+                bottoms[j] = rows[1]
+                j += 1
+            left_open = int(0)
+            for row in range(side):
                 base = wp.max(row * side, 0)
+                row_open = int(0)
                 for lane in range(side):
-                    p = base + lane
-                    e1 = ux[lane] + e12
-                    raw = opacity * falloff(e1 * e1 + e22)
-                    alpha = wp.where(alpha_max < raw, alpha_max, raw)
-                    before = t[p]
-                    drawn = alpha >= alpha_cut and before >= stop
-                    blended = drawn and before * (real(1.0) - alpha) >= leave
-                    alpha = wp.where(blended, alpha, real(0.0))
-                    w = alpha * before
-                    t[p] = before * wp.where(drawn and not blended, real(-1.0), real(1.0) - alpha)
-                    end[p] = wp.max(end[p], wp.where(blended, instance + 1, 0))
-                    red[p] = red[p] + w * c0
-                    green[p] = green[p] + w * c1
-                    blue[p] = blue[p] + w * c2
-                    z[p] = z[p] + w * distance
-                    total[p] = total[p] + w
-            instance += 1
-            if (instance - first) % STOP_CHECK == 0:
-                left_open = int(0)
-                for p in range(pixels):
-                    left_open += wp.where(t[p] >= stop, 1, 0)
-                if left_open == 0:
-                    instance = last
+                    row_t[lane] = t[base + lane]
+                    row_open += wp.where(row_t[lane] >= stop, 1, 0)
+                if row_open > 0:
+                    reaching = int(0)
+                    for j in range(BATCH):  # without a branch, which would be mispredicted once for each Gaussian
+                        list[wp.max(reaching, 0)] = j
+                        reaching += wp.where(row >= tops[j], wp.where(row < bottoms[j], 1, 0), 0)
+                    for lane in range(side):
+                        row_red[lane] = red[base + lane]
+                        row_green[lane] = green[base + lane]
+                        row_blue[lane] = blue[base + lane]
+                        row_z[lane] = z[base + lane]
+                        row_total[lane] = total[base + lane]
+                        row_end[lane] = end[base + lane]
+                    k = int(0)
+                    while k < reaching:
+                        j = list[wp.max(k, 0)]
+                        k += 1
+                        v = wp.max(j * 10, 0)
+                        x0 = real(left) + real(0.5) - values[v]
+                        dy = real(top + row) + real(0.5) - values[v + 1]
+                        u11 = values[v + 2]
+                        e12 = values[v + 3] * dy
+                        e2 = values[v + 4] * dy
+                        e22 = e2 * e2
+                        opacity = values[v + 5]
+                        c0 = values[v + 6]
+                        c1 = values[v + 7]
+                        c2 = values[v + 8]
+                        distance = values[v + 9]
+                        number = first + j + 1
+                        for lane in range(side):
+                            e1 = f.apart(u11 * (x0 + real(lane))) + e12
+                            raw = opacity * f.falloff(e1 * e1 + e22)
+                            alpha = wp.where(alpha_max < raw, alpha_max, raw)
+                            before = row_t[lane]
+                            drawn = alpha >= alpha_cut and before >= stop
+                            blended = drawn and before * (real(1.0) - alpha) >= leave
+                            alpha = wp.where(blended, alpha, real(0.0))
+                            w = alpha * before
+                            row_t[lane] = before * wp.where(drawn and not blended, real(-1.0), real(1.0) - alpha)
+                            row_end[lane] = wp.max(row_end[lane], wp.where(blended, number, 0))
+                            row_red[lane] = row_red[lane] + w * c0
+                            row_green[lane] = row_green[lane] + w * c1
+                            row_blue[lane] = row_blue[lane] + w * c2
+                            row_z[lane] = row_z[lane] + w * distance
+                            row_total[lane] = row_total[lane] + w
+                    for lane in range(side):
+                        t[base + lane] = row_t[lane]
+                        red[base + lane] = row_red[lane]
+                        green[base + lane] = row_green[lane]
+                        blue[base + lane] = row_blue[lane]
+                        z[base + lane] = row_z[lane]
+                        total[base + lane] = row_total[lane]
+                        end[base + lane] = row_end[lane]
+                left_open += row_open
+            first += BATCH
+            if left_open == 0:
+                first = last
 
         for row in range(wp.min(side, height - top)):
             for lane in range(wp.min(side, width - left)):
@@ -241,10 +247,10 @@ def make_kernels(real, tile_size: int):
             c1 = splats[i, 7]
             c2 = splats[i, 8]
             distance = splats[i, 9]
-            rows = rows_of(my, splats[i, 11], whole_tiles, top)
+            rows = f.rows_of(my, splats[i, 11], whole_tiles, top)
             x0 = real(left) + real(0.5) - mx
             for lane in range(side):
-                ux[lane] = u11 * (x0 + real(lane))
+                ux[lane] = f.apart(u11 * (x0 + real(lane)))
                 s1[lane] = real(0.0)
                 s2[lane] = real(0.0)
                 s11[lane] = real(0.0)
@@ -266,7 +272,7 @@ def make_kernels(real, tile_size: int):
                     p = base + lane
                     dx = x0 + real(lane)
                     e1 = ux[lane] + e12
-                    g = falloff(e1 * e1 + e22)
+                    g = f.falloff(e1 * e1 + e22)
                     raw = opacity * g
                     alpha = wp.where(alpha_max < raw, alpha_max, raw)
                     drawn = alpha >= alpha_cut and instance < end[p]
@@ -352,10 +358,10 @@ def make_kernels(real, tile_size: int):
                 last = wp.max(last, end[p])
         for instance in range(ranges[tile, 0], last):
             i = splat_ids[instance]
-            rows = rows_of(splats[i, 1], splats[i, 11], whole_tiles, top)
+            rows = f.rows_of(splats[i, 1], splats[i, 11], whole_tiles, top)
             x0 = real(left) + real(0.5) - splats[i, 0]
             for lane in range(side):
-                ux[lane] = splats[i, 2] * (x0 + real(lane))
+                ux[lane] = f.apart(splats[i, 2] * (x0 + real(lane)))
             weight_sum = real(0.0)
             weight_max = real(0.0)
             for row in range(rows[0], rows[1]):
@@ -365,7 +371,7 @@ def make_kernels(real, tile_size: int):
                 for lane in range(side):
                     p = row * side + lane
                     e1 = ux[lane] + e12
-                    alpha = wp.min(alpha_max, splats[i, 5] * falloff(e1 * e1 + e2 * e2))
+                    alpha = wp.min(alpha_max, splats[i, 5] * f.falloff(e1 * e1 + e2 * e2))
                     if alpha >= alpha_cut and instance < end[p]:
                         w = alpha * t[p]
                         t[p] = t[p] * (real(1.0) - alpha)
