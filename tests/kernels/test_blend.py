@@ -12,7 +12,7 @@ from tests.tolerances import close
 from warpgs.constants import RULES
 from warpgs.kernels.blend import blend, contributions
 from warpgs.kernels.project import project
-from warpgs.kernels.tiles import bin_tiles
+from warpgs.kernels.tiles import Tiles, bin_tiles
 
 
 def drawn(gaussians, cam, background, rule, tile_size=16, degree=1):
@@ -238,3 +238,33 @@ def test_cpu_equals_cuda():
         found[device] = everything(gaussians, cam)
     for a, b in zip(found["cuda:0"], found["cpu"]):
         close("gradient", a, b)
+
+
+def test_both_passes_see_the_same_alpha():
+    """Each of many Gaussians has a pixel whose alpha lies within a few roundings of the cut.
+
+    Were alpha compiled otherwise in the two passes, some pixels would be drawn in one and not in the other.
+    """
+    count, side, rule = 4000, 16, RULES["exact"]
+    generator = torch.Generator().manual_seed(0)
+
+    def rand(*shape):
+        return torch.rand(*shape, generator=generator)
+
+    splats = torch.ones(count, 1, 12)
+    splats[..., 0:2] = rand(count, 1, 2) * side
+    splats[..., 2:5] = rand(count, 1, 3) * 0.6 + 0.2
+    splats[..., 10:] = 100
+    mx, my, u11, u12, u22 = splats[:, 0, :5].double().unbind(-1)
+    dx = torch.floor(mx) + 0.5 - mx + 1
+    dy = torch.floor(my) + 0.5 - my + 1
+    q = 0.5 * ((u11 * dx + u12 * dy) ** 2 + (u22 * dy) ** 2)
+    splats[:, 0, 5] = (rule.alpha_cut * torch.exp(q) * (1 + 6e-7 * (rand(count).double() - 0.5))).float()
+    splats.requires_grad_()
+    numbers = torch.arange(count, dtype=torch.int32)
+    tiles = Tiles(side, torch.stack([numbers, numbers + 1], 1), numbers, numbers, numbers, torch.ones_like(numbers))
+    rgb = blend(splats, tiles, torch.zeros(count, 3), width=side, height=side, rule=rule)[0]
+    rgb.sum().backward()
+    forward, backward = rgb[..., 0].detach().double().sum((1, 2)), splats.grad[:, 0, 6].double()
+    assert bool((forward > 0).sum() > count / 2)
+    assert float((forward - backward).abs().max()) < 0.5 * rule.alpha_cut

@@ -9,73 +9,35 @@ from types import SimpleNamespace
 
 import warp as wp
 
-STOP_CHECK = 8
-"""Gaussians between two looks at whether any pixel of the tile is still open."""
+from warpgs.kernels.compiler import ROLLED
+from warpgs.kernels.falloff import make_functions
 
-
-@functools.cache
-def make_exp(real):
-    """exp(x) for x <= 0. In float32 by a polynomial, because a call to the C library would not vectorise."""
-    if real is wp.float64:
-
-        @wp.func
-        def exp64(x: real) -> real:
-            return wp.exp(x)
-
-        return exp64
-
-    @wp.func
-    def exp32(x: real) -> real:
-        # x = n ln 2 + r, |r| <= ln 2 / 2. Adding 1.5 * 2^23 rounds to an integer and leaves it in the low bits.
-        x = wp.max(x, real(-87.0))
-        shifted = x * real(1.4426950408889634) + real(12582912.0)
-        n = shifted - real(12582912.0)
-        r = (x - n * real(0.693359375)) - n * real(-2.12194440e-4)  # ln 2 in two parts, the first exact in 10 bits
-        # minimax polynomial of (exp(r) - 1 - r) / r^2 on |r| <= ln 2 / 2 (Moshier, Cephes expf)
-        p = real(1.9875691500e-4)
-        p = p * r + real(1.3981999507e-3)
-        p = p * r + real(8.3334519073e-3)
-        p = p * r + real(4.1665795894e-2)
-        p = p * r + real(1.6666665459e-1)
-        p = p * r + real(5.0000001201e-1)
-        p = (p * r) * r + r + real(1.0)
-        # 2^n by adding n to the exponent bits
-        return wp.cast(wp.cast(p, wp.int32) + (wp.cast(shifted, wp.int32) << 23), wp.float32)
-
-    return exp32
+VALUES = 10
+"""Gradient values of an instance."""
+BATCH = 32
+"""Gaussians that the forward pass takes at a time, row by row; between batches it looks for pixels still open."""
 
 
 @functools.cache
 def make_kernels(real, tile_size: int):
     """Forward, backward and contribution kernels for one scalar type and tile size."""
-    exp = make_exp(real)
-    vec2i = wp.types.vector(2, wp.int32)
-    # Vectors rather than local arrays: the compiler must see that they do not overlap.
-    tile_reals = wp.types.vector(tile_size * tile_size, real)
-    tile_ints = wp.types.vector(tile_size * tile_size, wp.int32)
+    f = make_functions(real, tile_size)
+    # Vectors rather than local arrays: the compiler must see that they do not overlap. One row longer than the tile, so that
+    # they do not lie 4096 bytes apart, where a load is taken to wait for a store to the other.
+    tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
+    tile_ints = wp.types.vector(tile_size * (tile_size + 1), wp.int32)
     row_reals = wp.types.vector(tile_size, real)
+    row_ints = wp.types.vector(tile_size, wp.int32)
+    batch_values = wp.types.vector(10 * BATCH, real)
+    batch_ints = wp.types.vector(BATCH, wp.int32)
+    side_sums = wp.types.vector(VALUES * tile_size, real)
+    half_sums = wp.types.vector(VALUES * (tile_size // 2), real)
+    value_reals = wp.types.vector(VALUES, real)
+    half = wp.constant(tile_size // 2)
     side = wp.constant(tile_size)
     pixels = wp.constant(tile_size * tile_size)
-    options = {"max_unroll": 0}  # Warp would unroll the pixel loop, and unrolled it does not vectorise
 
-    @wp.func
-    def rows_of(my: real, half_height: real, whole_tiles: wp.int32, top: wp.int32) -> vec2i:
-        """Rows of the tile, counted from its top, whose pixel centres may lie in the Gaussian's box."""
-        if whole_tiles != 0:
-            return vec2i(0, side)
-        margin = real(0.01) + real(2.0e-6) * (wp.abs(my) + half_height)
-        center = my - real(top) - real(0.5)
-        first = wp.ceil(wp.clamp(center - half_height - margin, real(0.0), real(side)))
-        last = wp.floor(wp.clamp(center + half_height + margin, real(-1.0), real(side) - real(1.0)))
-        return vec2i(int(first), int(last) + 1)
-
-    @wp.func
-    def gaussian(u11: real, u22: real, dx: real, e12: real, e2: real) -> real:
-        """exp(-|U d|^2 / 2); e12 = u12 dy and e2 = u22 dy are the same for a row. Never above 1."""
-        e1 = u11 * dx + e12
-        return exp(real(-0.5) * (e1 * e1 + e2 * e2))
-
-    @wp.kernel(enable_backward=False, module="unique", module_options=options)
+    @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def forward(
         begin: int, splats: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), splat_ids: wp.array(dtype=int),
         backgrounds: wp.array2d(dtype=real), width: int, height: int, columns: int, tiles: int,
@@ -90,71 +52,120 @@ def make_kernels(real, tile_size: int):
         top = (in_camera // columns) * side
         left = (in_camera - (in_camera // columns) * columns) * side
 
-        t = tile_reals()  # transmittance
+        # The state of the tile: transmittance, below ``stop`` once the pixel is finished, negative where it was finished
+        # before a Gaussian instead of by one; sums; one past the last instance blended.
+        t = tile_reals()
         red = tile_reals()
         green = tile_reals()
         blue = tile_reals()
         z = tile_reals()
         total = tile_reals()
-        open = tile_ints()  # 1 until the pixel stops
-        end = tile_ints()  # one past the last instance blended
+        end = tile_ints()
         for p in range(pixels):
-            t[p] = real(1.0)
             # pixels outside the image are finished before they begin
-            if top + p // side < height and left + p - (p // side) * side < width:
-                open[p] = 1
+            inside = top + p // side < height and left + p - (p // side) * side < width
+            t[p] = wp.where(inside, real(1.0), real(-1.0))
+        # The same for one row, in registers, and the Gaussians of a batch: values, u11 dx, and by row which of them reach it.
+        row_t = row_reals()
+        row_red = row_reals()
+        row_green = row_reals()
+        row_blue = row_reals()
+        row_z = row_reals()
+        row_total = row_reals()
+        row_end = row_ints()
+        values = batch_values()
+        tops = batch_ints()
+        bottoms = batch_ints()
+        list = batch_ints()
 
-        first = ranges[tile, 0]
+        # inclusive: blend, then stop; exclusive: stop instead of blending
+        leave = wp.where(inclusive != 0, real(-1.0), stop)
         last = ranges[tile, 1]
-        instance = first
-        while instance < last:
-            i = splat_ids[instance]
-            mx = splats[i, 0]
-            my = splats[i, 1]
-            u11 = splats[i, 2]
-            u12 = splats[i, 3]
-            u22 = splats[i, 4]
-            opacity = splats[i, 5]
-            c0 = splats[i, 6]
-            c1 = splats[i, 7]
-            c2 = splats[i, 8]
-            distance = splats[i, 9]
-            rows = rows_of(my, splats[i, 11], whole_tiles, top)
-            x0 = real(left) + real(0.5) - mx
-            for row in range(rows[0], rows[1]):
-                dy = real(top + row) + real(0.5) - my
-                e12 = u12 * dy
-                e2 = u22 * dy
+        first = ranges[tile, 0]
+        while first < last:
+            for j in range(BATCH):
+                tops[j] = side  # reaches no row
+            j = int(0)
+            while j < wp.min(BATCH, last - first):
+                i = splat_ids[wp.max(first + j, 0)]
+                if i < 0:
+                    break  # never; but a loop that may end early is not vectorised, which here would mean slow gathers
+                for k in range(10):
+                    values[j * 10 + k] = splats[i, k]
+                rows = f.rows_of(splats[i, 1], splats[i, 11], whole_tiles, top)
+                tops[j] = rows[0]
+                bottoms[j] = rows[1]
+                j += 1
+            left_open = int(0)
+            for row in range(side):
+                base = wp.max(row * side, 0)
+                row_open = int(0)
                 for lane in range(side):
-                    p = row * side + lane
-                    alpha = wp.min(alpha_max, opacity * gaussian(u11, u22, x0 + real(lane), e12, e2))
-                    before = t[p]
-                    after = before * (real(1.0) - alpha)
-                    drawn = wp.where(alpha >= alpha_cut, open[p], 0)
-                    stays = wp.where(after >= stop, 1, 0)
-                    # inclusive: blend, then stop; exclusive: stop instead of blending
-                    blended = wp.where(inclusive + stays > 0, drawn, 0)
-                    open[p] = wp.where(drawn == 1, stays, open[p])
-                    w = wp.where(blended == 1, alpha * before, real(0.0))
-                    t[p] = wp.where(blended == 1, after, before)
-                    end[p] = wp.where(blended == 1, instance + 1, end[p])
-                    red[p] = red[p] + w * c0
-                    green[p] = green[p] + w * c1
-                    blue[p] = blue[p] + w * c2
-                    z[p] = z[p] + w * distance
-                    total[p] = total[p] + w
-            instance += 1
-            if (instance - first) % STOP_CHECK == 0:
-                left_open = int(0)
-                for p in range(pixels):
-                    left_open += open[p]
-                if left_open == 0:
-                    instance = last
+                    row_t[lane] = t[base + lane]
+                    row_open += wp.where(row_t[lane] >= stop, 1, 0)
+                if row_open > 0:
+                    reaching = int(0)
+                    for j in range(BATCH):  # without a branch, which would be mispredicted once for each Gaussian
+                        list[wp.max(reaching, 0)] = j
+                        reaching += wp.where(row >= tops[j], wp.where(row < bottoms[j], 1, 0), 0)
+                    for lane in range(side):
+                        row_red[lane] = red[base + lane]
+                        row_green[lane] = green[base + lane]
+                        row_blue[lane] = blue[base + lane]
+                        row_z[lane] = z[base + lane]
+                        row_total[lane] = total[base + lane]
+                        row_end[lane] = end[base + lane]
+                    k = int(0)
+                    while k < reaching:
+                        j = list[wp.max(k, 0)]
+                        k += 1
+                        v = wp.max(j * 10, 0)
+                        x0 = real(left) + real(0.5) - values[v]
+                        dy = real(top + row) + real(0.5) - values[v + 1]
+                        u11 = values[v + 2]
+                        e12 = values[v + 3] * dy
+                        e2 = values[v + 4] * dy
+                        e22 = e2 * e2
+                        opacity = values[v + 5]
+                        c0 = values[v + 6]
+                        c1 = values[v + 7]
+                        c2 = values[v + 8]
+                        distance = values[v + 9]
+                        number = first + j + 1
+                        for lane in range(side):
+                            e1 = f.apart(u11 * (x0 + real(lane))) + e12
+                            raw = opacity * f.falloff(e1 * e1 + e22)
+                            alpha = wp.where(alpha_max < raw, alpha_max, raw)
+                            before = row_t[lane]
+                            drawn = alpha >= alpha_cut and before >= stop
+                            blended = drawn and before * (real(1.0) - alpha) >= leave
+                            alpha = wp.where(blended, alpha, real(0.0))
+                            w = alpha * before
+                            row_t[lane] = before * wp.where(drawn and not blended, real(-1.0), real(1.0) - alpha)
+                            row_end[lane] = wp.max(row_end[lane], wp.where(blended, number, 0))
+                            row_red[lane] = row_red[lane] + w * c0
+                            row_green[lane] = row_green[lane] + w * c1
+                            row_blue[lane] = row_blue[lane] + w * c2
+                            row_z[lane] = row_z[lane] + w * distance
+                            row_total[lane] = row_total[lane] + w
+                    for lane in range(side):
+                        t[base + lane] = row_t[lane]
+                        red[base + lane] = row_red[lane]
+                        green[base + lane] = row_green[lane]
+                        blue[base + lane] = row_blue[lane]
+                        z[base + lane] = row_z[lane]
+                        total[base + lane] = row_total[lane]
+                        end[base + lane] = row_end[lane]
+                left_open += row_open
+            first += BATCH
+            if left_open == 0:
+                first = last
 
         for row in range(wp.min(side, height - top)):
             for lane in range(wp.min(side, width - left)):
                 p = row * side + lane
                 o = (camera * height + top + row) * width + left + lane
+                t[p] = wp.abs(t[p])
                 rgb[o, 0] = red[p] + t[p] * backgrounds[camera, 0]
                 rgb[o, 1] = green[p] + t[p] * backgrounds[camera, 1]
                 rgb[o, 2] = blue[p] + t[p] * backgrounds[camera, 2]
@@ -164,7 +175,7 @@ def make_kernels(real, tile_size: int):
                 weights[o] = total[p]
                 ends[o] = end[p]
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=options)
+    @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def backward(
         begin: int, splats: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), splat_ids: wp.array(dtype=int),
         slots: wp.array(dtype=int), backgrounds: wp.array2d(dtype=real), width: int, height: int, columns: int, tiles: int,
@@ -209,6 +220,7 @@ def make_kernels(real, tile_size: int):
                 end[p] = ends[o]
                 instance = wp.max(instance, ends[o])
 
+        ux = row_reals()
         s1 = row_reals()
         s2 = row_reals()
         s11 = row_reals()
@@ -219,6 +231,9 @@ def make_kernels(real, tile_size: int):
         s_c1 = row_reals()
         s_c2 = row_reals()
         sz = row_reals()
+        sums = side_sums()
+        halves = half_sums()
+        totals = value_reals()
         while instance > ranges[tile, 0]:
             instance -= 1
             i = splat_ids[instance]
@@ -232,9 +247,10 @@ def make_kernels(real, tile_size: int):
             c1 = splats[i, 7]
             c2 = splats[i, 8]
             distance = splats[i, 9]
-            rows = rows_of(my, splats[i, 11], whole_tiles, top)
+            rows = f.rows_of(my, splats[i, 11], whole_tiles, top)
             x0 = real(left) + real(0.5) - mx
             for lane in range(side):
+                ux[lane] = f.apart(u11 * (x0 + real(lane)))
                 s1[lane] = real(0.0)
                 s2[lane] = real(0.0)
                 s11[lane] = real(0.0)
@@ -249,61 +265,75 @@ def make_kernels(real, tile_size: int):
                 dy = real(top + row) + real(0.5) - my
                 e12 = u12 * dy
                 e2 = u22 * dy
+                e22 = e2 * e2
+                e2y = e2 * dy
+                base = wp.max(row * side, 0)
                 for lane in range(side):
-                    p = row * side + lane
+                    p = base + lane
                     dx = x0 + real(lane)
-                    g = gaussian(u11, u22, dx, e12, e2)
+                    e1 = ux[lane] + e12
+                    g = f.falloff(e1 * e1 + e22)
                     raw = opacity * g
-                    alpha = wp.min(alpha_max, raw)
-                    drawn = wp.where(alpha >= alpha_cut, wp.where(instance < end[p], 1, 0), 0)
+                    alpha = wp.where(alpha_max < raw, alpha_max, raw)
+                    drawn = alpha >= alpha_cut and instance < end[p]
+                    alpha = wp.where(drawn, alpha, real(0.0))
                     inverse = real(1.0) / (real(1.0) - alpha)
-                    before = wp.where(drawn == 1, t[p] * inverse, t[p])
-                    w = wp.where(drawn == 1, alpha * before, real(0.0))
+                    before = t[p] * inverse
+                    w = alpha * before
                     d = c0 * g0[p] + c1 * g1[p] + c2 * g2[p] + distance * v_z[p] + v_w[p]
-                    v = wp.where(drawn == 1, before * d - behind[p] * inverse, real(0.0))
-                    v = wp.where(raw <= alpha_max, v, real(0.0))
+                    v = before * d - behind[p] * inverse
+                    v = wp.where(drawn and raw <= alpha_max, v * g, real(0.0))
                     t[p] = before
                     behind[p] = behind[p] + w * d
-                    v_q = -raw * v  # q = |U d|^2 / 2
-                    v_e1 = v_q * (u11 * dx + e12)
-                    v_e2 = v_q * e2
+                    v_e1 = v * e1
                     s1[lane] = s1[lane] + v_e1
-                    s2[lane] = s2[lane] + v_e2
+                    s2[lane] = s2[lane] + v * e2
                     s11[lane] = s11[lane] + v_e1 * dx
                     s12[lane] = s12[lane] + v_e1 * dy
-                    s22[lane] = s22[lane] + v_e2 * dy
-                    so[lane] = so[lane] + v * g
+                    s22[lane] = s22[lane] + v * e2y
+                    so[lane] = so[lane] + v
                     s_c0[lane] = s_c0[lane] + w * g0[p]
                     s_c1[lane] = s_c1[lane] + w * g1[p]
                     s_c2[lane] = s_c2[lane] + w * g2[p]
                     sz[lane] = sz[lane] + w * v_z[p]
-            half = side // 2
-            while half > 0:  # pairwise, so that the sums vectorise too
+            # Into one array per width, because additions vectorise only where nothing may overlap.
+            for lane in range(side):
+                sums[0 * side + lane] = s1[lane]
+                sums[1 * side + lane] = s2[lane]
+                sums[2 * side + lane] = s11[lane]
+                sums[3 * side + lane] = s12[lane]
+                sums[4 * side + lane] = s22[lane]
+                sums[5 * side + lane] = so[lane]
+                sums[6 * side + lane] = s_c0[lane]
+                sums[7 * side + lane] = s_c1[lane]
+                sums[8 * side + lane] = s_c2[lane]
+                sums[9 * side + lane] = sz[lane]
+            for k in range(VALUES):
                 for lane in range(half):
-                    s1[lane] = s1[lane] + s1[lane + half]
-                    s2[lane] = s2[lane] + s2[lane + half]
-                    s11[lane] = s11[lane] + s11[lane + half]
-                    s12[lane] = s12[lane] + s12[lane + half]
-                    s22[lane] = s22[lane] + s22[lane + half]
-                    so[lane] = so[lane] + so[lane + half]
-                    s_c0[lane] = s_c0[lane] + s_c0[lane + half]
-                    s_c1[lane] = s_c1[lane] + s_c1[lane + half]
-                    s_c2[lane] = s_c2[lane] + s_c2[lane + half]
-                    sz[lane] = sz[lane] + sz[lane + half]
-                half = half // 2
+                    halves[k * half + lane] = sums[k * side + lane] + sums[k * side + half + lane]
+            for k in range(VALUES):
+                o = k * half
+                if wp.static(tile_size == 16):
+                    even = (halves[o] + halves[o + 4]) + (halves[o + 2] + halves[o + 6])
+                    odd = (halves[o + 1] + halves[o + 5]) + (halves[o + 3] + halves[o + 7])
+                    totals[k] = even + odd
+                else:
+                    rest = halves[o]
+                    for lane in range(1, half):
+                        rest += halves[o + lane]
+                    totals[k] = rest
             slot = slots[instance]
-            v_slots[slot, 0] = -u11 * s1[0]
-            v_slots[slot, 1] = -(u12 * s1[0] + u22 * s2[0])
-            v_slots[slot, 2] = s11[0]
-            v_slots[slot, 3] = s12[0]
-            v_slots[slot, 4] = s22[0]
-            v_slots[slot, 5] = so[0]
-            v_slots[slot, 6] = s_c0[0]
-            v_slots[slot, 7] = s_c1[0]
-            v_slots[slot, 8] = s_c2[0]
-            v_slots[slot, 9] = sz[0]
+            v_e1 = opacity * totals[0]
+            v_e2 = opacity * totals[1]
+            v_slots[slot, 0] = u11 * v_e1
+            v_slots[slot, 1] = u12 * v_e1 + u22 * v_e2
+            v_slots[slot, 2] = -opacity * totals[2]
+            v_slots[slot, 3] = -opacity * totals[3]
+            v_slots[slot, 4] = -opacity * totals[4]
+            for k in range(5, VALUES):
+                v_slots[slot, k] = totals[k]
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=options)
+    @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def contributions(
         begin: int, splats: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), splat_ids: wp.array(dtype=int),
         slots: wp.array(dtype=int), width: int, height: int, columns: int, tiles: int,
@@ -316,6 +346,7 @@ def make_kernels(real, tile_size: int):
         in_camera = tile - camera * tiles
         top = (in_camera // columns) * side
         left = (in_camera - (in_camera // columns) * columns) * side
+        ux = row_reals()
         t = tile_reals()
         end = tile_ints()
         last = int(0)
@@ -327,16 +358,20 @@ def make_kernels(real, tile_size: int):
                 last = wp.max(last, end[p])
         for instance in range(ranges[tile, 0], last):
             i = splat_ids[instance]
-            rows = rows_of(splats[i, 1], splats[i, 11], whole_tiles, top)
+            rows = f.rows_of(splats[i, 1], splats[i, 11], whole_tiles, top)
             x0 = real(left) + real(0.5) - splats[i, 0]
+            for lane in range(side):
+                ux[lane] = f.apart(splats[i, 2] * (x0 + real(lane)))
             weight_sum = real(0.0)
             weight_max = real(0.0)
             for row in range(rows[0], rows[1]):
                 dy = real(top + row) + real(0.5) - splats[i, 1]
+                e12 = splats[i, 3] * dy
+                e2 = splats[i, 4] * dy
                 for lane in range(side):
                     p = row * side + lane
-                    g = gaussian(splats[i, 2], splats[i, 4], x0 + real(lane), splats[i, 3] * dy, splats[i, 4] * dy)
-                    alpha = wp.min(alpha_max, splats[i, 5] * g)
+                    e1 = ux[lane] + e12
+                    alpha = wp.min(alpha_max, splats[i, 5] * f.falloff(e1 * e1 + e2 * e2))
                     if alpha >= alpha_cut and instance < end[p]:
                         w = alpha * t[p]
                         t[p] = t[p] * (real(1.0) - alpha)

@@ -1,0 +1,157 @@
+"""Blending as one would first write it in Warp: a thread per pixel, scalar code, float atomics. A peer to compare with.
+
+The rule is `exact`, in float32. On a CPU Warp's atomics are plain additions, so launch it there from one thread only.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import torch
+import warp as wp
+
+from warpgs.constants import Rule
+from warpgs.kernels import bridge
+from warpgs.kernels.tiles import Tiles, grid
+
+
+@functools.cache
+def make_kernels():
+    """Forward and backward kernel."""
+
+    @wp.func
+    def tile_of(i: wp.int32, width: wp.int32, height: wp.int32, columns: wp.int32, tiles: wp.int32, side: wp.int32):
+        camera = i // (width * height)
+        y = (i // width) % height
+        return camera * tiles + (y // side) * columns + (i % width) // side
+
+    @wp.kernel(enable_backward=False, module="bench.naive")
+    def forward(
+        splats: wp.array2d(dtype=float), ranges: wp.array2d(dtype=int), ids: wp.array(dtype=int),
+        backgrounds: wp.array2d(dtype=float), width: int, height: int, columns: int, tiles: int, side: int,
+        alpha_cut: float, alpha_max: float, stop: float,
+        # outputs
+        rgb: wp.array2d(dtype=float), transmittances: wp.array(dtype=float), ends: wp.array(dtype=int),
+    ):  # fmt: skip
+        i = wp.tid()
+        x = float(i % width) + 0.5
+        y = float((i // width) % height) + 0.5
+        tile = tile_of(i, width, height, columns, tiles, side)
+        t = float(1.0)
+        red = float(0.0)
+        green = float(0.0)
+        blue = float(0.0)
+        end = int(0)
+        for k in range(ranges[tile, 0], ranges[tile, 1]):
+            s = ids[k]
+            dx = x - splats[s, 0]
+            dy = y - splats[s, 1]
+            e1 = splats[s, 2] * dx + splats[s, 3] * dy
+            e2 = splats[s, 4] * dy
+            alpha = wp.min(alpha_max, splats[s, 5] * wp.exp(-0.5 * (e1 * e1 + e2 * e2)))
+            if alpha < alpha_cut:
+                continue
+            w = alpha * t
+            red += w * splats[s, 6]
+            green += w * splats[s, 7]
+            blue += w * splats[s, 8]
+            t = t * (1.0 - alpha)
+            end = k + 1
+            if t < stop:
+                break
+        camera = i // (width * height)
+        rgb[i, 0] = red + t * backgrounds[camera, 0]
+        rgb[i, 1] = green + t * backgrounds[camera, 1]
+        rgb[i, 2] = blue + t * backgrounds[camera, 2]
+        transmittances[i] = t
+        ends[i] = end
+
+    @wp.kernel(enable_backward=False, module="bench.naive")
+    def backward(
+        splats: wp.array2d(dtype=float), ranges: wp.array2d(dtype=int), ids: wp.array(dtype=int),
+        backgrounds: wp.array2d(dtype=float), width: int, height: int, columns: int, tiles: int, side: int,
+        alpha_cut: float, alpha_max: float, transmittances: wp.array(dtype=float), ends: wp.array(dtype=int),
+        v_rgb: wp.array2d(dtype=float),
+        # outputs, zero on entry
+        v_splats: wp.array2d(dtype=float),
+    ):  # fmt: skip
+        i = wp.tid()
+        x = float(i % width) + 0.5
+        y = float((i // width) % height) + 0.5
+        tile = tile_of(i, width, height, columns, tiles, side)
+        camera = i // (width * height)
+        g0 = v_rgb[i, 0]
+        g1 = v_rgb[i, 1]
+        g2 = v_rgb[i, 2]
+        t = transmittances[i]
+        behind = t * (backgrounds[camera, 0] * g0 + backgrounds[camera, 1] * g1 + backgrounds[camera, 2] * g2)
+        k = ends[i]
+        while k > ranges[tile, 0]:
+            k -= 1
+            s = ids[k]
+            dx = x - splats[s, 0]
+            dy = y - splats[s, 1]
+            e1 = splats[s, 2] * dx + splats[s, 3] * dy
+            e2 = splats[s, 4] * dy
+            g = wp.exp(-0.5 * (e1 * e1 + e2 * e2))
+            alpha = wp.min(alpha_max, splats[s, 5] * g)
+            if alpha < alpha_cut:
+                continue
+            t = t / (1.0 - alpha)
+            w = alpha * t
+            d = splats[s, 6] * g0 + splats[s, 7] * g1 + splats[s, 8] * g2
+            v = t * d - behind / (1.0 - alpha)
+            behind += w * d
+            wp.atomic_add(v_splats, s, 6, w * g0)
+            wp.atomic_add(v_splats, s, 7, w * g1)
+            wp.atomic_add(v_splats, s, 8, w * g2)
+            if splats[s, 5] * g <= alpha_max:
+                v_e1 = -alpha * v * e1
+                v_e2 = -alpha * v * e2
+                wp.atomic_add(v_splats, s, 0, -splats[s, 2] * v_e1)
+                wp.atomic_add(v_splats, s, 1, -splats[s, 3] * v_e1 - splats[s, 4] * v_e2)
+                wp.atomic_add(v_splats, s, 2, v_e1 * dx)
+                wp.atomic_add(v_splats, s, 3, v_e1 * dy)
+                wp.atomic_add(v_splats, s, 4, v_e2 * dy)
+                wp.atomic_add(v_splats, s, 5, v * g)
+
+    return SimpleNamespace(forward=forward, backward=backward)
+
+
+class Naive:
+    """The kernels bound to one set of inputs; colour only, neither alpha nor depth."""
+
+    def __init__(self, splats: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, width: int, height: int, rule: Rule):
+        if not rule.inclusive_stop or rule.square_sigma:
+            raise ValueError("the naive kernels know only the rule `exact`")
+        cameras, pixels = len(backgrounds), len(backgrounds) * height * width
+        self.splats, self.device, self.pixels = splats.detach().contiguous(), wp.device_from_torch(splats.device), pixels
+        self.rgb = splats.new_empty(cameras, height, width, 3)
+        self.v_splats = torch.zeros_like(self.splats)
+        transmittances = splats.new_empty(pixels)
+        ends = torch.empty(pixels, dtype=torch.int32, device=splats.device)
+        columns, rows = grid(width, height, tiles.size)
+        self.inputs = [
+            bridge.view(self.splats.view(-1, 12), wp.float32), bridge.view(tiles.ranges, wp.int32),
+            bridge.view(tiles.splat_ids, wp.int32), bridge.view(backgrounds, wp.float32), width, height, columns,
+            columns * rows, tiles.size, rule.alpha_cut, rule.alpha_max,
+        ]  # fmt: skip
+        self.stop, self.kept = rule.transmittance_stop, [transmittances, ends]
+        self.state = [bridge.view(transmittances, wp.float32), bridge.view(ends, wp.int32)]
+        self.kernels = make_kernels()
+
+    def _launch(self, kernel, inputs: list) -> None:
+        with bridge.stream_of(self.rgb.device):
+            wp.launch(kernel, self.pixels, inputs=inputs, device=self.device, record_tape=False)
+
+    def forward(self) -> torch.Tensor:
+        """The image, shape [C, H, W, 3]."""
+        outputs = [bridge.view(self.rgb.view(-1, 3), wp.float32), *self.state]
+        self._launch(self.kernels.forward, [*self.inputs, self.stop, *outputs])
+        return self.rgb
+
+    def backward(self, v_rgb: torch.Tensor) -> torch.Tensor:
+        """Gradient of the records for an upstream gradient, after `forward`; shape [C, N, 12]."""
+        self.v_splats.zero_()
+        arrays = [bridge.view(t.view(-1, t.shape[-1]), wp.float32) for t in (v_rgb.contiguous(), self.v_splats)]
+        self._launch(self.kernels.backward, [*self.inputs, *self.state, *arrays])
+        return self.v_splats
