@@ -95,6 +95,8 @@ def _fit_arguments(arguments: list[str]):
         """Steps after which the spherical-harmonics degree rises by one."""
         checkpoint_every: int = base.checkpoint_every
         """Steps between checkpoints."""
+        cuda_graph: bool = base.cuda_graph
+        """On CUDA, record a step once and replay it: the same bytes in less time."""
         init: InitConfig = field(default_factory=lambda: base.init)
         loss: LossConfig = field(default_factory=lambda: base.loss)
         optimizer: OptimizerConfig = field(default_factory=lambda: base.optimizer)
@@ -103,7 +105,8 @@ def _fit_arguments(arguments: list[str]):
     a = _parse(Fit, "fit", arguments)
     if a.threads < 0:
         raise UsageError(f"--threads must be 0 or more, not {a.threads}")
-    rooms = {n: getattr(a, n) for n in ("rule", "seed", "sh_every", "checkpoint_every", "init", "loss", "optimizer", "density")}
+    own = ("rule", "seed", "sh_every", "checkpoint_every", "cuda_graph", "init", "loss", "optimizer", "density")
+    rooms = {n: getattr(a, n) for n in own}
 
     def config(device: str) -> "FitConfig":
         return dataclasses.replace(base, steps=a.steps if a.steps is not None else DEFAULT_STEPS[device], **rooms)

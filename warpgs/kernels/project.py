@@ -354,10 +354,10 @@ class _Project(torch.autograd.Function):
         m = make_projection(real)
         device = splats.device
         v_splats = v_splats.contiguous().view(-1, RECORD)
-        # One allocation for the five, coefficients first: their rows are written in aligned pieces.
-        order = (4, 0, 1, 2, 3)
-        flat = splats.new_zeros(sum(t.numel() for t in tensors[:5])).split([tensors[i].numel() for i in order])
-        gradients = [flat[order.index(i)].view(tensors[i].shape) for i in range(5)]
+        # One allocation for the five, each from a multiple of 16 bytes on, as kernels that read four at a time want it.
+        sizes = [-(-t.numel() // 4) * 4 for t in tensors[:5]]
+        flat = splats.new_zeros(sum(sizes)).split(sizes)
+        gradients = [part[: t.numel()].view(t.shape) for part, t in zip(flat, tensors)]
         cameras, count = len(tensors[5]), len(tensors[0])
         wants_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
         rows = (cameras, count) if wants_camera else (0, 0)

@@ -6,6 +6,7 @@ choice of the view to Adam, and replayed in bursts; rates and views of a burst a
 
 from __future__ import annotations
 
+import gc
 from dataclasses import dataclass
 
 import torch
@@ -76,7 +77,8 @@ class StepGraph:
 
     def _record(self) -> None:
         # torch.cuda.graph would collect garbage and empty the cache each time, which takes 80 ms
-        here = bridge.warp_stream(self.burst.device)
+        here, collecting = bridge.warp_stream(self.burst.device), gc.isenabled()
+        gc.disable()  # it might free another graph, which must not happen while recording
         self.graph.capture_begin()
         wp.capture_begin(stream=here, external=True)
         try:
@@ -84,6 +86,8 @@ class StepGraph:
         finally:
             self.lent = wp.capture_end(stream=here)  # holds what Warp lends to the graph
             self.graph.capture_end()
+            if collecting:
+                gc.enable()
 
     def _project(self, viewmat: torch.Tensor, K: torch.Tensor):
         gaussians = self.optimizer.gaussians.tensors().values()
