@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
+
+# Between its loops torch's OpenMP keeps its threads spinning, on cores that our own launches need: two threads then blend no
+# faster than one. OpenMP reads this once, when torch is imported; whoever set it, or imported torch before us, has their way.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 __version__ = "0.1.0"
 
