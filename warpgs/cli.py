@@ -94,7 +94,9 @@ def _fit_arguments(arguments: list[str]):
         sh_every: int = base.sh_every
         """Steps after which the spherical-harmonics degree rises by one."""
         checkpoint_every: int = base.checkpoint_every
-        """Steps between checkpoints."""
+        """A checkpoint may be written at multiples of this step."""
+        checkpoint_seconds: float = base.checkpoint_seconds
+        """Time from one checkpoint to the next at the least [s]."""
         cuda_graph: bool = base.cuda_graph
         """On CUDA, record a step once and replay it: the same bytes in less time."""
         init: InitConfig = field(default_factory=lambda: base.init)
@@ -105,7 +107,18 @@ def _fit_arguments(arguments: list[str]):
     a = _parse(Fit, "fit", arguments)
     if a.threads < 0:
         raise UsageError(f"--threads must be 0 or more, not {a.threads}")
-    own = ("rule", "seed", "sh_every", "checkpoint_every", "cuda_graph", "init", "loss", "optimizer", "density")
+    own = (
+        "rule",
+        "seed",
+        "sh_every",
+        "checkpoint_every",
+        "checkpoint_seconds",
+        "cuda_graph",
+        "init",
+        "loss",
+        "optimizer",
+        "density",
+    )
     rooms = {n: getattr(a, n) for n in own}
 
     def config(device: str) -> "FitConfig":

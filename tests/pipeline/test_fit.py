@@ -233,7 +233,8 @@ def test_resume_after_kill_gives_the_same_ply(tmp_path):
     """SIGKILL in the middle, --resume, and the PLY equals that of a run left alone, byte for byte."""
     write_demo(tmp_path / "scene", views=8, width=64, height=48)
     flags = [
-        str(tmp_path / "scene"), "--split", split_spec(8), "--steps", "60", "--checkpoint-every", "10", "--device", "cpu",
+        str(tmp_path / "scene"), "--split", split_spec(8), "--steps", "60", "--device", "cpu",
+        "--checkpoint-every", "10", "--checkpoint-seconds", "0",
         "--density.start", "10", "--density.every", "10",
     ]  # fmt: skip
 

@@ -7,11 +7,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-BLOCK = 256
+BLOCK = 128
 """Threads of a block that `compact` works in."""
-EACH = 1
-"""Items that a thread of it looks at. More would fill the block better where few are wanted, but leave fewer blocks; four
-were measured to be slower."""
 
 
 def source(*names: str, **numbers) -> str:
@@ -24,38 +21,21 @@ def source(*names: str, **numbers) -> str:
 
 
 _COMPACT = """
-    __shared__ int s_counts[BLOCK / 32], s_items[BLOCK * EACH];
-    if (place >= 0)
-        return s_items[place];
+    __shared__ int s_counts[BLOCK / 32], s_items[BLOCK];
     const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
-    const int first = item / BLOCK * (BLOCK * EACH) + warp * (32 * EACH) + lane;
-    const int items = counts.shape[0] / rows;
-    bool wanted[EACH];
-    int mine = 0;
-    #pragma unroll
-    for (int k = 0; k < EACH; ++k) {
-        wanted[k] = false;
-        for (int row = 0; row < rows && first + 32 * k < items; ++row)
-            wanted[k] |= counts.data[(long long)row * items + first + 32 * k] > 0;
-        mine += __popc(__ballot_sync(0xffffffffu, wanted[k]));
-    }
+    const unsigned mask = __ballot_sync(0xffffffffu, wanted != 0);
     if (lane == 0)
-        s_counts[warp] = mine;
+        s_counts[warp] = __popc(mask);
     __syncthreads();
     int before = 0, all = 0;
     for (int w = 0; w < BLOCK / 32; ++w) {
         before += w < warp ? s_counts[w] : 0;
         all += s_counts[w];
     }
-    #pragma unroll
-    for (int k = 0; k < EACH; ++k) {
-        const unsigned mask = __ballot_sync(0xffffffffu, wanted[k]);
-        if (wanted[k])
-            s_items[before + __popc(mask & ((1u << lane) - 1u))] = first + 32 * k;
-        before += __popc(mask);
-    }
+    if (wanted)
+        s_items[before + __popc(mask & ((1u << lane) - 1u))] = item;
     __syncthreads();
-    return all;
+    return (int)threadIdx.x < all ? s_items[threadIdx.x] : -1;
 """
 
 # Rows of K x 3 floats are a multiple of 16 bytes for K = 4 and 16. Weights past the count are zero.
@@ -123,12 +103,11 @@ def make_functions():
     """The functions, for CUDA; those on colours for float32."""
     vec16 = wp.types.vector(16, wp.float32)
 
-    @wp.func_native(_COMPACT.replace("BLOCK", str(BLOCK)).replace("EACH", str(EACH)))
-    def compact(place: int, item: int, counts: wp.array(dtype=int), rows: int) -> int:
-        """With place -1, list which of the block's BLOCK * EACH items have a positive count in some row; returns how many.
+    @wp.func_native(_COMPACT.replace("BLOCK", str(BLOCK)))
+    def compact(item: int, wanted: int) -> int:
+        """The items of the block's threads that are wanted, dealt to its first threads in order; -1 for the others.
 
-        All threads of the block must call it so, ``item`` being the thread's number in the launch. With a place below that
-        number, the item listed there.
+        All BLOCK threads of the block must call it.
         """
         ...
 

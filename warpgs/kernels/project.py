@@ -9,7 +9,7 @@ from torch.autograd.function import once_differentiable
 from warpgs.constants import Rule
 from warpgs.kernels import bridge, sh
 from warpgs.kernels.functions import make_projection, make_spans
-from warpgs.kernels.native import BLOCK, EACH
+from warpgs.kernels.native import BLOCK
 from warpgs.kernels.native import make_functions as make_native
 
 RECORD = 12
@@ -43,10 +43,6 @@ def make_forward(real, native: bool):
         camera = i // count
         n = i - camera * count
         view = viewmats[camera]
-        mean = means[n]
-        # what lies behind the camera need not be read
-        if not (view[2, 0] * mean[0] + view[2, 1] * mean[1] + view[2, 2] * mean[2] + view[2, 3] >= real(0.5) * near):
-            return
         e = m.ellipse(
             means[n], quats[n], log_scales[n], view, Ks[camera], real(width), real(height), near, low_pass
         )  # fmt: skip
@@ -116,7 +112,7 @@ def make_forward(real, native: bool):
 def make_backward(real, native: bool):
     """The backward kernel for one scalar type: one thread per Gaussian, over all cameras, so no sum needs atomics.
 
-    ``native`` is for CUDA and float32: a block lists the Gaussians that some camera sees and deals them to its threads.
+    ``native`` is for CUDA and float32: the Gaussians that some camera sees are dealt to the first threads of each block.
     """
     m = make_projection(real)
     functions = sh.make_functions(real)
@@ -127,21 +123,30 @@ def make_backward(real, native: bool):
     compact = make_native().compact if native else None
     color_backward = make_native().color_backward if native else None
 
-    @wp.func
-    def backward_of(
-        n: int,
+    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.project.backward.{real.__name__}.{int(native)}")
+    def backward(
+        begin: int,
         means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
         logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
         viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33),
         width: int, height: int, sh_count: int, near: real, low_pass: real,
         splats: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), v_splats: wp.array2d(dtype=real),
         camera_gradients: int,
+        # outputs, zero on entry
         v_means: wp.array(dtype=m.vec3), v_quats: wp.array(dtype=m.vec4), v_log_scales: wp.array(dtype=m.vec3),
         v_logit_opacities: wp.array(dtype=real), v_coefficients: wp.array2d(dtype=m.vec3),
         v_viewmats: wp.array2d(dtype=m.mat44), v_Ks: wp.array2d(dtype=m.mat33),
     ):  # fmt: skip
-        """Gradients of Gaussian n, over all cameras."""
+        n = begin + wp.tid()
         count = means.shape[0]
+        if wp.static(native):
+            seen = int(0)
+            if n < count:
+                for camera in range(viewmats.shape[0]):
+                    seen += tile_counts[camera * count + n]
+            n = compact(n, seen)
+            if n < 0:
+                return
         v_mean = vec3()
         v_quat = vec4()
         v_log_scale = vec3()
@@ -279,37 +284,6 @@ def make_backward(real, native: bool):
         v_log_scales[n] = v_log_scale
         v_logit_opacities[n] = v_logit
 
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.project.backward.{real.__name__}.{int(native)}")
-    def backward(
-        begin: int,
-        means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
-        logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
-        viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33),
-        width: int, height: int, sh_count: int, near: real, low_pass: real,
-        splats: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), v_splats: wp.array2d(dtype=real),
-        camera_gradients: int,
-        # outputs, zero on entry
-        v_means: wp.array(dtype=m.vec3), v_quats: wp.array(dtype=m.vec4), v_log_scales: wp.array(dtype=m.vec3),
-        v_logit_opacities: wp.array(dtype=real), v_coefficients: wp.array2d(dtype=m.vec3),
-        v_viewmats: wp.array2d(dtype=m.mat44), v_Ks: wp.array2d(dtype=m.mat33),
-    ):  # fmt: skip
-        if wp.static(native):
-            seen = compact(-1, wp.tid(), tile_counts, viewmats.shape[0])
-            place = wp.tid() % wp.static(BLOCK)
-            while place < seen:
-                backward_of(
-                    compact(place, 0, tile_counts, 1), means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks,
-                    width, height, sh_count, near, low_pass, splats, tile_counts, v_splats, camera_gradients,
-                    v_means, v_quats, v_log_scales, v_logit_opacities, v_coefficients, v_viewmats, v_Ks,
-                )  # fmt: skip
-                place += wp.static(BLOCK)
-        else:
-            backward_of(
-                begin + wp.tid(), means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks,
-                width, height, sh_count, near, low_pass, splats, tile_counts, v_splats, camera_gradients,
-                v_means, v_quats, v_log_scales, v_logit_opacities, v_coefficients, v_viewmats, v_Ks,
-            )  # fmt: skip
-
     return backward
 
 
@@ -370,7 +344,7 @@ class _Project(torch.autograd.Function):
             int(wants_camera), *outputs, bridge.view(v_viewmats, m.mat44), bridge.view(v_Ks, m.mat33),
         ]  # fmt: skip
         native = _native(splats)
-        threads = -(-count // (BLOCK * EACH)) * BLOCK if native else count
+        threads = -(-count // BLOCK) * BLOCK if native else count
         bridge.launch(make_backward(real, native), threads, inputs, device, cost=10 * cameras, block_dim=BLOCK)
         camera_gradients = (v_viewmats.sum(1), v_Ks.sum(1)) if wants_camera else (None, None)
         return *gradients, *camera_gradients, None, None, None, None

@@ -29,7 +29,9 @@ class FitConfig:
     sh_every: int = 1000
     """Steps after which the spherical-harmonics degree in use rises by one."""
     checkpoint_every: int = 1000
-    """Steps between checkpoints; one is written at the end in any case."""
+    """A checkpoint may be written at multiples of this step; one is written at the end in any case."""
+    checkpoint_seconds: float = 20.0
+    """Time from one checkpoint to the next at the least [s]: writing takes time too. No result depends on it."""
     cuda_graph: bool = True
     """On CUDA, record a step once and replay it; the same kernels and the same bytes as without, in less time."""
     init: InitConfig = field(default_factory=InitConfig)
@@ -41,6 +43,8 @@ class FitConfig:
         for name in ("steps", "sh_every", "checkpoint_every"):
             if getattr(self, name) < 1:
                 raise UsageError(f"{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
+        if not self.checkpoint_seconds >= 0:
+            raise UsageError(f"checkpoint-seconds must be at least 0, not {self.checkpoint_seconds}")
         if self.rule not in ("exact", "gsplat", "inria"):
             raise UsageError(f"rule {self.rule!r} is not one of exact, gsplat, inria")
 

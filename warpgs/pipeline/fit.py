@@ -266,12 +266,14 @@ def run(fit: Fit, on_step: Callable[[StepReport], None], save: Callable[[Fit], N
     Raises:
         KeyboardInterrupt: ``stopped`` said so after a step; the state after it is saved.
     """
-    every = fit.config.checkpoint_every
+    every, saved = fit.config.checkpoint_every, time.monotonic()
     while fit.step < fit.config.steps:
         for report in fit.burst(every - fit.step % every):
             on_step(report)
         stop = stopped()
-        if stop or fit.step % every == 0 or fit.step == fit.config.steps:
+        due = fit.step % every == 0 and time.monotonic() - saved >= fit.config.checkpoint_seconds
+        if stop or due or fit.step == fit.config.steps:
             save(fit)
+            saved = time.monotonic()
         if stop:
             raise KeyboardInterrupt
