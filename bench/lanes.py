@@ -11,6 +11,7 @@ usage: python -m bench.lanes [--repeats 15] [--gaussians 20000]
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from collections.abc import Callable
 
@@ -112,15 +113,16 @@ def main() -> None:
     works = {"forward": forward, "backward": backward}
     naives = {"naive forward": naive.forward, "naive backward": lambda: naive.backward(v_rgb)}
     one = fastest(works | naives, a.repeats, time.process_time_ns)
-    walls = {}
-    for threads in (1, 2):
+    walls, counts = {}, [2**k for k in range(8) if 2**k <= (os.cpu_count() or 1)]
+    for threads in counts:
         torch.set_num_threads(threads)
         walls[threads] = fastest(works, 2 * a.repeats, time.perf_counter_ns)
     for name in works:
         slow = one["naive " + name]
+        gains = "  ".join(f"{n} threads {walls[1][name] / walls[n][name]:.2f} x" for n in counts[1:])
         print(
             f"{name:<9} {one[name] / 1e6:8.2f} ms  {one[name] / evaluated:.2f} ns a lane  naive {slow / 1e6:8.1f} ms  "
-            f"{slow / one[name]:5.1f} x  2 threads {walls[1][name] / walls[2][name]:.2f} x"
+            f"{slow / one[name]:5.1f} x  {gains}"
         )
 
 

@@ -6,6 +6,7 @@ usage: python -m bench.many GARDEN.npz [--count 10000000] [--width 3840] [--heig
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import time
@@ -55,7 +56,7 @@ def train(path: str, count: int, width: int, height: int, steps: int) -> dict:
     return {
         "device": torch.cuda.get_device_name(), "gaussians": len(gaussians), "width": width, "height": height, "steps": steps,
         "capacity": graph.capacity, "loss_first": losses[0], "loss_last": losses[-1],
-        "falling_pairs": sum(a > b for a, b in zip(losses, losses[1:])), "ms_per_step": 1000 * seconds / steps,
+        "falling_pairs": sum(a > b for a, b in itertools.pairwise(losses)), "ms_per_step": 1000 * seconds / steps,
         "peak_gib": torch.cuda.max_memory_allocated() / 2**30, "reserved_gib": torch.cuda.max_memory_reserved() / 2**30,
     }  # fmt: skip
 

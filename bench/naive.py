@@ -140,6 +140,7 @@ class Naive:
         self.kernels = make_kernels()
 
     def _launch(self, kernel, inputs: list) -> None:
+        inputs = [a.array() if isinstance(a, bridge.View) else a for a in inputs]
         with bridge.stream_of(self.rgb.device):
             wp.launch(kernel, self.pixels, inputs=inputs, device=self.device, record_tape=False)
 

@@ -43,7 +43,8 @@ def drawn_pairs(splats: torch.Tensor, tiles: Tiles, width: int, height: int, rul
     """Pairs blended into the pictures of records [C, N, 12]: alpha at or above the cut, pixel not yet finished."""
     background = splats.new_zeros(len(splats), 3)
     rgb = blend(splats.detach().requires_grad_(), tiles, background, width=width, height=height, rule=rule)[0]
-    ends = rgb.grad_fn.saved_tensors[-1]  # one past the last instance each pixel blended
+    # one past the last instance each pixel blended: the only whole numbers by pixel that are kept
+    ends = next(t for t in rgb.grad_fn.saved_tensors if t.dtype == torch.int32 and t.shape == rgb.shape[:3])
     columns, rows = -(-width // tiles.size), -(-height // tiles.size)
     drawn = torch.empty(ends.numel(), dtype=torch.int32, device=splats.device)
     with bridge.stream_of(splats.device):

@@ -16,7 +16,7 @@ from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.density import DensityStats, refine
 from warpgs.pipeline.graph import BURST, NOT_FINITE, Burst, StepGraph, Views
 from warpgs.pipeline.init import initial_gaussians, initial_points
-from warpgs.pipeline.loss import photometric_loss
+from warpgs.pipeline.loss import masked_mse, photometric_loss
 from warpgs.pipeline.optimizer import Optimizer
 from warpgs.pipeline.schedule import sh_degree
 from warpgs.rasterizer import RasterizeOptions, rasterize
@@ -138,9 +138,7 @@ class Fit:
         if densifying:
             self._refine()
         with torch.no_grad():
-            error = (render.rgb.clamp(0, 1) - target) ** 2
-            mse = error.mean() if mask is None else (error * mask[..., None]).sum() / (3 * mask.sum().clamp_min(1))
-            psnr = -10 * math.log10(max(mse.item(), 1e-12))
+            psnr = -10 * math.log10(max(masked_mse(render.rgb, target, mask).item(), 1e-12))
         return StepReport(self.step, value, psnr, len(self.optimizer.gaussians), time.perf_counter() - begin)
 
     def burst(self, limit: int) -> list[StepReport]:

@@ -19,7 +19,7 @@ from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, available_bytes, bin_tiles
 from warpgs.pipeline.density import DensityStats
-from warpgs.pipeline.loss import LossConfig, photometric_loss
+from warpgs.pipeline.loss import LossConfig, masked_mse, photometric_loss
 from warpgs.pipeline.optimizer import Optimizer
 
 BURST = 100
@@ -118,13 +118,12 @@ class StepGraph:
         params = self.optimizer.params
         *gradients, v_splats = torch.autograd.grad(loss, [*params.values(), splats])
         with torch.no_grad():
-            burst.stop.masked_fill_((burst.stop == 0) & ~torch.isfinite(loss), NOT_FINITE)
+            burst.stop.masked_fill_(~torch.isfinite(loss), NOT_FINITE)
             self.optimizer.step_scheduled(dict(zip(params, gradients)), rates, burst.stop)
             going = burst.stop == 0
             if self.stats is not None:
                 self.stats.add_gradient(v_splats, counts > 0, self.width, self.height, weight=going)
-            error = (rgb.clamp(0, 1) - target) ** 2
-            mse = error.mean() if mask is None else (error * mask[..., None]).sum() / (3 * mask.sum().clamp_min(1))
+            mse = masked_mse(rgb, target, mask)
             burst.history.index_copy_(0, burst.counter, torch.stack([loss, mse])[None])
             burst.counter += going
 

@@ -49,3 +49,11 @@ def photometric_loss(
         return l1, l1.detach()
     structural = ((1 - ssim(rgb, target)) * mask[..., None]).sum() / (3 * pixels)
     return (1 - share) * l1 + share * structural, l1.detach()
+
+
+def masked_mse(rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+    """Mean squared error of a rendered image clamped to [0, 1], over the pixels that count; shapes as in `photometric_loss`."""
+    rgb = rgb.clamp(0, 1)
+    if mask is None:
+        return torch.nn.functional.mse_loss(rgb, target)
+    return ((rgb - target) ** 2 * mask[..., None]).sum() / (3 * mask.sum().clamp_min(1))
