@@ -7,7 +7,9 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PRODUCT = sorted((ROOT / "warpgs").rglob("*.py"))
-SHARED = {"__init__", "bridge", "functions", "compiler", "falloff", "ssim_cpu", "blend_cpu", "blend_cuda"}
+SHARED = {
+    "__init__", "bridge", "functions", "native", "compiler", "falloff", "ssim_cpu", "ssim_cuda", "blend_cpu", "blend_cuda",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("op", sorted({p.stem for p in (ROOT / "warpgs/kernels").glob("*.py")} - SHARED))

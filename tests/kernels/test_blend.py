@@ -240,7 +240,7 @@ def test_cpu_equals_cuda():
         close("gradient", a, b)
 
 
-def test_both_passes_see_the_same_alpha():
+def test_both_passes_see_the_same_alpha(device):
     """Each of many Gaussians has a pixel whose alpha lies within a few roundings of the cut.
 
     Were alpha compiled otherwise in the two passes, some pixels would be drawn in one and not in the other.
@@ -260,10 +260,11 @@ def test_both_passes_see_the_same_alpha():
     dy = torch.floor(my) + 0.5 - my + 1
     q = 0.5 * ((u11 * dx + u12 * dy) ** 2 + (u22 * dy) ** 2)
     splats[:, 0, 5] = (rule.alpha_cut * torch.exp(q) * (1 + 6e-7 * (rand(count).double() - 0.5))).float()
-    splats.requires_grad_()
-    numbers = torch.arange(count, dtype=torch.int32)
-    tiles = Tiles(side, torch.stack([numbers, numbers + 1], 1), numbers, numbers, numbers, torch.ones_like(numbers))
-    rgb = blend(splats, tiles, torch.zeros(count, 3), width=side, height=side, rule=rule)[0]
+    splats = splats.to(device).requires_grad_()
+    numbers = torch.arange(count, dtype=torch.int32, device=device)
+    ranges, one = torch.stack([numbers, numbers + 1], 1), torch.ones_like(numbers)
+    tiles = Tiles(side, ranges, numbers, numbers, numbers, one, numbers, torch.tensor([count], device=device))
+    rgb = blend(splats, tiles, torch.zeros(count, 3, device=device), width=side, height=side, rule=rule)[0]
     rgb.sum().backward()
     forward, backward = rgb[..., 0].detach().double().sum((1, 2)), splats.grad[:, 0, 6].double()
     assert bool((forward > 0).sum() > count / 2)

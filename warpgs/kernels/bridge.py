@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import itertools
 import os
 import sys
 import threading
@@ -42,6 +41,9 @@ REALS = {torch.float32: wp.float32, torch.float64: wp.float64}
 
 CHUNKS_PER_THREAD = 8
 """A CPU launch is cut into this many ranges per thread, so that a few heavy tiles do not hold up the rest."""
+
+FEW_THREADS = 4
+"""With more threads than this there are half as many ranges each: Python hands them out one at a time."""
 
 SERIAL_WORK = 20_000
 """Launches with less work than this (items times cost) stay on the calling thread: a hand-over costs about 50 us."""
@@ -196,13 +198,21 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
         return
     # Compiling from several threads at once is not safe; launches on a CPU are compiled for blocks of one thread.
     kernel.module.load("cpu", block_dim=1)
-    chunks = min(count, threads * CHUNKS_PER_THREAD)
-    bounds = [count * i // chunks for i in range(chunks + 1)]
+    first = wp.launch(kernel, count, inputs=[0, *inputs], device="cpu", record_cmd=True)
+    chunks = min(count, threads * (CHUNKS_PER_THREAD if threads <= FEW_THREADS else CHUNKS_PER_THREAD // 2))
+    left = iter(range(chunks))  # threads take the next range when they are done with one
 
-    def run(begin: int, end: int) -> None:
-        wp.launch(kernel, end - begin, inputs=[begin, *inputs], device="cpu", record_tape=False)
+    def run() -> None:
+        # a recorded launch of its own for each thread, which shares the packed arrays
+        bounds = type(first.bounds)((count,))
+        begin = type(first.params[1])(0)
+        command = wp.Launch(kernel, first.device, hooks=first.hooks, params=[bounds, begin, *first.params[2:]], bounds=bounds)
+        for i in left:
+            begin.value, end = count * i // chunks, count * (i + 1) // chunks
+            bounds.shape[0] = bounds.size = end - begin.value
+            command.launch()
 
-    for done in [_pool(threads).submit(run, a, b) for a, b in itertools.pairwise(bounds)]:
+    for done in [_pool(threads).submit(run) for _ in range(min(threads, chunks))]:
         done.result()
 
 
