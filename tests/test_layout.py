@@ -8,7 +8,8 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PRODUCT = sorted((ROOT / "warpgs").rglob("*.py"))
 SHARED = {
-    "__init__", "bridge", "functions", "native", "compiler", "falloff", "ssim_cpu", "ssim_cuda", "blend_cpu", "blend_cuda",
+    "__init__", "bridge", "functions", "native", "compiler", "falloff",
+    "project_backward", "ssim_cpu", "ssim_cuda", "blend_cpu", "blend_cuda",
 }  # fmt: skip
 
 

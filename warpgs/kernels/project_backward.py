@@ -1,0 +1,188 @@
+"""The backward kernel of `project`; docs/project.md has the derivation, by whose sections the comments go."""
+
+import functools
+
+import warp as wp
+
+from warpgs.kernels import sh
+from warpgs.kernels.functions import make_projection
+from warpgs.kernels.native import make_functions as make_native
+
+
+@functools.cache
+def make_backward(real, native: bool):
+    """The backward kernel for one scalar type: one thread per Gaussian, over all cameras, so no sum needs atomics.
+
+    ``native`` is for CUDA and float32: the Gaussians that some camera sees are dealt to the first threads of each block.
+    """
+    m = make_projection(real)
+    functions = sh.make_functions(real)
+    vec3 = m.vec3
+    vec4 = m.vec4
+    vec16 = functions.vec16
+    mat33 = m.mat33
+    compact = make_native().compact if native else None
+    color_backward = make_native().color_backward if native else None
+
+    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.project.backward.{real.__name__}.{int(native)}")
+    def backward(
+        begin: int,
+        means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
+        logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
+        viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33),
+        width: int, height: int, sh_count: int, near: real, low_pass: real,
+        splats: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), v_splats: wp.array2d(dtype=real),
+        camera_gradients: int,
+        # outputs, zero on entry
+        v_means: wp.array(dtype=m.vec3), v_quats: wp.array(dtype=m.vec4), v_log_scales: wp.array(dtype=m.vec3),
+        v_logit_opacities: wp.array(dtype=real), v_coefficients: wp.array2d(dtype=m.vec3),
+        v_viewmats: wp.array2d(dtype=m.mat44), v_Ks: wp.array2d(dtype=m.mat33),
+    ):  # fmt: skip
+        n = begin + wp.tid()
+        count = means.shape[0]
+        if wp.static(native):
+            seen = int(0)
+            if n < count:
+                for camera in range(viewmats.shape[0]):
+                    seen += tile_counts[camera * count + n]
+            n = compact(n, seen)
+            if n < 0:
+                return
+        v_mean = vec3()
+        v_quat = vec4()
+        v_log_scale = vec3()
+        v_logit = real(0.0)
+        for camera in range(viewmats.shape[0]):
+            i = camera * count + n
+            if tile_counts[i] > 0:
+                view = viewmats[camera]
+                K = Ks[camera]
+                e = m.ellipse(means[n], quats[n], log_scales[n], view, K, real(width), real(height), near, low_pass)
+                x = e.position[0]
+                y = e.position[1]
+                z = e.position[2]
+                rotation = mat33(
+                    view[0, 0], view[0, 1], view[0, 2],
+                    view[1, 0], view[1, 1], view[1, 2],
+                    view[2, 0], view[2, 1], view[2, 2],
+                )  # fmt: skip
+
+                # factor -> projected axes (section 4); v_u and u are both per shrunk pixel
+                inv_c = real(1.0) / wp.sqrt(e.c)
+                inv_det = real(1.0) / wp.sqrt(e.det)
+                t11 = v_splats[i, 2] * e.shrink * (e.c * inv_c * inv_det)
+                t12 = v_splats[i, 3] * e.shrink * (-e.b * inv_c * inv_det)
+                t22 = v_splats[i, 4] * e.shrink * inv_c
+                v_det = real(-0.5) * (t11 + t12) / e.det
+                v_c = real(0.5) * (t11 - t12 - t22) / e.c
+                v_b = -v_splats[i, 3] * e.shrink * inv_c * inv_det
+                blur = low_pass * e.shrink * e.shrink
+                normal = wp.cross(e.m1, e.m2)
+                two = real(2.0)
+                v_m1 = two * v_det * (wp.cross(e.m2, normal) + blur * e.m1) + v_b * e.m2
+                v_m2 = two * v_det * (wp.cross(normal, e.m1) + blur * e.m2) + v_b * e.m1 + two * v_c * e.m2
+                v_m1 = v_m1 * e.shrink
+                v_m2 = v_m2 * e.shrink
+
+                # projected axes -> camera axes and Jacobian (section 3)
+                fx = K[0, 0]
+                fy = K[1, 1]
+                inv_z = real(1.0) / z
+                jx = fx * inv_z
+                jy = fy * inv_z
+                jxz = (K[0, 2] - e.clamped[0]) * inv_z
+                jyz = (K[1, 2] - e.clamped[1]) * inv_z
+                axes0 = vec3(e.axes[0, 0], e.axes[0, 1], e.axes[0, 2])
+                axes1 = vec3(e.axes[1, 0], e.axes[1, 1], e.axes[1, 2])
+                axes2 = vec3(e.axes[2, 0], e.axes[2, 1], e.axes[2, 2])
+                v_jx = wp.dot(v_m1, axes0)
+                v_jxz = wp.dot(v_m1, axes2)
+                v_jy = wp.dot(v_m2, axes1)
+                v_jyz = wp.dot(v_m2, axes2)
+                g0 = jx * v_m1
+                g1 = jy * v_m2
+                g2 = jxz * v_m1 + jyz * v_m2
+                v_axes = mat33(g0[0], g0[1], g0[2], g1[0], g1[1], g1[2], g2[0], g2[1], g2[2])
+                v_log_scale += wp.cw_mul(g0, axes0) + wp.cw_mul(g1, axes1) + wp.cw_mul(g2, axes2)
+                v_turned = v_axes * wp.diag(e.scales)  # gradient of camera rotation times Gaussian rotation
+                v_unit = m.rotation_backward(e.quat, wp.transpose(rotation) * v_turned)
+                v_quat += (v_unit - e.quat * wp.dot(e.quat, v_unit)) / e.quat_length
+
+                # mean in the image, Jacobian and depth -> position in the camera (section 3)
+                v_px = v_splats[i, 0]
+                v_py = v_splats[i, 1]
+                v_K = mat33()
+                v_x = v_px * jx
+                v_y = v_py * jy
+                v_z = (
+                    -(v_px * jx * x + v_py * jy * y + v_jx * jx + v_jy * jy + v_jxz * jxz + v_jyz * jyz) * inv_z
+                    + v_splats[i, 9]
+                )
+                v_K[0, 0] = (v_px * x + v_jx) * inv_z
+                v_K[1, 1] = (v_py * y + v_jy) * inv_z
+                v_K[0, 2] = v_px
+                v_K[1, 2] = v_py
+                if e.clamped[0] == e.pixel[0]:  # the Jacobian moves with the mean: cx - px = -fx x / z
+                    v_x -= v_jxz * jx * inv_z
+                    v_z += v_jxz * jx * x * inv_z * inv_z
+                    v_K[0, 0] = v_K[0, 0] - v_jxz * x * inv_z * inv_z
+                else:
+                    v_K[0, 2] = v_K[0, 2] + v_jxz * inv_z
+                if e.clamped[1] == e.pixel[1]:
+                    v_y -= v_jyz * jy * inv_z
+                    v_z += v_jyz * jy * y * inv_z * inv_z
+                    v_K[1, 1] = v_K[1, 1] - v_jyz * y * inv_z * inv_z
+                else:
+                    v_K[1, 2] = v_K[1, 2] + v_jyz * inv_z
+                v_position = vec3(v_x, v_y, v_z)
+                v_mean += wp.transpose(rotation) * v_position
+
+                # colour -> coefficients and direction (section 5)
+                d = m.direction(means[n], view)
+                unit = vec3(d[0], d[1], d[2])
+                basis = functions.basis(unit)
+                v_color = vec3(v_splats[i, 6], v_splats[i, 7], v_splats[i, 8])
+                for channel in range(3):
+                    if not (splats[i, 6 + channel] > real(0.0)):  # clamped at zero
+                        v_color[channel] = real(0.0)
+                w = vec16()
+                if wp.static(native):
+                    for k in range(16):
+                        if k >= sh_count:
+                            basis[k] = real(0.0)
+                    w = color_backward(coefficients, n, sh_count, basis, v_color, camera, v_coefficients)
+                else:
+                    for k in range(16):
+                        if k < sh_count:
+                            v_coefficients[n, k] = v_coefficients[n, k] + basis[k] * v_color
+                            w[k] = wp.dot(coefficients[n, k], v_color)
+                v_centered = vec3()
+                if d[3] > real(0.0):
+                    v_unit_direction = functions.basis_backward(unit, w)
+                    v_centered = (v_unit_direction - unit * wp.dot(unit, v_unit_direction)) / d[3]
+                v_mean += v_centered
+
+                # opacity
+                opacity = splats[i, 5]
+                v_logit += v_splats[i, 5] * opacity * m.sigmoid(-logit_opacities[n])
+
+                if camera_gradients != 0:
+                    t = vec3(view[0, 3], view[1, 3], view[2, 3])
+                    v_rotation = (
+                        wp.outer(v_position, means[n]) + wp.outer(t, v_centered)
+                        + v_turned * wp.transpose(m.rotation(e.quat))
+                    )  # fmt: skip
+                    v_t = v_position + rotation * v_centered
+                    v_view = m.mat44()
+                    for row in range(3):
+                        for column in range(3):
+                            v_view[row, column] = v_rotation[row, column]
+                        v_view[row, 3] = v_t[row]
+                    v_viewmats[camera, n] = v_view
+                    v_Ks[camera, n] = v_K
+        v_means[n] = v_mean
+        v_quats[n] = v_quat
+        v_log_scales[n] = v_log_scale
+        v_logit_opacities[n] = v_logit
+
+    return backward
