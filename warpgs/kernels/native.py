@@ -38,6 +38,24 @@ _COMPACT = """
     return (int)threadIdx.x < all ? s_items[threadIdx.x] : -1;
 """
 
+# The rows of a block are neighbours, so its threads clear them together, in whole 16-byte pieces where they can.
+_CLEAR = """
+    __shared__ int s_kept[BLOCK];
+    __syncthreads();
+    s_kept[threadIdx.x] = kept;
+    __syncthreads();
+    const int first = item - (int)threadIdx.x, rows = min(BLOCK, sh.shape[0] - first), size = 3 * sh.shape[1];
+    float* from = reinterpret_cast<float*>(sh.data) + (long long)first * size;
+    if (size % 4 == 0) {
+        for (int i = threadIdx.x; i < rows * (size / 4); i += BLOCK)
+            if (!s_kept[i / (size / 4)])
+                reinterpret_cast<float4*>(from)[i] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+    } else
+        for (int i = threadIdx.x; i < rows * size; i += BLOCK)
+            if (!s_kept[i / size])
+                from[i] = 0.0f;
+"""
+
 # Rows of K x 3 floats are a multiple of 16 bytes for K = 4 and 16. Weights past the count are zero.
 _COLOR = """
     const int size = sh.shape[1];
@@ -70,29 +88,32 @@ _COLOR_BACKWARD = """
     wp::vec_t<16, float> w;
     if (size % 4 == 0) {
         #pragma unroll
-        for (int q = 0; q < 12; ++q)
+        for (int q = 0; q < 12; ++q) {
+            float4* to = reinterpret_cast<float4*>(v_row) + q;
             if (4 * q < 3 * count) {
                 const float4 c = reinterpret_cast<const float4*>(row)[q];
                 w[(4 * q) / 3] += c.x * v[(4 * q) % 3];
                 w[(4 * q + 1) / 3] += c.y * v[(4 * q + 1) % 3];
                 w[(4 * q + 2) / 3] += c.z * v[(4 * q + 2) % 3];
                 w[(4 * q + 3) / 3] += c.w * v[(4 * q + 3) % 3];
-                float4* to = reinterpret_cast<float4*>(v_row) + q;
                 float4 sum = add ? *to : make_float4(0.0f, 0.0f, 0.0f, 0.0f);
                 sum.x += weights[(4 * q) / 3] * v[(4 * q) % 3];
                 sum.y += weights[(4 * q + 1) / 3] * v[(4 * q + 1) % 3];
                 sum.z += weights[(4 * q + 2) / 3] * v[(4 * q + 2) % 3];
                 sum.w += weights[(4 * q + 3) / 3] * v[(4 * q + 3) % 3];
                 *to = sum;
-            }
+            } else if (!add && 4 * q < 3 * size)
+                *to = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+        }
     } else {
         #pragma unroll
         for (int k = 0; k < 16; ++k)
-            if (k < count)
-                for (int channel = 0; channel < 3; ++channel) {
+            for (int channel = 0; channel < 3; ++channel)
+                if (k < count) {
                     w[k] += row[3 * k + channel] * v[channel];
                     v_row[3 * k + channel] = (add ? v_row[3 * k + channel] : 0.0f) + weights[k] * v[channel];
-                }
+                } else if (!add && k < size)
+                    v_row[3 * k + channel] = 0.0f;
     }
     return w;
 """
@@ -109,6 +130,11 @@ def make_functions():
 
         All BLOCK threads of the block must call it.
         """
+        ...
+
+    @wp.func_native(_CLEAR.replace("BLOCK", str(BLOCK)))
+    def clear_rows(item: int, kept: int, sh: wp.array2d(dtype=wp.vec3)):
+        """Set the rows of the block's items to zero but for those that are kept. All BLOCK threads must call it."""
         ...
 
     @wp.func_native("return (int)__ballot_sync(0xffffffffu, wanted != 0);")
@@ -150,10 +176,12 @@ def make_functions():
         sh: wp.array2d(dtype=wp.vec3), n: int, count: int, weights: vec16, v: wp.vec3, add: int,
         v_sh: wp.array2d(dtype=wp.vec3),
     ) -> vec16:  # fmt: skip
-        """Gradients of `color` for an upstream ``v``: those of the row are stored or added, those of the weights returned."""
+        """Gradients of `color` for an upstream ``v``: those of the row are stored, past ``count`` as zeros, or added; those of
+        the weights are returned.
+        """
         ...
 
     return SimpleNamespace(
-        compact=compact, ballot=ballot, broadcast=broadcast, running_sum=running_sum, lowest=lowest,
+        compact=compact, clear_rows=clear_rows, ballot=ballot, broadcast=broadcast, running_sum=running_sum, lowest=lowest,
         color=color, color_backward=color_backward,
     )  # fmt: skip

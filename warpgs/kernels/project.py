@@ -28,50 +28,29 @@ def make_forward(real, native: bool):
     vec3 = m.vec3
     color_of = make_native().color if native else None
 
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.project.forward.{real.__name__}.{int(native)}")
-    def forward(
-        begin: int,
+    @wp.func
+    def draw(
+        i: int, n: int, view: m.mat44, K: m.mat33,
         means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
         logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
-        viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33),
         width: int, height: int, tile_size: int, sh_count: int,
-        near: real, low_pass: real, alpha_cut: real, square_sigma: real,
-        # outputs, zero on entry
-        splats: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
+        near: real, low_pass: real, alpha_cut: real, square_sigma: real, splats: wp.array2d(dtype=real),
     ):  # fmt: skip
-        i = begin + wp.tid()
-        count = means.shape[0]
-        camera = i // count
-        n = i - camera * count
-        view = viewmats[camera]
+        """Write the record of Gaussian n; returns the tiles it touches, 0 where it is culled and nothing is written."""
         e = m.ellipse(
-            means[n], quats[n], log_scales[n], view, Ks[camera], real(width), real(height), near, low_pass
+            means[n], quats[n], log_scales[n], view, K, real(width), real(height), near, low_pass
         )  # fmt: skip
         if e.valid == 0:
-            return
+            return 0
         opacity = m.sigmoid(logit_opacities[n])
         if not (opacity > real(0.0) and opacity >= alpha_cut):
-            return
-        d = m.direction(means[n], view)
-        y = basis(vec3(d[0], d[1], d[2]))
-        color = vec3(real(0.5), real(0.5), real(0.5))
-        if wp.static(native):
-            for k in range(16):
-                if k >= sh_count:
-                    y[k] = real(0.0)
-            color += color_of(coefficients, n, sh_count, y)
-        else:
-            for k in range(16):
-                if k < sh_count:
-                    color += y[k] * coefficients[n, k]
-        if not m.finite3(color):
-            return
+            return 0
 
         inv_c = real(1.0) / wp.sqrt(e.c)
         inv_det = real(1.0) / wp.sqrt(e.det)
         factor = vec3(e.c * inv_c * inv_det, -e.b * inv_c * inv_det, inv_c) * e.shrink
         if not m.finite3(factor):
-            return
+            return 0
 
         reach = s.reach_of(opacity, alpha_cut, square_sigma)
         half_width = real(1.0e30)  # without a cut every tile is touched
@@ -91,7 +70,23 @@ def make_forward(real, native: bool):
             columns = s.tile_columns(e.pixel[0], e.pixel[1], factor, reach, half_width, half_height, row, width, tile_size)
             tiles += columns[1] - columns[0]
         if tiles == 0:
-            return
+            return 0
+
+        # last, since most of what is read belongs to it
+        d = m.direction(means[n], view)
+        y = basis(vec3(d[0], d[1], d[2]))
+        color = vec3(real(0.5), real(0.5), real(0.5))
+        if wp.static(native):
+            for k in range(16):
+                if k >= sh_count:
+                    y[k] = real(0.0)
+            color += color_of(coefficients, n, sh_count, y)
+        else:
+            for k in range(16):
+                if k < sh_count:
+                    color += y[k] * coefficients[n, k]
+        if not m.finite3(color):
+            return 0
         splats[i, 0] = e.pixel[0]
         splats[i, 1] = e.pixel[1]
         splats[i, 2] = factor[0]
@@ -104,7 +99,31 @@ def make_forward(real, native: bool):
         splats[i, 9] = e.position[2]
         splats[i, 10] = half_width
         splats[i, 11] = half_height
+        return tiles
+
+    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.project.forward.{real.__name__}.{int(native)}")
+    def forward(
+        begin: int,
+        means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
+        logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
+        viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33),
+        width: int, height: int, tile_size: int, sh_count: int,
+        near: real, low_pass: real, alpha_cut: real, square_sigma: real,
+        # outputs
+        splats: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        count = means.shape[0]
+        camera = i // count
+        n = i - camera * count
+        tiles = draw(
+            i, n, viewmats[camera], Ks[camera], means, quats, log_scales, logit_opacities, coefficients,
+            width, height, tile_size, sh_count, near, low_pass, alpha_cut, square_sigma, splats,
+        )  # fmt: skip
         tile_counts[i] = tiles
+        if tiles == 0:
+            for k in range(wp.static(RECORD)):
+                splats[i, k] = real(0.0)
 
     return forward
 
@@ -126,11 +145,8 @@ class _Project(torch.autograd.Function):
         real = bridge.real_of(means)
         tensors = [t.contiguous() for t in (means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks)]
         count = len(viewmats) * len(means)
-        zeros = torch.zeros((RECORD + 1) * count, dtype=torch.int32, device=means.device)
-        if real is wp.float32:  # one allocation for both
-            splats, tile_counts = zeros[: RECORD * count].view(means.dtype).view(count, RECORD), zeros[RECORD * count :]
-        else:
-            splats, tile_counts = means.new_zeros(count, RECORD), zeros[:count]
+        splats = means.new_empty(count, RECORD)
+        tile_counts = torch.empty(count, dtype=torch.int32, device=means.device)
         inputs = [
             *_inputs(*tensors), *size, tile, sh_count,
             rule.near, rule.low_pass, rule.alpha_cut, rule.square_sigma,
@@ -152,7 +168,8 @@ class _Project(torch.autograd.Function):
         v_splats = v_splats.contiguous().view(-1, RECORD)
         # One allocation for the five, each from a multiple of 16 bytes on, as kernels that read four at a time want it.
         sizes = [-(-t.numel() // 4) * 4 for t in tensors[:5]]
-        flat = splats.new_zeros(sum(sizes)).split(sizes)
+        native = _native(splats)  # writes zeros itself
+        flat = (splats.new_empty if native else splats.new_zeros)(sum(sizes)).split(sizes)
         gradients = [part[: t.numel()].view(t.shape) for part, t in zip(flat, tensors)]
         cameras, count = len(tensors[5]), len(tensors[0])
         wants_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
@@ -165,7 +182,6 @@ class _Project(torch.autograd.Function):
             bridge.view(splats, real), bridge.view(tile_counts, wp.int32), bridge.view(v_splats, real),
             int(wants_camera), *outputs, bridge.view(v_viewmats, m.mat44), bridge.view(v_Ks, m.mat33),
         ]  # fmt: skip
-        native = _native(splats)
         threads = -(-count // BLOCK) * BLOCK if native else count
         bridge.launch(make_backward(real, native), threads, inputs, device, cost=10 * cameras, block_dim=BLOCK)
         camera_gradients = (v_viewmats.sum(1), v_Ks.sum(1)) if wants_camera else (None, None)

@@ -22,9 +22,13 @@ def make_backward(real, native: bool):
     vec16 = functions.vec16
     mat33 = m.mat33
     compact = make_native().compact if native else None
+    clear_rows = make_native().clear_rows if native else None
     color_backward = make_native().color_backward if native else None
 
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.project.backward.{real.__name__}.{int(native)}")
+    # four blocks to a multiprocessor
+    registers = {"cuda_max_registers": 128} if native else {}
+
+    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.project.backward.{real.__name__}.{int(native)}", **registers)
     def backward(
         begin: int,
         means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
@@ -33,7 +37,7 @@ def make_backward(real, native: bool):
         width: int, height: int, sh_count: int, near: real, low_pass: real,
         splats: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), v_splats: wp.array2d(dtype=real),
         camera_gradients: int,
-        # outputs, zero on entry
+        # outputs, zero on entry where not native
         v_means: wp.array(dtype=m.vec3), v_quats: wp.array(dtype=m.vec4), v_log_scales: wp.array(dtype=m.vec3),
         v_logit_opacities: wp.array(dtype=real), v_coefficients: wp.array2d(dtype=m.vec3),
         v_viewmats: wp.array2d(dtype=m.mat44), v_Ks: wp.array2d(dtype=m.mat33),
@@ -45,6 +49,12 @@ def make_backward(real, native: bool):
             if n < count:
                 for camera in range(viewmats.shape[0]):
                     seen += tile_counts[camera * count + n]
+                if seen == 0:
+                    v_means[n] = vec3()
+                    v_quats[n] = vec4()
+                    v_log_scales[n] = vec3()
+                    v_logit_opacities[n] = real(0.0)
+            clear_rows(n, seen, v_coefficients)
             n = compact(n, seen)
             if n < 0:
                 return
@@ -52,6 +62,7 @@ def make_backward(real, native: bool):
         v_quat = vec4()
         v_log_scale = vec3()
         v_logit = real(0.0)
+        stored = int(0)
         for camera in range(viewmats.shape[0]):
             i = camera * count + n
             if tile_counts[i] > 0:
@@ -150,7 +161,8 @@ def make_backward(real, native: bool):
                     for k in range(16):
                         if k >= sh_count:
                             basis[k] = real(0.0)
-                    w = color_backward(coefficients, n, sh_count, basis, v_color, camera, v_coefficients)
+                    w = color_backward(coefficients, n, sh_count, basis, v_color, stored, v_coefficients)
+                    stored += 1
                 else:
                     for k in range(16):
                         if k < sh_count:
