@@ -176,9 +176,7 @@ def make_functions():
         sh: wp.array2d(dtype=wp.vec3), n: int, count: int, weights: vec16, v: wp.vec3, add: int,
         v_sh: wp.array2d(dtype=wp.vec3),
     ) -> vec16:  # fmt: skip
-        """Gradients of `color` for an upstream ``v``: those of the row are stored, past ``count`` as zeros, or added; those of
-        the weights are returned.
-        """
+        """Gradients of `color` for an upstream ``v``: the row's are stored (zeros past ``count``) or added, the weights' returned."""
         ...
 
     return SimpleNamespace(
