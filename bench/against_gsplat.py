@@ -108,7 +108,8 @@ def our_step(gaussians: Gaussians, camera: Camera, target: torch.Tensor):
         views, optimizer, None, burst, degree=gaussians.sh_degree, rule="gsplat", loss=LossConfig(),
         background=torch.zeros(3, device=device),
     )  # fmt: skip
-    burst.load([0] * BURST, [optimizer.schedule(0.0, k + 1) for k in range(BURST)])
+    steps = range(1, BURST + 1)
+    burst.load([0] * BURST, [optimizer.schedule(0.0, k) for k in steps], [(0.0, k) for k in steps])
 
     def work():
         burst.counter.zero_()

@@ -109,6 +109,11 @@ def adam(numbers: int) -> Cost:
     return Cost(7 * REAL * numbers, 13 * numbers)
 
 
+def dropout(count: int) -> Cost:
+    """A factor a Gaussian, from three rounds of an integer hash."""
+    return Cost(REAL * count, 20 * count)
+
+
 def knn(count: int) -> Cost:
     """Positions in, distances out, a sort of 64-bit codes with 64-bit numbers; 32 distances to neighbours on the curve."""
     return Cost(16 * count + 8 * 32 * count, 32 * 8 * count)

@@ -8,7 +8,7 @@ import torch
 from warpgs.geometry import look_at
 from warpgs.kernels.sh import C0
 from warpgs.rasterizer import rasterize
-from warpgs.scene import Camera, Gaussians, PointCloud, View
+from warpgs.scene import Camera, Gaussians, PointCloud, Prior, View
 
 
 def three_gaussians() -> Gaussians:
@@ -48,3 +48,16 @@ def seeds(count: int = 60) -> PointCloud:
     means = three_gaussians().means.numpy().astype(np.float64)
     points = means[generator.integers(3, size=count)] + 0.12 * generator.standard_normal((count, 3))
     return PointCloud(points, np.full((count, 3), 0.5, np.float32))
+
+
+def priors(views: list[View]) -> list[Prior]:
+    """A tilted plane with a step in it, the bright half of the picture in front, boundaries at the step."""
+    found = []
+    for v in views:
+        height, width = v.image.shape[:2]
+        y, x = np.mgrid[:height, :width].astype(np.float32)
+        step = (x > width // 2).astype(np.float32)
+        boundary = np.exp(-(((x - width / 2) / 3) ** 2)).astype(np.float32)
+        disparity = 0.2 * y / height + 0.1 * (x / width) ** 2 + 0.5 * step
+        found.append(Prior(disparity / disparity.max(), 0.5 + 0.4 * step, boundary, step, "a plane", "a step"))
+    return found

@@ -49,7 +49,9 @@ def _fit_arguments(arguments: list[str]):
     from warpgs.pipeline.density import DensityConfig
     from warpgs.pipeline.init import InitConfig
     from warpgs.pipeline.loss import LossConfig
+    from warpgs.pipeline.method import MethodConfig
     from warpgs.pipeline.optimizer import OptimizerConfig
+    from warpgs.pipeline.schedule import PhaseConfig
 
     name = "3dgs"
     for i, word in enumerate(arguments):
@@ -93,6 +95,8 @@ def _fit_arguments(arguments: list[str]):
         """Cut-offs of the rasterizer: exact, gsplat or inria."""
         sh_every: int = base.sh_every
         """Steps after which the spherical-harmonics degree rises by one."""
+        dropout: float = base.dropout
+        """Probability, at the last step, that a Gaussian is hidden for a step; it grows linearly from 0."""
         checkpoint_every: int = base.checkpoint_every
         """A checkpoint may be written at multiples of this step."""
         checkpoint_seconds: float = base.checkpoint_seconds
@@ -103,6 +107,8 @@ def _fit_arguments(arguments: list[str]):
         loss: LossConfig = field(default_factory=lambda: base.loss)
         optimizer: OptimizerConfig = field(default_factory=lambda: base.optimizer)
         density: DensityConfig = field(default_factory=lambda: base.density)
+        phases: PhaseConfig = field(default_factory=lambda: base.phases)
+        method: MethodConfig = field(default_factory=lambda: base.method)
 
     a = _parse(Fit, "fit", arguments)
     if a.threads < 0:
@@ -111,6 +117,7 @@ def _fit_arguments(arguments: list[str]):
         "rule",
         "seed",
         "sh_every",
+        "dropout",
         "checkpoint_every",
         "checkpoint_seconds",
         "cuda_graph",
@@ -118,6 +125,8 @@ def _fit_arguments(arguments: list[str]):
         "loss",
         "optimizer",
         "density",
+        "phases",
+        "method",
     )
     rooms = {n: getattr(a, n) for n in own}
 

@@ -34,6 +34,8 @@ class RasterizeOptions:
     """Bytes that the (Gaussian, tile) instances may take; None for four fifths of what is free."""
     deterministic: bool = True
     """Sum gradients in a fixed order, so that the same inputs give the same bits. False takes less memory on CUDA."""
+    opacity_factors: torch.Tensor | None = None
+    """Numbers that the opacities are multiplied by, at least 0, shape [N]; 0 hides a Gaussian. Not differentiable."""
     capacity: int | None = None
     """Room for this many (Gaussian, tile) instances instead of as many as there are. Nothing is then read back from the
     device, so the call can be captured in a CUDA graph; look at `Render.overflow` before using the result."""
@@ -81,8 +83,9 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
 
     splats, tile_counts = project(
-        *gaussians.tensors().values(), viewmats, Ks, **size, degree=degree, rule=rule, tile_size=options.tile_size
-    )
+        *gaussians.tensors().values(), viewmats, Ks, **size, degree=degree, rule=rule, tile_size=options.tile_size,
+        opacity_factors=options.opacity_factors,
+    )  # fmt: skip
     overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=means.device)
     tiles = bin_tiles(
         splats, tile_counts, **size, tile_size=options.tile_size, rule=rule,

@@ -118,6 +118,25 @@ class Scene:
 
 
 @dataclass(frozen=True)
+class Prior:
+    """What is believed of one view's pixels before anything is fitted; every map is float32, shape [H, W], in [0, 1]."""
+
+    disparity: np.ndarray
+    """Relative inverse depth, 0 at the farthest and 1 at the nearest pixel of the view; 0 everywhere where nothing is known."""
+    confidence: np.ndarray
+    """Probability of the likeliest class: F_seg of the paper (Multi-Modal Importance Assessment)."""
+    boundary: np.ndarray
+    """omega_boundary: 1 at label changes, falling with the distance to them."""
+    foreground: np.ndarray
+    """omega_foreground: probability of not being background. 0 everywhere, as then is ``boundary``, where semantics say nothing
+    of the view: its semantic weight must then be 0."""
+    depth_source: str
+    """Where the disparity comes from, a phrase for reports."""
+    semantics_source: str
+    """Where the other three come from, a phrase for reports."""
+
+
+@dataclass(frozen=True)
 class Gaussians:
     """A set of N Gaussians as stored and optimised; the kernels apply exp, sigmoid and normalisation."""
 

@@ -95,7 +95,7 @@ def test_optimizer_rows_follow():
     before = {k: v.clone() for k, v in optimizer.state().items()}
     keep = torch.tensor([0, 3, 4])
     added = {n: t[:2] + 1 for n, t in cloud(5).tensors().items()}
-    optimizer.apply(Refinement(keep, added))
+    optimizer.apply(Refinement(keep, added, torch.full((2,), -1)))
     after = optimizer.state()
     for name in added:
         assert torch.equal(after[f"param.{name}"][:3], before[f"param.{name}"][keep])

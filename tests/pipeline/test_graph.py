@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.scenes import photographs, seeds
+from tests.pipeline.test_method import CONFIG as METHOD
+from tests.scenes import photographs, priors, seeds
 from warpgs.pipeline import graph
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.density import DensityConfig
@@ -24,7 +25,8 @@ BUSY = FitConfig(
 
 def fitted(views: list[View], recorded: bool, config: FitConfig = BUSY) -> tuple[Fit, list]:
     """A fit of all steps on CUDA, and its reports."""
-    fit = Fit(views, seeds(61), dataclasses.replace(config, cuda_graph=recorded), torch.device("cuda", 0))
+    config = dataclasses.replace(config, cuda_graph=recorded)
+    fit = Fit(views, seeds(61), config, torch.device("cuda", 0), priors=priors(views))
     reports = []
     while fit.step < config.steps:
         reports += fit.burst(100)
@@ -50,6 +52,15 @@ def test_recorded_steps_equal_single_steps(views):
     assert all(torch.equal(a[k], b[k]) for k in a)
     assert [(r.step, r.count) for r in said] == [(r.step, r.count) for r in reports]
     assert np.allclose([r.loss for r in said], [r.loss for r in reports], rtol=1e-6)
+
+
+def test_recorded_method_equals_single_steps():
+    """With dropout, sampling events, two layers and protection: the same bits too."""
+    single, said = fitted(photographs(3), recorded=False, config=METHOD)
+    recorded, reports = fitted(photographs(3), recorded=True, config=METHOD)
+    a, b = single.state()[0], recorded.state()[0]
+    assert single.events == recorded.events and len(single.events) > 2
+    assert all(torch.equal(a[k], b[k]) for k in a) and [r.count for r in said] == [r.count for r in reports]
 
 
 def test_too_little_room_is_found_and_mended(monkeypatch):

@@ -176,7 +176,7 @@ def make_functions():
         sh: wp.array2d(dtype=wp.vec3), n: int, count: int, weights: vec16, v: wp.vec3, add: int,
         v_sh: wp.array2d(dtype=wp.vec3),
     ) -> vec16:  # fmt: skip
-        """Gradients of `color` for an upstream ``v``: the row's are stored (zeros past ``count``) or added, the weights' returned."""
+        """Gradients of `color`, upstream ``v``: the row's are stored (0 past ``count``) or added, the weights' returned."""
         ...
 
     return SimpleNamespace(

@@ -32,7 +32,8 @@ def make_forward(real, native: bool):
     def draw(
         i: int, n: int, view: m.mat44, K: m.mat33,
         means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
-        logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
+        logit_opacities: wp.array(dtype=real), opacity_factors: wp.array(dtype=real),
+        coefficients: wp.array2d(dtype=m.vec3),
         width: int, height: int, tile_size: int, sh_count: int,
         near: real, low_pass: real, alpha_cut: real, square_sigma: real, splats: wp.array2d(dtype=real),
     ):  # fmt: skip
@@ -43,6 +44,8 @@ def make_forward(real, native: bool):
         if e.valid == 0:
             return 0
         opacity = m.sigmoid(logit_opacities[n])
+        if opacity_factors.shape[0] > 0:
+            opacity *= opacity_factors[n]
         if not (opacity > real(0.0) and opacity >= alpha_cut):
             return 0
 
@@ -106,7 +109,7 @@ def make_forward(real, native: bool):
         begin: int,
         means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
         logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
-        viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33),
+        viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33), opacity_factors: wp.array(dtype=real),
         width: int, height: int, tile_size: int, sh_count: int,
         near: real, low_pass: real, alpha_cut: real, square_sigma: real,
         # outputs
@@ -117,7 +120,7 @@ def make_forward(real, native: bool):
         camera = i // count
         n = i - camera * count
         tiles = draw(
-            i, n, viewmats[camera], Ks[camera], means, quats, log_scales, logit_opacities, coefficients,
+            i, n, viewmats[camera], Ks[camera], means, quats, log_scales, logit_opacities, opacity_factors, coefficients,
             width, height, tile_size, sh_count, near, low_pass, alpha_cut, square_sigma, splats,
         )  # fmt: skip
         tile_counts[i] = tiles
@@ -141,14 +144,16 @@ def _native(tensor: torch.Tensor) -> bool:
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks, size, sh_count, rule, tile):
+    def forward(
+        ctx, means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks, factors, size, sh_count, rule, tile
+    ):
         real = bridge.real_of(means)
         tensors = [t.contiguous() for t in (means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks)]
         count = len(viewmats) * len(means)
         splats = means.new_empty(count, RECORD)
         tile_counts = torch.empty(count, dtype=torch.int32, device=means.device)
         inputs = [
-            *_inputs(*tensors), *size, tile, sh_count,
+            *_inputs(*tensors), bridge.view(factors, real), *size, tile, sh_count,
             rule.near, rule.low_pass, rule.alpha_cut, rule.square_sigma,
             bridge.view(splats, real), bridge.view(tile_counts, wp.int32),
         ]  # fmt: skip
@@ -185,7 +190,7 @@ class _Project(torch.autograd.Function):
         threads = -(-count // BLOCK) * BLOCK if native else count
         bridge.launch(make_backward(real, native), threads, inputs, device, cost=10 * cameras, block_dim=BLOCK)
         camera_gradients = (v_viewmats.sum(1), v_Ks.sum(1)) if wants_camera else (None, None)
-        return *gradients, *camera_gradients, None, None, None, None
+        return *gradients, *camera_gradients, None, None, None, None, None
 
 
 def project(
@@ -202,6 +207,7 @@ def project(
     degree: int,
     rule: Rule,
     tile_size: int = 16,
+    opacity_factors: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Project N Gaussians into C cameras (EWA, first order).
 
@@ -223,6 +229,7 @@ def project(
         degree: Spherical-harmonics degree used, 0 to 3.
         rule: Cut-offs.
         tile_size: Side of a tile [px].
+        opacity_factors: Numbers that the opacities are multiplied by, at least 0, shape [N]; None for 1. Not differentiable.
 
     Returns:
         ``splats`` [C, N, 12], records laid out as ``RECORD`` says, and ``tile_counts`` [C, N] int32, the number of tiles
@@ -242,6 +249,12 @@ def project(
         raise ValueError(f"sh holds {sizes['K']} coefficients a channel, degree {degree} needs {sh_count}")
     if width < 1 or height < 1:
         raise ValueError(f"the image must be at least 1 x 1 px, not {width} x {height}")
+    if opacity_factors is None:
+        opacity_factors = means.new_empty(0)
+    else:
+        bridge.check(means=(means, "N 3"), opacity_factors=(opacity_factors, "N"))
+    factors = opacity_factors.detach().contiguous()
     return _Project.apply(
-        means, quats, log_scales, logit_opacities, sh_coefficients, viewmats, Ks, (width, height), sh_count, rule, tile_size
-    )
+        means, quats, log_scales, logit_opacities, sh_coefficients, viewmats, Ks, factors, (width, height), sh_count, rule,
+        tile_size,
+    )  # fmt: skip

@@ -5,13 +5,16 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import typing
 from dataclasses import dataclass, field
 
 from warpgs.errors import UsageError
 from warpgs.pipeline.density import DensityConfig
 from warpgs.pipeline.init import InitConfig
 from warpgs.pipeline.loss import LossConfig
+from warpgs.pipeline.method import MethodConfig
 from warpgs.pipeline.optimizer import OptimizerConfig
+from warpgs.pipeline.schedule import PhaseConfig
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,9 @@ class FitConfig:
     """Cut-offs of the rasterizer: exact, gsplat or inria."""
     sh_every: int = 1000
     """Steps after which the spherical-harmonics degree in use rises by one."""
+    dropout: float = 0.0
+    """Probability, at the last step, that a Gaussian is hidden for a step; it grows linearly from 0 (DropGaussian, Park et
+    al. 2025)."""
     checkpoint_every: int = 1000
     """A checkpoint may be written at multiples of this step; one is written at the end in any case."""
     checkpoint_seconds: float = 20.0
@@ -38,6 +44,8 @@ class FitConfig:
     loss: LossConfig = field(default_factory=LossConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
+    phases: PhaseConfig = field(default_factory=PhaseConfig)
+    method: MethodConfig = field(default_factory=MethodConfig)
 
     def __post_init__(self):
         for name in ("steps", "sh_every", "checkpoint_every"):
@@ -45,6 +53,8 @@ class FitConfig:
                 raise UsageError(f"{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
         if not self.checkpoint_seconds >= 0:
             raise UsageError(f"checkpoint-seconds must be at least 0, not {self.checkpoint_seconds}")
+        if not 0 <= self.dropout < 1:
+            raise UsageError(f"dropout must lie in [0, 1), not {self.dropout}")
         if self.rule not in ("exact", "gsplat", "inria"):
             raise UsageError(f"rule {self.rule!r} is not one of exact, gsplat, inria")
 
@@ -55,15 +65,20 @@ class FitConfig:
     @staticmethod
     def from_json(values: dict) -> FitConfig:
         """The configuration that `to_json` stored; UsageError where a field is unknown."""
-        rooms = {"init": InitConfig, "loss": LossConfig, "optimizer": OptimizerConfig, "density": DensityConfig}
         try:
-            return FitConfig(**{k: rooms[k](**v) if k in rooms else v for k, v in values.items()})
-        except TypeError as e:
+            return _compose(FitConfig, values)
+        except (TypeError, KeyError) as e:
             raise UsageError(f"the stored configuration is of another version of warpgs ({e})") from e
 
     def fingerprint(self) -> str:
         """First 12 hexadecimal digits of the SHA-256 of the settings."""
         return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:12]
+
+
+def _compose(kind: type, values: dict):
+    """A settings dataclass from nested plain values; its fields that are dataclasses are composed in turn."""
+    kinds = typing.get_type_hints(kind)
+    return kind(**{k: _compose(kinds[k], v) if dataclasses.is_dataclass(kinds[k]) else v for k, v in values.items()})
 
 
 PRESETS: dict[str, FitConfig] = {

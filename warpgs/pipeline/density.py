@@ -55,6 +55,8 @@ class Refinement:
     """Numbers of the surviving rows in ascending order, int64, shape [S]."""
     added: dict[str, torch.Tensor]
     """New rows of each of the five tensors."""
+    parents: torch.Tensor
+    """For each new row the number of the row it grew from, -1 for none, int64, shape [A]."""
 
 
 class DensityStats:
@@ -77,6 +79,12 @@ class DensityStats:
         norms = torch.hypot(v_splats[..., 0] * (0.5 * width), v_splats[..., 1] * (0.5 * height))
         self.gradient += torch.where(visible, norms, 0).sum(0) * weight
         self.seen += visible.sum(0) * weight
+
+    def apply(self, change: Refinement) -> None:
+        """Keep what is known of the rows that stay; nothing is known of new ones."""
+        fresh = torch.zeros(len(change.parents), device=self.seen.device)
+        self.gradient = torch.cat([self.gradient[change.keep], fresh])
+        self.seen = torch.cat([self.seen[change.keep], fresh])
 
     def state(self) -> dict[str, torch.Tensor]:
         """Both tensors by name, for the checkpoint."""
@@ -109,6 +117,8 @@ def refine(
     extent: float,
     after_reset: bool,
     generator: torch.Generator,
+    growing: torch.Tensor | None = None,
+    protected: torch.Tensor | None = None,
 ) -> Refinement:
     """Clone small Gaussians and split large ones where the image pulls at them; prune the transparent and the huge.
 
@@ -119,6 +129,8 @@ def refine(
         extent: Size of the scene [u].
         after_reset: An opacity reset has happened, so size pruning is on.
         generator: CPU generator for the children's positions; the same numbers on every device.
+        growing: Gaussians that may be cloned and split, bool, shape [N]; None for all.
+        protected: Gaussians that are not pruned, bool, shape [N]; None for none.
 
     Returns:
         Rows that stay and rows to append. At least one Gaussian always stays, the most opaque.
@@ -129,6 +141,9 @@ def refine(
         opacities = tensors["logit_opacities"].sigmoid()
         pull = stats.gradient / stats.seen.clamp_min(1)
         grows = pull > config.gradient
+        if growing is not None:
+            grows &= growing
+            pull = torch.where(growing, pull, 0)
         room = max(0, config.max_gaussians - len(gaussians))
         if int(grows.sum()) > room:
             strongest = torch.topk(pull, room).indices
@@ -137,6 +152,8 @@ def refine(
         faint = ~(opacities >= config.prune_opacity)
         if after_reset and config.prune_size > 0:
             faint |= scales > config.prune_size * extent
+        if protected is not None:
+            faint &= ~protected
         if bool(faint.all()):
             faint[opacities.argmax()] = False
         cloned = torch.nonzero(grows & small & ~faint).squeeze(1)
@@ -145,4 +162,4 @@ def refine(
         remove[split] = True
         children = _split(tensors, split, generator)
         added = {n: torch.cat([t[cloned], children[n]]) for n, t in tensors.items()}
-        return Refinement(torch.nonzero(~remove).squeeze(1), added)
+        return Refinement(torch.nonzero(~remove).squeeze(1), added, torch.cat([cloned, split.repeat(2)]))

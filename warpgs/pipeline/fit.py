@@ -12,15 +12,18 @@ import torch
 
 from warpgs import geometry
 from warpgs.errors import DataError, WarpgsError
+from warpgs.kernels.dropout import opacity_dropout
 from warpgs.pipeline.config import FitConfig
-from warpgs.pipeline.density import DensityStats, refine
+from warpgs.pipeline.density import DensityStats, Refinement, refine
 from warpgs.pipeline.graph import BURST, NOT_FINITE, Burst, StepGraph, Views
 from warpgs.pipeline.init import initial_gaussians, initial_points
+from warpgs.pipeline.layers import COARSE, FINE, LONG_AGO, Layers
 from warpgs.pipeline.loss import masked_mse, photometric_loss
+from warpgs.pipeline.method import Event, TrainingView, sampling_event
 from warpgs.pipeline.optimizer import Optimizer
-from warpgs.pipeline.schedule import sh_degree
+from warpgs.pipeline.schedule import plan_phases, sh_degree
 from warpgs.rasterizer import RasterizeOptions, rasterize
-from warpgs.scene import Camera, Gaussians, PointCloud, Scene, View
+from warpgs.scene import Camera, Gaussians, PointCloud, Prior, Scene, View
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,18 @@ class NotFiniteError(WarpgsError):
     """The loss stopped being a number."""
 
 
+@dataclass(frozen=True)
+class Phase:
+    """What a step does beyond rendering, comparing and updating; steps of one phase can share a recording."""
+
+    degree: int
+    """Spherical-harmonics degree in use."""
+    densifying: bool
+    """Gradients are gathered, and the set is refined now and then."""
+    layered: bool
+    """The coarse layer is kept stable."""
+
+
 class Fit:
     """The state of one fit: everything that changes from step to step, and nothing else."""
 
@@ -53,6 +68,7 @@ class Fit:
         config: FitConfig,
         device: torch.device,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        priors: list[Prior] | None = None,
     ):
         """Set up the first Gaussians.
 
@@ -62,6 +78,7 @@ class Fit:
             config: Settings.
             device: Where to work.
             background: Colour behind the scene.
+            priors: What is believed of each view; needed where ``config.method.events`` asks for sampling.
 
         Raises:
             DataError: There is nothing to start from.
@@ -74,11 +91,16 @@ class Fit:
         cloud, self.start = initial_points(train, points, config.init, np.random.default_rng(config.seed))
         self.extent = self._extent([v.camera for v in train], cloud)
         self.optimizer = Optimizer(initial_gaussians(cloud, config.init, self.extent, device), config.optimizer, self.extent)
-        self.stats = DensityStats(len(cloud), device)
+        self.stats, self.layers = DensityStats(len(cloud), device), Layers(len(cloud), device)
+        self.phases = plan_phases(config.phases, config.steps)
+        self.events: list[dict] = []
         self.step, self.reset_done = 0, False
         self.order: list[int] = []
+        self.on_event: Callable[[int, Event], None] | None = None
         self.graphs: dict[tuple, StepGraph] = {}
         self.views = [self._on_device(v) for v in train]
+        if config.method.events:
+            self.views = [v.scored(p, config.method) for v, p in zip(self.views, priors, strict=True)]
         if device.type == "cuda" and config.cuda_graph:
             self._stack()
 
@@ -89,7 +111,7 @@ class Fit:
         spread = float(np.linalg.norm(np.std(cloud.points, axis=0)))
         return max(extent, 0.1 * spread if extent < 1e-3 * spread else 0.0, 1e-6)
 
-    def _on_device(self, view: View) -> tuple[Camera, torch.Tensor, torch.Tensor | None]:
+    def _on_device(self, view: View) -> TrainingView:
         camera = Camera(
             torch.as_tensor(view.camera.viewmat, dtype=torch.float32, device=self.device),
             torch.as_tensor(view.camera.K, dtype=torch.float32, device=self.device),
@@ -98,7 +120,7 @@ class Fit:
         mask = None
         if view.mask is not None:
             mask = torch.as_tensor(view.mask, dtype=torch.float32, device=self.device)
-        return camera, torch.as_tensor(view.image, dtype=torch.float32, device=self.device), mask
+        return TrainingView(camera, torch.as_tensor(view.image, dtype=torch.float32, device=self.device), mask)
 
     @property
     def gaussians(self) -> Gaussians:
@@ -112,33 +134,36 @@ class Fit:
         return self.order.pop()
 
     def advance(self) -> StepReport:
-        """Render a view, compare it, update the Gaussians, and refine the set when it is time.
+        """Render a view, compare it, update the Gaussians, and change the set when it is time.
 
         Raises:
             NotFiniteError: The loss is not finite; the Gaussians are as before the step.
         """
         begin = time.perf_counter()
         self.step += 1
-        c = self.config
-        camera, target, mask = self.views[self.next_view()]
-        degree = sh_degree(self.step, c.sh_every, c.init.max_sh_degree)
-        options = RasterizeOptions(rule=c.rule, sh_degree=degree, background=self.background)
-        render = rasterize(self.optimizer.gaussians, camera, options)
+        c, phase = self.config, self._phase(self.step)
+        view = self.views[self.next_view()]
+        factors = None
+        if c.dropout > 0:
+            settings = torch.tensor(self._settings(self.step), dtype=torch.float32, device=self.device)
+            factors = opacity_dropout(len(self.optimizer.gaussians), settings, c.seed)
+        options = RasterizeOptions(rule=c.rule, sh_degree=phase.degree, background=self.background, opacity_factors=factors)
+        render = rasterize(self.optimizer.gaussians, view.camera, options)
         render.splats.retain_grad()
-        loss, _ = photometric_loss(render.rgb, target, mask, c.loss)
+        loss, _ = photometric_loss(render.rgb, view.photo, view.mask, c.loss)
         loss.backward()
         value = loss.item()
         if not math.isfinite(value):
             raise NotFiniteError(f"the loss became {value} at step {self.step}; the last checkpoint is the state before")
 
-        densifying = self.step <= c.density.times(c.steps)[2]
-        if densifying:
+        if phase.densifying:
             self.stats.add(render)
-        self.optimizer.step((self.step - 1) / max(1, c.steps - 1))
-        if densifying:
-            self._refine()
+        self.optimizer.step(self._progress(self.step), self._share(phase))
+        if self._protects:
+            self.layers.hold_up(self.optimizer.params["logit_opacities"].detach(), self.step, c.method.protect)
+        self._change_set(phase)
         with torch.no_grad():
-            psnr = -10 * math.log10(max(masked_mse(render.rgb, target, mask).item(), 1e-12))
+            psnr = -10 * math.log10(max(masked_mse(render.rgb, view.photo, view.mask).item(), 1e-12))
         return StepReport(self.step, value, psnr, len(self.optimizer.gaussians), time.perf_counter() - begin)
 
     def burst(self, limit: int) -> list[StepReport]:
@@ -154,20 +179,18 @@ class Fit:
             return [self.advance()]
         begin = time.perf_counter()
         c, first = self.config, self.step + 1
-        degree, densifying = self._phase(first)
-        start, every, _ = c.density.times(c.steps)
-        count = 1
-        while count < min(limit, BURST, c.steps - self.step) and self._phase(first + count) == (degree, densifying):
-            last = first + count - 1
-            if densifying and (
-                (last > start and last % every == 0) or (c.density.reset_every and last % c.density.reset_every == 0)
-            ):
-                break
+        phase, count = self._phase(first), 1
+        while (
+            count < min(limit, BURST, c.steps - self.step)
+            and self._phase(first + count) == phase
+            and not self._changes_after(first + count - 1)
+        ):
             count += 1
         chosen = [self.next_view() for _ in range(count)]
-        graphs = [self._graph(self.places[i][0], degree, densifying) for i in chosen]
-        rates = [self.optimizer.schedule((s - 1) / max(1, c.steps - 1), s) for s in range(first, first + count)]
-        self.work.load([self.places[i][1] for i in chosen], rates)
+        graphs = [self._graph(self.places[i][0], phase) for i in chosen]
+        steps = range(first, first + count)
+        rates = [self.optimizer.schedule(self._progress(s), s) for s in steps]
+        self.work.load([self.places[i][1] for i in chosen], rates, [self._settings(s) for s in steps])
         for graph in graphs:
             graph.replay()
         done, stop, history = self.work.result()
@@ -181,8 +204,8 @@ class Fit:
         if stop:
             self.graphs.clear()  # recorded anew with more room
         counts = [len(self.optimizer.gaussians)] * done
-        if densifying and done == count:
-            self._refine()
+        if done == count:
+            self._change_set(phase)
             counts[-1] = len(self.optimizer.gaussians)
         seconds = (time.perf_counter() - begin) / max(1, done)
         return [
@@ -190,54 +213,126 @@ class Fit:
             for k, (loss, mse) in enumerate(history[:done])
         ]
 
-    def _phase(self, step: int) -> tuple[int, bool]:
-        """Degree in use at a step, and whether its gradients count for densification."""
-        c = self.config
-        return sh_degree(step, c.sh_every, c.init.max_sh_degree), step <= c.density.times(c.steps)[2]
+    def _progress(self, step: int) -> float:
+        return (step - 1) / max(1, self.config.steps - 1)
 
-    def _graph(self, kind: tuple[int, int, bool], degree: int, densifying: bool) -> StepGraph:
-        key = (kind, degree, densifying)
+    def _settings(self, step: int) -> tuple[float, int]:
+        """Dropout probability and number of a step."""
+        return self.config.dropout * self._progress(step), step
+
+    def _phase(self, step: int) -> Phase:
+        c = self.config
+        layered = c.method.hier and c.method.events and step > self.phases.refine
+        return Phase(sh_degree(step, c.sh_every, c.init.max_sh_degree), step <= self._densify_until, layered)
+
+    @property
+    def _densify_until(self) -> int:
+        c = self.config
+        return self.phases.settle if c.phases.coarse + c.phases.stable > 0 else c.density.times(c.steps)[2]
+
+    @property
+    def _protects(self) -> bool:
+        return self.config.method.events and self.config.method.pm
+
+    def _share(self, phase: Phase) -> torch.Tensor | None:
+        """Part of its step that each mean takes."""
+        if not phase.layered:
+            return None
+        return torch.where(self.layers.fine, 1.0, self.config.method.coarse_rate)
+
+    def _graph(self, kind: tuple[int, int, bool], phase: Phase) -> StepGraph:
+        key = (kind, phase)
         if key not in self.graphs:
+            c = self.config
             self.graphs = {k: g for k, g in self.graphs.items() if k[1:] == key[1:]}
             self.graphs[key] = StepGraph(
-                self.stacks[kind], self.optimizer, self.stats if densifying else None, self.work,
-                degree=degree, rule=self.config.rule, loss=self.config.loss, background=self.background,
+                self.stacks[kind], self.optimizer, self.stats if phase.densifying else None, self.work,
+                degree=phase.degree, rule=c.rule, loss=c.loss, background=self.background,
+                dropout_seed=c.seed if c.dropout > 0 else None, share=self._share(phase),
+                protected=(self.layers, c.method.protect) if self._protects else None,
             )  # fmt: skip
         return self.graphs[key]
 
     def _stack(self) -> None:
         """Views by size and by whether they have a mask, as recorded steps take them."""
         self.work, self.stacks = Burst(self.device), {}
-        kinds = [(camera.width, camera.height, mask is not None) for camera, _, mask in self.views]
+        kinds = [(v.camera.width, v.camera.height, v.mask is not None) for v in self.views]
         for kind in dict.fromkeys(kinds):
-            cameras, targets, masks = zip(*(v for v, k in zip(self.views, kinds) if k == kind))
+            same = [v for v, k in zip(self.views, kinds) if k == kind]
             self.stacks[kind] = Views(
-                torch.stack([c.viewmat for c in cameras]), torch.stack([c.K for c in cameras]), torch.stack(targets),
-                torch.stack(masks) if kind[2] else None,
+                torch.stack([v.camera.viewmat for v in same]), torch.stack([v.camera.K for v in same]),
+                torch.stack([v.photo for v in same]), torch.stack([v.mask for v in same]) if kind[2] else None,
             )  # fmt: skip
         self.places = [(k, kinds[:i].count(k)) for i, k in enumerate(kinds)]
 
-    def _refine(self) -> None:
-        c = self.config.density
-        start, every, _ = c.times(self.config.steps)
-        if self.step > start and self.step % every == 0:
-            change = refine(
-                self.gaussians, self.stats, c, extent=self.extent, after_reset=self.reset_done, generator=self.generator
-            )
+    def _refines_after(self, step: int) -> bool:
+        start, every, _ = self.config.density.times(self.config.steps)
+        return start < step <= self._densify_until and step % every == 0
+
+    def _resets_after(self, step: int) -> bool:
+        every = self.config.density.reset_every
+        return every > 0 and step <= self._densify_until and step % every == 0
+
+    def _samples_after(self, step: int) -> bool:
+        return self.config.method.events and step in self.phases.events
+
+    def _changes_after(self, step: int) -> bool:
+        return self._refines_after(step) or self._resets_after(step) or self._samples_after(step)
+
+    def _change_set(self, phase: Phase) -> None:
+        """Whatever changes the set of Gaussians after the step that was just taken: refinement, reset, sampling."""
+        if self._refines_after(self.step):
+            self._refine(phase)
+        if self._resets_after(self.step):
             self.graphs.clear()
-            self.optimizer.apply(change)
-            self.stats = DensityStats(len(self.optimizer.gaussians), self.device)
-        if c.reset_every and self.step % c.reset_every == 0:
-            self.graphs.clear()
-            self.optimizer.cap_opacity(c.reset_opacity)
+            self.optimizer.cap_opacity(self.config.density.reset_opacity)
             self.reset_done = True
+        if self._samples_after(self.step):
+            self._sample()
+
+    def _refine(self, phase: Phase) -> None:
+        c = self.config
+        change = refine(
+            self.gaussians, self.stats, c.density, extent=self.extent, after_reset=self.reset_done, generator=self.generator,
+            growing=self.layers.fine if phase.layered else None,
+            protected=self.layers.young(self.step, c.method.protect) if self._protects else None,
+        )  # fmt: skip
+        self._apply(change, COARSE, LONG_AGO)
+        self.stats = DensityStats(len(self.optimizer.gaussians), self.device)
+
+    def _sample(self) -> None:
+        """Add fine Gaussians (docs/decisions/008-importance.md)."""
+        c = self.config
+        event = sampling_event(
+            self.gaussians, self.layers, self.views, c.method, step=self.step, rule=c.rule, background=self.background,
+            room=c.density.max_gaussians - len(self.optimizer.gaussians), generator=self.generator,
+        )  # fmt: skip
+        self._apply(event.change, FINE, self.step)
+        self.events.append({
+            "step": self.step, "added": len(event.change.parents), "freed": event.freed,
+            "quantiles": [v.quantile for v in event.views],
+        })  # fmt: skip
+        if self.on_event is not None:
+            self.on_event(self.step, event)
+
+    def _apply(self, change: Refinement, level: int, birth: int) -> None:
+        """Follow a change of the set with all that goes by row."""
+        self.graphs.clear()
+        self.optimizer.apply(change)
+        self.layers.apply(change, level=level, birth=birth)
+        self.stats.apply(change)
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict]:
         """Tensors and plain values from which the fit goes on as if it had never stopped."""
-        tensors = {**self.optimizer.state(), **self.stats.state(), "generator": self.generator.get_state()}
+        tensors = {
+            **self.optimizer.state(),
+            **self.stats.state(),
+            **self.layers.state(),
+            "generator": self.generator.get_state(),
+        }
         plain = {
             "step": self.step, "order": self.order, "reset_done": self.reset_done, "extent": self.extent,
-            "start": self.start, "config": self.config.to_json(),
+            "start": self.start, "events": self.events, "config": self.config.to_json(),
         }  # fmt: skip
         return tensors, plain
 
@@ -249,6 +344,8 @@ class Fit:
         self.optimizer.load(tensors, self.step)
         self.stats = DensityStats(len(self.optimizer.gaussians), self.device)
         self.stats.load(tensors)
+        self.layers.load(tensors)
+        self.events = plain["events"]
         self.graphs.clear()
         self.generator.set_state(tensors["generator"])
 

@@ -16,9 +16,11 @@ from warpgs.constants import RULES
 from warpgs.errors import ResourceError
 from warpgs.kernels import bridge
 from warpgs.kernels.blend import blend
+from warpgs.kernels.dropout import opacity_dropout
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, available_bytes, bin_tiles
 from warpgs.pipeline.density import DensityStats
+from warpgs.pipeline.layers import Layers, ProtectConfig
 from warpgs.pipeline.loss import LossConfig, masked_mse, photometric_loss
 from warpgs.pipeline.optimizer import Optimizer
 
@@ -52,15 +54,30 @@ class StepGraph:
 
     def __init__(
         self, views: Views, optimizer: Optimizer, stats: DensityStats | None, burst: Burst, *,
-        degree: int, rule: str, loss: LossConfig, background: torch.Tensor,
+        degree: int, rule: str, loss: LossConfig, background: torch.Tensor, dropout_seed: int | None = None,
+        share: torch.Tensor | None = None, protected: tuple[Layers, ProtectConfig] | None = None,
     ):  # fmt: skip
-        """Record. ``stats`` None where gradients need not be gathered.
+        """Record.
+
+        Args:
+            views: What steps may look at.
+            optimizer: The Gaussians and their moments.
+            stats: Where gradients are gathered for densification; None where they need not be.
+            burst: Where steps find their settings and leave their results.
+            degree: Spherical-harmonics degree.
+            rule: Cut-offs of the rasterizer.
+            loss: Weights of the loss.
+            background: Colour behind the scene, shape [3].
+            dropout_seed: Seed of the opacity dropout; None for none.
+            share: Part of its step that each mean takes, shape [N]; None for all of it.
+            protected: What holds up the opacity of the young; None where nothing does.
 
         Raises:
             ResourceError: The instances would not fit into memory.
         """
         self.views, self.optimizer, self.stats, self.burst = views, optimizer, stats, burst
         self.degree, self.rule, self.loss, self.background = degree, RULES[rule], loss, background[None]
+        self.dropout_seed, self.share, self.protected = dropout_seed, share, protected
         self.height, self.width = views.targets.shape[1:3]
         self.capacity = self._capacity()
         stream = torch.cuda.Stream()
@@ -89,9 +106,10 @@ class StepGraph:
             if collecting:
                 gc.enable()
 
-    def _project(self, viewmat: torch.Tensor, K: torch.Tensor):
+    def _project(self, viewmat: torch.Tensor, K: torch.Tensor, factors: torch.Tensor | None = None):
         gaussians = self.optimizer.gaussians.tensors().values()
-        return project(*gaussians, viewmat, K, width=self.width, height=self.height, degree=self.degree, rule=self.rule)
+        size = {"width": self.width, "height": self.height}
+        return project(*gaussians, viewmat, K, **size, degree=self.degree, rule=self.rule, opacity_factors=factors)
 
     def _capacity(self) -> int:
         with torch.no_grad():
@@ -111,7 +129,10 @@ class StepGraph:
         rates = burst.rate_rows.index_select(0, burst.counter)[0]
         target = views.targets.index_select(0, view)[0]
         mask = None if views.masks is None else views.masks.index_select(0, view)[0]
-        splats, counts = self._project(views.viewmats.index_select(0, view), views.Ks.index_select(0, view))
+        settings, factors = burst.setting_rows.index_select(0, burst.counter)[0], None
+        if self.dropout_seed is not None:
+            factors = opacity_dropout(len(self.optimizer.gaussians), settings, self.dropout_seed)
+        splats, counts = self._project(views.viewmats.index_select(0, view), views.Ks.index_select(0, view), factors)
         tiles = bin_tiles(splats, counts, **size, rule=self.rule, capacity=self.capacity, overflow=burst.stop)
         rgb = blend(splats, tiles, self.background, **size, rule=self.rule)[0][0]
         loss, _ = photometric_loss(rgb, target, mask, self.loss)
@@ -119,8 +140,11 @@ class StepGraph:
         *gradients, v_splats = torch.autograd.grad(loss, [*params.values(), splats])
         with torch.no_grad():
             burst.stop.masked_fill_(~torch.isfinite(loss), NOT_FINITE)
-            self.optimizer.step_scheduled(dict(zip(params, gradients)), rates, burst.stop)
+            self.optimizer.step_scheduled(dict(zip(params, gradients)), rates, burst.stop, self.share)
             going = burst.stop == 0
+            if self.protected is not None:
+                layers, protect = self.protected
+                layers.hold_up(params["logit_opacities"].detach(), settings[1], protect, going)
             if self.stats is not None:
                 self.stats.add_gradient(v_splats, counts > 0, self.width, self.height, weight=going)
             mse = masked_mse(rgb, target, mask)
@@ -141,6 +165,8 @@ class Burst:
         """Number of each step's view among those of its size."""
         self.rate_rows = torch.ones(BURST, 15, device=device)
         """Rates of each step (Optimizer.schedule)."""
+        self.setting_rows = torch.zeros(BURST, 2, device=device)
+        """Dropout probability and number of each step."""
         self.counter = torch.zeros(1, dtype=torch.int64, device=device)
         """Number of the step at hand. It stays once a step stops, and so do all Gaussians."""
         self.stop = torch.zeros(1, dtype=torch.int32, device=device)
@@ -158,12 +184,13 @@ class Burst:
         """Undo `hold`."""
         self.stop.zero_()
 
-    def load(self, views: list[int], rates: list[list[float]]) -> None:
-        """Upload the views and rates of the next steps, at most BURST."""
+    def load(self, views: list[int], rates: list[list[float]], settings: list[tuple[float, int]]) -> None:
+        """Upload views, rates, and dropout probability and number of the next steps, at most BURST."""
         self.counter.zero_()
         self.stop.zero_()
         self.view_rows[: len(views)] = torch.tensor(views).to(self.device)
         self.rate_rows[: len(rates)] = torch.tensor(rates, dtype=torch.float32).to(self.device)
+        self.setting_rows[: len(settings)] = torch.tensor(settings, dtype=torch.float32).to(self.device)
 
     def result(self) -> tuple[int, int, list[list[float]]]:
         """Steps taken, the stop flag, and loss and mean squared error of each step taken and of one that was not a number."""

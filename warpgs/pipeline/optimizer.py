@@ -64,9 +64,13 @@ class Optimizer:
             "sh": c.sh_lr * c.sh_rest_factor,
         }
 
-    def step(self, progress: float) -> None:
-        """Update all parameters from their gradients, which are then cleared."""
+    def step(self, progress: float, share: torch.Tensor | None = None) -> None:
+        """Update all parameters from their gradients, which are then cleared.
+
+        ``share`` [N]: the part of its step that each mean takes; None for all of it.
+        """
         self.step_count += 1
+        before = None if share is None else self.params["means"].detach().clone()
         for name, rate in self.rates(progress).items():
             param = self.params[name]
             if param.grad is None:
@@ -75,6 +79,13 @@ class Optimizer:
             state = (param.detach(), param.grad, self.means[name], self.squares[name])
             adam_step(*state, lr=rate, step=self.step_count, **head)
             param.grad = None
+        self._hold_back(before, share)
+
+    def _hold_back(self, before: torch.Tensor | None, share: torch.Tensor | None) -> None:
+        """Take back a part of the last step of the means, whose size Adam makes independent of the gradient's."""
+        if share is not None:
+            means = self.params["means"].detach()
+            means.copy_(torch.where(share[:, None] == 1, means, before + share[:, None] * (means - before)))
 
     def schedule(self, progress: float, step: int) -> list[float]:
         """Numbers that `step_scheduled` reads from memory: three for each tensor, in order."""
@@ -83,11 +94,15 @@ class Optimizer:
             row += scheduled_rates(rate, step, head_lr=self.config.sh_lr if name == "sh" else None)
         return row
 
-    def step_scheduled(self, gradients: dict[str, torch.Tensor], rates: torch.Tensor, skip: torch.Tensor) -> None:
+    def step_scheduled(
+        self, gradients: dict[str, torch.Tensor], rates: torch.Tensor, skip: torch.Tensor, share: torch.Tensor | None = None
+    ) -> None:
         """`step` on CUDA with a row [15] of `schedule` in memory; nothing changes where ``skip`` [1] is not 0."""
+        before = None if share is None else self.params["means"].detach().clone()
         for i, (name, gradient) in enumerate(gradients.items()):
             state = (self.params[name].detach(), gradient, self.means[name], self.squares[name])
             adam_scheduled(*state, rates[3 * i : 3 * i + 3], skip, head=3 if name == "sh" else 0)
+        self._hold_back(before, share)
 
     def apply(self, change: Refinement) -> None:
         """Keep the named rows with their moments and append new rows with zero moments."""

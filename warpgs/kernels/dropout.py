@@ -1,0 +1,51 @@
+"""Opacity dropout: hide random Gaussians for a step and make the others more opaque (DropGaussian, Park et al. 2025)."""
+
+import functools
+
+import torch
+import warp as wp
+
+from warpgs.kernels import bridge
+
+
+@functools.cache
+def make_kernel():
+    """The kernel; its settings are in memory, so that it can be recorded once and replayed."""
+
+    @wp.kernel(enable_backward=False, module="warpgs.kernels.dropout")
+    def draw(
+        begin: int, settings: wp.array(dtype=float), seed: int,
+        # outputs
+        factors: wp.array(dtype=float),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        p = settings[0]
+        # one stream of numbers for each seed and step, one number of it for each Gaussian
+        state = wp.rand_init(wp.randi(wp.rand_init(seed, int(settings[1]))), i)
+        factors[i] = wp.where(wp.randf(state) >= p, 1.0 / (1.0 - p), 0.0)
+
+    return draw
+
+
+def opacity_dropout(count: int, settings: torch.Tensor, seed: int) -> torch.Tensor:
+    """Factors for the opacities of ``count`` Gaussians: 0 with probability p, else 1 / (1 - p).
+
+    The expected opacity stays. The factors depend on seed, step and row alone: the same on every device, and again after a
+    fit is continued.
+
+    Args:
+        count: Number of Gaussians N.
+        settings: p in [0, 1) and the number of the step (a whole number below 2^24), float32, shape [2].
+        seed: Any 32-bit integer.
+
+    Returns:
+        Factors, float32, shape [N], on the device of ``settings``.
+
+    Raises:
+        ValueError: ``settings`` is not of shape [2].
+    """
+    bridge.check(settings=(settings, "2"))
+    factors = torch.empty(count, dtype=torch.float32, device=settings.device)
+    inputs = [bridge.view(settings, wp.float32), seed, bridge.view(factors, wp.float32)]
+    bridge.launch(make_kernel(), count, inputs, settings.device)
+    return factors
