@@ -34,7 +34,8 @@ def make_forward(real, native: bool):
         means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
         logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
         viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33),
-        width: int, height: int, tile_size: int, sh_count: int,
+        width: int, height: int, origin_x: int, origin_y: int, window_width: int, window_height: int,
+        tile_size: int, sh_count: int,
         near: real, low_pass: real, alpha_cut: real, square_sigma: real,
         # outputs, zero on entry
         splats: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
@@ -85,10 +86,12 @@ def make_forward(real, native: bool):
             half_width = reach * wp.sqrt(e.a) / e.shrink
             half_height = reach * wp.sqrt(e.c) / e.shrink
 
-        rows = s.tile_rows(e.pixel[1], half_height, height, tile_size)
+        rows = s.tile_rows(e.pixel[1], half_height, origin_y, window_height, tile_size)
         tiles = int(0)
         for row in range(rows[0], rows[1]):
-            columns = s.tile_columns(e.pixel[0], e.pixel[1], factor, reach, half_width, half_height, row, width, tile_size)
+            columns = s.tile_columns(
+                e.pixel[0], e.pixel[1], factor, reach, half_width, half_height, row, origin_x, window_width, tile_size
+            )
             tiles += columns[1] - columns[0]
         if tiles == 0:
             return
@@ -122,7 +125,7 @@ def _native(tensor: torch.Tensor) -> bool:
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks, size, sh_count, rule, tile):
+    def forward(ctx, means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks, size, window, sh_count, rule, tile):
         real = bridge.real_of(means)
         tensors = [t.contiguous() for t in (means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks)]
         count = len(viewmats) * len(means)
@@ -132,7 +135,7 @@ class _Project(torch.autograd.Function):
         else:
             splats, tile_counts = means.new_zeros(count, RECORD), zeros[:count]
         inputs = [
-            *_inputs(*tensors), *size, tile, sh_count,
+            *_inputs(*tensors), *size, *window, tile, sh_count,
             rule.near, rule.low_pass, rule.alpha_cut, rule.square_sigma,
             bridge.view(splats, real), bridge.view(tile_counts, wp.int32),
         ]  # fmt: skip
@@ -169,7 +172,7 @@ class _Project(torch.autograd.Function):
         threads = -(-count // BLOCK) * BLOCK if native else count
         bridge.launch(make_backward(real, native), threads, inputs, device, cost=10 * cameras, block_dim=BLOCK)
         camera_gradients = (v_viewmats.sum(1), v_Ks.sum(1)) if wants_camera else (None, None)
-        return *gradients, *camera_gradients, None, None, None, None
+        return *gradients, *camera_gradients, None, None, None, None, None
 
 
 def project(
@@ -186,6 +189,7 @@ def project(
     degree: int,
     rule: Rule,
     tile_size: int = 16,
+    window: tuple[int, int, int, int] | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Project N Gaussians into C cameras (EWA, first order).
 
@@ -207,6 +211,8 @@ def project(
         degree: Spherical-harmonics degree used, 0 to 3.
         rule: Cut-offs.
         tile_size: Side of a tile [px].
+        window: Left, top, width and height [px] of the part of the image that is wanted, from a tile's corner on; None for all.
+            What touches no tile in it is culled.
 
     Returns:
         ``splats`` [C, N, 12], records laid out as ``RECORD`` says, and ``tile_counts`` [C, N] int32, the number of tiles
@@ -227,5 +233,6 @@ def project(
     if width < 1 or height < 1:
         raise ValueError(f"the image must be at least 1 x 1 px, not {width} x {height}")
     return _Project.apply(
-        means, quats, log_scales, logit_opacities, sh_coefficients, viewmats, Ks, (width, height), sh_count, rule, tile_size
-    )
+        means, quats, log_scales, logit_opacities, sh_coefficients, viewmats, Ks,
+        (width, height), window or (0, 0, width, height), sh_count, rule, tile_size,
+    )  # fmt: skip
