@@ -6,6 +6,8 @@ import pytest
 import torch
 
 from tests.splats import camera, cloud, leaves
+from warpgs.bands import Frame, parts
+from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.rasterizer import RasterizeOptions, rasterize
 
@@ -55,8 +57,56 @@ def test_gradients_of_bands_add_up(device, dtype):
     whole = gradients(*scenery, upstream)
     bands = [gradients(*scenery, upstream, window=(0, y, 75, min(16, 53 - y))) for y in range(0, 53, 16)]
     near = 3e-5 if dtype is torch.float32 else 1e-12
-    for a, *parts in zip(whole, *bands):
-        assert float((a - sum(parts)).norm()) <= near * float(a.norm())
+    for a, *pieces in zip(whole, *bands):
+        assert float((a - sum(pieces)).norm()) <= near * float(a.norm())
+
+
+@pytest.mark.parametrize("most", [1, 150, 700])
+def test_bands_make_the_same_picture(device, dtype, most):
+    """In parts as small as a tile, pictures are the same bits and gradients the same numbers."""
+    gaussians, cam, background = scene(dtype, device)
+    whole = rasterize(gaussians, cam, RasterizeOptions(background=background))
+    banded = rasterize(gaussians, cam, RasterizeOptions(background=background, max_instances=most))
+    assert int(whole.tile_counts.sum()) > 2 * most and torch.equal(whole.splats, banded.splats)
+    for name in ("rgb", "alpha", "depth"):
+        assert torch.equal(getattr(whole, name), getattr(banded, name)), name
+    upstream = torch.rand(2, SIZE[1], SIZE[0], 5, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 0.4
+    upstream = upstream.to(device, dtype)
+    near = 3e-5 if dtype is torch.float32 else 1e-12
+    pairs = [gradients(gaussians, cam, background, upstream, **o) for o in ({}, {"max_instances": most})]
+    for a, b in zip(*pairs):
+        assert float((a - b).norm()) <= near * float(a.norm())
+
+
+def test_bands_hold_no_more_instances_than_asked_for():
+    """Every part but a single tile keeps to the number; together they are the window."""
+    gaussians, cam, _ = scene(torch.float32, "cpu")
+    frame = Frame(*SIZE, (16, 16, 59, 37), 1, RULES["exact"], 16, 150)
+    found = list(parts(frame, (*gaussians.tensors().values(), cam.viewmat, cam.K)))
+    covered = torch.zeros(SIZE[1], SIZE[0], dtype=torch.int32)
+    for (x, y, width, height), counts in found:
+        covered[y : y + height, x : x + width] += 1
+        assert int(counts.sum()) <= 150 or (width <= 16 and height <= 16)
+    assert len(found) > 4 and bool((covered[16:, 16:] == 1).all()) and int(covered.sum()) == 59 * 37
+
+
+def test_sources_changed_before_the_gradient_are_noticed():
+    """A band that would be drawn from other Gaussians than the picture was is an error, not a wrong gradient."""
+    gaussians, cam, background = scene(torch.float32, "cpu")
+    g = leaves(gaussians)
+    r = rasterize(g, cam, RasterizeOptions(background=background, max_instances=100))
+    with torch.no_grad():
+        g.means.add_(1)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        r.rgb.sum().backward()
+
+
+@pytest.mark.parametrize("more", [{"contributions": True}, {"capacity": 100}, {"max_instances": 0}])
+def test_options_that_bands_exclude_are_refused(more):
+    """Said before anything is drawn."""
+    gaussians, cam, _ = scene(torch.float32, "cpu")
+    with pytest.raises(UsageError, match="max_instances must be at least 1"):
+        rasterize(gaussians, cam, RasterizeOptions(**{"max_instances": 10, **more}))
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
+from warpgs.bands import Frame, blend_in_bands
 from warpgs.constants import RULES, Rule
 from warpgs.errors import UsageError
 from warpgs.kernels.blend import blend, contributions
@@ -40,6 +41,10 @@ class RasterizeOptions:
     window: tuple[int, int, int, int] | None = None
     """Left, top, width and height [px] of the part to draw: the pictures are the crop of the whole ones, to the bit. Edges lie
     at multiples of ``tile_size`` or at the picture's. None for all."""
+    max_instances: int | None = None
+    """Draw a picture of more (Gaussian, tile) instances than this in bands that have no more, and each band again for its
+    gradients: the same picture in less memory and more time. None for all at once. Not with ``contributions`` or
+    ``capacity``."""
 
 
 def _checked_window(camera: Camera, options: RasterizeOptions) -> tuple[int, int, int, int]:
@@ -81,7 +86,7 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
     Raises:
         ResourceError: The Gaussians touch more tiles than memory allows.
         TypeError: A scalar type is neither float32 nor float64, or they differ.
-        UsageError: The rule's name or the tile size is unknown, or the window cuts tiles.
+        UsageError: The rule's name or the tile size is unknown, the window cuts tiles, or options exclude each other.
         ValueError: A shape or device disagrees; the message names argument, wanted and found.
     """
     rule = options.rule if isinstance(options.rule, Rule) else RULES.get(options.rule)
@@ -90,6 +95,9 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
     means = gaussians.means
     if options.tile_size not in TILE_SIZES:
         raise UsageError(f"tile size {options.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
+    most = options.max_instances
+    if most is not None and (options.contributions or options.capacity is not None or most < 1):
+        raise UsageError("max_instances must be at least 1 and goes neither with contributions nor with a capacity")
     viewmats, Ks = _as_batch(camera.viewmat, means, 4), _as_batch(camera.K, means, 3)
     background = means.new_zeros(3) if options.background is None else options.background
     background = torch.as_tensor(background, dtype=means.dtype, device=means.device)
@@ -102,16 +110,20 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
         *gaussians.tensors().values(), viewmats, Ks, width=camera.width, height=camera.height, degree=degree, rule=rule,
         tile_size=options.tile_size, window=window,
     )  # fmt: skip
+    if most is not None and int(tile_counts.sum()) > most:
+        frame = Frame(camera.width, camera.height, window, degree, rule, options.tile_size, most, options.deterministic)
+        pictures = blend_in_bands(splats, backgrounds, frame, (*gaussians.tensors().values(), viewmats, Ks))
+        return _render(camera, pictures, splats, tile_counts)
     overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=means.device)
     tiles = bin_tiles(
         splats, tile_counts, **size, tile_size=options.tile_size, rule=rule,
         budget_bytes=options.memory_budget, capacity=options.capacity, overflow=overflow, origin=(x, y),
     )  # fmt: skip
     how = {**size, "rule": rule, "origin": (x, y)}
-    rgb, alpha, depth = blend(splats, tiles, backgrounds, **how, deterministic=options.deterministic)
-    sums = maxima = None
-    if options.contributions:
-        sums, maxima = contributions(splats, tiles, **how)
-    if len(camera.viewmat.shape) == 2:
-        rgb, alpha, depth = rgb[0], alpha[0], depth[0]
-    return Render(rgb, alpha, depth, splats, tile_counts, sums, maxima, overflow)
+    pictures = blend(splats, tiles, backgrounds, **how, deterministic=options.deterministic)
+    weights = contributions(splats, tiles, **how) if options.contributions else (None, None)
+    return _render(camera, pictures, splats, tile_counts, *weights, overflow)
+
+
+def _render(camera: Camera, pictures: tuple[torch.Tensor, ...], *rest) -> Render:
+    return Render(*(p[0] if len(camera.viewmat.shape) == 2 else p for p in pictures), *rest)
