@@ -7,10 +7,11 @@ import pytest
 import torch
 
 import warpgs
+from tests.scenes import ring, three_gaussians
 from tests.splats import SMOOTH, camera, cloud, hand_placed, leaves
 from warpgs.errors import ResourceError, UsageError
 from warpgs.rasterizer import RasterizeOptions, rasterize
-from warpgs.scene import Camera
+from warpgs.scene import Camera, Gaussians
 
 
 def test_public_names_load_on_use():
@@ -140,3 +141,20 @@ def test_errors_name_the_cause(device):
         rasterize(gaussians, cam, RasterizeOptions(memory_budget=1))
     with pytest.raises(ValueError, match="at least 1 x 1"):
         rasterize(gaussians, Camera(cam.viewmat, cam.K, 0, 12))
+
+
+def test_opacity_factors_multiply_opacities_and_hide():
+    """The same picture and gradients as with those opacities, also in bands; 0 hides a Gaussian and leaves it no gradient."""
+    gaussians, camera = three_gaussians(), ring(3)[0]
+    factors = torch.tensor([0.5, 0.0, 1.0])
+    opacities = gaussians.logit_opacities.sigmoid() * factors
+    lower = dataclasses.replace(gaussians, logit_opacities=torch.logit(opacities))
+    leaves = [t.clone().requires_grad_() for t in gaussians.tensors().values()]
+    for most in (None, 4):
+        options = RasterizeOptions(opacity_factors=factors, max_instances=most)
+        render = rasterize(Gaussians(*leaves), camera, options)
+        assert torch.allclose(render.rgb, rasterize(lower, camera).rgb, atol=1e-6)
+        gradients = torch.autograd.grad(render.rgb.sum(), leaves)
+        assert all(bool(v[0].any()) and not bool(v[1].any()) for v in gradients if v.shape != (3, 4))
+    with pytest.raises(ValueError, match="opacity_factors"):
+        rasterize(gaussians, camera, RasterizeOptions(opacity_factors=torch.ones(2)))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
+from warpgs.bands import Frame, blend_in_bands
 from warpgs.constants import RULES, Rule
 from warpgs.errors import UsageError
 from warpgs.kernels.blend import blend, contributions
@@ -39,6 +40,27 @@ class RasterizeOptions:
     capacity: int | None = None
     """Room for this many (Gaussian, tile) instances instead of as many as there are. Nothing is then read back from the
     device, so the call can be captured in a CUDA graph; look at `Render.overflow` before using the result."""
+    window: tuple[int, int, int, int] | None = None
+    """Left, top, width and height [px] of the part to draw: the pictures are the crop of the whole ones, to the bit. Edges lie
+    at multiples of ``tile_size`` or at the picture's. None for all."""
+    max_instances: int | None = None
+    """Draw a picture of more (Gaussian, tile) instances than this in bands that have no more, and each band again for its
+    gradients: the same picture in less memory and more time. None for all at once. Not with ``contributions`` or
+    ``capacity``."""
+
+
+def _checked_window(camera: Camera, options: RasterizeOptions) -> tuple[int, int, int, int]:
+    width, height, side = camera.width, camera.height, options.tile_size
+    if options.window is None:
+        return 0, 0, width, height
+    x, y, w, h = options.window
+    inside = 0 <= x < x + w <= width and 0 <= y < y + h <= height
+    if not inside or x % side or y % side or ((x + w) % side and x + w != width) or ((y + h) % side and y + h != height):
+        raise UsageError(
+            f"window {options.window} does not fit: in a picture of {width} x {height} px its edges must lie at multiples of "
+            f"{side} px or at the picture's edges"
+        )
+    return x, y, w, h
 
 
 def _as_batch(array, like: torch.Tensor, rows: int) -> torch.Tensor:
@@ -66,7 +88,7 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
     Raises:
         ResourceError: The Gaussians touch more tiles than memory allows.
         TypeError: A scalar type is neither float32 nor float64, or they differ.
-        UsageError: The rule's name or the tile size is unknown.
+        UsageError: The rule's name or the tile size is unknown, the window cuts tiles, or options exclude each other.
         ValueError: A shape or device disagrees; the message names argument, wanted and found.
     """
     rule = options.rule if isinstance(options.rule, Rule) else RULES.get(options.rule)
@@ -75,26 +97,36 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
     means = gaussians.means
     if options.tile_size not in TILE_SIZES:
         raise UsageError(f"tile size {options.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
+    most = options.max_instances
+    if most is not None and (options.contributions or options.capacity is not None or most < 1):
+        raise UsageError("max_instances must be at least 1 and goes neither with contributions nor with a capacity")
     viewmats, Ks = _as_batch(camera.viewmat, means, 4), _as_batch(camera.K, means, 3)
     background = means.new_zeros(3) if options.background is None else options.background
     background = torch.as_tensor(background, dtype=means.dtype, device=means.device)
     backgrounds = background.expand(len(viewmats), 3) if background.ndim == 1 else background
-    size = {"width": camera.width, "height": camera.height}
+    x, y, width, height = window = _checked_window(camera, options)
+    size = {"width": width, "height": height}
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
 
     splats, tile_counts = project(
-        *gaussians.tensors().values(), viewmats, Ks, **size, degree=degree, rule=rule, tile_size=options.tile_size,
-        opacity_factors=options.opacity_factors,
+        *gaussians.tensors().values(), viewmats, Ks, width=camera.width, height=camera.height, degree=degree, rule=rule,
+        tile_size=options.tile_size, window=window, opacity_factors=options.opacity_factors,
     )  # fmt: skip
+    if most is not None and int(tile_counts.sum()) > most:
+        frame = Frame(camera.width, camera.height, window, degree, rule, options.tile_size, most, options.deterministic)
+        factors = () if options.opacity_factors is None else (options.opacity_factors,)
+        pictures = blend_in_bands(splats, backgrounds, frame, (*gaussians.tensors().values(), viewmats, Ks, *factors))
+        return _render(camera, pictures, splats, tile_counts)
     overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=means.device)
     tiles = bin_tiles(
         splats, tile_counts, **size, tile_size=options.tile_size, rule=rule,
-        budget_bytes=options.memory_budget, capacity=options.capacity, overflow=overflow,
+        budget_bytes=options.memory_budget, capacity=options.capacity, overflow=overflow, origin=(x, y),
     )  # fmt: skip
-    rgb, alpha, depth = blend(splats, tiles, backgrounds, **size, rule=rule, deterministic=options.deterministic)
-    sums = maxima = None
-    if options.contributions:
-        sums, maxima = contributions(splats, tiles, **size, rule=rule)
-    if len(camera.viewmat.shape) == 2:
-        rgb, alpha, depth = rgb[0], alpha[0], depth[0]
-    return Render(rgb, alpha, depth, splats, tile_counts, sums, maxima, overflow)
+    how = {**size, "rule": rule, "origin": (x, y)}
+    pictures = blend(splats, tiles, backgrounds, **how, deterministic=options.deterministic)
+    weights = contributions(splats, tiles, **how) if options.contributions else (None, None)
+    return _render(camera, pictures, splats, tile_counts, *weights, overflow)
+
+
+def _render(camera: Camera, pictures: tuple[torch.Tensor, ...], *rest) -> Render:
+    return Render(*(p[0] if len(camera.viewmat.shape) == 2 else p for p in pictures), *rest)

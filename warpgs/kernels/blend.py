@@ -70,22 +70,22 @@ def _tile_inputs(splats: torch.Tensor, tiles: Tiles, real) -> list[bridge.View]:
     ]
 
 
-def _frame(width: int, height: int, tile_size: int) -> list[int]:
+def _frame(origin: tuple[int, int], width: int, height: int, tile_size: int) -> list[int]:
     columns, rows = grid(width, height, tile_size)
-    return [width, height, columns, columns * rows]
+    return [*origin, width, height, columns, columns * rows]
 
 
-def _forward(splats, tiles, backgrounds, width, height, rule, keep, deterministic=True):
+def _forward(splats, tiles, backgrounds, origin, width, height, rule, keep, deterministic=True):
     """Pictures, and what the backward pass needs: rgb, alpha, depth, transmittances, weights, ends, states (CUDA only)."""
     if _native(splats):
-        return blend_cuda.forward(splats, tiles, backgrounds, width, height, rule, keep, deterministic)
+        return blend_cuda.forward(splats, tiles, backgrounds, origin, width, height, rule, keep, deterministic)
     real, device = bridge.real_of(splats), splats.device
     shape = (len(backgrounds), height, width)
     rgb = splats.new_empty(*shape, 3)
     alpha, depth, transmittances, weights = (splats.new_empty(shape) for _ in range(4))
     ends = torch.empty(shape, dtype=torch.int32, device=device)
     inputs = [
-        *_tile_inputs(splats, tiles, real), bridge.view(backgrounds, real), *_frame(width, height, tiles.size),
+        *_tile_inputs(splats, tiles, real), bridge.view(backgrounds, real), *_frame(origin, width, height, tiles.size),
         rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), rule.transmittance_stop, int(rule.inclusive_stop),
         bridge.view(rgb.view(-1, 3), real),
         *(bridge.view(t.view(-1), real) for t in (alpha, depth, transmittances, weights)),
@@ -95,7 +95,7 @@ def _forward(splats, tiles, backgrounds, width, height, rule, keep, deterministi
     return rgb, alpha, depth, transmittances, weights, ends, splats.new_empty(0)
 
 
-def _backward(splats, tiles, backgrounds, width, height, rule, _, saved, v_rgb, v_alpha, v_depth):
+def _backward(splats, tiles, backgrounds, origin, width, height, rule, _, saved, v_rgb, v_alpha, v_depth):
     """Gradient of the records by the generic kernels; ``saved`` as in blend_cuda.backward."""
     _, depth, transmittances, weights, ends, _ = saved
     real, device = bridge.real_of(splats), splats.device
@@ -106,7 +106,7 @@ def _backward(splats, tiles, backgrounds, width, height, rule, _, saved, v_rgb, 
         upstream.append(bridge.view((torch.zeros_like(depth) if v is None else v.contiguous()).view(-1), real))
     inputs = [
         *_tile_inputs(splats, tiles, real), bridge.view(tiles.slots, wp.int32), bridge.view(backgrounds, real),
-        *_frame(width, height, tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
+        *_frame(origin, width, height, tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
         *(bridge.view(t.view(-1), real) for t in (transmittances, weights, depth)), bridge.view(ends.view(-1), wp.int32),
         *upstream, bridge.view(v_slots, real),
     ]  # fmt: skip
@@ -121,14 +121,14 @@ def _backward(splats, tiles, backgrounds, width, height, rule, _, saved, v_rgb, 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, splats, backgrounds, tiles, width, height, rule, deterministic):
+    def forward(ctx, splats, backgrounds, tiles, origin, width, height, rule, deterministic):
         splats, backgrounds = splats.contiguous(), backgrounds.contiguous()
         keep = any(ctx.needs_input_grad)
-        rgb, alpha, depth, *rest = _forward(splats, tiles, backgrounds, width, height, rule, keep, deterministic)
+        rgb, alpha, depth, *rest = _forward(splats, tiles, backgrounds, origin, width, height, rule, keep, deterministic)
         if keep:
             # all of it as saved tensors: those are freed once the gradient is taken
             ctx.save_for_backward(splats, backgrounds, rgb, depth, *rest, *tiles.tensors())
-            ctx.tile_size, ctx.how = tiles.size, (width, height, rule, deterministic)
+            ctx.tile_size, ctx.how = tiles.size, (origin, width, height, rule, deterministic)
         ctx.set_materialize_grads(False)
         return rgb, alpha, depth
 
@@ -144,7 +144,7 @@ class _Blend(torch.autograd.Function):
             v_backgrounds = torch.einsum("chw,chwk->ck", saved[2], v_rgb)
         work = blend_cuda.backward if _native(splats) else _backward
         v_splats = work(splats, tiles, backgrounds, *ctx.how, saved, v_rgb, v_alpha, v_depth)
-        return v_splats, v_backgrounds, None, None, None, None, None
+        return v_splats, v_backgrounds, None, None, None, None, None, None
 
 
 def _check(splats: torch.Tensor, tiles: Tiles, width: int, height: int, **backgrounds) -> None:
@@ -166,6 +166,7 @@ def blend(
     height: int,
     rule: Rule,
     deterministic: bool = True,
+    origin: tuple[int, int] = (0, 0),
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Composite C images of H x W pixels (Kerbl et al. 2023, eq. 3; order and early stop as ``rule`` says).
 
@@ -181,6 +182,7 @@ def blend(
         rule: Cut-offs.
         deterministic: Sum gradients in a fixed order. False adds them atomically on CUDA in float32, which takes less memory
             and gives other bits each time; elsewhere it changes nothing.
+        origin: Left and top [px] of the window of that size which the tiles were made for.
 
     Returns:
         ``rgb`` [C, H, W, 3]; ``alpha`` [C, H, W], accumulated opacity; ``depth`` [C, H, W], the mean z-depth [u] under the
@@ -191,11 +193,11 @@ def blend(
         ValueError: A shape or device disagrees, or the tiles belong to another image size.
     """
     _check(splats, tiles, width, height, backgrounds=(backgrounds, "C 3"))
-    return _Blend.apply(splats, backgrounds, tiles, width, height, rule, deterministic)
+    return _Blend.apply(splats, backgrounds, tiles, origin, width, height, rule, deterministic)
 
 
 def contributions(
-    splats: torch.Tensor, tiles: Tiles, *, width: int, height: int, rule: Rule
+    splats: torch.Tensor, tiles: Tiles, *, width: int, height: int, rule: Rule, origin: tuple[int, int] = (0, 0)
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """How much each Gaussian shows in each image: sum and maximum over pixels of its weight alpha * T. Not differentiable.
 
@@ -205,6 +207,7 @@ def contributions(
         width: Image width [px].
         height: Image height [px].
         rule: Cut-offs.
+        origin: Left and top [px] of the window of that size which the tiles were made for.
 
     Returns:
         ``weight_sums`` [C, N] and ``weight_maxima`` [C, N].
@@ -216,13 +219,13 @@ def contributions(
     _check(splats, tiles, width, height)
     splats = splats.detach().contiguous()
     real, device = bridge.real_of(splats), splats.device
-    ends = _forward(splats, tiles, splats.new_zeros(len(splats), 3), width, height, rule, keep=False)[5]
+    ends = _forward(splats, tiles, splats.new_zeros(len(splats), 3), origin, width, height, rule, keep=False)[5]
     if _native(splats):
-        weights = blend_cuda.instance_weights(splats, tiles, width, height, rule, ends)
+        weights = blend_cuda.instance_weights(splats, tiles, origin, width, height, rule, ends)
     else:
         weights = splats.new_zeros(len(tiles.slots), 2)
         inputs = [
-            *_tile_inputs(splats, tiles, real), bridge.view(tiles.slots, wp.int32), *_frame(width, height, tiles.size),
+            *_tile_inputs(splats, tiles, real), bridge.view(tiles.slots, wp.int32), *_frame(origin, width, height, tiles.size),
             rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), bridge.view(ends.view(-1), wp.int32),
             bridge.view(weights, real),
         ]  # fmt: skip

@@ -40,7 +40,7 @@ def make_kernels(real, tile_size: int):
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def forward(
         begin: int, splats: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), splat_ids: wp.array(dtype=int),
-        backgrounds: wp.array2d(dtype=real), width: int, height: int, columns: int, tiles: int,
+        backgrounds: wp.array2d(dtype=real), origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
         alpha_cut: real, alpha_max: real, whole_tiles: int, stop: real, inclusive: int,
         # outputs
         rgb: wp.array2d(dtype=real), alpha_out: wp.array(dtype=real), depth: wp.array(dtype=real),
@@ -92,7 +92,7 @@ def make_kernels(real, tile_size: int):
                     break  # never; but a loop that may end early is not vectorised, which here would mean slow gathers
                 for k in range(10):
                     values[j * 10 + k] = splats[i, k]
-                rows = f.rows_of(splats[i, 1], splats[i, 11], whole_tiles, top)
+                rows = f.rows_of(splats[i, 1], splats[i, 11], whole_tiles, origin_y + top)
                 tops[j] = rows[0]
                 bottoms[j] = rows[1]
                 j += 1
@@ -120,8 +120,8 @@ def make_kernels(real, tile_size: int):
                         j = list[wp.max(k, 0)]
                         k += 1
                         v = wp.max(j * 10, 0)
-                        x0 = real(left) + real(0.5) - values[v]
-                        dy = real(top + row) + real(0.5) - values[v + 1]
+                        x0 = real(origin_x + left) + real(0.5) - values[v]
+                        dy = real(origin_y + top + row) + real(0.5) - values[v + 1]
                         u11 = values[v + 2]
                         e12 = values[v + 3] * dy
                         e2 = values[v + 4] * dy
@@ -178,7 +178,8 @@ def make_kernels(real, tile_size: int):
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def backward(
         begin: int, splats: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), splat_ids: wp.array(dtype=int),
-        slots: wp.array(dtype=int), backgrounds: wp.array2d(dtype=real), width: int, height: int, columns: int, tiles: int,
+        slots: wp.array(dtype=int), backgrounds: wp.array2d(dtype=real),
+        origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
         alpha_cut: real, alpha_max: real, whole_tiles: int,
         transmittances: wp.array(dtype=real), weights: wp.array(dtype=real), depth: wp.array(dtype=real),
         ends: wp.array(dtype=int),
@@ -247,8 +248,8 @@ def make_kernels(real, tile_size: int):
             c1 = splats[i, 7]
             c2 = splats[i, 8]
             distance = splats[i, 9]
-            rows = f.rows_of(my, splats[i, 11], whole_tiles, top)
-            x0 = real(left) + real(0.5) - mx
+            rows = f.rows_of(my, splats[i, 11], whole_tiles, origin_y + top)
+            x0 = real(origin_x + left) + real(0.5) - mx
             for lane in range(side):
                 ux[lane] = f.apart(u11 * (x0 + real(lane)))
                 s1[lane] = real(0.0)
@@ -262,7 +263,7 @@ def make_kernels(real, tile_size: int):
                 s_c2[lane] = real(0.0)
                 sz[lane] = real(0.0)
             for row in range(rows[0], rows[1]):
-                dy = real(top + row) + real(0.5) - my
+                dy = real(origin_y + top + row) + real(0.5) - my
                 e12 = u12 * dy
                 e2 = u22 * dy
                 e22 = e2 * e2
@@ -336,7 +337,7 @@ def make_kernels(real, tile_size: int):
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def contributions(
         begin: int, splats: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), splat_ids: wp.array(dtype=int),
-        slots: wp.array(dtype=int), width: int, height: int, columns: int, tiles: int,
+        slots: wp.array(dtype=int), origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
         alpha_cut: real, alpha_max: real, whole_tiles: int, ends: wp.array(dtype=int),
         # outputs, zero on entry: sum and maximum of the weight of each instance
         weights: wp.array2d(dtype=real),
@@ -358,14 +359,14 @@ def make_kernels(real, tile_size: int):
                 last = wp.max(last, end[p])
         for instance in range(ranges[tile, 0], last):
             i = splat_ids[instance]
-            rows = f.rows_of(splats[i, 1], splats[i, 11], whole_tiles, top)
-            x0 = real(left) + real(0.5) - splats[i, 0]
+            rows = f.rows_of(splats[i, 1], splats[i, 11], whole_tiles, origin_y + top)
+            x0 = real(origin_x + left) + real(0.5) - splats[i, 0]
             for lane in range(side):
                 ux[lane] = f.apart(splats[i, 2] * (x0 + real(lane)))
             weight_sum = real(0.0)
             weight_max = real(0.0)
             for row in range(rows[0], rows[1]):
-                dy = real(top + row) + real(0.5) - splats[i, 1]
+                dy = real(origin_y + top + row) + real(0.5) - splats[i, 1]
                 e12 = splats[i, 3] * dy
                 e2 = splats[i, 4] * dy
                 for lane in range(side):

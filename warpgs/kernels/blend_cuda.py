@@ -47,7 +47,8 @@ def make_kernels(tile_size: int):
     @wp.func_native(_source("forward", tile_size))
     def forward_body(
         item: int, splats: wp.array(dtype=float), order: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        splat_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float), width: int, height: int, columns: int, tiles: int,
+        splat_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
+        origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int, stop: float, inclusive: int, chunk: int,
         rgb: wp.array(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
         transmittances: wp.array(dtype=float), weights: wp.array(dtype=float), ends: wp.array(dtype=int),
@@ -60,7 +61,7 @@ def make_kernels(tile_size: int):
     @wp.func_native(_source("contributions", tile_size))
     def contributions_body(
         tile: int, splats: wp.array(dtype=float), ranges: wp.array(dtype=int), splat_ids: wp.array(dtype=int),
-        slots: wp.array(dtype=int), width: int, height: int, columns: int, tiles: int,
+        slots: wp.array(dtype=int), origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
         alpha_cut: float, alpha_max: float, ends: wp.array(dtype=int), instance_weights: wp.array(dtype=float),
     ): ...  # fmt: skip
 
@@ -70,7 +71,8 @@ def make_kernels(tile_size: int):
     @wp.kernel(**options)
     def forward(
         begin: int, splats: wp.array(dtype=float), order: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        splat_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float), width: int, height: int, columns: int, tiles: int,
+        splat_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
+        origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int, stop: float, inclusive: int, chunk: int,
         # outputs
         rgb: wp.array(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
@@ -78,7 +80,7 @@ def make_kernels(tile_size: int):
         states: wp.array(dtype=float),
     ):  # fmt: skip
         forward_body(
-            wp.tid() // 32, splats, order, ranges, splat_ids, backgrounds, width, height, columns, tiles,
+            wp.tid() // 32, splats, order, ranges, splat_ids, backgrounds, origin_x, origin_y, width, height, columns, tiles,
             alpha_cut, alpha_max, whole_tiles, stop, inclusive, chunk,
             rgb, alpha_out, depth, transmittances, weights, ends, states,
         )  # fmt: skip
@@ -94,13 +96,13 @@ def make_kernels(tile_size: int):
     @wp.kernel(**options)
     def contributions(
         begin: int, splats: wp.array(dtype=float), ranges: wp.array(dtype=int), splat_ids: wp.array(dtype=int),
-        slots: wp.array(dtype=int), width: int, height: int, columns: int, tiles: int,
+        slots: wp.array(dtype=int), origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
         alpha_cut: float, alpha_max: float, ends: wp.array(dtype=int),
         # outputs, zero on entry
         weights: wp.array(dtype=float),
     ):  # fmt: skip
         contributions_body(
-            wp.tid() // threads, splats, ranges, splat_ids, slots, width, height, columns, tiles,
+            wp.tid() // threads, splats, ranges, splat_ids, slots, origin_x, origin_y, width, height, columns, tiles,
             alpha_cut, alpha_max, ends, weights,
         )  # fmt: skip
 
@@ -119,7 +121,8 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
     def backward_body(
         item: int, splats: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
         splat_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
-        backgrounds: wp.array(dtype=float), width: int, height: int, columns: int, tiles: int, no_tile: int,
+        backgrounds: wp.array(dtype=float),
+        origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int, no_tile: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int,
         rgb: wp.array(dtype=float), depth: wp.array(dtype=float), transmittances: wp.array(dtype=float),
         weights: wp.array(dtype=float), ends: wp.array(dtype=int), states: wp.array(dtype=float),
@@ -142,7 +145,8 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
     def backward(
         begin: int, splats: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
         splat_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
-        backgrounds: wp.array(dtype=float), width: int, height: int, columns: int, tiles: int, no_tile: int,
+        backgrounds: wp.array(dtype=float),
+        origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int, no_tile: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int,
         rgb: wp.array(dtype=float), depth: wp.array(dtype=float), transmittances: wp.array(dtype=float),
         weights: wp.array(dtype=float), ends: wp.array(dtype=int), states: wp.array(dtype=float),
@@ -151,9 +155,9 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
         v_slots: wp.array(dtype=float),
     ):  # fmt: skip
         backward_body(
-            wp.tid() // 32, splats, keys, ranges, splat_ids, slots, totals, capacity, backgrounds, width, height, columns,
-            tiles, no_tile, alpha_cut, alpha_max, whole_tiles, rgb, depth, transmittances, weights, ends, states,
-            v_rgb, v_alpha, v_depth, v_slots,
+            wp.tid() // 32, splats, keys, ranges, splat_ids, slots, totals, capacity, backgrounds,
+            origin_x, origin_y, width, height, columns, tiles, no_tile, alpha_cut, alpha_max, whole_tiles,
+            rgb, depth, transmittances, weights, ends, states, v_rgb, v_alpha, v_depth, v_slots,
         )  # fmt: skip
 
     @wp.kernel(**options)
@@ -176,9 +180,9 @@ def _ints(*tensors: torch.Tensor) -> list[bridge.View]:
     return [bridge.view(t.view(-1), wp.int32) for t in tensors]
 
 
-def _frame(width: int, height: int, tile_size: int) -> list[int]:
+def _frame(origin: tuple[int, int], width: int, height: int, tile_size: int) -> list[int]:
     columns, rows = grid(width, height, tile_size)
-    return [width, height, columns, columns * rows]
+    return [*origin, width, height, columns, columns * rows]
 
 
 def chunk_of(tiles: Tiles, deterministic: bool) -> int:
@@ -186,7 +190,10 @@ def chunk_of(tiles: Tiles, deterministic: bool) -> int:
     return CHUNKS[int(tiles.ranges.shape[0] > MANY or not deterministic)]
 
 
-def forward(splats, tiles: Tiles, backgrounds, width: int, height: int, rule: Rule, keep: bool, deterministic: bool):
+def forward(
+    splats, tiles: Tiles, backgrounds, origin: tuple[int, int], width: int, height: int, rule: Rule, keep: bool,
+    deterministic: bool,
+):  # fmt: skip
     """Pictures and what the backward pass needs of them: rgb, alpha, depth, transmittances, weights, ends, states."""
     device = splats.device
     shape = (backgrounds.shape[0], height, width)
@@ -201,7 +208,7 @@ def forward(splats, tiles: Tiles, backgrounds, width: int, height: int, rule: Ru
     bridge.launch(k.order_tiles, 1024, [*_ints(tiles.ranges), count, *_ints(order)], device, block_dim=1024)
     inputs = [
         *_floats(splats), *_ints(order, tiles.ranges, tiles.splat_ids), *_floats(backgrounds),
-        *_frame(width, height, tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
+        *_frame(origin, width, height, tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
         rule.transmittance_stop, int(rule.inclusive_stop), chunk,
         *_floats(rgb, alpha, depth, transmittances, weights), *_ints(ends), *_floats(states),
     ]  # fmt: skip
@@ -210,8 +217,9 @@ def forward(splats, tiles: Tiles, backgrounds, width: int, height: int, rule: Ru
 
 
 def backward(
-    splats, tiles: Tiles, backgrounds, width: int, height: int, rule: Rule, deterministic: bool, saved, v_rgb, v_alpha, v_depth
-):
+    splats, tiles: Tiles, backgrounds, origin: tuple[int, int], width: int, height: int, rule: Rule, deterministic: bool,
+    saved, v_rgb, v_alpha, v_depth,
+):  # fmt: skip
     """Gradient of the records, shape [C, N, 12], from what `forward` returned and the gradients of its pictures."""
     rgb, depth, transmittances, weights, ends, states = saved
     device, count = splats.device, tiles.slots.shape[0]
@@ -226,7 +234,7 @@ def backward(
     v_slots = splats.new_empty(count, STRIDE) if deterministic else v_splats
     inputs = [
         *_floats(splats), *_ints(tiles.tile_ids, tiles.ranges, tiles.splat_ids, tiles.slots),
-        bridge.view(tiles.total, wp.int64), count, *_floats(backgrounds), *_frame(width, height, tiles.size),
+        bridge.view(tiles.total, wp.int64), count, *_floats(backgrounds), *_frame(origin, width, height, tiles.size),
         tiles.ranges.shape[0], rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
         *_floats(rgb, depth, transmittances, weights), *_ints(ends), *_floats(states),
         *_floats(v_rgb.contiguous(), v_alpha, v_depth, v_slots),
@@ -237,11 +245,11 @@ def backward(
     return v_splats
 
 
-def instance_weights(splats, tiles: Tiles, width: int, height: int, rule: Rule, ends) -> torch.Tensor:
+def instance_weights(splats, tiles: Tiles, origin: tuple[int, int], width: int, height: int, rule: Rule, ends) -> torch.Tensor:
     """Sum and maximum over a tile's pixels of the blending weight, for each instance at its slot, shape [M, 2]."""
     weights = splats.new_zeros(tiles.slots.shape[0], 2)
     inputs = [
-        *_floats(splats), *_ints(tiles.ranges, tiles.splat_ids, tiles.slots), *_frame(width, height, tiles.size),
+        *_floats(splats), *_ints(tiles.ranges, tiles.splat_ids, tiles.slots), *_frame(origin, width, height, tiles.size),
         rule.alpha_cut, rule.alpha_max, *_ints(ends), *_floats(weights),
     ]  # fmt: skip
     pixels = tiles.size * tiles.size

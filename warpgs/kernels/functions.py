@@ -214,18 +214,18 @@ def make_spans(real):
     vec2i = wp.types.vector(2, wp.int32)
 
     @wp.func
-    def pixel_range(lo: real, hi: real, size: wp.int32) -> vec2i:
-        """Pixels whose centres lie in [lo, hi], clipped to the image in floating point before the cast."""
-        limit = real(size)
-        first = wp.ceil(wp.clamp(lo - real(0.5), real(0.0), limit))
-        last = wp.floor(wp.clamp(hi - real(0.5), real(-1.0), limit - real(1.0)))
+    def pixel_range(lo: real, hi: real, begin: wp.int32, size: wp.int32) -> vec2i:
+        """Pixels from ``begin`` on whose centres lie in [lo, hi], clipped in floating point before the cast."""
+        limit = real(begin + size)
+        first = wp.ceil(wp.clamp(lo - real(0.5), real(begin), limit))
+        last = wp.floor(wp.clamp(hi - real(0.5), real(begin) - real(1.0), limit - real(1.0)))
         return vec2i(int(first), int(last))
 
     @wp.func
-    def tile_rows(my: real, half_height: real, height: wp.int32, tile_size: wp.int32) -> vec2i:
-        """First tile row and one past the last that [my - half_height, my + half_height] touches."""
+    def tile_rows(my: real, half_height: real, origin_y: wp.int32, height: wp.int32, tile_size: wp.int32) -> vec2i:
+        """First tile row of the picture, and one past the last, that my +- half_height touches within the window."""
         margin = real(0.01) + real(2.0e-6) * (wp.abs(my) + half_height)
-        rows = pixel_range(my - half_height - margin, my + half_height + margin, height)
+        rows = pixel_range(my - half_height - margin, my + half_height + margin, origin_y, height)
         if rows[1] < rows[0]:
             return vec2i(0, 0)
         return vec2i(rows[0] // tile_size, rows[1] // tile_size + 1)
@@ -233,7 +233,7 @@ def make_spans(real):
     @wp.func
     def tile_columns(
         mx: real, my: real, factor: vec3, reach: real, half_width: real, half_height: real,
-        row: wp.int32, width: wp.int32, tile_size: wp.int32,
+        row: wp.int32, origin_x: wp.int32, width: wp.int32, tile_size: wp.int32,
     ) -> vec2i:  # fmt: skip
         """First tile column and one past the last that the ellipse |U d| <= reach touches in a row of tiles.
 
@@ -257,7 +257,7 @@ def make_spans(real):
             dy = wp.clamp(-turn, top, bottom)
             e = factor[2] * dy
             left = (-wp.sqrt(wp.max(reach * reach - e * e, real(0.0))) - factor[1] * dy) / factor[0]
-        columns = pixel_range(mx + left - margin, mx + right + margin, width)
+        columns = pixel_range(mx + left - margin, mx + right + margin, origin_x, width)
         if columns[1] < columns[0]:
             return vec2i(0, 0)
         return vec2i(columns[0] // tile_size, columns[1] // tile_size + 1)

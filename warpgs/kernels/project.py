@@ -34,7 +34,8 @@ def make_forward(real, native: bool):
         means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
         logit_opacities: wp.array(dtype=real), opacity_factors: wp.array(dtype=real),
         coefficients: wp.array2d(dtype=m.vec3),
-        width: int, height: int, tile_size: int, sh_count: int,
+        width: int, height: int, origin_x: int, origin_y: int, window_width: int, window_height: int,
+        tile_size: int, sh_count: int,
         near: real, low_pass: real, alpha_cut: real, square_sigma: real, splats: wp.array2d(dtype=real),
     ):  # fmt: skip
         """Write the record of Gaussian n; returns the tiles it touches, 0 where it is culled and nothing is written."""
@@ -67,10 +68,12 @@ def make_forward(real, native: bool):
             half_width = reach * wp.sqrt(e.a) / e.shrink
             half_height = reach * wp.sqrt(e.c) / e.shrink
 
-        rows = s.tile_rows(e.pixel[1], half_height, height, tile_size)
+        rows = s.tile_rows(e.pixel[1], half_height, origin_y, window_height, tile_size)
         tiles = int(0)
         for row in range(rows[0], rows[1]):
-            columns = s.tile_columns(e.pixel[0], e.pixel[1], factor, reach, half_width, half_height, row, width, tile_size)
+            columns = s.tile_columns(
+                e.pixel[0], e.pixel[1], factor, reach, half_width, half_height, row, origin_x, window_width, tile_size
+            )
             tiles += columns[1] - columns[0]
         if tiles == 0:
             return 0
@@ -110,7 +113,8 @@ def make_forward(real, native: bool):
         means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
         logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
         viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33), opacity_factors: wp.array(dtype=real),
-        width: int, height: int, tile_size: int, sh_count: int,
+        width: int, height: int, origin_x: int, origin_y: int, window_width: int, window_height: int,
+        tile_size: int, sh_count: int,
         near: real, low_pass: real, alpha_cut: real, square_sigma: real,
         # outputs
         splats: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
@@ -121,7 +125,8 @@ def make_forward(real, native: bool):
         n = i - camera * count
         tiles = draw(
             i, n, viewmats[camera], Ks[camera], means, quats, log_scales, logit_opacities, opacity_factors, coefficients,
-            width, height, tile_size, sh_count, near, low_pass, alpha_cut, square_sigma, splats,
+            width, height, origin_x, origin_y, window_width, window_height, tile_size, sh_count,
+            near, low_pass, alpha_cut, square_sigma, splats,
         )  # fmt: skip
         tile_counts[i] = tiles
         if tiles == 0:
@@ -145,7 +150,7 @@ def _native(tensor: torch.Tensor) -> bool:
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx, means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks, factors, size, sh_count, rule, tile
+        ctx, means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks, factors, size, window, sh_count, rule, tile
     ):
         real = bridge.real_of(means)
         tensors = [t.contiguous() for t in (means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks)]
@@ -153,7 +158,7 @@ class _Project(torch.autograd.Function):
         splats = means.new_empty(count, RECORD)
         tile_counts = torch.empty(count, dtype=torch.int32, device=means.device)
         inputs = [
-            *_inputs(*tensors), bridge.view(factors, real), *size, tile, sh_count,
+            *_inputs(*tensors), bridge.view(factors, real), *size, *window, tile, sh_count,
             rule.near, rule.low_pass, rule.alpha_cut, rule.square_sigma,
             bridge.view(splats, real), bridge.view(tile_counts, wp.int32),
         ]  # fmt: skip
@@ -190,7 +195,7 @@ class _Project(torch.autograd.Function):
         threads = -(-count // BLOCK) * BLOCK if native else count
         bridge.launch(make_backward(real, native), threads, inputs, device, cost=10 * cameras, block_dim=BLOCK)
         camera_gradients = (v_viewmats.sum(1), v_Ks.sum(1)) if wants_camera else (None, None)
-        return *gradients, *camera_gradients, None, None, None, None, None
+        return *gradients, *camera_gradients, None, None, None, None, None, None
 
 
 def project(
@@ -208,6 +213,7 @@ def project(
     rule: Rule,
     tile_size: int = 16,
     opacity_factors: torch.Tensor | None = None,
+    window: tuple[int, int, int, int] | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Project N Gaussians into C cameras (EWA, first order).
 
@@ -230,6 +236,8 @@ def project(
         rule: Cut-offs.
         tile_size: Side of a tile [px].
         opacity_factors: Numbers that the opacities are multiplied by, at least 0, shape [N]; None for 1. Not differentiable.
+        window: Left, top, width and height [px] of the part of the image that is wanted, from a tile's corner on; None for all.
+            What touches no tile in it is culled.
 
     Returns:
         ``splats`` [C, N, 12], records laid out as ``RECORD`` says, and ``tile_counts`` [C, N] int32, the number of tiles
@@ -255,6 +263,6 @@ def project(
         bridge.check(means=(means, "N 3"), opacity_factors=(opacity_factors, "N"))
     factors = opacity_factors.detach().contiguous()
     return _Project.apply(
-        means, quats, log_scales, logit_opacities, sh_coefficients, viewmats, Ks, factors, (width, height), sh_count, rule,
-        tile_size,
+        means, quats, log_scales, logit_opacities, sh_coefficients, viewmats, Ks, factors,
+        (width, height), window or (0, 0, width, height), sh_count, rule, tile_size,
     )  # fmt: skip

@@ -150,22 +150,27 @@ def make_emit(real, native: bool):
 
     @wp.func
     def span_of(
-        splats: wp.array2d(dtype=real), i: int, row: int, alpha_cut: real, square_sigma: real, width: int, tile_size: int
-    ) -> vec2i:
+        splats: wp.array2d(dtype=real), i: int, row: int, alpha_cut: real, square_sigma: real,
+        origin_x: int, width: int, tile_size: int,
+    ) -> vec2i:  # fmt: skip
         factor = vec3(splats[i, 2], splats[i, 3], splats[i, 4])
         reach = s.reach_of(splats[i, 5], alpha_cut, square_sigma)
-        return s.tile_columns(splats[i, 0], splats[i, 1], factor, reach, splats[i, 10], splats[i, 11], row, width, tile_size)
+        return s.tile_columns(
+            splats[i, 0], splats[i, 1], factor, reach, splats[i, 10], splats[i, 11], row, origin_x, width, tile_size
+        )
 
     @wp.kernel(enable_backward=False, module=f"warpgs.kernels.tiles.emit.{real.__name__}.{int(native)}")
     def emit(
         begin: int, splats: wp.array2d(dtype=real), order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
-        ends: wp.array(dtype=wp.int64), count: int, per_camera: int, width: int, height: int, tile_size: int,
+        ends: wp.array(dtype=wp.int64), count: int, per_camera: int,
+        origin_x: int, origin_y: int, width: int, height: int, tile_size: int,
         alpha_cut: real, square_sigma: real, columns: int, tiles: int, no_tile: int, capacity: int,
         # outputs
         starts: wp.array(dtype=int), keys: wp.array(dtype=int), slots: wp.array(dtype=int), owners: wp.array(dtype=int),
         overflow: wp.array(dtype=int),
     ):  # fmt: skip
         j = begin + wp.tid()
+        corner = (origin_y // tile_size) * columns + origin_x // tile_size  # rows and columns count from the picture's corner
         i = int(0)
         touched = int(0)
         slot = int(0)
@@ -183,10 +188,10 @@ def make_emit(real, native: bool):
             slot = end - touched
             starts[i] = slot
         if touched > 0 and wp.static(SMALL if native else 2**31 - 1) >= touched:
-            rows = s.tile_rows(splats[i, 1], splats[i, 11], height, tile_size)
-            base = (i // per_camera) * tiles
+            rows = s.tile_rows(splats[i, 1], splats[i, 11], origin_y, height, tile_size)
+            base = (i // per_camera) * tiles - corner
             for row in range(rows[0], rows[1]):
-                span = span_of(splats, i, row, alpha_cut, square_sigma, width, tile_size)
+                span = span_of(splats, i, row, alpha_cut, square_sigma, origin_x, width, tile_size)
                 for column in range(span[0], span[1]):
                     if slot < end:
                         keys[slot] = base + row * columns + column
@@ -208,14 +213,14 @@ def make_emit(real, native: bool):
                 g = lanes.broadcast(i, owner)
                 at = lanes.broadcast(slot, owner)
                 last = lanes.broadcast(end, owner)
-                base = (g // per_camera) * tiles
-                rows = s.tile_rows(splats[g, 1], splats[g, 11], height, tile_size)
+                base = (g // per_camera) * tiles - corner
+                rows = s.tile_rows(splats[g, 1], splats[g, 11], origin_y, height, tile_size)
                 first = rows[0]
                 while first < rows[1]:
                     row = first + lane
                     span = vec2i(0, 0)
                     if row < rows[1]:
-                        span = span_of(splats, g, row, alpha_cut, square_sigma, width, tile_size)
+                        span = span_of(splats, g, row, alpha_cut, square_sigma, origin_x, width, tile_size)
                     wide = span[1] - span[0]
                     sum = lanes.running_sum(wide)
                     to = at + sum - wide
@@ -281,6 +286,7 @@ def bin_tiles(
     budget_bytes: int | None = None,
     capacity: int | None = None,
     overflow: torch.Tensor | None = None,
+    origin: tuple[int, int] = (0, 0),
 ) -> Tiles:
     """List for every tile the Gaussians that touch it, front to back. Not differentiable.
 
@@ -296,6 +302,7 @@ def bin_tiles(
             recorded once and replayed. What is over is marked as no tile's.
         overflow: Set to 1 where there are more instances than ``capacity``: the lists are then cut short and must not be
             used. Int32, shape [1]; needed with ``capacity``.
+        origin: Left and top [px] of the window of that width and height which `project` was given; a tile's corner.
 
     Returns:
         The sorted instances; M is ``capacity`` where one is given.
@@ -357,7 +364,7 @@ def bin_tiles(
         keys_view, slots_view, owners_view = (bridge.view(t, wp.int32) for t in (keys, slots, owners))
         inputs = [
             splats_view, order_view, counts_view, ends_view, visible, sizes["N"],
-            width, height, tile_size, rule.alpha_cut, rule.square_sigma, columns, tiles, no_tile, total,
+            *origin, width, height, tile_size, rule.alpha_cut, rule.square_sigma, columns, tiles, no_tile, total,
             bridge.view(starts, wp.int32), keys_view, slots_view, owners_view,
             bridge.view(overflow if fixed else starts, wp.int32),
         ]  # fmt: skip

@@ -35,7 +35,7 @@ while (top_instance > floor) {
     top_instance = first;
     const int camera = tile / tiles, in_camera = tile - camera * tiles;
     const int left = (in_camera % columns) * SIDE, top = (in_camera / columns) * SIDE;
-    const float px = left + lane % 8 + 0.5f, py = top + lane / 8 + 0.5f;  // of the pixel in the first block
+    const float px = origin_x + left + lane % 8 + 0.5f, py = origin_y + top + lane / 8 + 0.5f;  // of the pixel in the first block
     const float* background = backgrounds.data + 3 * camera;
     float T[BLOCKS], behind[BLOCKS], g0[BLOCKS], g1[BLOCKS], g2[BLOCKS], vz[BLOCKS], vw[BLOCKS];
     int last[BLOCKS];
@@ -103,7 +103,8 @@ while (top_instance > floor) {
                 const float limit = limit_of(s.b.y, alpha_cut);
                 #pragma unroll
                 for (int k = 0; k < BLOCKS; ++k)
-                    if (whole_tiles || s.touches((float)(left + (k % WIDE) * 8), (float)(top + (k / WIDE) * 4), limit))
+                    if (whole_tiles || s.touches(
+                            (float)(origin_x + left + (k % WIDE) * 8), (float)(origin_y + top + (k / WIDE) * 4), limit))
                         mask |= 1u << k;
                 s_a[warp][lane] = s.a;
                 s_b[warp][lane] = s.b;

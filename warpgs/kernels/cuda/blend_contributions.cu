@@ -6,7 +6,7 @@ const int t = threadIdx.x, block = t / 32;
 const int camera = tile / tiles, in_camera = tile - camera * tiles;
 const int x = (in_camera % columns) * SIDE + (block % WIDE) * 8 + lane % 8;
 const int y = (in_camera / columns) * SIDE + (block / WIDE) * 4 + lane / 8;
-const float px = x + 0.5f, py = y + 0.5f;
+const float px = origin_x + x + 0.5f, py = origin_y + y + 0.5f;
 const int last = x < width && y < height ? ends.data[((long long)camera * height + y) * width + x] : 0;
 float T = 1.0f;
 const int begin = ranges.data[2 * tile], end = ranges.data[2 * tile + 1];

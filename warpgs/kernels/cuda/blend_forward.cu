@@ -9,7 +9,7 @@ const int left = (in_camera % columns) * SIDE + (block % WIDE) * 8, top = (in_ca
 const int x = left + lane % 8, y = top + lane / 8;
 const bool inside = x < width && y < height;
 const long long o = ((long long)camera * height + y) * width + x;
-const float px = x + 0.5f, py = y + 0.5f;
+const float px = origin_x + x + 0.5f, py = origin_y + y + 0.5f;
 float T = 1.0f, red = 0.0f, green = 0.0f, blue = 0.0f, z = 0.0f, total = 0.0f;
 int last = 0;
 bool done = !inside;
@@ -33,7 +33,7 @@ for (int batch = begin & ~31; batch < end; batch += 32) {
     bool touched = false;
     if (i >= begin && i < end) {
         s.rescale();
-        touched = whole_tiles || s.touches((float)left, (float)top, limit_of(s.b.y, alpha_cut));
+        touched = whole_tiles || s.touches((float)(origin_x + left), (float)(origin_y + top), limit_of(s.b.y, alpha_cut));
     }
     const unsigned mask = __ballot_sync(ALL, touched);
     const int slot = __popc(mask & ((1u << lane) - 1u));
