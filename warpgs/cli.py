@@ -17,6 +17,7 @@ COMMANDS = {
     "eval": "score a run again on its held-out views",
     "render": "render a run: its views, an orbit or a spiral, as PNG and mp4",
     "export": "write a run's Gaussians to a PLY file",
+    "convert-lpips": "join published LPIPS weights into the file that --lpips-weights takes",
     "demo": "write a synthetic scene to try things with",
     "doctor": "say what this machine has, what is missing, and how to get it",
 }
@@ -239,7 +240,16 @@ def _doctor(arguments: list[str]) -> int:
     return print_report(diagnose())
 
 
-RUN = {"fit": _fit, "eval": _eval, "render": _render, "export": _export, "demo": _demo, "doctor": _doctor}
+def _convert_lpips(arguments: list[str]) -> int:
+    from warpgs.cli_studies import convert_lpips
+
+    return convert_lpips(arguments, COMMANDS["convert-lpips"])
+
+
+RUN = {
+    "fit": _fit, "eval": _eval, "render": _render, "export": _export, "convert-lpips": _convert_lpips, "demo": _demo,
+    "doctor": _doctor,
+}  # fmt: skip
 
 
 def main(arguments: list[str] | None = None) -> int:
