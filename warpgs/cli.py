@@ -90,6 +90,10 @@ def _fit_arguments(arguments: list[str]):
         """Let transforms.json name files outside the scene folder."""
         invert_masks: bool = False
         """White in a mask removes a pixel."""
+        score_masks: Path | None = None
+        """Folder of object masks for scoring, matched by image id; the scene's idrmasks where not given."""
+        lpips_weights: Path | None = None
+        """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
         rule: str = base.rule
         """Cut-offs of the rasterizer: exact, gsplat or inria."""
         sh_every: int = base.sh_every
@@ -139,8 +143,9 @@ def _fit(arguments: list[str]) -> int:
     settings = config(device.type)
     if a.steps is None:
         print(f"preset {settings.preset}, {settings.steps} steps, as usual on {device.type}; --steps changes that")
-    scene = SceneRequest(str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.invert_masks)
-    fit_scene(FitRequest(scene, a.out, settings, a.device, a.resume))
+    masks = None if a.score_masks is None else str(a.score_masks.resolve())
+    scene = SceneRequest(str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.invert_masks, masks)
+    fit_scene(FitRequest(scene, a.out, settings, a.device, a.resume, a.lpips_weights))
     return 0
 
 
@@ -153,11 +158,13 @@ def _eval(arguments: list[str]) -> int:
         """Run folder of `warpgs fit`."""
         device: str = "auto"
         """auto, cpu or cuda."""
+        lpips_weights: Path | None = None
+        """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
 
     a = _parse(Eval, "eval", arguments)
     from warpgs.pipeline.reuse import evaluate
 
-    for line in evaluate(a.run, a.device):
+    for line in evaluate(a.run, a.device, a.lpips_weights):
         print(line)
     return 0
 
