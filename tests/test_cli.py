@@ -8,10 +8,12 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 
 from warpgs.cli import main
 from warpgs.demo import split_spec, write_demo
 from warpgs.export.ply import read_ply
+from warpgs.pipeline.lpips_weights import NETS, convert_lpips
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +52,13 @@ def test_run_folder_holds_what_it_promises(run):
     assert len((run / "metrics.jsonl").read_text().splitlines()) == 40
     for name in config["test"]:
         assert (run / "renders" / name).is_file() and (run / "depth" / name).is_file()
+    protocol = metrics["protocol"]
+    assert protocol["split"] == split_spec(9) and protocol["ground_truth"] == "images as stored"
+    assert protocol["resolution"] == ["64 x 48"] and protocol["held_out_views"] == len(config["test"])
+    assert metrics["variants"]["lpips"].startswith("not measured") and "8 bits" in metrics["variants"]["psnr"]
+    assert metrics["config_hash"] == config["config_hash"]
     page = (run / "report.html").read_text()
+    assert "images as stored" in page and "not measured" in page and metrics["config_hash"] in page
     assert f"{metrics['test']['psnr']:.2f} dB" in page and "points of the reconstruction" in page
     assert len(read_ply(run / "point_cloud.ply")) == metrics["gaussians"]
 
@@ -61,6 +69,23 @@ def test_eval_repeats_the_scores(run, capsys):
     metrics = json.loads((run / "metrics.json").read_text())
     assert f"PSNR {metrics['test']['psnr']:.2f} dB" in capsys.readouterr().out.splitlines()[-1]
     assert json.loads((run / "eval.json").read_text())["test"] == metrics["test"]
+
+
+def test_eval_measures_lpips(run, tmp_path, capsys):
+    """With weights the figures stand in eval.json, named by net and mode; a file that holds none is refused first."""
+    torch.manual_seed(0)
+    net = NETS["alex"]
+    state = {name: torch.randn(shape).abs() / 10 for name, shape in net.shapes().items()}
+    torch.save({k: v for k, v in state.items() if k.startswith("features")}, tmp_path / "b.pth")
+    torch.save({k: v for k, v in state.items() if k.startswith("lin")}, tmp_path / "h.pth")
+    convert_lpips(tmp_path / "b.pth", tmp_path / "h.pth", tmp_path / "l.safetensors")
+    assert main(["eval", str(run), "--device", "cpu", "--lpips-weights", str(tmp_path / "l.safetensors")]) == 0
+    assert "LPIPS-Alex, [0, 1]" in capsys.readouterr().out
+    result = json.loads((run / "eval.json").read_text())
+    assert result["test"]["lpips_alex_legacy"] == pytest.approx(np.mean([v["lpips_alex_legacy"] for v in result["views"]]))
+    assert "[-1, 1]" in result["variants"]["lpips_alex_standard"] and result["steps"] == 40 and len(result["config_hash"]) == 12
+    foreign = str(run / "point_cloud.ply")
+    assert "warpgs convert-lpips" in failure(capsys, 3, "eval", str(run), "--lpips-weights", foreign)
 
 
 @pytest.mark.parametrize(("path", "pictures"), [("orbit", 4), ("spiral", 4), ("views", 9)])

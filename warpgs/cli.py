@@ -17,6 +17,7 @@ COMMANDS = {
     "eval": "score a run again on its held-out views",
     "render": "render a run: its views, an orbit or a spiral, as PNG and mp4",
     "export": "write a run's Gaussians to a PLY file",
+    "convert-lpips": "join published LPIPS weights into the file that --lpips-weights takes",
     "demo": "write a synthetic scene to try things with",
     "doctor": "say what this machine has, what is missing, and how to get it",
 }
@@ -91,6 +92,10 @@ def _fit_arguments(arguments: list[str]):
         """Let transforms.json name files outside the scene folder."""
         invert_masks: bool = False
         """White in a mask removes a pixel."""
+        score_masks: Path | None = None
+        """Folder of object masks for scoring, matched by image id; the scene's idrmasks where not given."""
+        lpips_weights: Path | None = None
+        """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
         rule: str = base.rule
         """Cut-offs of the rasterizer: exact, gsplat or inria."""
         sh_every: int = base.sh_every
@@ -147,8 +152,9 @@ def _fit(arguments: list[str]) -> int:
     settings = config(device.type)
     if a.steps is None:
         print(f"preset {settings.preset}, {settings.steps} steps, as usual on {device.type}; --steps changes that")
-    scene = SceneRequest(str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.invert_masks)
-    fit_scene(FitRequest(scene, a.out, settings, a.device, a.resume))
+    masks = None if a.score_masks is None else str(a.score_masks.resolve())
+    scene = SceneRequest(str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.invert_masks, masks)
+    fit_scene(FitRequest(scene, a.out, settings, a.device, a.resume, a.lpips_weights))
     return 0
 
 
@@ -161,11 +167,13 @@ def _eval(arguments: list[str]) -> int:
         """Run folder of `warpgs fit`."""
         device: str = "auto"
         """auto, cpu or cuda."""
+        lpips_weights: Path | None = None
+        """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
 
     a = _parse(Eval, "eval", arguments)
     from warpgs.pipeline.reuse import evaluate
 
-    for line in evaluate(a.run, a.device):
+    for line in evaluate(a.run, a.device, a.lpips_weights):
         print(line)
     return 0
 
@@ -248,7 +256,16 @@ def _doctor(arguments: list[str]) -> int:
     return print_report(diagnose())
 
 
-RUN = {"fit": _fit, "eval": _eval, "render": _render, "export": _export, "demo": _demo, "doctor": _doctor}
+def _convert_lpips(arguments: list[str]) -> int:
+    from warpgs.cli_studies import convert_lpips
+
+    return convert_lpips(arguments, COMMANDS["convert-lpips"])
+
+
+RUN = {
+    "fit": _fit, "eval": _eval, "render": _render, "export": _export, "convert-lpips": _convert_lpips, "demo": _demo,
+    "doctor": _doctor,
+}  # fmt: skip
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -52,6 +52,8 @@ class View:
     """Colours in [0, 1], float32, shape [H, W, 3]."""
     mask: np.ndarray | None = None
     """True where the pixel counts, bool, shape [H, W]; None where every pixel counts."""
+    score_mask: np.ndarray | None = None
+    """True where a rendering is scored, bool, shape [H, W], and no say in the fit; None where ``mask`` decides both."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,9 @@ class Scene:
     """SHA-256 over names, cameras and pixels, hexadecimal: the same data gives the same fingerprint."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Colour behind the scene that the format implies (white for Blender's transparent images)."""
+    pixels: str = ""
+    """Where the pixels come from: the image folder, and whether they are as stored or area-resampled. Scores against
+    `images_8` and against `images` resampled by 8 do not compare."""
 
     def view(self, name: str) -> View:
         """The view of that name; KeyError where there is none."""

@@ -43,6 +43,38 @@ def test_llff_protocol(kind, views, k, train):
     assert ids(split.test) == list(range(0, views, 8))
 
 
+LLFF = {
+    "fern": (20, 3, [1, 10, 19]), "flower": (34, 5, [1, 17, 33]), "fortress": (42, 6, [1, 21, 41]),
+    "horns": (62, 8, [1, 30, 61]), "leaves": (26, 4, [1, 12, 25]), "orchids": (25, 4, [1, 12, 23]),
+    "room": (41, 6, [1, 20, 39]), "trex": (55, 7, [1, 28, 54]),
+}  # fmt: skip
+"""Photographs, held-out views and 3-view training ids of the eight scenes; rounding half up would give others for horns and
+leaves, whose middle falls on 26.5 and 10.5 of the pool."""
+
+
+@pytest.mark.parametrize("name", LLFF)
+def test_llff_tables(name):
+    views, held_out, train = LLFF[name]
+    split = split_views(numbered(views), "llff:3")
+    assert ids(split.train) == train and len(split.test) == held_out
+
+
+@pytest.mark.parametrize(
+    "spec,views,train",
+    [
+        ("llff:6", 20, [1, 4, 7, 12, 15, 19]),  # places 0, 3.2, 6.4, 9.6, 12.8, 16 of 1-7, 9-15, 17-19
+        ("llff:9", 20, [1, 3, 5, 7, 10, 12, 14, 17, 19]),
+        ("mip360:24", 185, [
+            1, 9, 17, 25, 33, 41, 49, 57, 65, 73, 81, 89, 95, 103, 111, 119, 127, 135, 143, 151, 159, 167, 175, 183,
+        ]),  # garden
+        ("mip360:12", 185, [1, 18, 34, 51, 67, 84, 100, 117, 133, 150, 166, 183]),
+    ],
+)  # fmt: skip
+def test_more_views_come_from_the_same_pool(spec, views, train):
+    split = split_views(numbered(views), spec)
+    assert ids(split.train) == train and ids(split.test) == list(range(0, views, 8))
+
+
 def test_llff_rounds_half_to_even():
     # pool of 6 (1..6 of 7 views): linspace(0, 5, 3) has 2.5 in the middle, which goes to 2, the third of the pool
     assert ids(split_views(numbered(7), "llff:3").train) == [1, 3, 6]
@@ -60,6 +92,27 @@ def test_dtu_protocol(views):
     for k in (3, 6, 9):
         split = split_views(numbered(views), f"dtu:{k}")
         assert ids(split.train) == train[:k] and ids(split.test) == test
+
+
+@pytest.mark.parametrize("form", ["rect_{:03d}_3_r5000.png", "images/{:03d}.png"])
+def test_dtu_ids_are_those_of_the_names(form):
+    """DTU's own names, and files renamed to count from one, give the same views as files that count from zero."""
+    split = split_views(scene_of([form.format(i + 1) for i in range(49)]), "dtu:3")
+    assert split.train == tuple(form.format(i + 1) for i in (25, 22, 28)) and split.test[0] == form.format(2)
+
+
+def test_dtu_scan_with_a_gap_is_refused():
+    """64 photographs less one would still be enough, with every id after the gap shifted by one."""
+    names = [f"rect_{i + 1:03d}_3_r5000.png" for i in range(64)]
+    with pytest.raises(DataError, match=r"with the ids 10 are missing .* rect_001_3_r5000.png to rect_064"):
+        split_views(scene_of(names[:10] + names[11:]), "dtu:3")
+    with pytest.raises(DataError, match=r"with the ids 0 are missing"):
+        split_views(scene_of(names[1:]), "dtu:3")
+
+
+def test_dtu_names_without_numbers_are_counted_in_sorted_order():
+    names = [a + b for a in "abcdefg" for b in "abcdefg"]
+    assert split_views(scene_of(names), "dtu:3").train == (names[25], names[22], names[28])
 
 
 def test_blender_protocol_counts_frames_not_names():

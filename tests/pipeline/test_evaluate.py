@@ -4,11 +4,12 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
 from tests.scenes import photographs, ring
 from warpgs.errors import UsageError
 from warpgs.geometry import back_project, camera_extent, focus_point, in_image, project_points
-from warpgs.pipeline.evaluate import guesses, psnr, score, summarize, to_8_bit
+from warpgs.pipeline.evaluate import guesses, psnr, score, summarize, to_8_bit, variants
 from warpgs.pipeline.paths import camera_path
 from warpgs.pipeline.region import counted_region
 from warpgs.scene import View
@@ -45,6 +46,60 @@ def test_counted_region():
     mask = np.zeros(view.image.shape[:2], bool)
     mask[0] = True
     assert counted_region(View("a", view.camera, dark, mask))[1] == "mask"
+
+
+class Witness:
+    """Stands in for LPIPS and keeps what it was given."""
+
+    def measure(self, image, target):
+        self.seen = (image, target)
+        return {"lpips_vgg_legacy": 0.25, "lpips_vgg_standard": float("nan")}
+
+
+@pytest.mark.parametrize("kind", ["mask", "score_mask"])
+def test_masked_view_is_scored_by_the_dtu_recipe(kind):
+    """PSNR over the mask alone; SSIM and LPIPS on both images with white outside, so what stands there cannot matter."""
+    view = photographs(1)[0]
+    mask = np.zeros(view.image.shape[:2], bool)
+    mask[8:24, 10:30] = True
+    rng = np.random.default_rng(0)
+    image = view.image + 0.1 * mask[..., None].astype(np.float32)
+    scores = []
+    for filling in (0.0, 1.0):
+        truth, render = view.image.copy(), image.copy()
+        truth[~mask], render[~mask] = filling, rng.random((int((~mask).sum()), 3))
+        witness = Witness()
+        scores.append(score(View("a", view.camera, truth, **{kind: mask}), render, witness))
+        assert all((i[~mask] == 1).all() for i in witness.seen)
+        assert np.array_equal(witness.seen[1][mask], to_8_bit(view.image)[mask])
+    a, b = scores
+    assert (a.psnr, a.ssim, a.ssim_skimage) == (b.psnr, b.ssim, b.ssim_skimage) and a.region == kind.replace("_", " ")
+    expected = np.mean((to_8_bit(image)[mask].astype(float) - to_8_bit(view.image)[mask]) ** 2)
+    assert a.psnr == pytest.approx(-10 * math.log10(expected), abs=1e-4) and a.ssim < 1
+    from tests.reference.ssim import ssim_reference  # the same figure, from images composited here
+
+    pair = [torch.from_numpy(np.where(mask[..., None], to_8_bit(i), 1)).double() for i in (image, view.image)]
+    assert a.ssim == pytest.approx(float(ssim_reference(*pair).mean()), abs=1e-5)
+
+
+def test_score_mask_wins_over_the_mask_of_the_fit():
+    """The protocol's mask decides the score, whatever the fit was allowed to see."""
+    view = photographs(1)[0]
+    left, right = np.zeros((2, *view.image.shape[:2]), bool)
+    left[:, :20], right[:, 20:] = True, True
+    image = view.image.copy()
+    image[:, :20] = 1
+    assert score(View("a", view.camera, view.image, left, right), image).psnr == math.inf
+
+
+def test_lpips_joins_the_figures():
+    """Measured: in the row and the means, by variant; not measured: no figure, and the words say so."""
+    view = photographs(1)[0]
+    m = score(view, view.image, Witness())
+    assert m.row()["lpips_vgg_legacy"] == 0.25 and "lpips" not in m.row()
+    assert summarize([m, m])["lpips_vgg_legacy"] == 0.25
+    assert "lpips_vgg_legacy" not in summarize([score(view, view.image)])
+    assert "not measured" in variants(None)["lpips"]
 
 
 def test_guesses():

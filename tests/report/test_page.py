@@ -60,7 +60,8 @@ def write(path, **changes):
         "notes": ["every 8th view held out", "downscaled by 2"],
         "table": [["view", "PSNR [dB]"], ["images/0.png", "20.25"], ["images/1.png", "21.25"]],
         "views": views, "curves": [curve("Training loss", [1, 2, 3], [0.3, 0.2, 0.1])],
-        "overview": picture(0.7), "details": {"config": {"steps": 2000}, "versions": {"torch": "2"}},
+        "overview": picture(0.7), "protocol": {"ground truth": "images_8 as stored", "LPIPS": "not measured"},
+        "details": {"config": {"steps": 2000}, "versions": {"torch": "2"}},
     }  # fmt: skip
     values |= changes
     write_page(path, **values)
@@ -96,6 +97,7 @@ def test_every_number_given_is_shown_as_given(tmp_path):
     cells = [c for row in values["table"] for c in row]
     assert page.text("th", "td") == cells
     assert page.text("li") == values["notes"]
+    assert dict(zip(page.text("dt"), page.text("dd"))) == values["protocol"]
     captions = " ".join(page.text("figcaption"))
     assert all(v.caption in captions and v.name in shown for v in values["views"])
     assert json.loads("".join(page.text("pre"))) == values["details"]
@@ -121,7 +123,7 @@ def test_names_from_files_cannot_become_markup(tmp_path):
 
 
 def test_parts_that_are_not_there_leave_no_empty_heading(tmp_path):
-    _, _, page = write(tmp_path / "report.html", notes=[], table=[["view"]], views=[], curves=[], overview=None)
+    _, _, page = write(tmp_path / "report.html", notes=[], table=[["view"]], views=[], curves=[], overview=None, protocol={})
     assert page.text("h2") == ["Settings"] and not page.all("img")
 
 

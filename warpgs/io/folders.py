@@ -106,6 +106,21 @@ def image_folder(root: Path, downscale: int, base: str = "images") -> tuple[Path
     return largest, downscale, f"there is no full-size folder '{base}': images taken from {largest.name}{how}"
 
 
+def pixel_source(root: Path, downscale: int, by_folder: bool) -> str:
+    """Where a scene's pixels come from, for result files: the folder, and whether they are as stored or area-resampled.
+
+    Args:
+        root: The scene folder.
+        downscale: Factor by which both sides shrink.
+        by_folder: The format takes a ready-made `images_N` (`image_folder`); others always read what the scene names.
+    """
+    name, factor = "images", downscale
+    if by_folder:
+        folder, factor, _ = image_folder(root, downscale)
+        name = folder.name
+    return f"{name} area-resampled by {factor}" if factor > 1 else f"{name} as stored"
+
+
 class ViewList:
     """The views of a scene as they are read, and a count of what was done to them."""
 

@@ -7,7 +7,9 @@ from pathlib import Path
 from warpgs.errors import DataError, UsageError
 from warpgs.io import colmap, dtu, llff, middlebury, transforms
 from warpgs.io.detect import detect
+from warpgs.io.folders import pixel_source
 from warpgs.io.normalize import fingerprint, normalization_of, normalize_points, normalize_view
+from warpgs.io.score_masks import FOLDER, add_score_masks
 from warpgs.scene import Scene, View
 
 READERS = {
@@ -16,7 +18,13 @@ READERS = {
 
 
 def load_scene(
-    path: str | Path, *, downscale: int = 1, strict: bool = False, allow_outside: bool = False, invert_masks: bool = False
+    path: str | Path,
+    *,
+    downscale: int = 1,
+    strict: bool = False,
+    allow_outside: bool = False,
+    invert_masks: bool = False,
+    score_masks: str | Path | None = None,
 ) -> Scene:
     """Read a scene folder of any supported format.
 
@@ -29,6 +37,8 @@ def load_scene(
         strict: A frame without an image file is an error instead of a note.
         allow_outside: Let the scene name image files outside its folder.
         invert_masks: White in a mask file removes a pixel instead of keeping it.
+        score_masks: Folder with object masks for scoring, matched by image id; None for `idrmasks` in the scene folder where
+            there is one.
 
     Returns:
         The scene.
@@ -42,13 +52,13 @@ def load_scene(
     options = {"downscale": downscale, "strict": strict, "allow_outside": allow_outside, "invert_masks": invert_masks}
     root = Path(path)
     try:
-        return _read(root, options)
+        return _read(root, options, score_masks)
     except OSError as e:
         # folders without permission, names too long for the file system, disks that fail
         raise DataError(f"{e.filename or root}: cannot be read ({e.strerror or e}); mend its permissions or copy it") from e
 
 
-def _read(root: Path, options: dict) -> Scene:
+def _read(root: Path, options: dict, score_masks: str | Path | None) -> Scene:
     name, notes = detect(root)
     views, points, more = READERS[name](root, **options)
     if len(views) < 2:
@@ -62,6 +72,9 @@ def _read(root: Path, options: dict) -> Scene:
     views = [normalize_view(v, n) for v in sorted(views, key=lambda v: v.name)]
     if points is not None:
         points = normalize_points(points, n)
+    if score_masks is not None or (root / FOLDER).is_dir():
+        views, note = add_score_masks(views, Path(score_masks) if score_masks is not None else root / FOLDER)
+        more = [*more, note]
     blender = name == "transforms" and transforms.is_blender(root)
     return Scene(
         path=str(root),
@@ -72,6 +85,7 @@ def _read(root: Path, options: dict) -> Scene:
         notes=(*notes, *more),
         fingerprint=fingerprint(views),
         background=transforms.WHITE if blender else (0.0, 0.0, 0.0),
+        pixels=pixel_source(root, options["downscale"], name in ("colmap", "llff")),
     )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import camera_extent
+from warpgs.io.image_ids import protocol_ids
 from warpgs.scene import Scene
 
 DTU_TRAIN = (25, 22, 28, 40, 44, 48, 0, 8, 13)
@@ -57,12 +58,8 @@ def _every_8th(names: list[str], count: int, spec: str) -> Split:
 def _dtu(names: list[str], count: int, spec: str) -> Split:
     if count not in (3, 6, 9):
         raise UsageError(f"split {spec!r}: the DTU protocol has 3, 6 or 9 training views; use dtu:3, dtu:6 or dtu:9")
-    if len(names) < DTU_VIEWS:
-        raise DataError(
-            f"split {spec}: the DTU protocol picks from {DTU_VIEWS} views, this scene has {len(names)}; restore the scan, or "
-            "use llff:K or every:N"
-        )
-    return Split(tuple(names[i] for i in DTU_TRAIN[:count]), tuple(names[i] for i in DTU_TEST))
+    found = protocol_ids(names, DTU_TRAIN[:count] + DTU_TEST, DTU_VIEWS, f"split {spec}")
+    return Split(tuple(found[i] for i in DTU_TRAIN[:count]), tuple(found[i] for i in DTU_TEST))
 
 
 def _frame_number(name: str) -> tuple[int, str]:

@@ -1,4 +1,4 @@
-"""Which pixels of a photograph count: those of its mask, or the object where it stands before black."""
+"""Which pixels of a photograph count, for the fit and for the score: its mask's, or the object where it stands before black."""
 
 from __future__ import annotations
 
@@ -10,6 +10,16 @@ DARK = 16 / 255
 """A pixel whose brightest channel is below this belongs to a black background."""
 DARK_SHARE = 0.3
 """A photograph with at least this share of such pixels, and a dark border, shows an object on black."""
+
+
+def scored_region(view: View) -> tuple[np.ndarray | None, str]:
+    """Pixels that a rendering is scored on, bool [H, W], and their name; None for all.
+
+    The view's score mask where it has one (DTU's protocol), else what `counted_region` says.
+    """
+    if view.score_mask is not None:
+        return view.score_mask, "score mask"
+    return counted_region(view)
 
 
 def counted_region(view: View) -> tuple[np.ndarray | None, str]:

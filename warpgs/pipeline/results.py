@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from warpgs.files import write_bytes
 from warpgs.io.splits import Split
-from warpgs.pipeline.evaluate import guesses, render_view, score, summarize
+from warpgs.pipeline.evaluate import guesses, render_view, score, summarize, variants
+from warpgs.pipeline.lpips import Lpips
 from warpgs.rasterizer import RasterizeOptions
 from warpgs.report.curve import curve
 from warpgs.report.events import read_events
@@ -17,6 +17,25 @@ from warpgs.report.overview import render_overview
 from warpgs.report.page import ViewPictures, write_page
 from warpgs.report.pictures import depth_map, error_map, png, side_by_side
 from warpgs.scene import Gaussians, Scene, View
+
+LABELS = {
+    "psnr": "PSNR [dB]", "ssim": "SSIM", "ssim_skimage": "SSIM (scikit-image)",
+    "lpips_vgg_legacy": "LPIPS-VGG, [0, 1]", "lpips_vgg_standard": "LPIPS-VGG, [-1, 1]",
+    "lpips_alex_legacy": "LPIPS-Alex, [0, 1]", "lpips_alex_standard": "LPIPS-Alex, [-1, 1]", "lpips": "LPIPS",
+}  # fmt: skip
+"""Names of figures for people."""
+
+
+def score_keys(metrics: dict) -> list[str]:
+    """Names of the figures that result files hold for held-out views, in the order to show them."""
+    return [k for k in LABELS if k in metrics["test"]]
+
+
+def score_line(scores: dict[str, float]) -> str:
+    """Mean figures as one line for people."""
+    distances = [f", {LABELS[k]} {v:.3f}" for k, v in scores.items() if k.startswith("lpips")]
+    return f"PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f}{''.join(distances) or ', LPIPS not measured'}"
+
 
 SHOWN_VIEWS = 6
 """Held-out views with pictures in the report; all have files in the run folder."""
@@ -32,15 +51,31 @@ def file_stem(name: str) -> str:
     return str(PurePosixPath(name).with_suffix("")).replace("/", "_")
 
 
+def protocol_of(scene: Scene, spec: str | None, downscale: int, train: list[View], test: list[View]) -> dict:
+    """What scores must agree in before they may be compared; stands in every result file and on the page."""
+    sizes = sorted({(v.camera.width, v.camera.height) for v in test or train})
+    return {
+        "split": spec or "default (no --split given)", "training_views": len(train), "held_out_views": len(test),
+        "ground_truth": scene.pixels, "downscale": downscale, "resolution": [f"{w} x {h}" for w, h in sizes],
+        "score_masks": sum(v.score_mask is not None for v in test),
+    }  # fmt: skip
+
+
 def evaluate_run(
-    out: Path, gaussians: Gaussians, train: list[View], test: list[View], rule: str, background: tuple[float, float, float]
+    out: Path,
+    gaussians: Gaussians,
+    train: list[View],
+    test: list[View],
+    rule: str,
+    background: tuple[float, float, float],
+    lpips: Lpips | None = None,
 ) -> dict:
     """Score held-out and training views, and save a picture and a depth map of each held-out view.
 
-    Where no view is held out, the pictures are of the training views.
+    Where no view is held out, the pictures are of the training views. LPIPS is measured on held-out views alone.
 
     Returns:
-        Means over held-out and over training views, a row per held-out view, and what guessing scores.
+        Means over held-out and over training views, a row per held-out view, what guessing scores, and what each figure is.
     """
     options = options_for(rule, background, gaussians)
     (out / "renders").mkdir(exist_ok=True)
@@ -50,16 +85,16 @@ def evaluate_run(
         train_rows.append(score(view, render_view(gaussians, view, options)[0]))
     for view in test or train:
         image, depth, alpha = render_view(gaussians, view, options)
-        rows.append(score(view, image))
+        rows.append(score(view, image, lpips if test else None))
         stem = file_stem(view.name)
         row = side_by_side([np.clip(image, 0, 1), view.image, error_map(image, view.image)])
         write_bytes(out / "renders" / f"{stem}.png", png(row))
         write_bytes(out / "depth" / f"{stem}.png", png(depth_map(depth, alpha)))
     return {
         "test": summarize(rows) if test else {}, "train": summarize(train_rows),
-        "views": [asdict(r) for r in rows] if test else [],
+        "views": [r.row() for r in rows] if test else [],
         "guesses": guesses(train, test) if test else {},
-        "metrics": "PSNR on 8-bit images; ssim: 11x11 Gaussian, zero padding; ssim_skimage: border cropped; LPIPS not measured",
+        "variants": variants(lpips),
     }  # fmt: skip
 
 
@@ -107,17 +142,21 @@ def write_report(out: Path, scene: Scene, split: Split, gaussians: Gaussians, me
         ("training PSNR", f"{metrics['train']['psnr']:.2f} dB"), ("Gaussians", f"{metrics['gaussians']:,}"),
         ("steps", f"{metrics['steps']:,}"), ("time", f"{seconds['total']:.0f} s"),
     ]  # fmt: skip
-    table = [["view", "PSNR [dB]", "SSIM", "SSIM (scikit-image)", "pixels"]] + [
-        [r["name"], f"{r['psnr']:.2f}", f"{r['ssim']:.4f}", f"{r['ssim_skimage']:.4f}", r["region"]] for r in metrics["views"]
+    keys = score_keys(metrics)
+    table = [["view", *(LABELS.get(k, k) for k in keys), "pixels"]] + [
+        [r["name"], *(f"{r[k]:.{2 if k == 'psnr' else 4}f}" for k in keys), r["region"]] for r in metrics["views"]
     ]
     options = options_for(record["config"]["rule"], tuple(record["background"]), gaussians)
     pictures = _pictures(test or train, gaussians, options, {r["name"]: r for r in metrics["views"]})
     camera = train[0].camera
-    details = {k: v for k, v in record.items() if k != "cameras"} | {"metrics": metrics["metrics"]}
+    details = {k: v for k, v in record.items() if k != "cameras"}
+    protocol = {k.replace("_", " "): ", ".join(v) if isinstance(v, list) else str(v) for k, v in metrics["protocol"].items()}
+    protocol["configuration"] = f"{metrics['config_hash']}, step {metrics['steps']:,}"
     write_page(
         out / "report.html",
         title=Path(scene.path).resolve().name,
         subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
         f"{camera.width} x {camera.height} px, {metrics['device']}",
         figures=figures, notes=notes, table=table, views=pictures, curves=curves, overview=overview, details=details,
+        protocol=protocol | {LABELS.get(k, k): v for k, v in metrics["variants"].items()},
     )  # fmt: skip

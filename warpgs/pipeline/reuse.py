@@ -11,8 +11,9 @@ from warpgs.errors import DataError, UsageError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_bytes, write_json
 from warpgs.pipeline.fit import train_views
+from warpgs.pipeline.lpips import load_lpips
 from warpgs.pipeline.paths import PATHS, camera_path
-from warpgs.pipeline.results import evaluate_run, file_stem, options_for
+from warpgs.pipeline.results import evaluate_run, file_stem, options_for, protocol_of, score_line
 from warpgs.pipeline.run import SceneRequest, choose_device, open_run, read_scene
 from warpgs.rasterizer import rasterize
 from warpgs.report.film import write_mp4
@@ -20,28 +21,39 @@ from warpgs.report.pictures import png
 from warpgs.scene import Camera, Gaussians
 
 
-def evaluate(folder: Path, device_name: str) -> list[str]:
+def evaluate(folder: Path, device_name: str, lpips_weights: Path | None = None) -> list[str]:
     """Score a run on its held-out views and rewrite its pictures; returns lines for the user.
 
     The scores go to eval.json beside metrics.json, which stays as the fit wrote it.
 
+    Args:
+        folder: The run folder.
+        device_name: auto, cpu or cuda.
+        lpips_weights: File of `warpgs convert-lpips`; without one LPIPS is not measured.
+
     Raises:
-        DataError: The folder is no run, its scene is gone, or the scene's data have changed since the fit.
+        DataError: The folder is no run, its scene is gone, the scene's data have changed since the fit, or the weights are
+            no weights.
     """
     device, _ = choose_device(device_name)
+    lpips = None if lpips_weights is None else load_lpips(lpips_weights, device)
     stored = open_run(folder, device)
-    scene, _, _ = read_scene(SceneRequest(**stored.record["scene"]))
+    request = SceneRequest(**stored.record["scene"])
+    scene, _, _ = read_scene(request)
     if scene.fingerprint != stored.record["fingerprint"]:
         raise DataError(f"{scene.path}: its photographs or cameras are not those that {folder} was fitted to; restore them")
     train, test = (train_views(scene, tuple(stored.record[k])) for k in ("train", "test"))
     rule, background = stored.record["config"]["rule"], tuple(stored.record["background"])
-    metrics = evaluate_run(folder, stored.gaussians, train, test, rule, background)
+    metrics = evaluate_run(folder, stored.gaussians, train, test, rule, background, lpips)
+    metrics |= {
+        "protocol": protocol_of(scene, request.split, request.downscale, train, test),
+        "config_hash": stored.record["config_hash"], "steps": stored.step,
+    }  # fmt: skip
     write_json(folder / "eval.json", metrics)
     if not test:
         return [f"no view is held out; training PSNR {metrics['train']['psnr']:.2f} dB"]
     lines = [f"{r['name']}: PSNR {r['psnr']:.2f} dB, SSIM {r['ssim']:.4f} ({r['region']})" for r in metrics["views"]]
-    mean = metrics["test"]
-    return [*lines, f"mean of {len(test)}: PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.4f}"]
+    return [*lines, f"mean of {len(test)}: {score_line(metrics['test'])}"]
 
 
 @torch.no_grad()

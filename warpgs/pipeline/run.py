@@ -24,7 +24,8 @@ from warpgs.io.splits import Split, default_split, split_views, twins
 from warpgs.pipeline.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.fit import Fit, StepReport, run, train_views
-from warpgs.pipeline.results import evaluate_run, write_report
+from warpgs.pipeline.lpips import load_lpips
+from warpgs.pipeline.results import evaluate_run, protocol_of, score_line, write_report
 from warpgs.report.events import EventLog
 from warpgs.report.progress import Progress
 from warpgs.scene import Camera, Gaussians, Normalization, Scene
@@ -42,6 +43,8 @@ class SceneRequest:
     strict: bool = False
     allow_outside: bool = False
     invert_masks: bool = False
+    score_masks: str | None = None
+    """Folder of object masks for scoring, matched by image id; None for the scene's own `idrmasks`, if any."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,8 @@ class FitRequest:
     config: FitConfig
     device: str
     resume: bool = False
+    lpips_weights: Path | None = None
+    """File of `warpgs convert-lpips`; without one LPIPS is not measured."""
 
 
 def choose_device(name: str) -> tuple[torch.device, str]:
@@ -87,13 +92,18 @@ def read_scene(request: SceneRequest) -> tuple[Scene, Split, list[str]]:
     """Load a scene and split its views; returns both with the notes for the user."""
     scene = load_scene(
         request.path, downscale=request.downscale, strict=request.strict,
-        allow_outside=request.allow_outside, invert_masks=request.invert_masks,
+        allow_outside=request.allow_outside, invert_masks=request.invert_masks, score_masks=request.score_masks,
     )  # fmt: skip
     if request.split is None:
         split, note = default_split(scene)
         notes = [*scene.notes, note]
     else:
         split, notes = split_views(scene, request.split), list(scene.notes)
+    if (request.split or "").startswith("dtu:") and any(v.mask is not None for v in scene.views):
+        notes.append(
+            "masks hide pixels from the fit, which the published DTU protocol does not do: object masks that only scores "
+            "should see belong into a folder idrmasks, or behind --score-masks"
+        )
     for test, train in twins(scene, split):
         notes.append(f"{test} is held out, but {train} was taken from the same place: its score says nothing of new views")
     return scene, split, notes
@@ -160,6 +170,7 @@ def fit_scene(request: FitRequest) -> dict:
     _prepare_folder(out, request.resume)
     try:
         device, where = choose_device(request.device)
+        lpips = None if request.lpips_weights is None else load_lpips(request.lpips_weights, device)
         scene, split, notes = read_scene(request.scene)
     except WarpgsError:
         if not request.resume:
@@ -189,8 +200,9 @@ def fit_scene(request: FitRequest) -> dict:
     _train(fit, out)
     trained = time.perf_counter() - began - setup
     write_ply(out / "point_cloud.ply", fit.gaussians, scene.normalization)
-    metrics = evaluate_run(out, fit.gaussians, train, test, request.config.rule, scene.background)
+    metrics = evaluate_run(out, fit.gaussians, train, test, request.config.rule, scene.background, lpips)
     metrics |= {
+        "protocol": protocol_of(scene, request.scene.split, request.scene.downscale, train, test),
         "steps": fit.step, "gaussians": len(fit.gaussians), "preset": request.config.preset, "seed": request.config.seed,
         "config_hash": request.config.fingerprint(), "fingerprint": scene.fingerprint, "device": where.removeprefix("on "),
         "seconds": {"setup": setup, "training": trained, "total": time.perf_counter() - began},
@@ -251,7 +263,7 @@ def _train(fit: Fit, out: Path) -> None:
 def _print_result(out: Path, metrics: dict) -> None:
     if metrics["test"]:
         scores = metrics["test"]
-        print(f"held-out PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f} over {len(metrics['views'])} views")
+        print(f"held-out {score_line(scores)} over {len(metrics['views'])} views")
         for name, value in metrics["guesses"].items():
             print(f"  without a fit, the {name.replace('_', ' ')} scores {value:.2f} dB")
     print(f"{metrics['gaussians']:,} Gaussians; report: {out / 'report.html'}  pictures: {out / 'renders'}")
@@ -265,6 +277,8 @@ class StoredRun:
     record: dict
     gaussians: Gaussians
     cameras: dict[str, Camera]
+    step: int
+    """Steps done when the checkpoint was written."""
 
     @property
     def normalization(self) -> Normalization:
@@ -287,6 +301,6 @@ def open_run(folder: Path, device: torch.device) -> StoredRun:
         }
     except (OSError, ValueError, KeyError, TypeError) as e:
         raise DataError(f"{path}: cannot be read ({e}); give a folder that `warpgs fit --out` filled") from e
-    tensors, _ = load_checkpoint(folder)
+    tensors, state = load_checkpoint(folder)
     gaussians = Gaussians(**{n: tensors[f"param.{n}"].to(device) for n in Gaussians.__dataclass_fields__})
-    return StoredRun(folder, record, gaussians, cameras)
+    return StoredRun(folder, record, gaussians, cameras, state["step"])

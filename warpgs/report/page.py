@@ -41,6 +41,8 @@ figure{margin:0}figcaption{font-size:13px;padding:5px 0 0}
 .curve{width:100%;height:auto}.curve text{font-size:11px;fill:var(--soft)}
 .curve .title{font-size:13px;fill:var(--ink);font-weight:600}
 .curve .grid{stroke:var(--line)}.curve .line{fill:none;stroke:var(--accent);stroke-width:1.8;stroke-linejoin:round}
+dl{display:grid;grid-template-columns:minmax(120px,max-content) 1fr;gap:4px 18px;margin:0;font-size:14px}
+dt{color:var(--soft)}dd{margin:0;overflow-wrap:anywhere}
 details{margin-top:14px}summary{cursor:pointer}
 pre{background:var(--card);border:1px solid var(--line);border-radius:8px;padding:16px;overflow:auto;
 font-size:13px;line-height:1.45}
@@ -103,6 +105,7 @@ def write_page(
     views: list[ViewPictures],
     curves: list[str],
     overview: bytes | None,
+    protocol: dict[str, str],
     details: dict,
 ) -> None:
     """Write the report, self-contained and without a link to anywhere.
@@ -117,6 +120,7 @@ def write_page(
         views: Pictures of held-out views.
         curves: SVG charts.
         overview: Picture of cameras and points, or None.
+        protocol: What scores must agree in to be compared, and what each figure is, by name.
         details: Configuration, versions and data, shown as JSON on request.
 
     Raises:
@@ -133,6 +137,9 @@ def write_page(
         sections.append("<h2>Views the fit has not seen</h2>" + "".join(map(_view, views)))
     if len(table) > 1:
         sections.append("<h2>Scores</h2>" + _table(table))
+    if protocol:
+        items = "".join(f"<dt>{html.escape(k)}</dt><dd>{html.escape(v)}</dd>" for k, v in protocol.items())
+        sections.append(f"<h2>How it was scored</h2><dl>{items}</dl>")
     if curves:
         sections.append(f'<h2>The fit</h2><div class="curves">{"".join(curves)}</div>')
     if overview:
