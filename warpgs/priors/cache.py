@@ -81,7 +81,7 @@ class MapCache:
 
         try:
             stored = load(path.read_bytes())
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError, KeyError, safetensors.SafetensorError) as e:
             self.notes.append(f"{path}: a stored map could not be read ({e}) and was made again")

@@ -17,6 +17,8 @@ COLOR_SIGMA = 8.0
 REACHES = ((10.0, 1.0), (100.0, 1e-3), (1000.0, 1e-6))
 """Lengths [px] over which confirmed depths spread within an even surface, and how much each counts: the far ones matter only
 where nothing near says anything."""
+WORST = 1e3
+"""Largest ratio of an error to the median error that is told apart: no confirmed depth counts less than a millionth."""
 FLOOR = 1e-9
 """Weight of the mean of all confirmed depths, for pixels that edges shut off from every one of them."""
 
@@ -91,9 +93,12 @@ def complete_disparity(image: np.ndarray, depth: np.ndarray, valid: np.ndarray, 
     low, high = inverse[valid].min(), inverse[valid].max()
     if not high > low:
         return np.zeros(depth.shape, np.float32)
-    error = np.where(valid, sensitivity, 0) * inverse**2  # |d(1/z)/dpx|
-    scale = max(float(np.median(error[valid])), 1e-6 * high)
-    weight = np.where(valid, 1 / (1 + np.minimum(error / scale, 1e3) ** 2), 0).astype(np.float32)
+    error = sensitivity[valid] * inverse[valid] ** 2  # |d(1/z)/dpx|
+    known = error[np.isfinite(error)]
+    scale = max(float(np.median(known)) if len(known) else 0.0, 1e-6 * high)
+    ratio = np.minimum(np.where(np.isfinite(error), error, np.inf) / scale, WORST)
+    weight = np.zeros(depth.shape, np.float32)
+    weight[valid] = 1 / (1 + ratio**2)
     return unit_range(_spread(image, ((inverse - low) / (high - low)).astype(np.float32), weight))
 
 

@@ -28,18 +28,20 @@ def semantic_score(prior: Prior) -> np.ndarray:
     return prior.confidence * (prior.boundary + prior.foreground)
 
 
-def geometric_score(disparity: np.ndarray, curvature_weight: float = 0.5) -> np.ndarray:
-    """S_geometry = |grad D| + lambda_curv kappa of a disparity map [H, W], float32; not normalised as a sum.
-
-    kappa is the Frobenius norm of the Hessian of D blurred by 1 px; both terms are normalised to [0, 1] first, so that
-    noise of second order does not rule.
-    """
+def curvature(disparity: np.ndarray) -> np.ndarray:
+    """kappa: Frobenius norm of the Hessian [1/px^2] of a map [H, W] blurred by 1 px, float32."""
     import cv2
 
-    d = np.ascontiguousarray(disparity, np.float32)
-    gradient = np.hypot(*np.gradient(d))
-    smooth = cv2.GaussianBlur(d, (0, 0), BLUR, borderType=cv2.BORDER_REPLICATE)
+    smooth = cv2.GaussianBlur(np.ascontiguousarray(disparity, np.float32), (0, 0), BLUR, borderType=cv2.BORDER_REPLICATE)
     dy, dx = np.gradient(smooth)
     (dyy, dyx), (dxy, dxx) = np.gradient(dy), np.gradient(dx)
-    kappa = np.sqrt(dxx**2 + dxy**2 + dyx**2 + dyy**2)
-    return normalized(gradient) + np.float32(curvature_weight) * normalized(kappa)
+    return np.sqrt(dxx**2 + dxy**2 + dyx**2 + dyy**2)
+
+
+def geometric_score(disparity: np.ndarray, curvature_weight: float = 0.5) -> np.ndarray:
+    """S_geometry = |grad D| + lambda_curv kappa of a disparity map [H, W], float32, in [0, 1 + lambda_curv].
+
+    Both terms are normalised to [0, 1] first, so that noise of second order does not rule; their sum is not.
+    """
+    gradient = np.hypot(*np.gradient(disparity.astype(np.float32)))
+    return normalized(gradient) + np.float32(curvature_weight) * normalized(curvature(disparity))
