@@ -37,7 +37,7 @@ def _parse(kind: type, name: str, arguments: list[str], default: object = None):
     import tyro
 
     extra = {} if default is None else {"default": default}
-    return tyro.cli(kind, args=arguments, prog=f"warpgs {name}", description=COMMANDS[name], **extra)
+    return tyro.cli(kind, args=arguments, prog=f"warpgs {name}", description=COMMANDS[name.split()[0]], **extra)
 
 
 def _fit_arguments(arguments: list[str]):
@@ -243,7 +243,7 @@ def _priors_show(arguments: list[str]) -> int:
         """CPU threads of the networks; 0 for as many as there are cores."""
         priors: tyro.conf.OmitArgPrefixes[PriorConfig] = field(default_factory=PriorConfig)
 
-    a = _parse(Show, "priors", arguments)
+    a = _parse(Show, "priors show", arguments)
     from warpgs.pipeline.preview import show_priors
     from warpgs.pipeline.run import SceneRequest
 
@@ -265,7 +265,7 @@ def _priors_export(arguments: list[str]) -> int:
         out: Path
         """ONNX file to write; FILE.onnx.json beside it says how to feed it."""
 
-    a = _parse(Export, "priors", arguments)
+    a = _parse(Export, "priors export", arguments)
     from warpgs.priors.export import export_network
 
     for line in export_network(a.request, a.out):

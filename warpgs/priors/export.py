@@ -43,18 +43,14 @@ class ExportRequest:
     """dpt: a Hugging Face name or folder instead of Intel/dpt-large. fcn-resnet18: a safetensors file of one's own."""
     random_weights: bool = False
     """Small, untrained: for trying the way only."""
-    height: int = 384
-    """Height of the input [px], a multiple of 32."""
-    width: int = 384
-    """Width of the input [px], a multiple of 32."""
+    size: int = 384
+    """Both sides of the input [px], a multiple of 32; photographs are stretched to it, and the map back."""
 
     def __post_init__(self):
         if self.model not in MODELS:
             raise UsageError(f"model {self.model!r} is not one of {', '.join(MODELS)}")
-        for name in ("height", "width"):
-            value = getattr(self, name)
-            if not (32 <= value <= 4096 and value % MULTIPLE == 0):
-                raise UsageError(f"--{name} must be a multiple of {MULTIPLE} from 32 to 4096, not {value}")
+        if not (32 <= self.size <= 4096 and self.size % MULTIPLE == 0):
+            raise UsageError(f"--size must be a multiple of {MULTIPLE} from 32 to 4096, not {self.size}")
         if self.random_weights and self.weights is not None:
             raise UsageError("--weights and --random-weights exclude each other; leave one out")
         if self.model == "fcn-resnet50" and self.weights is not None:
@@ -214,12 +210,12 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
     import torch
 
     network = build(request)
-    size = sum(p.numel() * p.element_size() for p in network.parameters())
-    if not size < LARGEST_FILE:
+    weight = sum(p.numel() * p.element_size() for p in network.parameters())
+    if not weight < LARGEST_FILE:
         raise DataError(
-            f"{request.model}: {size / 2**30:.1f} GiB of weights do not fit into one ONNX file; choose smaller ones"
+            f"{request.model}: {weight / 2**30:.1f} GiB of weights do not fit into one ONNX file; choose smaller ones"
         )
-    picture = torch.rand(1, 3, request.height, request.width, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    picture = torch.rand(1, 3, request.size, request.size, generator=torch.Generator().manual_seed(0)) * 2 - 1
     output = "disparity" if request.model == "dpt" else "scores"
     with torch.no_grad():
         wanted = network(picture).numpy()
@@ -236,7 +232,7 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
     flag = "--depth-model" if request.model == "dpt" else "--segmentation-model"
     trained = "small and untrained, of no use but for tests; " if request.random_weights else ""
     return [
-        f"{out}: {request.model}, {request.width} x {request.height} px, {out.stat().st_size / 2**20:.1f} MiB; "
+        f"{out}: {request.model}, {request.size} x {request.size} px, {out.stat().st_size / 2**20:.1f} MiB; "
         f"{trained}onnxruntime and torch agree to {difference:.1e} standard deviations",
         f"next: warpgs priors show SCENE {flag} {out} --out priors",
     ]
