@@ -17,6 +17,7 @@ COMMANDS = {
     "eval": "score a run again on its held-out views",
     "render": "render a run: its views, an orbit or a spiral, as PNG and mp4",
     "export": "write a run's Gaussians to a PLY file",
+    "priors": "look at what is known before a fit (priors show), or write networks as ONNX (priors export)",
     "convert-lpips": "join published LPIPS weights into the file that --lpips-weights takes",
     "demo": "write a synthetic scene to try things with",
     "doctor": "say what this machine has, what is missing, and how to get it",
@@ -37,7 +38,7 @@ def _parse(kind: type, name: str, arguments: list[str], default: object = None):
     import tyro
 
     extra = {} if default is None else {"default": default}
-    return tyro.cli(kind, args=arguments, prog=f"warpgs {name}", description=COMMANDS[name], **extra)
+    return tyro.cli(kind, args=arguments, prog=f"warpgs {name}", description=COMMANDS[name.split()[0]], **extra)
 
 
 def _fit_arguments(arguments: list[str]):
@@ -220,6 +221,66 @@ def _export(arguments: list[str]) -> int:
     return 0
 
 
+def _priors(arguments: list[str]) -> int:
+    kinds = {"show": _priors_show, "export": _priors_export}
+    if not arguments or arguments[0] not in kinds:
+        if arguments and arguments[0] in ("-h", "--help"):
+            print("usage: warpgs priors show SCENE --out DIR [flags]")
+            print("       warpgs priors export --model MODEL --out FILE.onnx [flags]")
+            return 0
+        raise UsageError("priors: say show or export; `warpgs priors show --help` lists flags")
+    return kinds[arguments[0]](arguments[1:])
+
+
+def _priors_show(arguments: list[str]) -> int:
+    import tyro
+
+    from warpgs.priors.view_prior import PriorConfig
+
+    @dataclass(frozen=True)
+    class Show:
+        scene: tyro.conf.Positional[Path]
+        """Scene folder."""
+        out: Path
+        """Folder for a PNG sheet per training view."""
+        split: str | None = None
+        """As for `warpgs fit`."""
+        downscale: int = 1
+        """Factor by which both image sides shrink."""
+        threads: int = 0
+        """CPU threads of the networks; 0 for as many as there are cores."""
+        priors: tyro.conf.OmitArgPrefixes[PriorConfig] = field(default_factory=PriorConfig)
+
+    a = _parse(Show, "priors show", arguments)
+    from warpgs.pipeline.preview import show_priors
+    from warpgs.pipeline.run import SceneRequest
+
+    if a.threads < 0:
+        raise UsageError(f"--threads must be 0 or more, not {a.threads}")
+    for line in show_priors(SceneRequest(str(a.scene), a.split, a.downscale), a.priors, a.out, a.threads):
+        print(line)
+    return 0
+
+
+def _priors_export(arguments: list[str]) -> int:
+    import tyro
+
+    from warpgs.priors.export import ExportRequest
+
+    @dataclass(frozen=True)
+    class Export:
+        request: tyro.conf.OmitArgPrefixes[ExportRequest]
+        out: Path
+        """ONNX file to write; FILE.onnx.json beside it says how to feed it."""
+
+    a = _parse(Export, "priors export", arguments)
+    from warpgs.priors.export import export_network
+
+    for line in export_network(a.request, a.out):
+        print(line)
+    return 0
+
+
 def _demo(arguments: list[str]) -> int:
     import tyro
 
@@ -263,8 +324,8 @@ def _convert_lpips(arguments: list[str]) -> int:
 
 
 RUN = {
-    "fit": _fit, "eval": _eval, "render": _render, "export": _export, "convert-lpips": _convert_lpips, "demo": _demo,
-    "doctor": _doctor,
+    "fit": _fit, "eval": _eval, "render": _render, "export": _export, "priors": _priors, "convert-lpips": _convert_lpips,
+    "demo": _demo, "doctor": _doctor,
 }  # fmt: skip
 
 

@@ -20,8 +20,8 @@ def png(image: np.ndarray) -> bytes:
     return data.tobytes()
 
 
-def _colormap(values: np.ndarray, name: str) -> np.ndarray:
-    """Colours [H, W, 3] of values in [0, 1] by one of OpenCV's maps."""
+def colored(values: np.ndarray, name: str) -> np.ndarray:
+    """Colours [H, W, 3] of values in [0, 1], [H, W], by one of OpenCV's colour maps: INFERNO, TURBO, VIRIDIS and so on."""
     import cv2
 
     table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], getattr(cv2, f"COLORMAP_{name}"))[:, 0, ::-1]
@@ -30,7 +30,7 @@ def _colormap(values: np.ndarray, name: str) -> np.ndarray:
 
 def error_map(image: np.ndarray, truth: np.ndarray, largest: float = 0.3) -> np.ndarray:
     """Colours [H, W, 3] of the absolute error averaged over channels; ``largest`` and above is the brightest."""
-    return _colormap(np.abs(np.clip(image, 0, 1) - truth).mean(-1) / largest, "INFERNO")
+    return colored(np.abs(np.clip(image, 0, 1) - truth).mean(-1) / largest, "INFERNO")
 
 
 def depth_map(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
@@ -43,7 +43,7 @@ def depth_map(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     if valid.any():
         inverse = 1 / depth[valid]
         low, high = np.percentile(inverse, [2, 98])
-        colors[valid] = _colormap(((inverse - low) / max(high - low, 1e-12))[:, None], "TURBO")[:, 0]
+        colors[valid] = colored(((inverse - low) / max(high - low, 1e-12))[:, None], "TURBO")[:, 0]
     return colors
 
 

@@ -1,0 +1,56 @@
+"""Pictures of the priors of a scene's training views, to look at before a fit relies on them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from warpgs.errors import ResourceError
+from warpgs.files import write_bytes
+from warpgs.pipeline.region import counted_region
+from warpgs.pipeline.results import file_stem
+from warpgs.pipeline.run import SceneRequest, read_scene
+from warpgs.priors.cache import cache_folder
+from warpgs.priors.scores import geometric_score, normalized, semantic_score
+from warpgs.priors.view_prior import PriorConfig, view_priors
+from warpgs.report.contact_sheet import Tile, contact_sheet
+from warpgs.report.pictures import png
+from warpgs.scene import Prior, View
+
+
+def prior_sheet(view: View, prior: Prior):
+    """One sheet, [rows, columns, 3] in [0, 1]: photograph, the four maps, and the two scores that follow from them."""
+    tiles = [
+        Tile("photograph", view.image),
+        Tile("disparity, near is 1", prior.disparity, "TURBO"),
+        Tile("confidence of the likeliest class", prior.confidence, "VIRIDIS"),
+        Tile("foreground", prior.foreground, "VIRIDIS"),
+        Tile("boundary", prior.boundary),
+        Tile("S_semantic = confidence (boundary + foreground)", normalized(semantic_score(prior))),
+        Tile("S_geometry = |grad D| + 0.5 kappa", normalized(geometric_score(prior.disparity))),
+    ]
+    size = f"{view.camera.width} x {view.camera.height} px"
+    lines = [
+        f"{size}. Scores are scaled to the 2nd and 98th percentile of the view.",
+        f"Depth: {prior.depth_source}.",
+        f"Semantics: {prior.semantics_source}. Mean foreground {prior.foreground.mean():.1%}.",
+    ]
+    return contact_sheet(view.name, lines, tiles)
+
+
+def show_priors(request: SceneRequest, config: PriorConfig, out: Path, threads: int = 0) -> list[str]:
+    """Write a sheet per training view as PNG; returns lines for the user.
+
+    Raises:
+        WarpgsError: The scene, a model or the folder is not what it must be.
+    """
+    scene, split, notes = read_scene(request)
+    views = [scene.view(name) for name in split.train]
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise ResourceError(f"{out}: cannot be written ({e.strerror}); choose another --out") from e
+    regions = [counted_region(v)[0] for v in views]
+    priors, said = view_priors(views, config, regions=regions, threads=threads, cache=cache_folder())
+    for view, prior in zip(views, priors):
+        write_bytes(out / f"{file_stem(view.name)}.png", png(prior_sheet(view, prior)))
+    return [*notes, *said, f"{len(views)} sheets in {out}"]

@@ -1,0 +1,104 @@
+"""Maps that a network made of a photograph, kept on disk under the hash of everything that decides them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from warpgs.errors import ResourceError
+from warpgs.files import write_bytes
+
+CODE = 1
+"""Version of the code between photograph and maps: counts up whenever the same inputs give other maps."""
+
+
+def cache_folder() -> Path:
+    """Where warpgs may keep what it can make again: WARPGS_CACHE, or the place that the system has for such files."""
+    if own := os.environ.get("WARPGS_CACHE"):
+        return Path(own)
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local") / "warpgs" / "Cache"
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "warpgs"
+    # the XDG rules ask to pass over a relative path
+    base = Path(os.environ.get("XDG_CACHE_HOME") or "")
+    return (base if base.is_absolute() else Path.home() / ".cache") / "warpgs"
+
+
+@dataclass
+class MapCache:
+    """A folder of maps; an entry that is not whole is made again, and a folder that cannot be written is done without."""
+
+    folder: Path
+    """Where entries lie."""
+    notes: list[str] = field(default_factory=list)
+    """What a user must know: entries that were broken, a folder that took none."""
+    found: int = 0
+    """Entries taken from disk."""
+    made: int = 0
+    """Entries computed."""
+
+    def maps(
+        self, image: np.ndarray, names: tuple[str, ...], decided_by: dict, make: Callable[[], tuple[np.ndarray, ...]]
+    ) -> tuple[np.ndarray, ...]:
+        """Maps of an image, from disk or made now.
+
+        Args:
+            image: Colours, float32, shape [H, W, 3].
+            names: What the maps are called.
+            decided_by: Everything else that the maps depend on, as JSON can hold it.
+            make: Computes them, float32 [H, W] in [0, 1] each.
+
+        Returns:
+            One array per name.
+        """
+        path = self._path(image, names, decided_by)
+        stored = self._read(path, names, image.shape[:2])
+        if stored is not None:
+            self.found += 1
+            return stored
+        maps = make()
+        self.made += 1
+        self._write(path, names, maps)
+        return maps
+
+    def _path(self, image: np.ndarray, names: tuple[str, ...], decided_by: dict) -> Path:
+        words = {"code": CODE, "names": names, "shape": image.shape, "type": str(image.dtype), **decided_by}
+        key = hashlib.sha256(json.dumps(words, sort_keys=True).encode())
+        key.update(np.ascontiguousarray(image).data)
+        return self.folder / f"{key.hexdigest()}.safetensors"
+
+    def _read(self, path: Path, names: tuple[str, ...], shape: tuple[int, int]) -> tuple[np.ndarray, ...] | None:
+        import safetensors
+        from safetensors.numpy import load
+
+        try:
+            stored = load(path.read_bytes())
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        except (OSError, ValueError, KeyError, safetensors.SafetensorError) as e:
+            self.notes.append(f"{path}: a stored map could not be read ({e}) and was made again")
+            return None
+        maps = tuple(stored.get(n) for n in names)
+        if all(m is not None and m.dtype == np.float32 and m.shape == shape and ((m >= 0) & (m <= 1)).all() for m in maps):
+            return maps
+        self.notes.append(f"{path}: a stored map is not what it must be and was made again")
+        return None
+
+    def _write(self, path: Path, names: tuple[str, ...], maps: tuple[np.ndarray, ...]) -> None:
+        from safetensors.numpy import save
+
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(path, save({n: np.ascontiguousarray(m) for n, m in zip(names, maps)}))
+        except (OSError, ResourceError) as e:
+            note = f"maps are not kept for the next time ({e}); WARPGS_CACHE names another folder"
+            if not any(n.startswith("maps are not kept") for n in self.notes):
+                self.notes.append(note)

@@ -1,0 +1,238 @@
+"""Networks for `--depth-model` and `--segmentation-model`, written as ONNX from public implementations."""
+
+from __future__ import annotations
+
+import json
+import logging
+import tempfile
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.files import write_bytes, write_text
+from warpgs.priors.preprocess import HALF, IMAGENET, side_file
+from warpgs.priors.semantics import CLASSES
+from warpgs.priors.session import open_network
+
+if TYPE_CHECKING:
+    import torch
+
+MODELS = ("dpt", "fcn-resnet18", "fcn-resnet50")
+DPT_WEIGHTS = "Intel/dpt-large"
+"""On the Hugging Face hub, Apache-2.0: the network of Ranftl et al. 2021, which the paper uses."""
+MULTIPLE = 32
+"""Coarsest stride of all three networks [px]."""
+AGREEMENT = 1e-4
+"""Largest difference between onnxruntime and torch, in standard deviations of the output."""
+LARGEST_FILE = 2**31
+"""No protobuf message is longer [bytes]."""
+REMEDY = "`pip install warpgs[export]`"
+
+
+@dataclass(frozen=True)
+class ExportRequest:
+    """Which network to write, and how."""
+
+    model: str
+    """dpt (depth); fcn-resnet18, the paper's segmentation network; fcn-resnet50, one that torchvision has weights for."""
+    weights: str | None = None
+    """dpt: a Hugging Face name or folder instead of Intel/dpt-large. fcn-resnet18: a safetensors file of one's own."""
+    random_weights: bool = False
+    """Small, untrained: for trying the way only."""
+    size: int = 384
+    """Both sides of the input [px], a multiple of 32; photographs are stretched to it, and the map back."""
+
+    def __post_init__(self):
+        if self.model not in MODELS:
+            raise UsageError(f"model {self.model!r} is not one of {', '.join(MODELS)}")
+        if not (32 <= self.size <= 4096 and self.size % MULTIPLE == 0):
+            raise UsageError(f"--size must be a multiple of {MULTIPLE} from 32 to 4096, not {self.size}")
+        if self.random_weights and self.weights is not None:
+            raise UsageError("--weights and --random-weights exclude each other; leave one out")
+        if self.model == "fcn-resnet50" and self.weights is not None:
+            raise UsageError("--weights: fcn-resnet50 takes torchvision's own; leave the flag out")
+
+
+def _dpt(request: ExportRequest) -> torch.nn.Module:
+    from transformers import DPTConfig, DPTForDepthEstimation
+
+    if request.random_weights:
+        config = DPTConfig(
+            hidden_size=32, num_hidden_layers=4, num_attention_heads=4, intermediate_size=64, image_size=MULTIPLE,
+            backbone_out_indices=[0, 1, 2, 3], neck_hidden_sizes=[16, 24, 32, 32], fusion_hidden_size=16,
+            initializer_range=0.2,
+        )  # fmt: skip
+        return DPTForDepthEstimation(config)
+    try:
+        return DPTForDepthEstimation.from_pretrained(request.weights or DPT_WEIGHTS, use_safetensors=True)
+    except (OSError, ValueError) as e:
+        name = request.weights or DPT_WEIGHTS
+        raise DataError(f"{name}: the weights cannot be had ({str(e).splitlines()[0][:200]}); with a network at hand they are "
+                        "downloaded, else give a folder that holds them by --weights") from e  # fmt: skip
+
+
+def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
+    """FCN-8s (Long et al. 2015) on ResNet-18 (He et al. 2016): class scores at strides 8, 16 and 32, summed at stride 8."""
+    import torch
+    from transformers import ResNetBackbone, ResNetConfig
+
+    stages = ["stage2", "stage3", "stage4"]
+    small = {"embedding_size": 16, "hidden_sizes": [16, 24, 32, 48]} if request.random_weights else {}
+    full = {"embedding_size": 64, "hidden_sizes": [64, 128, 256, 512]}
+    config = ResNetConfig(depths=[2, 2, 2, 2], layer_type="basic", out_features=stages, **(small or full))
+
+    class FCN(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.backbone = ResNetBackbone(config)
+            self.scores = torch.nn.ModuleList(torch.nn.Conv2d(c, CLASSES, 1) for c in config.hidden_sizes[1:])
+
+        def forward(self, pixel_values):
+            def grow(x, size):
+                return torch.nn.functional.interpolate(x, size=size, mode="bilinear", align_corners=False)
+
+            maps = [score(f) for score, f in zip(self.scores, self.backbone(pixel_values).feature_maps)]
+            total = maps[2]
+            for finer in (maps[1], maps[0]):
+                total = grow(total, finer.shape[-2:]) + finer
+            return grow(total, pixel_values.shape[-2:])
+
+    network = FCN()
+    if request.random_weights:
+        return network
+    if request.weights is None:
+        raise UsageError(
+            "fcn-resnet18: no weights of it for the 21 VOC classes are known to be public; give your own by "
+            "--weights FILE.safetensors, or export fcn-resnet50, for which torchvision has some"
+        )
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    try:
+        network.load_state_dict(load(Path(request.weights).read_bytes()))
+    except (OSError, SafetensorError, RuntimeError) as e:
+        raise DataError(f"{request.weights}: no weights of fcn-resnet18 ({str(e).splitlines()[0][:200]})") from e
+    return network
+
+
+def _fcn_resnet50(request: ExportRequest) -> torch.nn.Module:
+    import torch
+    from torchvision.models.segmentation import FCN_ResNet50_Weights, fcn_resnet50
+
+    class Scores(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            # trained on the images of COCO that show VOC's 21 classes
+            weights = None if request.random_weights else FCN_ResNet50_Weights.COCO_WITH_VOC_LABELS_V1
+            self.network = fcn_resnet50(weights=weights, weights_backbone=None, num_classes=CLASSES)
+
+        def forward(self, pixel_values):
+            return self.network(pixel_values)["out"]
+
+    return Scores()
+
+
+def _depth_alone(network: torch.nn.Module) -> torch.nn.Module:
+    import torch
+
+    class Depth(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.network = network
+
+        def forward(self, pixel_values):
+            return self.network(pixel_values=pixel_values).predicted_depth
+
+    return Depth()
+
+
+def build(request: ExportRequest) -> torch.nn.Module:
+    """The network in torch, ready to infer: [1, 3, h, w] to disparity [1, h, w] or to scores [1, 21, h, w].
+
+    Raises:
+        ResourceError: A package of the extra ``export`` is missing.
+        DataError, UsageError: The weights cannot be had.
+    """
+    import torch
+
+    makers = {"dpt": _dpt, "fcn-resnet18": _fcn_resnet18, "fcn-resnet50": _fcn_resnet50}
+    try:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            network = makers[request.model](request)
+    except ImportError as e:
+        raise ResourceError(f"{request.model}: {e.name or e} is needed to write it; {REMEDY}") from e
+    return (_depth_alone(network) if request.model == "dpt" else network).eval()
+
+
+def _onnx_bytes(network: torch.nn.Module, picture: torch.Tensor, output: str) -> bytes:
+    import torch
+
+    try:
+        import onnxscript  # noqa: F401
+    except ImportError as e:
+        raise ResourceError(f"onnxscript, which writes ONNX for torch, is not installed; {REMEDY}") from e
+    exporter = logging.getLogger("torch.onnx")
+    before = exporter.level
+    exporter.setLevel(logging.ERROR)
+    try:
+        with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            path = Path(folder) / "network.onnx"
+            torch.onnx.export(
+                network, (picture,), path, input_names=["image"], output_names=[output],
+                dynamo=True, external_data=False, verbose=False,
+            )  # fmt: skip
+            return path.read_bytes()
+    finally:
+        exporter.setLevel(before)
+
+
+def export_network(request: ExportRequest, out: Path) -> list[str]:
+    """Write a network as ONNX, and beside it the JSON file that says how to feed it.
+
+    Args:
+        request: Which, and at what input size.
+        out: The ONNX file.
+
+    Returns:
+        Lines for the user, one on how well onnxruntime and torch agree.
+
+    Raises:
+        DataError: The weights cannot be had, the file would be too large, or onnxruntime gives something else than torch.
+        ResourceError: A package is missing, or the file cannot be written.
+        UsageError: There are no weights of that network.
+    """
+    import torch
+
+    network = build(request)
+    weight = sum(p.numel() * p.element_size() for p in network.parameters())
+    if not weight < LARGEST_FILE:
+        raise DataError(
+            f"{request.model}: {weight / 2**30:.1f} GiB of weights do not fit into one ONNX file; choose smaller ones"
+        )
+    picture = torch.rand(1, 3, request.size, request.size, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    output = "disparity" if request.model == "dpt" else "scores"
+    with torch.no_grad():
+        wanted = network(picture).numpy()
+        write_bytes(out, _onnx_bytes(network, picture, output))
+    mean, std = HALF if request.model == "dpt" else IMAGENET
+    values = {"output": "disparity" if request.model == "dpt" else "classes", "mean": mean, "std": std}
+    write_text(side_file(out), json.dumps(values) + "\n")
+    found = open_network(out).run(picture[0].permute(1, 2, 0).numpy())
+    difference = float(np.abs(found - wanted).max() / wanted.std())
+    if not difference < AGREEMENT:
+        raise DataError(
+            f"{out}: onnxruntime and torch differ by {difference:.1e} standard deviations; try other versions of both"
+        )
+    flag = "--depth-model" if request.model == "dpt" else "--segmentation-model"
+    trained = "small and untrained, of no use but for tests; " if request.random_weights else ""
+    return [
+        f"{out}: {request.model}, {request.size} x {request.size} px, {out.stat().st_size / 2**20:.1f} MiB; "
+        f"{trained}onnxruntime and torch agree to {difference:.1e} standard deviations",
+        f"next: warpgs priors show SCENE {flag} {out} --out priors",
+    ]

@@ -1,0 +1,135 @@
+"""What an ONNX file holds, read from its bytes before onnxruntime sees them: nothing outside the file may be pulled in.
+
+The wire format is protobuf; field numbers are those of onnx.proto (ONNX IR version 3 and later).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from warpgs.errors import DataError
+
+DOMAINS = ("", "ai.onnx", "ai.onnx.ml", "com.microsoft")
+"""Operator sets that onnxruntime itself brings; any other needs a library of foreign code, or a function in the file."""
+MAX_NESTING = 32
+"""Graphs within graphs (If, Loop, Scan) go no deeper in a sane model."""
+
+MODEL_GRAPH, MODEL_OPSET, MODEL_FUNCTION = 7, 8, 25
+GRAPH_NODE, GRAPH_INITIALIZER, GRAPH_SPARSE = 1, 5, 15
+FUNCTION_NAME, FUNCTION_NODE, FUNCTION_DOMAIN = 1, 7, 10
+NODE_TYPE, NODE_ATTRIBUTE, NODE_DOMAIN = 4, 5, 7
+ATTRIBUTE_TENSORS, ATTRIBUTE_GRAPHS, ATTRIBUTE_SPARSE = (5, 10), (6, 11), (22, 23)
+SPARSE_TENSORS = (1, 2)
+TENSOR_NAME, TENSOR_EXTERNAL, TENSOR_LOCATION = 8, 13, 14
+
+Message = list[tuple[int, "int | memoryview"]]
+
+
+def _varint(data: memoryview, at: int) -> tuple[int, int]:
+    value = shift = 0
+    while shift < 64:
+        byte = data[at]
+        value |= (byte & 127) << shift
+        at += 1
+        if byte < 128:
+            return value, at
+        shift += 7
+    raise ValueError("a number of more than 64 bits")
+
+
+def _message(data: memoryview) -> Message:
+    """Field numbers with their values: whole numbers, or bytes; ValueError or IndexError where it is no protobuf."""
+    fields, at = [], 0
+    while at < len(data):
+        key, at = _varint(data, at)
+        number, wire = key >> 3, key & 7
+        if wire == 0:
+            value, at = _varint(data, at)
+        else:
+            length, at = _varint(data, at) if wire == 2 else ({1: 8, 5: 4}.get(wire, -1), at)
+            if not 0 <= length <= len(data) - at:
+                raise ValueError(f"a field of wire type {wire} runs over the end")
+            value, at = data[at : at + length], at + length
+        if number == 0:
+            raise ValueError("field number 0")
+        fields.append((number, value))
+    return fields
+
+
+def _parts(message: Message, *numbers: int) -> Iterator[Message]:
+    return (_message(v) for n, v in message if n in numbers and isinstance(v, memoryview))
+
+
+def _text(message: Message, number: int) -> str:
+    return "".join(bytes(v).decode("utf-8", "replace") for n, v in message if n == number and isinstance(v, memoryview))
+
+
+class _Walk:
+    """Goes through every node and tensor of a model."""
+
+    def __init__(self, path: Path, own: set[tuple[str, str]]):
+        self.path, self.own = path, own
+
+    def tensor(self, tensor: Message) -> None:
+        if any(n == TENSOR_EXTERNAL or (n == TENSOR_LOCATION and v != 0) for n, v in tensor):
+            raise DataError(
+                f"{self.path}: the weights of {_text(tensor, TENSOR_NAME) or 'a constant'!r} lie in another file, which is not "
+                "read. Save the model as one file: `onnx.save(onnx.load(FILE), OUT)`, or export it without external data"
+            )
+
+    def node(self, node: Message, depth: int) -> None:
+        domain, kind = _text(node, NODE_DOMAIN), _text(node, NODE_TYPE)
+        if domain not in DOMAINS and (domain, kind) not in self.own:
+            raise DataError(
+                f"{self.path}: the operator {domain}::{kind} is not part of ONNX and would need foreign code to run. "
+                "Export the model with standard operators"
+            )
+        for attribute in _parts(node, NODE_ATTRIBUTE):
+            for tensor in _parts(attribute, *ATTRIBUTE_TENSORS):
+                self.tensor(tensor)
+            for sparse in _parts(attribute, *ATTRIBUTE_SPARSE):
+                self.sparse(sparse)
+            for graph in _parts(attribute, *ATTRIBUTE_GRAPHS):
+                self.graph(graph, depth + 1)
+
+    def sparse(self, sparse: Message) -> None:
+        for tensor in _parts(sparse, *SPARSE_TENSORS):
+            self.tensor(tensor)
+
+    def graph(self, graph: Message, depth: int = 0) -> None:
+        if depth > MAX_NESTING:
+            raise ValueError(f"graphs nested deeper than {MAX_NESTING}")
+        for tensor in _parts(graph, GRAPH_INITIALIZER):
+            self.tensor(tensor)
+        for sparse in _parts(graph, GRAPH_SPARSE):
+            self.sparse(sparse)
+        for node in _parts(graph, GRAPH_NODE):
+            self.node(node, depth)
+
+
+def check_onnx(data: bytes, path: Path) -> None:
+    """See that bytes are an ONNX model that needs nothing but itself: no external data, no operators of other domains.
+
+    Args:
+        data: The whole file.
+        path: Its name, for messages.
+
+    Raises:
+        DataError: It is no ONNX model, keeps weights elsewhere (even where that file exists), or uses custom operators.
+    """
+    try:
+        model = _message(memoryview(data))
+        graphs, functions = list(_parts(model, MODEL_GRAPH)), list(_parts(model, MODEL_FUNCTION))
+        if len(graphs) != 1 or not any(n == MODEL_OPSET for n, _ in model):
+            raise ValueError("it has no graph" if not graphs else "it names no operator set")
+        # exporters put what they compose of standard operators into functions that travel in the file
+        walk = _Walk(path, {(_text(f, FUNCTION_DOMAIN), _text(f, FUNCTION_NAME)) for f in functions})
+        walk.graph(graphs[0])
+        for function in functions:
+            for node in _parts(function, FUNCTION_NODE):
+                walk.node(node, 0)
+    except (ValueError, IndexError) as e:
+        raise DataError(
+            f"{path}: this is no ONNX model ({e}); give a file that `torch.onnx.export` or a like tool wrote"
+        ) from e

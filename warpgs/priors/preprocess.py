@@ -1,0 +1,148 @@
+"""What a network wants its picture to look like: told by flags, by a small JSON file beside the model, or assumed and said."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from warpgs.errors import DataError, UsageError
+from warpgs.priors.session import Network
+
+IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
+"""Mean and standard deviation of ImageNet's colours: what torchvision's and Depth Anything's networks take."""
+HALF = ((0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
+"""Colours in [-1, 1]: what DPT (Ranftl et al. 2021) takes."""
+
+
+@dataclass(frozen=True)
+class Preprocessing:
+    """Size and colours of a network's input, and what its output means."""
+
+    size: int
+    """Shorter side [px] of the input where the graph leaves it free."""
+    multiple: int
+    """Both sides are made multiples of this [px] where the graph leaves them free."""
+    mean: tuple[float, float, float]
+    """Subtracted from colours in [0, 1], red first."""
+    std: tuple[float, float, float]
+    """What the difference is divided by."""
+    output: str
+    """What the output is: disparity, depth or classes."""
+
+    def prepare(self, network: Network, image: np.ndarray) -> np.ndarray:
+        """The input [h, w, 3], float32, for a photograph [H, W, 3] in [0, 1]; both cover the same field of view."""
+        height, width = network.size or self.free_size(*image.shape[:2])
+        picture = resize(image, height, width)
+        return (picture - np.float32(self.mean)) / np.float32(self.std)
+
+    def free_size(self, height: int, width: int) -> tuple[int, int]:
+        """Input size with the photograph's proportions, rounded to the nearest multiple [px]."""
+        scale = self.size / min(height, width)
+        h, w = (max(1, round(scale * side / self.multiple)) * self.multiple for side in (height, width))
+        return h, w
+
+
+def resize(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    """An image [H, W] or [H, W, C] at another size, float32, pixel centres aligned at +0.5.
+
+    Bilinear where it grows; averages over areas where it shrinks, so that fine texture does not alias.
+    """
+    import cv2
+
+    shrinks = height <= image.shape[0] and width <= image.shape[1]
+    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return cv2.resize(np.ascontiguousarray(image, np.float32), (width, height), interpolation=method)
+
+
+def _numbers(value: object) -> bool:
+    real = isinstance(value, (list, tuple)) and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in value)
+    return real and len(value) == 3 and all(abs(v) < 1e6 for v in value)
+
+
+def _whole(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= 16384
+
+
+KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
+    "size": ("a whole number of pixels", _whole),
+    "multiple": ("a whole number of pixels", _whole),
+    "mean": ("three numbers", _numbers),
+    "std": ("three numbers above 0", lambda v: _numbers(v) and all(x > 0 for x in v)),
+    "output": ("disparity, depth or classes", lambda v: v in ("disparity", "depth", "classes")),
+}
+
+
+def check_value(key: str, value: object, where: str, error: type[Exception] = UsageError) -> None:
+    """See that a value may describe a network's input or output.
+
+    Raises:
+        UsageError: It may not; or ``error`` where given.
+    """
+    wanted, good = KEYS[key]
+    if not good(value):
+        raise error(f"{where}: {key} must be {wanted}, not {value!r}")
+
+
+def side_file(model: Path) -> Path:
+    """The JSON file that describes a model: its name with .json behind."""
+    return model.with_name(model.name + ".json")
+
+
+def read_side_file(model: Path) -> dict:
+    """What the JSON file beside a model says; empty where there is none.
+
+    Raises:
+        DataError: It is no JSON object, or holds a key or a value that means nothing.
+    """
+    path = side_file(model)
+    if not path.exists():
+        return {}
+    try:
+        values = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as e:
+        raise DataError(f"{path}: cannot be read ({e}); mend or remove it") from e
+    if not isinstance(values, dict):
+        raise DataError(f"{path}: holds no JSON object; write one with the keys {', '.join(KEYS)}")
+    for key, value in values.items():
+        if key not in KEYS:
+            raise DataError(f"{path}: the key {key!r} is unknown; {', '.join(KEYS)} may stand there")
+        check_value(key, value, str(path), DataError)
+    return values
+
+
+def describe(network: Network, flags: dict, usual: Preprocessing, flag: str) -> tuple[Preprocessing, list[str]]:
+    """How to feed a network: flags come before the file beside the model, and that before what is usual.
+
+    Args:
+        network: The opened model.
+        flags: Values of flags by field name; None or 0 where a flag was not given.
+        usual: What holds where neither says anything.
+        flag: Beginning of the flags' names, for notes.
+
+    Returns:
+        The description, and a note on what was assumed.
+
+    Raises:
+        DataError: The file beside the model is not what it must be.
+        UsageError: A size was asked for that the graph does not allow.
+    """
+    given = {k: v for k, v in flags.items() if v}
+    values = read_side_file(network.path) | given
+    if network.size and given.get("size", min(network.size)) != min(network.size):
+        height, width = network.size
+        raise UsageError(f"--{flag}-size {given['size']}: {network.path} takes {width} x {height} px only; leave the flag out")
+    needed = ["mean", "std"] + ([] if network.size else ["size", "multiple"]) + (["output"] if flag == "depth" else [])
+    assumed = [k for k in needed if k not in values]
+    values = asdict(usual) | values
+    values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    notes = []
+    if assumed:
+        said = ", ".join(
+            f"{k} {' '.join(map(str, v)) if isinstance(v, tuple) else v}" for k, v in values.items() if k in assumed
+        )
+        notes.append(f"{network.path.name}: assumed {said}; flags --{flag}-... or {side_file(network.path).name} say otherwise")
+    return Preprocessing(**values), notes

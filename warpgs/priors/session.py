@@ -1,0 +1,158 @@
+"""Networks that turn a photograph into a map, run by onnxruntime from one ONNX file that the user names."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.priors.onnx_file import check_onnx
+
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
+
+PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
+TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+ERRORS_ONLY = 3
+
+
+@dataclass(frozen=True)
+class Network:
+    """An opened model with one picture as input and one map as output."""
+
+    path: Path
+    """Its file."""
+    sha256: str
+    """SHA-256 of the file, hexadecimal."""
+    session: InferenceSession
+    """The onnxruntime session."""
+    layout: str
+    """Order of the input's axes: nchw or nhwc."""
+    size: tuple[int, int] | None
+    """Height and width [px] that the graph demands; None where both are free."""
+    type: type
+    """Scalar type of the input."""
+
+    @property
+    def title(self) -> str:
+        """File name and the first digits of the hash, for reports."""
+        return f"{self.path.name} (SHA-256 {self.sha256[:12]})"
+
+    def run(self, picture: np.ndarray) -> np.ndarray:
+        """The output, float32 of any shape, for one prepared picture [h, w, 3].
+
+        Raises:
+            DataError: onnxruntime cannot run the graph, or the output is NaN, infinite, or the same number everywhere.
+        """
+        batch = picture[None] if self.layout == "nhwc" else picture.transpose(2, 0, 1)[None]
+        feed = {self.session.get_inputs()[0].name: np.ascontiguousarray(batch, dtype=self.type)}
+        try:
+            (output,) = self.session.run(None, feed)
+        except Exception as e:  # onnxruntime's errors share no base but Exception
+            shape = " x ".join(map(str, batch.shape))
+            raise DataError(f"{self.path}: onnxruntime cannot run it on an input of {shape} ({_line(e)}); see --help for "
+                            "the flags that set its input") from e  # fmt: skip
+        output = np.asarray(output)
+        if output.dtype.kind != "f":
+            raise DataError(f"{self.path}: its output is of type {output.dtype}, not scores; leave argmax out of the export")
+        output = output.astype(np.float32)
+        if not np.isfinite(output).all():
+            raise DataError(f"{self.path}: its output holds NaN or infinity; check mean and standard deviation, or its weights")
+        if output.size == 0 or not output.max() > output.min():
+            raise DataError(f"{self.path}: its output is the same number everywhere; check the model's weights")
+        return output
+
+
+def _line(error: Exception) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0][:200] if lines else type(error).__name__
+
+
+def _start(data: bytes, path: Path, provider: str, threads: int) -> InferenceSession:
+    try:
+        import onnxruntime as ort
+    except ImportError as e:
+        raise ResourceError(f"{path}: onnxruntime, which runs it, cannot be imported ({e}); `pip install onnxruntime`") from e
+    there = [name for name, long in PROVIDERS.items() if long in ort.get_available_providers()]
+    remedy = "`pip uninstall onnxruntime`, then `pip install onnxruntime-gpu[cuda,cudnn]`; or leave the flag out"
+    if provider not in there:
+        raise ResourceError(
+            f"--onnx-provider {provider}: this onnxruntime {ort.__version__} has only {', '.join(there)}. {remedy}"
+        )
+    options = ort.SessionOptions()
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    options.intra_op_num_threads = threads or usable
+    options.inter_op_num_threads = 1
+    options.log_severity_level = ERRORS_ONLY
+    options.use_deterministic_compute = True
+    try:
+        session = ort.InferenceSession(data, options, providers=[PROVIDERS[provider]])
+    except Exception as e:
+        raise DataError(f"{path}: onnxruntime {ort.__version__} cannot load it ({_line(e)}); export it anew, perhaps with an "
+                        "older operator set") from e  # fmt: skip
+    # onnxruntime goes on without a provider whose libraries are missing
+    if PROVIDERS[provider] not in session.get_providers():
+        raise ResourceError(f"--onnx-provider {provider}: onnxruntime finds no {provider} libraries or device. {remedy}")
+    return session
+
+
+def _input_axes(path: Path, shape: list) -> tuple[str, tuple[int, int] | None]:
+    """Layout and fixed size of an input shape; names and None stand for free axes."""
+    dims = [d if isinstance(d, int) and d > 0 else None for d in shape]
+    text = " x ".join(str(d) for d in shape)
+    if len(dims) != 4 or dims[0] not in (1, None):
+        raise DataError(
+            f"{path}: its input is {text}; one picture, 1 x 3 x height x width or 1 x height x width x 3, is needed"
+        )
+    if dims[1] in (3, None) and (dims[1] == 3 or dims[3] != 3):
+        layout, sides = "nchw", (dims[2], dims[3])
+    elif dims[3] == 3:
+        layout, sides = "nhwc", (dims[1], dims[2])
+    else:
+        raise DataError(f"{path}: neither the second nor the last axis of its input, {text}, has the 3 channels of a picture")
+    if (sides[0] is None) != (sides[1] is None):
+        raise DataError(
+            f"{path}: its input, {text}, fixes only one side of the picture; export it with both fixed or both free"
+        )
+    return layout, None if sides[0] is None else sides
+
+
+def open_network(path: str | Path, *, provider: str = "cpu", threads: int = 0) -> Network:
+    """Open an ONNX file and see that it maps one picture to one output.
+
+    Args:
+        path: The file; its weights must be inside.
+        provider: cpu or cuda.
+        threads: CPU threads; 0 for as many as the process may use.
+
+    Returns:
+        The network.
+
+    Raises:
+        UsageError: The provider is neither cpu nor cuda.
+        DataError: The file is missing, no ONNX model, needs other files or foreign operators, or has other inputs or outputs.
+        ResourceError: onnxruntime or the provider is not there.
+    """
+    if provider not in PROVIDERS:
+        raise UsageError(f"onnx-provider {provider!r} is not one of {', '.join(PROVIDERS)}")
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as e:
+        raise DataError(f"{path}: the model cannot be read ({e.strerror or e}); give the path of an ONNX file") from e
+    check_onnx(data, path)
+    session = _start(data, path, provider, threads)
+    inputs, outputs = session.get_inputs(), session.get_outputs()
+    for what, found in (("input", inputs), ("output", outputs)):
+        if len(found) != 1:
+            names = ", ".join(f.name for f in found)
+            raise DataError(f"{path}: it has {len(found)} {what}s ({names}); one is needed. Export it with that one alone")
+    if inputs[0].type not in TYPES:
+        raise DataError(f"{path}: its input is a {inputs[0].type}; float or float16 is needed")
+    layout, size = _input_axes(path, inputs[0].shape)
+    return Network(path, hashlib.sha256(data).hexdigest(), session, layout, size, TYPES[inputs[0].type])

@@ -1,0 +1,252 @@
+"""One `Prior` per view: which network or classical method makes it, and what the user must know of that."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from warpgs.errors import DataError, UsageError
+from warpgs.priors import depth, semantics
+from warpgs.priors.cache import MapCache
+from warpgs.priors.depth import complete_disparity, network_disparity
+from warpgs.priors.preprocess import check_value, describe
+from warpgs.priors.semantics import SemanticMaps, boundary_weight, classical_semantics, knows_foreground, network_semantics
+from warpgs.priors.session import PROVIDERS, open_network
+from warpgs.scene import Prior, View
+
+if TYPE_CHECKING:
+    from warpgs.scene import ViewDepth
+
+MIN_CONFIRMED = 50
+"""Pixels with a confirmed depth below which a view's depth is taken for unknown."""
+LARGEST_OBJECT = 0.9
+"""A region of a larger share of the photograph is no object but what a mask leaves."""
+FLAGS = ("size", "multiple", "mean", "std")
+OUTPUTS = ("auto", "disparity", "depth")
+
+Colors = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class PriorConfig:
+    """Networks to take priors from, and how to feed them; classical methods where none is named."""
+
+    depth_model: str | None = None
+    """ONNX file of a monocular depth network (DPT, MiDaS, Depth Anything); without one, depth comes from the other views."""
+    depth_output: str = "auto"
+    """What it gives: disparity (inverse depth), depth, or auto: what FILE.json beside it says, else disparity."""
+    depth_size: int = 0
+    """Shorter side of its input [px] where the file leaves it free; 0 for what FILE.json says, else 384."""
+    depth_multiple: int = 0
+    """Its sides are multiples of this [px]; 0 for what FILE.json says, else 32. Depth Anything needs 14."""
+    depth_mean: Colors | None = None
+    """Subtracted from colours in [0, 1]; else what FILE.json says, else 0.5 0.5 0.5."""
+    depth_std: Colors | None = None
+    """Divides them; else what FILE.json says, else 0.5 0.5 0.5."""
+    segmentation_model: str | None = None
+    """ONNX file of a segmentation network for the 21 PASCAL VOC classes; without one, saliency and edges stand in."""
+    segmentation_size: int = 0
+    """Shorter side of its input [px] where the file leaves it free; 0 for what FILE.json says, else 512."""
+    segmentation_multiple: int = 0
+    """Its sides are multiples of this [px]; 0 for what FILE.json says, else 32."""
+    segmentation_mean: Colors | None = None
+    """Subtracted from colours in [0, 1]; else what FILE.json says, else ImageNet's 0.485 0.456 0.406."""
+    segmentation_std: Colors | None = None
+    """Divides them; else what FILE.json says, else ImageNet's 0.229 0.224 0.225."""
+    onnx_provider: str = "cpu"
+    """What runs the networks: cpu or cuda."""
+    cache: bool = True
+    """Keep what networks give in the user's cache folder, or in WARPGS_CACHE."""
+
+    def __post_init__(self):
+        if self.onnx_provider not in PROVIDERS:
+            raise UsageError(f"onnx-provider {self.onnx_provider!r} is not one of {', '.join(PROVIDERS)}")
+        if self.depth_output not in OUTPUTS:
+            raise UsageError(f"depth-output {self.depth_output!r} is not one of {', '.join(OUTPUTS)}")
+        for kind in ("depth", "segmentation"):
+            for key, value in self.flags(kind).items():
+                if value is not None and value != 0:
+                    check_value(key, value, f"--{kind}-{key}")
+                    if getattr(self, f"{kind}_model") is None:
+                        raise UsageError(
+                            f"--{kind}-{key} describes a network; name it by --{kind}-model, or leave the flag out"
+                        )
+        if self.depth_output != "auto" and self.depth_model is None:
+            raise UsageError("--depth-output describes a network; name it by --depth-model, or leave the flag out")
+
+    def flags(self, kind: str) -> dict:
+        """Values of the flags on how to feed a network, ``kind`` depth or segmentation, by the rest of their names."""
+        return {key: getattr(self, f"{kind}_{key}") for key in FLAGS}
+
+
+DisparitySource = Callable[[int], tuple[np.ndarray, str]]
+"""Disparity of the i-th view, and a phrase on where it comes from."""
+
+
+def _depth_network(views: Sequence[View], config: PriorConfig, threads: int, cache: MapCache | None, notes: list[str]):
+    network = open_network(config.depth_model, provider=config.onnx_provider, threads=threads)
+    output = None if config.depth_output == "auto" else config.depth_output
+    how, said = describe(network, {**config.flags("depth"), "output": output}, depth.USUAL, "depth")
+    if how.output not in ("disparity", "depth"):
+        raise DataError(f"{network.path}: described as giving {how.output}, so it is no depth network; check --depth-model")
+    notes += [f"depth: {network.title} gives {how.output}", *said]
+    decided_by = {"model": network.sha256, "provider": config.onnx_provider, **asdict(how)}
+
+    def disparity(i: int) -> tuple[np.ndarray, str]:
+        image = views[i].image
+
+        def make() -> tuple[np.ndarray]:
+            return (network_disparity(network, how, image),)
+
+        (found,) = make() if cache is None else cache.maps(image, ("disparity",), decided_by, make)
+        return found, f"{how.output} by {network.title}"
+
+    return disparity
+
+
+def _depth_views(views: Sequence[View], depths: Sequence[ViewDepth] | None, notes: list[str]) -> DisparitySource:
+    if depths is None:
+        notes.append("depth: none, since there is neither a network nor a depth from other views; geometry does not count")
+        return lambda i: (np.zeros(views[i].image.shape[:2], np.float32), "none")
+    shares = [float(d.valid.mean()) for d in depths]
+    notes.append(
+        f"depth: from the other views, {min(shares):.1%} to {max(shares):.1%} of a view's pixels, completed along even colours"
+    )
+    poor = [v.name for v, d in zip(views, depths) if d.valid.sum() < MIN_CONFIRMED]
+    if poor:
+        notes.append(f"no depth is confirmed in {', '.join(poor)}: geometry does not count there; --depth-model would help")
+
+    def disparity(i: int) -> tuple[np.ndarray, str]:
+        view, d = views[i], depths[i]
+        if d.valid.sum() < MIN_CONFIRMED:
+            return np.zeros(d.depth.shape, np.float32), "none"
+        found = complete_disparity(view.image, d.depth, d.valid, d.sensitivity)
+        return found, f"depth that other views confirm at {shares[i]:.1%} of the pixels, completed"
+
+    return disparity
+
+
+SemanticsSource = Callable[[int], tuple[SemanticMaps, str]]
+
+
+def _segmentation_network(views: Sequence[View], config: PriorConfig, threads: int, cache: MapCache | None, notes: list[str]):
+    network = open_network(config.segmentation_model, provider=config.onnx_provider, threads=threads)
+    how, said = describe(network, config.flags("segmentation"), semantics.USUAL, "segmentation")
+    if how.output != "classes":
+        raise DataError(f"{network.path}: described as giving {how.output}, so it is no segmentation network; check the flags")
+    notes += [f"semantics: {network.title}, {semantics.CLASSES} classes", *said]
+    decided_by = {"model": network.sha256, "provider": config.onnx_provider, **asdict(how)}
+
+    def maps(i: int) -> tuple[SemanticMaps, str]:
+        image = views[i].image
+
+        def make() -> tuple[np.ndarray, ...]:
+            m = network_semantics(network, how, image)
+            return m.confidence, m.boundary, m.foreground
+
+        found = make() if cache is None else cache.maps(image, ("confidence", "boundary", "foreground"), decided_by, make)
+        return SemanticMaps(*found), f"classes by {network.title}"
+
+    return maps
+
+
+def _classical(views: Sequence[View], notes: list[str]) -> SemanticsSource:
+    notes.append(
+        "semantics: no network, so saliency stands for foreground and edges for boundaries; --segmentation-model takes one"
+    )
+
+    def maps(i: int) -> tuple[SemanticMaps, str]:
+        return classical_semantics(views[i].image), "saliency and edges"
+
+    return maps
+
+
+def _stands_out(region: np.ndarray | None) -> bool:
+    """Whether a region shows an object: not where a mask only cuts off a frame or a passer-by."""
+    return region is not None and 0 < float(region.mean()) <= LARGEST_OBJECT
+
+
+def _fall_back(found: list[tuple[SemanticMaps, str]], views: Sequence[View], regions, classical: bool, notes: list[str]):
+    """The region of a view in place of a foreground that is not known; nothing where it has no region either."""
+    replaced, empty, result = [], [], []
+    for (maps, source), view, region in zip(found, views, regions):
+        if _stands_out(region) and (classical or not knows_foreground(maps)):
+            replaced.append(view.name)
+            foreground, source = region.astype(np.float32), f"{source}; foreground from the view's mask or black background"
+            if classical:  # saliency is a guess, a region is knowledge
+                maps = SemanticMaps(np.ones_like(foreground), maps.boundary, foreground)
+            else:
+                maps = SemanticMaps(maps.confidence, boundary_weight(region), foreground)
+        elif not knows_foreground(maps):
+            empty.append(view.name)
+            zeros = np.zeros_like(maps.foreground)
+            maps, source = (
+                SemanticMaps(maps.confidence, zeros, zeros),
+                "none: hardly any foreground and no mask of an object",
+            )
+        result.append((maps, source))
+    reason = "a mask is surer than saliency" if classical else "the network finds hardly any foreground"
+    if replaced:
+        notes.append(f"semantics: {reason}, so the mask or black background stands for foreground in {_names(replaced)}")
+    if empty:
+        notes.append(f"semantics: hardly any foreground and no mask of an object in {_names(empty)}: they do not count there")
+    return result
+
+
+def _names(names: list[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more views" if len(names) > 5 else "")
+
+
+def view_priors(
+    views: Sequence[View],
+    config: PriorConfig,
+    *,
+    depths: Sequence[ViewDepth] | None = None,
+    regions: Sequence[np.ndarray | None] | None = None,
+    threads: int = 0,
+    cache: Path | None = None,
+) -> tuple[list[Prior], list[str]]:
+    """What is believed about the pixels of each view, before anything is fitted.
+
+    Args:
+        views: The training views.
+        config: Networks and how to feed them.
+        depths: For each view the depth that the others confirm; read where no depth network is named.
+        regions: For each view the pixels that show its object, bool [H, W], or None: stands in where the foreground is unknown.
+        threads: CPU threads of a network; 0 for as many as the process may use.
+        cache: Folder that keeps what networks give; None, or ``config.cache`` off, for no keeping.
+
+    Returns:
+        A prior per view, and notes on what was chosen, assumed and missing.
+
+    Raises:
+        DataError: A model is not what it must be, or its output is no map.
+        UsageError: A flag contradicts a model.
+        ResourceError: onnxruntime or its provider is missing.
+    """
+    store = MapCache(Path(cache)) if config.cache and cache is not None else None
+    notes: list[str] = []
+    # both are opened before either runs: a wrong file is found at once
+    if config.depth_model is not None:
+        disparity = _depth_network(views, config, threads, store, notes)
+    else:
+        disparity = _depth_views(views, depths, notes)
+    if config.segmentation_model is not None:
+        maps = _segmentation_network(views, config, threads, store, notes)
+    else:
+        maps = _classical(views, notes)
+    found = [maps(i) for i in range(len(views))]
+    found = _fall_back(found, views, regions or [None] * len(views), config.segmentation_model is None, notes)
+    priors = []
+    for i, (m, source) in enumerate(found):
+        d, where = disparity(i)
+        priors.append(Prior(d, m.confidence, m.boundary, m.foreground, where, source))
+    if store is not None:
+        notes += store.notes
+        if store.found:
+            notes.append(f"priors: {store.found} of {store.found + store.made} maps were there already, in {store.folder}")
+    return priors, notes
