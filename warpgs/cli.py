@@ -38,7 +38,7 @@ def _parse(kind: type, name: str, arguments: list[str], default: object = None):
     import tyro
 
     extra = {} if default is None else {"default": default}
-    return tyro.cli(kind, args=arguments, prog=f"warpgs {name}", description=COMMANDS[name.split()[0]], **extra)
+    return tyro.cli(kind, args=arguments, prog=f"warpgs {name}", description=COMMANDS[name.split(maxsplit=1)[0]], **extra)
 
 
 def _fit_arguments(arguments: list[str]):
