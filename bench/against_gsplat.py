@@ -119,6 +119,16 @@ def our_step(gaussians: Gaussians, camera: Camera, target: torch.Tensor):
     return work
 
 
+def in_calling_thread(work):
+    """The same work with its backward pass in the caller's thread: torch hands it to another one otherwise, and waits."""
+
+    def here():
+        with torch.autograd.set_multithreading_enabled(False):
+            return work()
+
+    return here
+
+
 def torch_ssim(a: torch.Tensor, b: torch.Tensor, window: torch.Tensor) -> torch.Tensor:
     """Mean structural similarity by grouped convolutions, as in 3DGS trainers; images [1, 3, H, W], window [3, 1, 11, 11]."""
     from torch.nn.functional import conv2d
@@ -229,7 +239,9 @@ def compare(path: str, name: str, kernels: bool) -> dict:
         "warpgs graph": recorded(ours(gaussians, camera, upstream, capacity=room)),
     }
     works |= {f"gsplat {kind}": peer(gaussians, camera, upstream, kind == "packed") for kind in ("dense", "packed")}
-    row = {"configuration": name, "gaussians": len(gaussians), "wall_ms": wall_times(works), "gpu_ms": {}, "peak_mib": {}}
+    one = {f"{who}, one thread": in_calling_thread(works[who]) for who in ("warpgs", "gsplat dense")}
+    row = {"configuration": name, "gaussians": len(gaussians), "wall_ms": wall_times(works | one)}
+    row |= {"gpu_ms": {}, "peak_mib": {}}
     for who, work in works.items():
         row["gpu_ms"][who], by_kernel = gpu_times(work)
         if who != "warpgs graph":  # its memory is taken when it is recorded
@@ -240,6 +252,8 @@ def compare(path: str, name: str, kernels: bool) -> dict:
     for measure in ("wall_ms", "gpu_ms"):
         best = min(row[measure][who]["median"] for who in peers)
         row[f"{measure}_ratio"] = {w: round(row[measure][w]["median"] / best, 3) for w in works if w not in peers}
+    ours_alone, theirs_alone = (row["wall_ms"][who]["median"] for who in one)
+    row["wall_ms_ratio"]["warpgs, one thread"] = round(ours_alone / theirs_alone, 3)
     least = min(row["peak_mib"][who] for who in peers)
     row["peak_ratio"] = {who: round(row["peak_mib"][who] / least, 3) for who in ("warpgs", "warpgs atomic")}
     del works, work
@@ -271,9 +285,11 @@ def main() -> None:
             for kernel, microseconds in (row["kernels_us"] | {"step:": 0.0} | row["step_kernels_us"]).items():
                 print(f"    {microseconds:9.1f} us  {kernel[:100]}")
         for who in row["wall_ms"]:
-            wall, gpu = row["wall_ms"][who], row["gpu_ms"][who]
-            figures = f"wall {wall['median']:7.3f} {wall['quartiles']}  GPU {gpu['median']:7.3f} {gpu['spread']} ms"
-            print(f"{name:<18} {who:<14} {figures}  peak {row['peak_mib'].get(who, 0):7.1f} MiB")
+            wall, gpu = row["wall_ms"][who], row["gpu_ms"].get(who)
+            figures = f"wall {wall['median']:7.3f} {wall['quartiles']}"
+            if gpu is not None:
+                figures += f"  GPU {gpu['median']:7.3f} {gpu['spread']} ms  peak {row['peak_mib'].get(who, 0):7.1f} MiB"
+            print(f"{name:<18} {who:<24} {figures}")
         for who, wall in row["step_wall_ms"].items():
             print(f"{name:<18} {who:<14} step {wall['median']:7.3f} {wall['quartiles']} ms")
         ratios = f"wall {row['wall_ms_ratio']}, GPU {row['gpu_ms_ratio']}, memory {row['peak_ratio']}, step {row['step_ratio']}"

@@ -122,7 +122,7 @@ _COLOR_BACKWARD = """
 @functools.cache
 def make_functions():
     """The functions, for CUDA; those on colours for float32."""
-    vec16 = wp.types.vector(16, wp.float32)
+    vec12, vec16 = wp.types.vector(12, wp.float32), wp.types.vector(16, wp.float32)
 
     @wp.func_native(_COMPACT.replace("BLOCK", str(BLOCK)))
     def compact(item: int, wanted: int) -> int:
@@ -130,6 +130,16 @@ def make_functions():
 
         All BLOCK threads of the block must call it.
         """
+        ...
+
+    @wp.func_native("""
+        float4* row = reinterpret_cast<float4*>(records.data) + 3ll * i;
+        row[0] = make_float4(v[0], v[1], v[2], v[3]);
+        row[1] = make_float4(v[4], v[5], v[6], v[7]);
+        row[2] = make_float4(v[8], v[9], v[10], v[11]);
+    """)
+    def store_record(records: wp.array2d(dtype=float), i: int, v: vec12):
+        """Write row i of records of 12 floats, 16-byte aligned."""
         ...
 
     @wp.func_native(_CLEAR.replace("BLOCK", str(BLOCK)))
@@ -180,6 +190,6 @@ def make_functions():
         ...
 
     return SimpleNamespace(
-        compact=compact, clear_rows=clear_rows, ballot=ballot, broadcast=broadcast, running_sum=running_sum, lowest=lowest,
-        color=color, color_backward=color_backward,
+        compact=compact, store_record=store_record, clear_rows=clear_rows, ballot=ballot, broadcast=broadcast,
+        running_sum=running_sum, lowest=lowest, color=color, color_backward=color_backward,
     )  # fmt: skip

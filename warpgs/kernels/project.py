@@ -27,6 +27,14 @@ def make_forward(real, native: bool):
     basis = sh.make_functions(real).basis
     vec3 = m.vec3
     color_of = make_native().color if native else None
+    vec12 = wp.types.vector(RECORD, real)
+
+    @wp.func
+    def store_values(splats: wp.array2d(dtype=real), i: int, record: vec12):
+        for k in range(wp.static(RECORD)):
+            splats[i, k] = record[k]
+
+    store = make_native().store_record if native else store_values
 
     @wp.func
     def draw(
@@ -93,18 +101,19 @@ def make_forward(real, native: bool):
                     color += y[k] * coefficients[n, k]
         if not m.finite3(color):
             return 0
-        splats[i, 0] = e.pixel[0]
-        splats[i, 1] = e.pixel[1]
-        splats[i, 2] = factor[0]
-        splats[i, 3] = factor[1]
-        splats[i, 4] = factor[2]
-        splats[i, 5] = opacity
-        splats[i, 6] = wp.max(color[0], real(0.0))
-        splats[i, 7] = wp.max(color[1], real(0.0))
-        splats[i, 8] = wp.max(color[2], real(0.0))
-        splats[i, 9] = e.position[2]
-        splats[i, 10] = half_width
-        splats[i, 11] = half_height
+        record = vec12()
+        record[0] = e.pixel[0]
+        record[1] = e.pixel[1]
+        record[2] = factor[0]
+        record[3] = factor[1]
+        record[4] = factor[2]
+        record[5] = opacity
+        for channel in range(3):
+            record[6 + channel] = wp.max(color[channel], real(0.0))
+        record[9] = e.position[2]
+        record[10] = half_width
+        record[11] = half_height
+        store(splats, i, record)
         return tiles
 
     @wp.kernel(enable_backward=False, module=f"warpgs.kernels.project.forward.{real.__name__}.{int(native)}")
@@ -130,8 +139,7 @@ def make_forward(real, native: bool):
         )  # fmt: skip
         tile_counts[i] = tiles
         if tiles == 0:
-            for k in range(wp.static(RECORD)):
-                splats[i, k] = real(0.0)
+            store(splats, i, vec12())
 
     return forward
 
