@@ -142,6 +142,26 @@ class Prior:
 
 
 @dataclass(frozen=True)
+class ViewDepth:
+    """Depth that other views confirm at the pixels of one view: evidence, not a rendering."""
+
+    depth: np.ndarray
+    """z-depth [u], float32, shape [H, W]; 0 where not valid."""
+    valid: np.ndarray
+    """True where the depth passed every check, bool, shape [H, W]."""
+    sensitivity: np.ndarray
+    """|dz/dpx| [u/px]: change of the depth as the match slides along its epipolar line; float32, shape [H, W]; infinite where
+    not valid."""
+    notes: tuple[str, ...] = ()
+    """What a user must know: pairs left out, files missing, nothing found."""
+
+    @property
+    def coverage(self) -> float:
+        """Share of the pixels that are valid, in [0, 1]."""
+        return float(self.valid.mean())
+
+
+@dataclass(frozen=True)
 class Gaussians:
     """A set of N Gaussians as stored and optimised; the kernels apply exp, sigmoid and normalisation."""
 

@@ -1,4 +1,4 @@
-"""The first Gaussians: from the reconstruction's points, or at random where the training cameras look."""
+"""The first Gaussians: from depths that views confirm, the reconstruction's points, or at random where cameras look."""
 
 from __future__ import annotations
 
@@ -11,10 +11,15 @@ from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.sh import C0, coefficient_count
+from warpgs.pipeline.coarse import coarse_points, depth_bounds
 from warpgs.pipeline.region import counted_region
+from warpgs.priors.epipolar import EpipolarConfig, flow_depth
+from warpgs.priors.flow import RANGES, flow_between
 from warpgs.priors.matches import triangulate_matches
+from warpgs.priors.sweep import SweepConfig, sweep_depths
 from warpgs.scene import Gaussians, PointCloud, View
 
+SOURCES = ("auto", "sweep", "flow", "points", "random")
 MIN_POINTS = 100
 """With fewer sparse points a random start is better: they leave most of the picture empty."""
 MIN_MATCHES = 10
@@ -30,21 +35,46 @@ class InitConfig:
     """Where the first Gaussians come from."""
 
     source: str = "auto"
-    """points (the reconstruction's), random, or auto: points where the scene has at least 100 that training views saw."""
+    """sweep or flow (a point per pixel whose depth other views confirm), points (the reconstruction's), random, or auto: points
+    where the scene has at least 100 that training views saw."""
     random_count: int = 20_000
     """Number of random points."""
     opacity: float = 0.1
     """First opacity, in (0, 1)."""
     max_sh_degree: int = 3
     """Spherical-harmonics degree stored, 0 to 3."""
+    near_views: int = 4
+    """sweep, flow: nearest other views that each view is matched with."""
+    merge_px: float = 4.0
+    """sweep, flow: width of the cells in which confirmed points become one [px]; 0 keeps one for every pixel."""
+    fill_px: float = 16.0
+    """sweep, flow: width of the cells of points where no depth is confirmed [px]; 0 leaves those places empty."""
+    flow: str = "deepflow"
+    """flow: deepflow, dis, sparse, a folder of .flo files or an ONNX file (images in, flow out)."""
+    flow_range: str = "255"
+    """flow: colours that an ONNX file takes: 255 (0 to 255), unit (0 to 1) or signed (-1 to 1)."""
+    max_residual: float = 1.0
+    """flow: largest distance of a match from its epipolar line [px]."""
+    blend: str = "least_sensitive"
+    """flow: which source view decides: least_sensitive, nearest_first, mean_valid or inverse_sensitivity."""
 
     def __post_init__(self):
-        if self.source not in ("auto", "points", "random"):
-            raise UsageError(f"init source {self.source!r} is not one of auto, points, random")
+        if self.source not in SOURCES:
+            raise UsageError(f"init source {self.source!r} is not one of {', '.join(SOURCES)}")
+        for name in ("merge_px", "fill_px"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise UsageError(f"init {name.replace('_', '-')} must be 0 or more, not {getattr(self, name)}")
+        if self.flow_range not in RANGES:
+            raise UsageError(f"init flow-range {self.flow_range!r} is not one of {', '.join(RANGES)}")
+        self.epipolar()  # its own checks
         if not 0 < self.opacity < 1:
             raise UsageError(f"init opacity {self.opacity} must lie between 0 and 1")
         if self.random_count < 1:
             raise UsageError(f"init random count {self.random_count} must be at least 1")
+
+    def epipolar(self) -> EpipolarConfig:
+        """The part that decides about flow."""
+        return EpipolarConfig(max_residual=self.max_residual, near_count=self.near_views, blend=self.blend)
 
 
 def camera_depths(views: list[View]) -> tuple[float, float]:
@@ -129,6 +159,30 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
     return PointCloud(np.concatenate(points), np.concatenate(colors)), how
 
 
+def confirmed_points(
+    views: list[View], points: PointCloud, config: InitConfig, generator: np.random.Generator
+) -> tuple[PointCloud, str]:
+    """Points behind pixels whose depth other views confirm, and what was found in which view, a line each.
+
+    Where a random start has more points than that, it is taken instead, and the reason said.
+    """
+    reason = "a single view has no other to compare with"
+    if len(views) > 1:
+        if config.source == "flow":
+            between = flow_between(views, config.flow, config.flow_range)
+            depths = [flow_depth(views, i, between, config.epipolar()) for i in range(len(views))]
+        else:
+            known = np.concatenate([points.points, triangulate_matches(views).points])
+            bounds = [depth_bounds(v, known, camera_depths(views)) for v in views]
+            depths = sweep_depths(views, bounds, SweepConfig(near_count=config.near_views))
+        cloud, notes = coarse_points(views, depths, merge_px=config.merge_px, fill_px=config.fill_px, source=config.source)
+        if len(cloud) >= MIN_POINTS:
+            return cloud, "\n    ".join((notes[-1], *notes[:-1]))
+        reason = f"only {len(cloud)} points survived the checks ({' | '.join(notes[:-1])}); do the views overlap?"
+    cloud, how = random_points(views, config.random_count, generator)
+    return cloud, f"{how}, instead of --init.source {config.source}: {reason}"
+
+
 def initial_points(
     views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator
 ) -> tuple[PointCloud, str]:
@@ -139,6 +193,8 @@ def initial_points(
     """
     names = {v.name for v in views}
     usable = points.seen_by(names) if points is not None else PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+    if config.source in ("sweep", "flow"):
+        return confirmed_points(views, usable, config, generator)
     if config.source == "points" and len(usable) == 0:
         raise DataError(
             "the scene holds no 3D points that the training views saw, and --init.source points asks for them; "
