@@ -54,6 +54,7 @@ def _fit_arguments(arguments: list[str]):
     from warpgs.pipeline.method import MethodConfig
     from warpgs.pipeline.optimizer import OptimizerConfig
     from warpgs.pipeline.schedule import PhaseConfig
+    from warpgs.priors.view_prior import PriorConfig
 
     name = "3dgs"
     for i, word in enumerate(arguments):
@@ -115,6 +116,7 @@ def _fit_arguments(arguments: list[str]):
         density: DensityConfig = field(default_factory=lambda: base.density)
         phases: PhaseConfig = field(default_factory=lambda: base.phases)
         method: MethodConfig = field(default_factory=lambda: base.method)
+        priors: tyro.conf.OmitArgPrefixes[PriorConfig] = field(default_factory=lambda: base.priors)
 
     a = _parse(Fit, "fit", arguments)
     if a.threads < 0:
@@ -133,6 +135,7 @@ def _fit_arguments(arguments: list[str]):
         "density",
         "phases",
         "method",
+        "priors",
     )
     rooms = {n: getattr(a, n) for n in own}
 

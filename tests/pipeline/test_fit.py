@@ -159,9 +159,9 @@ def test_start_falls_back_to_random_and_says_so():
     """Too few points: a random start inside what the cameras see, named; asked for points: an error with a way out."""
     views = photographs(4)
     few = PointCloud(np.zeros((3, 3)), np.zeros((3, 3), np.float32))
-    cloud, how = initial_points(views, few, InitConfig(random_count=500), np.random.default_rng(0))
+    cloud, how, _ = initial_points(views, few, InitConfig(random_count=500), np.random.default_rng(0))
     assert len(cloud) == 500 and "500 random points" in how and "only 3 points" in how
-    again, _ = initial_points(views, few, InitConfig(random_count=500), np.random.default_rng(0))
+    again, *_ = initial_points(views, few, InitConfig(random_count=500), np.random.default_rng(0))
     assert np.array_equal(cloud.points, again.points)
     with pytest.raises(DataError, match=r"--init.source random"):
         initial_points(views, None, InitConfig(source="points"), np.random.default_rng(0))

@@ -15,6 +15,7 @@ from warpgs.pipeline.loss import LossConfig
 from warpgs.pipeline.method import MethodConfig
 from warpgs.pipeline.optimizer import OptimizerConfig
 from warpgs.pipeline.schedule import PhaseConfig
+from warpgs.priors.view_prior import PriorConfig
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,7 @@ class FitConfig:
     density: DensityConfig = field(default_factory=DensityConfig)
     phases: PhaseConfig = field(default_factory=PhaseConfig)
     method: MethodConfig = field(default_factory=MethodConfig)
+    priors: PriorConfig = field(default_factory=PriorConfig)
 
     def __post_init__(self):
         for name in ("steps", "sh_every", "checkpoint_every"):
@@ -81,10 +83,29 @@ def _compose(kind: type, values: dict):
     return kind(**{k: _compose(kinds[k], v) if dataclasses.is_dataclass(kinds[k]) else v for k, v in values.items()})
 
 
+_DENSE = InitConfig(source="sweep", max_sh_degree=1)
+_SPARSE = FitConfig(
+    preset="strong-3dgs", sh_every=500, dropout=0.2, init=_DENSE, optimizer=OptimizerConfig(scales_lr=0.03),
+    density=DensityConfig(gradient=5e-4), phases=PhaseConfig(coarse=2000, stable=3000),
+)  # fmt: skip
+
 PRESETS: dict[str, FitConfig] = {
     "3dgs": FitConfig(),
-}
-"""3dgs: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few."""
+    "strong-3dgs": _SPARSE,
+    "paper": dataclasses.replace(_SPARSE, preset="paper", method=MethodConfig(events=True, hier=True)),
+    "nexusgs": FitConfig(
+        preset="nexusgs", sh_every=500, init=InitConfig(source="flow", merge_px=0, fill_px=0),
+        optimizer=OptimizerConfig(scales_lr=0.03),
+        density=DensityConfig(gradient=5e-4, stop_share=1.0, reset_every=3000, reset_opacity=0.05, prune_size=0),
+    ),
+    "dropgaussian": FitConfig(
+        preset="dropgaussian", dropout=0.2, density=DensityConfig(gradient=5e-4, stop_share=1.0, prune_size=0),
+        optimizer=OptimizerConfig(scales_lr=0.005),
+    ),
+}  # fmt: skip
+"""3dgs: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few. strong-3dgs: with the start, degree,
+scale rate, dropout and schedule of ``paper``, and none of the paper's parts. paper: the method. nexusgs: Zheng et al. 2025, a
+flow-epipolar start with every pixel, and its resets. dropgaussian: Park et al. 2025."""
 
 DEFAULT_STEPS = {"cuda": 7000, "cpu": 1000}
 """Steps where the user names none: what a device gets through in minutes at sparse-view sizes."""

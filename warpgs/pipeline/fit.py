@@ -21,7 +21,10 @@ from warpgs.pipeline.layers import COARSE, FINE, LONG_AGO, Layers
 from warpgs.pipeline.loss import masked_mse, photometric_loss
 from warpgs.pipeline.method import Event, TrainingView, sampling_event
 from warpgs.pipeline.optimizer import Optimizer
+from warpgs.pipeline.region import counted_region
 from warpgs.pipeline.schedule import plan_phases, sh_degree
+from warpgs.priors.cache import cache_folder
+from warpgs.priors.view_prior import view_priors
 from warpgs.rasterizer import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians, PointCloud, Prior, Scene, View
 
@@ -78,7 +81,7 @@ class Fit:
             config: Settings.
             device: Where to work.
             background: Colour behind the scene.
-            priors: What is believed of each view; needed where ``config.method.events`` asks for sampling.
+            priors: What is believed of each view; None to find out where ``config.method.events`` asks for sampling.
 
         Raises:
             DataError: There is nothing to start from.
@@ -88,7 +91,8 @@ class Fit:
         self.config, self.device = config, device
         self.background = torch.tensor(background, dtype=torch.float32, device=device)
         self.generator = torch.Generator().manual_seed(config.seed)
-        cloud, self.start = initial_points(train, points, config.init, np.random.default_rng(config.seed))
+        start = initial_points(train, points, config.init, np.random.default_rng(config.seed))
+        cloud, self.notes = start.cloud, [f"start: {start.how}"]
         self.extent = self._extent([v.camera for v in train], cloud)
         self.optimizer = Optimizer(initial_gaussians(cloud, config.init, self.extent, device), config.optimizer, self.extent)
         self.stats, self.layers = DensityStats(len(cloud), device), Layers(len(cloud), device)
@@ -100,6 +104,10 @@ class Fit:
         self.graphs: dict[tuple, StepGraph] = {}
         self.views = [self._on_device(v) for v in train]
         if config.method.events:
+            if priors is None:
+                regions = [counted_region(v)[0] for v in train]
+                priors, notes = view_priors(train, config.priors, depths=start.depths, regions=regions, cache=cache_folder())
+                self.notes += notes
             self.views = [v.scored(p, config.method) for v, p in zip(self.views, priors, strict=True)]
         if device.type == "cuda" and config.cuda_graph:
             self._stack()
@@ -332,14 +340,14 @@ class Fit:
         }
         plain = {
             "step": self.step, "order": self.order, "reset_done": self.reset_done, "extent": self.extent,
-            "start": self.start, "events": self.events, "config": self.config.to_json(),
+            "notes": self.notes, "events": self.events, "config": self.config.to_json(),
         }  # fmt: skip
         return tensors, plain
 
     def load(self, tensors: dict[str, torch.Tensor], plain: dict) -> None:
         """Take over what `state` gave."""
         self.step, self.order, self.reset_done = plain["step"], list(plain["order"]), plain["reset_done"]
-        self.extent, self.start = plain["extent"], plain["start"]
+        self.extent, self.notes = plain["extent"], plain["notes"]
         self.optimizer.extent = self.extent
         self.optimizer.load(tensors, self.step)
         self.stats = DensityStats(len(self.optimizer.gaussians), self.device)

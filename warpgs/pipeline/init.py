@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from warpgs.priors.epipolar import EpipolarConfig, flow_depth
 from warpgs.priors.flow import RANGES, flow_between
 from warpgs.priors.matches import triangulate_matches
 from warpgs.priors.sweep import SweepConfig, sweep_depths
-from warpgs.scene import Gaussians, PointCloud, View
+from warpgs.scene import Gaussians, PointCloud, View, ViewDepth
 
 SOURCES = ("auto", "sweep", "flow", "points", "random")
 MIN_POINTS = 100
@@ -75,6 +76,16 @@ class InitConfig:
     def epipolar(self) -> EpipolarConfig:
         """The part that decides about flow."""
         return EpipolarConfig(max_residual=self.max_residual, near_count=self.near_views, blend=self.blend)
+
+
+class Start(NamedTuple):
+    """What a fit starts from."""
+
+    cloud: PointCloud
+    how: str
+    """Where it comes from, for the user."""
+    depths: list[ViewDepth] | None = None
+    """Depth of each view that the others confirm, where it was looked for."""
 
 
 def camera_depths(views: list[View]) -> tuple[float, float]:
@@ -159,14 +170,12 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
     return PointCloud(np.concatenate(points), np.concatenate(colors)), how
 
 
-def confirmed_points(
-    views: list[View], points: PointCloud, config: InitConfig, generator: np.random.Generator
-) -> tuple[PointCloud, str]:
+def confirmed_points(views: list[View], points: PointCloud, config: InitConfig, generator: np.random.Generator) -> Start:
     """Points behind pixels whose depth other views confirm, and what was found in which view, a line each.
 
     Where a random start has more points than that, it is taken instead, and the reason said.
     """
-    reason = "a single view has no other to compare with"
+    reason, depths = "a single view has no other to compare with", None
     if len(views) > 1:
         if config.source == "flow":
             between = flow_between(views, config.flow, config.flow_range)
@@ -177,16 +186,14 @@ def confirmed_points(
             depths = sweep_depths(views, bounds, SweepConfig(near_count=config.near_views))
         cloud, notes = coarse_points(views, depths, merge_px=config.merge_px, fill_px=config.fill_px, source=config.source)
         if len(cloud) >= MIN_POINTS:
-            return cloud, "\n    ".join((notes[-1], *notes[:-1]))
+            return Start(cloud, "\n    ".join((notes[-1], *notes[:-1])), depths)
         reason = f"only {len(cloud)} points survived the checks ({' | '.join(notes[:-1])}); do the views overlap?"
     cloud, how = random_points(views, config.random_count, generator)
-    return cloud, f"{how}, instead of --init.source {config.source}: {reason}"
+    return Start(cloud, f"{how}, instead of --init.source {config.source}: {reason}", depths)
 
 
-def initial_points(
-    views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator
-) -> tuple[PointCloud, str]:
-    """The points to start from and a sentence on where they come from.
+def initial_points(views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator) -> Start:
+    """The points to start from.
 
     Raises:
         DataError: Points were asked for and the scene has none that the training views saw.
@@ -201,11 +208,11 @@ def initial_points(
             "use --init.source random, or give a reconstruction with points"
         )
     if config.source == "points" or (config.source == "auto" and len(usable) >= MIN_POINTS):
-        return usable, f"{len(usable):,} points of the reconstruction that the training views saw"
+        return Start(usable, f"{len(usable):,} points of the reconstruction that the training views saw")
     cloud, how = random_points(views, config.random_count, generator)
     if config.source == "auto" and points is not None:
         how += f" (the reconstruction has only {len(usable)} points that the training views saw)"
-    return cloud, how
+    return Start(cloud, how)
 
 
 def initial_gaussians(cloud: PointCloud, config: InitConfig, extent: float, device: torch.device) -> Gaussians:

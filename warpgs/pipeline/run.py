@@ -190,7 +190,7 @@ def fit_scene(request: FitRequest) -> dict:
     if plain is not None:
         fit.load(tensors, plain)
         notes.append(f"continued from step {fit.step}")
-    notes.append(f"start: {fit.start}")
+    notes += fit.notes
     size = f"{train[0].camera.width} x {train[0].camera.height} px"
     print(f"{scene.path}: {scene.format}, {len(train)} views to fit, {len(test)} held out, {size}, {where}")
     for note in notes:
