@@ -63,7 +63,10 @@ def test_resize_is_linear_up_and_mean_down():
     np.testing.assert_allclose(resize(image, 4, 6), image.reshape(4, 2, 6, 2, 3).mean((1, 3)), atol=1e-6)
     wide = resize(np.float32([[0, 1]]), 1, 4)
     np.testing.assert_allclose(wide, [[0, 0.25, 0.75, 1]], atol=1e-6)
-    assert resize(photo(3, 4).repeat(7, 2), 6, 8).shape == (6, 8, 21)
+    many = np.random.default_rng(1).random((9, 13, 21), np.float32)
+    for size in ((7, 8), (20, 30), (9, 13), (7, 30)):
+        found = resize(many, *size)
+        np.testing.assert_array_equal(found, np.stack([resize(many[..., c], *size) for c in range(21)], -1))
 
 
 def test_depth_that_is_not_positive_is_refused(tmp_path):

@@ -4,29 +4,34 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+import torch
+
 from warpgs.errors import ResourceError
 from warpgs.files import write_bytes
+from warpgs.pipeline.importance import ImportanceConfig, geometry_score, semantic_score
 from warpgs.pipeline.region import counted_region
 from warpgs.pipeline.results import file_stem
 from warpgs.pipeline.run import SceneRequest, read_scene
 from warpgs.priors.cache import cache_folder
-from warpgs.priors.scores import geometric_score, normalized, semantic_score
 from warpgs.priors.view_prior import PriorConfig, view_priors
 from warpgs.report.contact_sheet import Tile, contact_sheet
 from warpgs.report.pictures import png
 from warpgs.scene import Prior, View
 
 
-def prior_sheet(view: View, prior: Prior):
+def prior_sheet(view: View, prior: Prior) -> np.ndarray:
     """One sheet, [rows, columns, 3] in [0, 1]: photograph, the four maps, and the two scores that follow from them."""
+    curvature = ImportanceConfig().curvature
+    disparity, *semantics = map(torch.from_numpy, (prior.disparity, prior.confidence, prior.boundary, prior.foreground))
     tiles = [
         Tile("photograph", view.image),
         Tile("disparity, near is 1", prior.disparity, "TURBO"),
         Tile("confidence of the likeliest class", prior.confidence, "VIRIDIS"),
         Tile("foreground", prior.foreground, "VIRIDIS"),
         Tile("boundary", prior.boundary),
-        Tile("S_semantic = confidence (boundary + foreground)", normalized(semantic_score(prior))),
-        Tile("S_geometry = |grad D| + 0.5 kappa", normalized(geometric_score(prior.disparity))),
+        Tile("S_semantic = confidence (boundary + foreground)", semantic_score(*semantics).numpy()),
+        Tile(f"S_geometry = |grad D| + {curvature:g} kappa", geometry_score(disparity, curvature).numpy()),
     ]
     size = f"{view.camera.width} x {view.camera.height} px"
     lines = [

@@ -55,7 +55,11 @@ def resize(image: np.ndarray, height: int, width: int) -> np.ndarray:
 
     shrinks = height <= image.shape[0] and width <= image.shape[1]
     method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return cv2.resize(np.ascontiguousarray(image, np.float32), (width, height), interpolation=method)
+    if image.ndim == 2:
+        return cv2.resize(np.ascontiguousarray(image, np.float32), (width, height), interpolation=method)
+    # OpenCV averages over areas in at most four channels at a time
+    parts = [np.ascontiguousarray(image[..., i : i + 4], np.float32) for i in range(0, image.shape[2], 4)]
+    return np.dstack([cv2.resize(p, (width, height), interpolation=method) for p in parts])
 
 
 def _numbers(value: object) -> bool:

@@ -1,0 +1,83 @@
+"""Writing networks as ONNX: requests that cannot be met, and the real architectures against torch."""
+
+import importlib.util
+import json
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from warpgs.cli import main
+from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.priors.export import ExportRequest, build, export_network
+from warpgs.priors.session import open_network
+from warpgs.priors.view_prior import PriorConfig, view_priors
+from warpgs.scene import Camera, View
+
+MISSING = [n for n in ("transformers", "onnx", "onnxscript") if importlib.util.find_spec(n) is None]
+needs_extra = pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not installed: pip install warpgs[export]")
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"model": "vgg"}, "'vgg' is not one of dpt, fcn-resnet18, fcn-resnet50"),
+        ({"model": "dpt", "size": 100}, "--size must be a multiple of 32 from 32 to 4096, not 100"),
+        ({"model": "dpt", "size": 0}, "--size must be a multiple"),
+        ({"model": "dpt", "weights": "x", "random_weights": True}, "exclude each other"),
+        ({"model": "fcn-resnet50", "weights": "x"}, "takes torchvision's own"),
+    ],
+)
+def test_requests_are_checked(fields, message):
+    with pytest.raises(UsageError, match=message):
+        ExportRequest(**fields)
+
+
+@pytest.mark.parametrize("name", ["dpt", "fcn-resnet18", "fcn-resnet50"])
+def test_a_missing_package_is_named_with_its_remedy(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    monkeypatch.setitem(sys.modules, "torchvision", None)
+    monkeypatch.setitem(sys.modules, "torchvision.models.segmentation", None)
+    with pytest.raises(ResourceError, match=r"pip install warpgs\[export\]"):
+        export_network(ExportRequest(name, random_weights=True, size=32), tmp_path / "x.onnx")
+    out = str(tmp_path / "x.onnx")
+    assert main(["priors", "export", "--model", name, "--random-weights", "--out", out]) == 4
+    assert "warpgs[export]" in capsys.readouterr().err and not (tmp_path / "x.onnx").exists()
+
+
+@pytest.mark.slow
+@needs_extra
+@pytest.mark.parametrize(("name", "shape"), [("dpt", (64, 64)), ("fcn-resnet18", (21, 64, 64))])
+def test_the_architecture_gives_in_onnxruntime_what_it_gives_in_torch(name, shape, tmp_path):
+    """Small random weights of the real classes; differences in standard deviations of the output."""
+    request, path = ExportRequest(name, random_weights=True, size=64), tmp_path / "n.onnx"
+    lines = export_network(request, path)
+    assert "small and untrained" in lines[0] and "warpgs priors show" in lines[1]
+    picture = np.random.default_rng(3).normal(size=(64, 64, 3)).astype(np.float32)
+    found = open_network(path).run(picture)[0]
+    with torch.no_grad():
+        wanted = build(request)(torch.from_numpy(picture).permute(2, 0, 1)[None])[0].numpy()
+    assert found.shape == wanted.shape == shape and wanted.std() > 1e-3
+    assert np.abs(found - wanted).max() < 1e-4 * wanted.std()
+    assert json.loads((tmp_path / "n.onnx.json").read_text())["output"] == ("disparity" if name == "dpt" else "classes")
+    # and it serves: the file beside it describes it, so nothing need be assumed
+    image = np.random.default_rng(4).random((40, 52, 3), np.float32)
+    flag = "depth_model" if name == "dpt" else "segmentation_model"
+    (prior,), notes = view_priors([View("a", Camera(np.eye(4), np.eye(3), 52, 40), image)], PriorConfig(**{flag: str(path)}))
+    assert prior.disparity.shape == (40, 52) and not any("assumed" in n for n in notes)
+
+
+@pytest.mark.slow
+@needs_extra
+def test_weights_of_ones_own(tmp_path):
+    from safetensors.torch import save
+
+    with pytest.raises(UsageError, match="no weights of it"):
+        build(ExportRequest("fcn-resnet18"))
+    path = tmp_path / "w.safetensors"
+    path.write_bytes(save({"x": torch.zeros(1)}))
+    with pytest.raises(DataError, match="no weights of fcn-resnet18"):
+        build(ExportRequest("fcn-resnet18", weights=str(path)))
+    with pytest.raises(DataError, match="the weights cannot be had"):
+        build(ExportRequest("dpt", weights=str(tmp_path)))

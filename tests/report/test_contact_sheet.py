@@ -1,0 +1,52 @@
+"""Sheets of labelled pictures: every tile in its place, unharmed, with its label, range and text."""
+
+import numpy as np
+
+from warpgs.report.contact_sheet import GAP, HEAD, MARGIN, PAPER, TITLE_SIZE, Tile, contact_sheet
+from warpgs.report.pictures import colored
+
+TOP = MARGIN + TITLE_SIZE + 18
+
+
+def corner(index, width, height, columns):
+    """Where the picture of a tile begins: x, y."""
+    return MARGIN + index % columns * (width + GAP), TOP + HEAD + index // columns * (HEAD + height + GAP)
+
+
+def test_tiles_keep_their_pixels_and_order():
+    """At their own size the pictures on the sheet are those that were given, maps by their colours."""
+    rng = np.random.default_rng(0)
+    photo = np.round(rng.random((150, 200, 3)) * 255).astype(np.float32) / 255
+    maps = [rng.random((150, 200), np.float32) for _ in range(3)]
+    tiles = [Tile("photo", photo), *(Tile(f"map {i}", m, "VIRIDIS") for i, m in enumerate(maps))]
+    sheet = contact_sheet("a view", ["one sentence"], tiles, columns=3, tile_width=200)
+    assert (
+        sheet.shape == (TOP + 2 * (HEAD + 150) + GAP + MARGIN, 2 * MARGIN + 3 * 200 + 2 * GAP, 3) and sheet.dtype == np.float32
+    )
+    for i, wanted in enumerate([photo, *(colored(m, "VIRIDIS") for m in maps)]):
+        x, y = corner(i, 200, 150, 3)
+        np.testing.assert_allclose(sheet[y : y + 150, x : x + 200], wanted, atol=0.51 / 255)
+
+
+def test_labels_ranges_and_text_are_drawn_on_paper():
+    """Ink where a label, a colour bar and the text belong; paper around them; longer text takes more of it."""
+
+    def ink(part):
+        return int((np.abs(part - np.float32(PAPER) / 255).max(-1) > 0.1).sum())
+
+    tiles = [Tile("photograph", np.zeros((60, 300, 3))), Tile("map", np.zeros((60, 300)), largest=2.5)]
+    short = contact_sheet("title", ["Depth: none."], tiles, columns=2, tile_width=300)
+    long = contact_sheet("title", ["Depth: none.", "Semantics: saliency and edges."], tiles, columns=2, tile_width=300)
+    (ax, ay), (bx, by), (cx, cy) = (corner(i, 300, 60, 2) for i in range(3))
+    assert ink(short[ay - HEAD : ay, ax : ax + 100]) > 50 and ink(short[ay - HEAD : ay, ax + 200 : ax + 300]) == 0
+    assert ink(short[by - HEAD : by, bx + 200 : bx + 300]) > 200, "a colour bar with its range"
+    assert ink(short[:TOP, MARGIN:]) > 50 and ink(short[:, :MARGIN]) == 0 == ink(short[:, -MARGIN:])
+    assert ink(long[cy + 4 :, cx:]) > ink(short[cy + 4 :, cx:]) > 50
+
+
+def test_a_range_above_one_is_scaled():
+    values = np.array([[0, 1.25], [2.5, 9]], np.float32).repeat(60, 0).repeat(60, 1)
+    sheet = contact_sheet("t", [], [Tile("m", values, "INFERNO", 2.5)], columns=2, tile_width=120)
+    x, y = corner(0, 120, 120, 2)
+    wanted = colored(np.array([[0, 0.5], [1, 1]]), "INFERNO")
+    np.testing.assert_allclose(sheet[y + 30 : y + 120 : 60, x + 30 : x + 120 : 60], wanted, atol=0.01)
