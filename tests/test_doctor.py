@@ -125,6 +125,17 @@ def test_devices_that_both_see(monkeypatch):
     assert f.status == OK and "13.1" in f.detail
 
 
+def test_the_prior_cache(monkeypatch, tmp_path):
+    """Its place and size; a place that cannot be written is a note, since a fit works without."""
+    monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "maps"))
+    (f,) = doctor._prior_cache()
+    assert f.status == OK and str(tmp_path / "maps") in f.detail and "0 B" in f.detail
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "file" / "maps"))
+    (f,) = doctor._prior_cache()
+    assert f.status == NOTE and "WARPGS_CACHE" in f.remedy and not f.required
+
+
 def test_a_kernel_cache_that_cannot_be_written(monkeypatch):
     def refuse(*args, **kwargs):
         raise PermissionError(13, "Permission denied")

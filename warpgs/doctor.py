@@ -220,6 +220,33 @@ def _warp_cuda() -> Finding:
     return Finding("Warp on CUDA", MISSING, why, "update the NVIDIA driver and warp-lang, or fit with --device cpu")
 
 
+def _size(folder: Path) -> int:
+    """Size of all files below a folder [bytes]."""
+    size = 0
+    for path in folder.rglob("*"):
+        try:
+            size += path.stat().st_size if path.is_file() else 0
+        except OSError:  # another process tidies up
+            continue
+    return size
+
+
+def _prior_cache() -> Iterable[Finding]:
+    """Where maps of networks are kept; a fit works without."""
+    from warpgs.priors.cache import cache_folder
+
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as e:
+        remedy = "set WARPGS_CACHE to a folder that you may write to"
+        yield Finding("Prior cache", NOTE, f"{folder} is not writable ({e.strerror}); networks run anew each time", remedy)
+        return
+    yield Finding("Prior cache", OK, f"{folder}, {_bytes(_size(folder))}, writable")
+
+
 def _kernel_cache() -> Iterable[Finding]:
     """Where Warp keeps compiled kernels: without a writable place no kernel runs."""
     topic = "Kernel cache"
@@ -236,12 +263,7 @@ def _kernel_cache() -> Iterable[Finding]:
         remedy = "set WARP_CACHE_PATH to a folder that you may write to"
         yield Finding(topic, MISSING, f"{folder} is not writable ({e.strerror})", remedy, True)
         return
-    size = 0
-    for path in folder.rglob("*"):
-        try:
-            size += path.stat().st_size if path.is_file() else 0
-        except OSError:  # another process tidies up
-            continue
+    size = _size(folder)
     first = "" if size else "; empty: the first fit compiles for a minute or two"
     yield Finding(topic, OK, f"{folder}, {_bytes(size)}, writable{first}", required=True)
 
@@ -295,7 +317,7 @@ def _disk() -> Iterable[Finding]:
 
 
 CHECKS: tuple[Callable[[], Iterable[Finding]], ...] = (
-    _python, _packages, _processor, _cuda, _kernel_cache, _rendering, _video, _disk,
+    _python, _packages, _processor, _cuda, _kernel_cache, _prior_cache, _rendering, _video, _disk,
 )  # fmt: skip
 
 

@@ -1,6 +1,8 @@
 """Disparity from networks with known answers, and from depth that other views confirm at some pixels."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -98,6 +100,12 @@ def test_flags_come_before_the_side_file_and_that_before_what_is_usual(tmp_path)
     assert described(path) == (Preprocessing(518, 14, *IMAGENET, "depth"), [])
     how, notes = described(path, mean=MEAN, output="disparity", size=0)
     assert how == Preprocessing(518, 14, MEAN, IMAGENET[1], "disparity") and notes == []
+
+
+def test_the_documented_side_file_is_one(tmp_path):
+    (text,) = re.findall(r"```json\n(.*?)```", (Path(__file__).parents[2] / "docs" / "priors.md").read_text("utf-8"), re.DOTALL)
+    (tmp_path / "d.onnx.json").write_text(text)
+    assert described(nw.depth_network(tmp_path / "d.onnx")) == (Preprocessing(518, 14, *IMAGENET, "disparity"), [])
 
 
 @pytest.mark.parametrize(
