@@ -187,6 +187,17 @@ def test_badly_conditioned_depths_yield():
     assert warned < 1.1 * right and fooled > 1.7 * right, errors
 
 
+def test_weights_are_those_of_inverse_depth():
+    """Depths 1 and 2 whose inverses are equally uncertain count alike where both are found on one surface."""
+    columns = np.arange(90) // 30 + np.zeros((40, 1), int)
+    image = np.repeat((0.1 + 0.4 * columns)[..., None], 3, 2).astype(np.float32)
+    board = np.indices((40, 90)).sum(0) % 2 == 0
+    depth = np.where((columns == 0) | ((columns == 1) & board), 1.0, 2.0)
+    found = complete_disparity(image, depth, np.ones(depth.shape, bool), 0.1 * depth**2)
+    assert abs(found[5:-5, 35:55].mean() - 0.5) < 0.02
+    assert found[:, :25].min() > 0.95 and found[:, 65:].max() < 0.05
+
+
 def test_one_depth_and_one_far_wild_depth():
     image, inverse, near = two_planes()
     lone = np.zeros(near.shape, bool)
@@ -195,7 +206,9 @@ def test_one_depth_and_one_far_wild_depth():
     everywhere = np.ones(near.shape, bool)
     depth = 1 / inverse
     depth[0, 0] = 1e-6  # a million times nearer than all else
-    found = complete_disparity(image, depth, everywhere, np.full(near.shape, 0.1))
+    sensitivity = np.full(near.shape, 0.1)
+    sensitivity[0, 0] = 0  # and quite sure of it
+    found = complete_disparity(image, depth, everywhere, sensitivity)
     assert found[near].mean() - found[~near].mean() > 0.8
 
 
