@@ -252,6 +252,8 @@ def _priors_show(arguments: list[str]) -> int:
         """Factor by which both image sides shrink."""
         threads: int = 0
         """CPU threads of the networks; 0 for as many as there are cores."""
+        source: str = "sweep"
+        """How depth is found in the other views where no depth network is named: sweep or flow, as --init.source of a fit."""
         priors: tyro.conf.OmitArgPrefixes[PriorConfig] = field(default_factory=PriorConfig)
 
     a = _parse(Show, "priors show", arguments)
@@ -260,7 +262,7 @@ def _priors_show(arguments: list[str]) -> int:
 
     if a.threads < 0:
         raise UsageError(f"--threads must be 0 or more, not {a.threads}")
-    for line in show_priors(SceneRequest(str(a.scene), a.split, a.downscale), a.priors, a.out, a.threads):
+    for line in show_priors(SceneRequest(str(a.scene), a.split, a.downscale), a.priors, a.source, a.out, a.threads):
         print(line)
     return 0
 

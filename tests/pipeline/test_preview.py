@@ -46,10 +46,13 @@ def test_a_sheet_per_training_view(scene, tmp_path, capsys):
         np.testing.assert_array_equal(cv2.imread(str(tmp_path / "b" / path.name)), cv2.imread(str(path)))
 
 
-def test_without_networks_the_notes_say_what_stands_in(scene, tmp_path, capsys):
-    assert main(show(scene, "--out", tmp_path / "a")) == 0
+@pytest.mark.parametrize("source", ["sweep", "flow"])
+def test_without_networks_the_notes_say_what_stands_in(scene, tmp_path, capsys, source):
+    """Depth comes from the other views, and some of it is confirmed in every one."""
+    assert main(show(scene, "--out", tmp_path / "a", "--source", source)) == 0
     text = capsys.readouterr().out
-    assert "semantics: no network, so saliency stands for foreground" in text and "depth: " in text
+    assert "semantics: no network, so saliency stands for foreground" in text
+    assert "depth: from the other views, " in text and "no depth is confirmed" not in text
     assert not (tmp_path / "cache").exists()
 
 
@@ -66,6 +69,7 @@ def test_mistakes_get_one_line(scene, tmp_path, capsys):
     out = tmp_path / "out"
     assert "say show or export" in failure(capsys, 2, "priors")
     assert "say show or export" in failure(capsys, 2, "priors", "draw")
+    assert "source 'lidar' is not one of sweep, flow" in failure(capsys, 2, *show(scene, "--out", out, "--source", "lidar"))
     assert "--threads must be 0 or more" in failure(capsys, 2, *show(scene, "--out", out, "--threads", -1))
     assert "name it by --depth-model" in failure(capsys, 2, *show(scene, "--out", out, "--depth-size", 64))
     (tmp_path / "x.onnx").write_text("no network")

@@ -170,6 +170,16 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
     return PointCloud(np.concatenate(points), np.concatenate(colors)), how
 
 
+def confirmed_depths(views: list[View], known: PointCloud, config: InitConfig) -> list[ViewDepth]:
+    """Depth of each of at least two views that the others confirm, by flow or by sweeping planes between ``known`` points."""
+    if config.source == "flow":
+        between = flow_between(views, config.flow, config.flow_range)
+        return [flow_depth(views, i, between, config.epipolar()) for i in range(len(views))]
+    points = np.concatenate([known.points, triangulate_matches(views).points])
+    bounds = [depth_bounds(v, points, camera_depths(views)) for v in views]
+    return sweep_depths(views, bounds, SweepConfig(near_count=config.near_views))
+
+
 def confirmed_points(views: list[View], points: PointCloud, config: InitConfig, generator: np.random.Generator) -> Start:
     """Points behind pixels whose depth other views confirm, and what was found in which view, a line each.
 
@@ -177,13 +187,7 @@ def confirmed_points(views: list[View], points: PointCloud, config: InitConfig, 
     """
     reason, depths = "a single view has no other to compare with", None
     if len(views) > 1:
-        if config.source == "flow":
-            between = flow_between(views, config.flow, config.flow_range)
-            depths = [flow_depth(views, i, between, config.epipolar()) for i in range(len(views))]
-        else:
-            known = np.concatenate([points.points, triangulate_matches(views).points])
-            bounds = [depth_bounds(v, known, camera_depths(views)) for v in views]
-            depths = sweep_depths(views, bounds, SweepConfig(near_count=config.near_views))
+        depths = confirmed_depths(views, points, config)
         cloud, notes = coarse_points(views, depths, merge_px=config.merge_px, fill_px=config.fill_px, source=config.source)
         if len(cloud) >= MIN_POINTS:
             return Start(cloud, "\n    ".join((notes[-1], *notes[:-1])), depths)
@@ -192,14 +196,19 @@ def confirmed_points(views: list[View], points: PointCloud, config: InitConfig, 
     return Start(cloud, f"{how}, instead of --init.source {config.source}: {reason}", depths)
 
 
+def seen_points(views: list[View], points: PointCloud | None) -> PointCloud:
+    """The reconstruction's points that the views saw; none where there is no reconstruction."""
+    nothing = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+    return nothing if points is None else points.seen_by({v.name for v in views})
+
+
 def initial_points(views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator) -> Start:
     """The points to start from.
 
     Raises:
         DataError: Points were asked for and the scene has none that the training views saw.
     """
-    names = {v.name for v in views}
-    usable = points.seen_by(names) if points is not None else PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+    usable = seen_points(views, points)
     if config.source in ("sweep", "flow"):
         return confirmed_points(views, usable, config, generator)
     if config.source == "points" and len(usable) == 0:

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from warpgs.errors import ResourceError
+from warpgs.errors import ResourceError, UsageError
 from warpgs.files import write_bytes
 from warpgs.pipeline.importance import ImportanceConfig, geometry_score, semantic_score
+from warpgs.pipeline.init import InitConfig, confirmed_depths, seen_points
 from warpgs.pipeline.region import counted_region
 from warpgs.pipeline.results import file_stem
 from warpgs.pipeline.run import SceneRequest, read_scene
@@ -18,6 +19,8 @@ from warpgs.priors.view_prior import PriorConfig, view_priors
 from warpgs.report.contact_sheet import Tile, contact_sheet
 from warpgs.report.pictures import png
 from warpgs.scene import Prior, View
+
+SOURCES = ("sweep", "flow")
 
 
 def prior_sheet(view: View, prior: Prior) -> np.ndarray:
@@ -42,12 +45,21 @@ def prior_sheet(view: View, prior: Prior) -> np.ndarray:
     return contact_sheet(view.name, lines, tiles)
 
 
-def show_priors(request: SceneRequest, config: PriorConfig, out: Path, threads: int = 0) -> list[str]:
+def show_priors(request: SceneRequest, config: PriorConfig, source: str, out: Path, threads: int = 0) -> list[str]:
     """Write a sheet per training view as PNG; returns lines for the user.
+
+    Args:
+        request: The scene and its split.
+        config: Networks.
+        source: sweep or flow: how depth is found in other views, where no depth network is named.
+        out: Folder for the sheets.
+        threads: CPU threads of the networks; 0 for as many as there are cores.
 
     Raises:
         WarpgsError: The scene, a model or the folder is not what it must be.
     """
+    if source not in SOURCES:
+        raise UsageError(f"source {source!r} is not one of {', '.join(SOURCES)}")
     scene, split, notes = read_scene(request)
     views = [scene.view(name) for name in split.train]
     try:
@@ -55,7 +67,10 @@ def show_priors(request: SceneRequest, config: PriorConfig, out: Path, threads: 
     except OSError as e:
         raise ResourceError(f"{out}: cannot be written ({e.strerror}); choose another --out") from e
     regions = [counted_region(v)[0] for v in views]
-    priors, said = view_priors(views, config, regions=regions, threads=threads, cache=cache_folder())
+    depths = None
+    if config.depth_model is None and len(views) > 1:
+        depths = confirmed_depths(views, seen_points(views, scene.points), InitConfig(source=source))
+    priors, said = view_priors(views, config, depths=depths, regions=regions, threads=threads, cache=cache_folder())
     for view, prior in zip(views, priors):
         write_bytes(out / f"{file_stem(view.name)}.png", png(prior_sheet(view, prior)))
     return [*notes, *said, f"{len(views)} sheets in {out}"]
