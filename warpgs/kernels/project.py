@@ -174,6 +174,7 @@ class _Project(torch.autograd.Function):
         ctx.save_for_backward(*tensors, splats, tile_counts)
         ctx.size, ctx.sh_count, ctx.rule = size, sh_count, rule
         ctx.mark_non_differentiable(tile_counts)
+        ctx.set_materialize_grads(False)  # else torch makes zeros for the counts
         return splats.view(len(viewmats), len(means), RECORD), tile_counts.view(len(viewmats), len(means))
 
     @staticmethod
