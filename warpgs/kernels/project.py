@@ -184,7 +184,7 @@ class _Project(torch.autograd.Function):
         real = bridge.real_of(splats)
         m = make_projection(real)
         device = splats.device
-        v_splats = v_splats.contiguous().view(-1, RECORD)
+        v_splats = torch.zeros_like(splats) if v_splats is None else v_splats.contiguous().view(-1, RECORD)
         # One allocation for the five, each from a multiple of 16 bytes on, as kernels that read four at a time want it.
         sizes = [-(-t.numel() // 4) * 4 for t in tensors[:5]]
         native = _native(splats)  # writes zeros itself
