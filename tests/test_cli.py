@@ -80,7 +80,7 @@ def test_eval_measures_lpips(run, tmp_path, capsys):
     torch.save({k: v for k, v in state.items() if k.startswith("lin")}, tmp_path / "h.pth")
     convert_lpips(tmp_path / "b.pth", tmp_path / "h.pth", tmp_path / "l.safetensors")
     assert main(["eval", str(run), "--device", "cpu", "--lpips-weights", str(tmp_path / "l.safetensors")]) == 0
-    assert "LPIPS-Alex, [0, 1]" in capsys.readouterr().out
+    assert "LPIPS-Alex [0, 1]" in capsys.readouterr().out
     result = json.loads((run / "eval.json").read_text())
     assert result["test"]["lpips_alex_legacy"] == pytest.approx(np.mean([v["lpips_alex_legacy"] for v in result["views"]]))
     assert "[-1, 1]" in result["variants"]["lpips_alex_standard"] and result["steps"] == 40 and len(result["config_hash"]) == 12

@@ -18,6 +18,8 @@ COMMANDS = {
     "render": "render a run: its views, an orbit or a spiral, as PNG and mp4",
     "export": "write a run's Gaussians to a PLY file",
     "priors": "look at what is known before a fit (priors show), or write networks as ONNX (priors export)",
+    "compare": "fit presets to scenes with several seeds; tables, plot and figure of the differences",
+    "ablate": "fit a preset with its parts off one at a time; the same tables, plot and figure",
     "convert-lpips": "join published LPIPS weights into the file that --lpips-weights takes",
     "demo": "write a synthetic scene to try things with",
     "doctor": "say what this machine has, what is missing, and how to get it",
@@ -322,15 +324,20 @@ def _doctor(arguments: list[str]) -> int:
     return print_report(diagnose())
 
 
-def _convert_lpips(arguments: list[str]) -> int:
-    from warpgs.cli_studies import convert_lpips
+def _study(name: str):
+    """The command of a name that `cli_studies` holds."""
 
-    return convert_lpips(arguments, COMMANDS["convert-lpips"])
+    def command(arguments: list[str]) -> int:
+        from warpgs import cli_studies
+
+        return getattr(cli_studies, name.replace("-", "_"))(arguments, COMMANDS[name])
+
+    return command
 
 
 RUN = {
-    "fit": _fit, "eval": _eval, "render": _render, "export": _export, "priors": _priors, "convert-lpips": _convert_lpips,
-    "demo": _demo, "doctor": _doctor,
+    "fit": _fit, "eval": _eval, "render": _render, "export": _export, "priors": _priors, "demo": _demo, "doctor": _doctor,
+    **{name: _study(name) for name in ("compare", "ablate", "convert-lpips")},
 }  # fmt: skip
 
 

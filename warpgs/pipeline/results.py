@@ -20,8 +20,8 @@ from warpgs.scene import Gaussians, Scene, View
 
 LABELS = {
     "psnr": "PSNR [dB]", "ssim": "SSIM", "ssim_skimage": "SSIM (scikit-image)",
-    "lpips_vgg_legacy": "LPIPS-VGG, [0, 1]", "lpips_vgg_standard": "LPIPS-VGG, [-1, 1]",
-    "lpips_alex_legacy": "LPIPS-Alex, [0, 1]", "lpips_alex_standard": "LPIPS-Alex, [-1, 1]", "lpips": "LPIPS",
+    "lpips_vgg_legacy": "LPIPS-VGG [0, 1]", "lpips_vgg_standard": "LPIPS-VGG [-1, 1]",
+    "lpips_alex_legacy": "LPIPS-Alex [0, 1]", "lpips_alex_standard": "LPIPS-Alex [-1, 1]", "lpips": "LPIPS",
 }  # fmt: skip
 """Names of figures for people."""
 

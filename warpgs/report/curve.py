@@ -9,7 +9,7 @@ LEFT, RIGHT, TOP, BOTTOM = 52, 12, 26, 26
 MAX_POINTS = 300
 
 
-def _ticks(low: float, high: float) -> list[float]:
+def ticks(low: float, high: float) -> list[float]:
     """Three to six round numbers that span a range."""
     rough = (high - low) / 4
     power = 10.0 ** math.floor(math.log10(rough))
@@ -18,7 +18,8 @@ def _ticks(low: float, high: float) -> list[float]:
     return [i * step for i in range(first, first + 8) if i * step <= high + 1e-9 * step]
 
 
-def _label(value: float) -> str:
+def tick_label(value: float) -> str:
+    """A number as people write it on axes."""
     if abs(value) >= 1e6:
         return f"{value / 1e6:g}M"
     return f"{value / 1e3:g}k" if abs(value) >= 1e4 else f"{value:g}"
@@ -49,13 +50,13 @@ def curve(title: str, xs: list[float], ys: list[float], unit: str = "") -> str:
         return px, TOP + (y1 - y) / (y1 - y0) * (HEIGHT - TOP - BOTTOM)
 
     parts = [head]
-    for tick in _ticks(y0, y1):
+    for tick in ticks(y0, y1):
         _, py = place(x0, tick)
         parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{py:.1f}" y2="{py:.1f}"/>')
-        parts.append(f'<text x="{LEFT - 6}" y="{py + 4:.1f}" text-anchor="end">{_label(tick)}</text>')
-    for tick in _ticks(x0, x1):
+        parts.append(f'<text x="{LEFT - 6}" y="{py + 4:.1f}" text-anchor="end">{tick_label(tick)}</text>')
+    for tick in ticks(x0, x1):
         px, _ = place(tick, y0)
-        parts.append(f'<text x="{px:.1f}" y="{HEIGHT - 8}" text-anchor="middle">{_label(tick)}</text>')
+        parts.append(f'<text x="{px:.1f}" y="{HEIGHT - 8}" text-anchor="middle">{tick_label(tick)}</text>')
     line = " ".join(f"{px:.1f},{py:.1f}" for px, py in (place(*p) for p in points))
     parts.append(f'<polyline class="line" points="{line}"/></svg>')
     return "".join(parts)
