@@ -5,7 +5,6 @@ import dataclasses
 import io
 import json
 import shutil
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -22,8 +21,9 @@ from warpgs.pipeline.compare import ABLATION_ROWS, ablation_variants, preset_var
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.init import InitConfig
 from warpgs.pipeline.lpips_weights import NETS, convert_lpips
+from warpgs.pipeline.method import MethodConfig
 from warpgs.pipeline.repeat import ensure_run
-from warpgs.pipeline.run import FitRequest, SceneRequest, read_scene
+from warpgs.pipeline.run import FitRequest, SceneRequest, fit_scene, read_scene
 from warpgs.pipeline.study import FILES, SWITCHES, StudyRequest, run_folder
 from warpgs.report.statistics import paired_difference
 
@@ -227,39 +227,45 @@ def test_several_scenes_are_averaged_by_seed(finished, scene, tmp_path):
     assert "they say nothing of other scenes" in (request.out / "table.md").read_text()
 
 
-@dataclass(frozen=True)
-class Method:
-    """Stands in for the method's settings."""
-
-    hier: bool = True
-    s_render: bool = True
-    s_semantic: bool = True
-    s_geometry: bool = True
-    ra: bool = True
-    agp: bool = True
-    pm: bool = True
-    events: bool = True
-
-
-@dataclass(frozen=True)
-class WithMethod:
-    """Stands in for a configuration that has them."""
-
-    preset: str = "paper"
-    method: Method = Method()
+FULL = dataclasses.replace(A, preset="whole", method=MethodConfig(events=True, hier=True))
 
 
 def test_ablation_rows_switch_off_one_part_each():
     """Full, seven parts of the paper's table, and no sampling at all; check marks in the order of the headings."""
-    variants, marks = ablation_variants(WithMethod())
-    assert list(variants) == list(ABLATION_ROWS) and len(variants) == 9 and variants["full"] == WithMethod()
+    variants, marks = ablation_variants(FULL)
+    assert list(variants) == list(ABLATION_ROWS) and len(variants) == 9 and variants["full"] == FULL
     for (row, variant), name in zip(list(variants.items())[1:], SWITCHES):
-        off = [f.name for f in dataclasses.fields(Method) if not getattr(variant.method, f.name)]
-        assert off == [name] and row == f"no {name}"
+        switches = dataclasses.asdict(variant.method)
+        assert [s for s, value in switches.items() if value is False] == [name] and row == f"no {name}"
+        assert dataclasses.replace(variant, method=FULL.method) == FULL
         assert [s for s, mark in zip(SWITCHES, marks[row]) if not mark] == [name]
     assert all(marks["full"]) and list(SWITCHES)[:7] == ["hier", "s_render", "s_semantic", "s_geometry", "ra", "agp", "pm"]
-    with pytest.raises(UsageError, match="pm switched off already"):
-        ablation_variants(WithMethod(method=Method(pm=False)))
+    with pytest.raises(UsageError, match="preset '3dgs' has hier, events switched off already"):
+        ablation_variants(FitConfig())
+
+
+def test_command_ablates(scene, tmp_path, capsys, monkeypatch):
+    """`warpgs ablate` from flags to a table with check marks; two of the nine rows, for time."""
+    monkeypatch.setitem(config.PRESETS, "whole", FULL)
+    monkeypatch.setattr("warpgs.pipeline.compare.ABLATION_ROWS", {n: ABLATION_ROWS[n] for n in ("full", "no pm")})
+    asked = []
+
+    def plain(request):
+        """Note what was asked for, and fit without the sampling: this test is of the study."""
+        asked.append((request.config.seed, request.config.method))
+        return fit_scene(dataclasses.replace(request, config=dataclasses.replace(request.config, method=MethodConfig())))
+
+    monkeypatch.setattr("warpgs.pipeline.repeat.fit_scene", plain)
+    flags = ["--preset", "whole", "--seeds", "2", "--steps", "2", "--device", "cpu", "--out", str(tmp_path / "out")]
+    assert main(["ablate", scene.path, "--split", scene.split, *flags]) == 0
+    assert "[4/4] still, no pm, seed 1" in capsys.readouterr().out
+    figures, gaps = cells((tmp_path / "out" / "table.md").read_text())
+    assert figures[0][1:9] == ["Hier", "S_rend", "S_sem", "S_geo", "RA", "AGP", "PM", "Events"]
+    assert [r[1:9] for r in figures[2:]] == [["✓"] * 8, ["✓"] * 6 + ["✗", "✓"]] and gaps[2][0] == "no pm"
+    off = dataclasses.replace(FULL.method, pm=False)
+    assert asked == [(0, FULL.method), (0, off), (1, FULL.method), (1, off)]
+    assert main(["ablate", scene.path, "--out", str(tmp_path / "y"), "--preset", "3dgs"]) == 2
+    assert "ablate a preset of the full method" in capsys.readouterr().err
 
 
 def test_requests_that_make_no_sense(scene, tmp_path):
