@@ -14,9 +14,9 @@ from warpgs.rasterizer import RasterizeOptions, rasterize
 from warpgs.scene import Gaussians, View
 
 VARIANTS = {
-    "psnr": "PSNR [dB] of images rounded to 8 bits, over the scored pixels alone; mean over images",
-    "ssim": "SSIM of the 3DGS line: 11 x 11 Gaussian window, sigma 1.5, zero padding, all pixels and channels",
-    "ssim_skimage": "SSIM of scikit-image, as NeRF papers use it: the same window, border left out; about 0.005 lower",
+    "psnr": "of images rounded to 8 bits, over the scored pixels alone; mean over images",
+    "ssim": "as the 3DGS line has it: 11 x 11 Gaussian window, sigma 1.5, zero padding, all pixels and channels",
+    "ssim_skimage": "of scikit-image, as NeRF papers have it: the same window, border left out; about 0.005 lower",
 }
 """What each figure is, for result files and reports. Every paper's table depends on these words."""
 MASKED = "where a view has a mask, SSIM and LPIPS compare both images with white outside of it"

@@ -69,7 +69,7 @@ class Lpips:
 
     def variants(self) -> dict[str, str]:
         """What each figure is, for result files and reports."""
-        base = f"LPIPS, {self.net.title}, heads {self.version}, weights SHA-256 {self.sha256[:12]}, inputs in "
+        base = f"{self.net.title}, heads {self.version}, weights SHA-256 {self.sha256[:12]}, inputs in "
         inputs = {"legacy": "[0, 1] (un-rescaled, as in the code of 3D Gaussian splatting)", "standard": "[-1, 1]"}
         return {f"lpips_{self.net.name}_{mode}": base + inputs[mode] for mode in MODES}
 

@@ -14,7 +14,7 @@ LARGEST_WIDTH = 2600
 """Width that a figure of many columns keeps to [px]."""
 CELL = (180, 480)
 """Narrowest and widest column [px]."""
-GAP, MARGIN, HEAD, CAPTION = 8, 20, 34, 26
+GAP, MARGIN, HEAD, CAPTION = 8, 20, 38, 32
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def sheet(headings: list[str], strips: list[Strip]) -> bytes:
     from PIL import Image, ImageDraw, ImageFont
 
     column = _column(len(headings), max(s.cells[0].image.shape[1] for s in strips))
-    bold, small = ImageFont.load_default(16), ImageFont.load_default(13)
+    bold, small = (ImageFont.load_default(max(least, column / part)) for least, part in ((17, 22), (14, 30)))
 
     def fitted(text: str, font, width: int) -> str:
         while text and font.getlength(text) > width:
@@ -81,7 +81,7 @@ def sheet(headings: list[str], strips: list[Strip]) -> bytes:
     canvas = Image.new("RGB", (width, height), PAPER)
     draw = ImageDraw.Draw(canvas)
     for i, heading in enumerate(headings):
-        draw.text((MARGIN + i * (column + GAP) + column / 2, MARGIN), fitted(heading, bold, column), INK, bold, anchor="mt")
+        draw.text((MARGIN + i * (column + GAP) + column / 2, MARGIN + 18), fitted(heading, bold, column), INK, bold, anchor="ms")
     y = MARGIN + HEAD
     for s, (tall, zoom) in zip(strips, heights):
         draw.line((MARGIN, y, width - MARGIN, y), (217, 220, 225))
@@ -100,7 +100,7 @@ def sheet(headings: list[str], strips: list[Strip]) -> bytes:
                 canvas.paste(scaled(cell.image[cy : cy + h, cx : cx + w], inner, round(inner * h / w)), (left, top))
                 draw.rectangle([left, top, left + inner - 1, top + round(inner * h / w) - 1], outline=color, width=3)
             words = fitted(cell.caption, small, column)
-            draw.text((x + column / 2, y + tall + zoom + 7), words, SOFT, small, anchor="mt")
+            draw.text((x + column / 2, y + tall + zoom + 20), words, SOFT, small, anchor="ms")
         y += tall + zoom + CAPTION
     out = io.BytesIO()
     canvas.save(out, "PNG")
