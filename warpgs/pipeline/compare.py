@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 
 import torch
 
@@ -79,6 +80,7 @@ def _run_all(request: StudyRequest, places: list[Place], device: torch.device, l
                 if outcome.state != "fitted":
                     print(f"  {outcome.state}{': ' if outcome.note else ''}{outcome.note}")
                 runs[place.name, name, seed] = outcome
+                gc.collect()  # a fit and its recorded steps refer to each other: without this their device memory piles up
     return runs
 
 

@@ -186,6 +186,8 @@ def fit_scene(request: FitRequest) -> dict:
     else:
         write_json(out / CONFIG, record)
 
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)  # earlier fits of this process are not this one's need
     fit = Fit(train, scene.points, request.config, device, scene.background)
     if plain is not None:
         fit.load(tensors, plain)
@@ -199,16 +201,15 @@ def fit_scene(request: FitRequest) -> dict:
     setup = time.perf_counter() - began
     _train(fit, out)
     trained = time.perf_counter() - began - setup
+    peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(device)} if device.type == "cuda" else {}
     write_ply(out / "point_cloud.ply", fit.gaussians, scene.normalization)
     metrics = evaluate_run(out, fit.gaussians, train, test, request.config.rule, scene.background, lpips)
     metrics |= {
         "protocol": protocol_of(scene, request.scene.split, request.scene.downscale, train, test),
         "steps": fit.step, "gaussians": len(fit.gaussians), "preset": request.config.preset, "seed": request.config.seed,
         "config_hash": request.config.fingerprint(), "fingerprint": scene.fingerprint, "device": where.removeprefix("on "),
-        "seconds": {"setup": setup, "training": trained, "total": time.perf_counter() - began},
+        "seconds": {"setup": setup, "training": trained, "total": time.perf_counter() - began}, **peak,
     }  # fmt: skip
-    if device.type == "cuda":
-        metrics["peak_torch_bytes"] = torch.cuda.max_memory_allocated(device)
     write_json(out / "metrics.json", metrics)
     record["notes"] = notes
     write_report(out, scene, split, fit.gaussians, metrics, record)

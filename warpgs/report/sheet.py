@@ -81,7 +81,8 @@ def sheet(headings: list[str], strips: list[Strip]) -> bytes:
     canvas = Image.new("RGB", (width, height), PAPER)
     draw = ImageDraw.Draw(canvas)
     for i, heading in enumerate(headings):
-        draw.text((MARGIN + i * (column + GAP) + column / 2, MARGIN + 18), fitted(heading, bold, column), INK, bold, anchor="ms")
+        middle = MARGIN + i * (column + GAP) + column / 2
+        draw.text((middle, MARGIN + 18), fitted(heading, bold, column), INK, bold, anchor="ms")
     y = MARGIN + HEAD
     for s, (tall, zoom) in zip(strips, heights):
         draw.line((MARGIN, y, width - MARGIN, y), (217, 220, 225))
