@@ -108,7 +108,8 @@ class Fit:
                 regions = [counted_region(v)[0] for v in train]
                 priors, notes = view_priors(train, config.priors, depths=start.depths, regions=regions, cache=cache_folder())
                 self.notes += notes
-            self.views = [v.scored(p, config.method) for v, p in zip(self.views, priors, strict=True)]
+            depths = start.depths or [None] * len(train)
+            self.views = [v.scored(p, d, config.method) for v, p, d in zip(self.views, priors, depths, strict=True)]
         if device.type == "cuda" and config.cuda_graph:
             self._stack()
 

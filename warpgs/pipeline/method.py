@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 
 from warpgs.errors import UsageError
@@ -13,7 +14,7 @@ from warpgs.pipeline.importance import ImportanceConfig
 from warpgs.pipeline.layers import Layers, ProtectConfig
 from warpgs.pipeline.sampler import SamplerConfig, fine_gaussians, geometry_gate, sample_pixels, valid_pixels
 from warpgs.rasterizer import RasterizeOptions, rasterize
-from warpgs.scene import Camera, Gaussians, Prior
+from warpgs.scene import Camera, Gaussians, Prior, ViewDepth
 
 MAX_VIEWS = 8
 """Views that one event looks at; drawn at random where there are more."""
@@ -71,15 +72,21 @@ class TrainingView:
     """S_semantic in [0, 1], shape [H, W]; None where nothing is known of it."""
     geometry: torch.Tensor | None = None
     """S_geometry in [0, 1], shape [H, W]; None before `scored`."""
+    confirmed: torch.Tensor | None = None
+    """z-depth [u] that other views confirm, 0 where none does, shape [H, W]; None where nothing is confirmed."""
 
-    def scored(self, prior: Prior, config: MethodConfig) -> TrainingView:
-        """The same view with the scores of its prior."""
+    def scored(self, prior: Prior, depth: ViewDepth | None, config: MethodConfig) -> TrainingView:
+        """The same view with the scores of its prior and the depth that other views confirm."""
         maps = {n: torch.as_tensor(getattr(prior, n), dtype=torch.float32, device=self.photo.device)
                 for n in ("disparity", "confidence", "boundary", "foreground")}  # fmt: skip
         valid = None if self.mask is None else self.mask > 0
         geometry = scoring.geometry_score(maps.pop("disparity"), config.importance.curvature, valid)
         semantic = scoring.semantic_score(**maps)
-        return TrainingView(self.camera, self.photo, self.mask, semantic if bool(semantic.any()) else None, geometry)
+        confirmed = None
+        if depth is not None and depth.valid.any():
+            confirmed = torch.as_tensor(np.where(depth.valid, depth.depth, 0), dtype=torch.float32, device=self.photo.device)
+        known = semantic if bool(semantic.any()) else None
+        return TrainingView(self.camera, self.photo, self.mask, known, geometry, confirmed)
 
 
 @dataclass(frozen=True)
@@ -121,7 +128,8 @@ def draw_from_view(
     """Score one view, draw its pixels, and make the fine Gaussians behind them."""
     c = config.sampler
     render = rasterize(gaussians, view.camera, options)
-    valid = valid_pixels(render.alpha, render.depth, view.mask, c)
+    depth = view.confirmed if c.depth == "confirmed" and view.confirmed is not None else render.depth
+    valid = valid_pixels(render.alpha, depth, view.mask, c)
     known = view.semantic is not None
     semantic = view.semantic if known else torch.zeros_like(view.geometry)
     scores = (scoring.render_score(render.rgb, view.photo, valid), semantic, view.geometry)
@@ -129,7 +137,7 @@ def draw_from_view(
     wanted = max(1, round(c.share * valid.numel()))
     gate, quantile = geometry_gate(view.geometry, valid, c.gate_quantile if config.ra else 0.0, wanted)
     at = sample_pixels(score, gate, wanted, generator, random=config.agp)
-    rows = fine_gaussians(view.camera, view.photo, render.depth, at, c, gaussians.sh.shape[1])
+    rows = fine_gaussians(view.camera, view.photo, depth, at, c, gaussians.sh.shape[1])
     return Drawn(number, render.rgb, scores, score, gate, quantile, at), rows
 
 

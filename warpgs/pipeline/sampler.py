@@ -18,6 +18,9 @@ SUPPORT = 4
 class SamplerConfig:
     """How fine Gaussians are placed at one event."""
 
+    depth: str = "rendered"
+    """Depth that Gaussians are placed at: rendered (the paper), or confirmed: what other views confirm of the start's depth, and
+    only there; a view of which nothing is confirmed takes the rendered one."""
     share: float = 0.005
     """Gaussians per event and view, as a share of the view's pixels."""
     gate_quantile: float = 0.6
@@ -34,6 +37,8 @@ class SamplerConfig:
     """Most fine Gaussians, as a share of the coarse ones."""
 
     def __post_init__(self):
+        if self.depth not in ("rendered", "confirmed"):
+            raise UsageError(f"sampler depth {self.depth!r} is not one of rendered, confirmed")
         if not 0 < self.share <= 1 or not 0 <= self.gate_quantile < 1 or not 0 <= self.min_alpha < 1:
             raise UsageError("sampler: share must lie in (0, 1], gate quantile and min alpha in [0, 1)")
         if not 0 < self.opacity < 1 or not self.footprint > 0 or self.border < 0 or not self.max_share >= 0:
