@@ -19,7 +19,7 @@ class SamplerConfig:
     """How fine Gaussians are placed at one event."""
 
     depth: str = "rendered"
-    """Depth that Gaussians are placed at: rendered (the paper), or confirmed: what other views confirm of the start's depth, and
+    """Depth that Gaussians are placed at: rendered (the paper), or confirmed: what other views confirm of the depth, and
     only there; a view of which nothing is confirmed takes the rendered one."""
     share: float = 0.005
     """Gaussians per event and view, as a share of the view's pixels."""
