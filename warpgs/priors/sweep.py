@@ -195,8 +195,7 @@ def confirm(views: Sequence[View], inverses: Sequence[np.ndarray], index: int, c
     view, own = views[index], inverses[index]
     camera, pixels, w = view.camera, pixel_grid(view.camera), own.ravel()
     sensitivity = np.full(len(pixels), np.inf)
-    near = np.linalg.inv(camera.K)
-    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ near.T
+    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ np.linalg.inv(camera.K).T
     world = (rays / w[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
     notes, own_direction = [], world - camera.center
     own_direction /= np.linalg.norm(own_direction, axis=1, keepdims=True)
