@@ -38,6 +38,12 @@ def exact_flow(views: list[View], depths: list[np.ndarray]):
     return flow
 
 
+def test_pixel_centres_are_at_one_half():
+    """Row by row, the first at (0.5, 0.5)."""
+    pixels = pixel_grid(rig()[0])
+    assert pixels.shape == (64 * 48, 2) and pixels[:2].tolist() == [[0.5, 0.5], [1.5, 0.5]] and pixels[64].tolist() == [0.5, 1.5]
+
+
 def test_depth_is_exact_on_a_synthetic_rig():
     """Depths drawn at random come back to a relative 1e-9, with no residual; some points leave the image and are not valid."""
     a, b, _ = rig()
@@ -147,6 +153,9 @@ def test_round_trip_measures_the_way_back():
     distance = round_trip(pixels + np.array([2, -0.5]), pixels, back)
     assert np.allclose(distance[:2], 0, atol=1e-6) and distance[2] == np.inf
     assert np.allclose(round_trip(pixels[:2] + np.array([2, 0]), pixels[:2], back), 0.5, atol=1e-6)
+    ramp = np.zeros((8, 10, 2), np.float32)
+    ramp[..., 0] = -0.25 * (np.arange(10) + 0.5)
+    assert np.allclose(round_trip(pixels[:2] / 0.75 * [1, 0.75], pixels[:2], ramp)[:1], 0, atol=0.01)
     assert (round_trip(np.full((2, 2), np.nan), pixels[:2], back) == np.inf).all()
 
 

@@ -158,7 +158,7 @@ def network(path: Path, weights: np.ndarray, bias: np.ndarray, sides=("h", "w"),
 def test_network_of_known_flow(tmp_path, value_range, factor):
     """Images of one colour each: u is the difference of reds as the network is shown them, v a constant; sides not of 8."""
     camera = Camera(np.eye(4), np.eye(3), 20, 13)
-    views = [View(f"{r}.png", camera, np.full((13, 20, 3), r, np.float32)) for r in (0.25, 0.75)]
+    views = [View(f"{r}.png", camera, np.full((13, 20, 3), [r, 0.5, 0.1], np.float32)) for r in (0.25, 0.75)]
     path = network(tmp_path / "net.onnx", np.array([[1.0, 0, 0], [0, 0, 0]]), np.array([0.0, -2]))
     flow = flow_between(views, str(path), value_range)(0, 1)
     assert flow.shape == (13, 20, 2)
