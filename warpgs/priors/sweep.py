@@ -42,7 +42,7 @@ class SweepConfig:
     """Penalty for a depth one plane off the neighbouring pixel's (P1); costs lie in [0, 1]."""
     large_step: float = 0.5
     """Penalty for any other depth (P2) where the picture is even; less across its edges, but above 1.5 P1."""
-    max_round_trip: float = 1.0
+    max_round_trip: float = 0.6
     """A depth counts where the depth that another view found leads back nearer than this [px]."""
     min_parallax: float = 0.5
     """Smallest angle between the two rays [deg]; below it depth is noise."""
