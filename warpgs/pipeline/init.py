@@ -50,8 +50,8 @@ class InitConfig:
     """sweep, flow: width of the cells in which confirmed points become one [px]; 0 keeps one for every pixel."""
     fill_px: float = 16.0
     """sweep, flow: width of the cells of points where no depth is confirmed [px]; 0 leaves those places empty."""
-    flow: str = "deepflow"
-    """flow: deepflow, dis, sparse, a folder of .flo files or an ONNX file (images in, flow out)."""
+    flow: str = "dis"
+    """flow: dis, deepflow, sparse, a folder of .flo files or an ONNX file (images in, flow out)."""
     flow_range: str = "255"
     """flow: colours that an ONNX file takes: 255 (0 to 255), unit (0 to 1) or signed (-1 to 1)."""
     max_residual: float = 1.0

@@ -42,7 +42,7 @@ class SweepConfig:
     """Penalty for a depth one plane off the neighbouring pixel's (P1); costs lie in [0, 1]."""
     large_step: float = 0.5
     """Penalty for any other depth (P2) where the picture is even; less across its edges, but above 1.5 P1."""
-    max_round_trip: float = 1.0
+    max_round_trip: float = 0.6
     """A depth counts where the depth that another view found leads back nearer than this [px]."""
     min_parallax: float = 0.5
     """Smallest angle between the two rays [deg]; below it depth is noise."""
@@ -195,8 +195,7 @@ def confirm(views: Sequence[View], inverses: Sequence[np.ndarray], index: int, c
     view, own = views[index], inverses[index]
     camera, pixels, w = view.camera, pixel_grid(view.camera), own.ravel()
     sensitivity = np.full(len(pixels), np.inf)
-    near = np.linalg.inv(camera.K)
-    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ near.T
+    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ np.linalg.inv(camera.K).T
     world = (rays / w[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
     notes, own_direction = [], world - camera.center
     own_direction /= np.linalg.norm(own_direction, axis=1, keepdims=True)

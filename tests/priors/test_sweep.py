@@ -1,0 +1,182 @@
+"""Planes in the right places, costs and paths as defined, and depth of a scene that is known exactly."""
+
+import numpy as np
+import pytest
+
+from tests.priors.rigs import rig, still_life
+from warpgs.errors import UsageError
+from warpgs.geometry import back_project, project_points
+from warpgs.priors.completion import complete
+from warpgs.priors.epipolar import pixel_grid
+from warpgs.priors.sweep import (
+    SweepConfig,
+    aggregate,
+    best_inverse,
+    confirm,
+    matching_costs,
+    plane_homography,
+    plane_inverses,
+    project_inverse,
+    sweep_depths,
+)
+from warpgs.scene import Camera, View
+
+
+def test_homography_and_inverse_depth_agree_with_projection():
+    """A plane's homography, the inverse-depth formula and plain geometry put a pixel in the same place."""
+    a, b, _ = rig()
+    pixels = pixel_grid(a)
+    wanted = project_points(b, back_project(a, pixels, np.full(len(pixels), 3.7)))[0]
+    assert np.allclose(project_inverse(a, b, pixels, np.full(len(pixels), 1 / 3.7)), wanted, atol=1e-9)
+    # whole numbers are the centres there
+    p = np.concatenate([pixels - 0.5, np.ones((len(pixels), 1))], 1) @ plane_homography(a, b, 1 / 3.7).T
+    assert np.allclose(p[:, :2] / p[:, 2:] + 0.5, wanted, atol=1e-9)
+    assert np.isnan(project_inverse(a, b, pixels[:1], np.array([1e3]))).all() or b.viewmat[2, 3] > 0
+
+
+def test_planes_are_half_a_pixel_apart():
+    """No match inside both images moves farther than asked between planes; fewer planes where they are capped or needless."""
+    a, b, _ = rig()
+    inverses = plane_inverses(a, [b], (2.5, 6.0), 0.5, 256)
+    assert inverses[0] == pytest.approx(1 / 6) and inverses[-1] == pytest.approx(1 / 2.5) and 8 < len(inverses) < 256
+    pixels = pixel_grid(a)
+    at = np.stack([project_inverse(a, b, pixels, np.full(len(pixels), w)) for w in inverses])
+    inside = ((at >= 0) & (at < [64, 48])).all(2)
+    steps = np.linalg.norm(np.diff(at, axis=0), axis=2)[inside[1:] & inside[:-1]]
+    assert 0.4 < steps.max() < 0.55
+    assert len(plane_inverses(a, [b], (2.5, 6.0), 0.5, 20)) == 20 and len(plane_inverses(a, [], (2.5, 6.0), 0.5, 20)) == 8
+
+
+def test_cost_is_least_at_the_true_plane():
+    """A wall parallel to the image: zero cost at its plane, more at others, no opinion where the other view does not reach."""
+    generator = np.random.default_rng(0)
+    K = np.array([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]])
+    texture = generator.uniform(0.1, 0.9, (30, 60, 3)).astype(np.float32)
+    shifted = np.eye(4)
+    shifted[0, 3] = -0.5  # a step to the right: 5 px at depth 4
+    views = [
+        View("a", Camera(np.eye(4), K, 40, 30), texture[:, :40]),
+        View("b", Camera(shifted, K, 40, 30), 0.5 * texture[:, 5:45] + 0.2),  # another exposure
+    ]
+    costs = matching_costs(views[0], views[1:], np.array([0.15, 0.25, 0.35]), 5)
+    seen = (slice(3, -3), slice(9, -3))
+    assert costs.shape == (30, 40, 3) and costs[(*seen, 1)].max() < 0.01
+    assert costs[(*seen, 0)].min() > 0.1 and costs[(*seen, 2)].min() > 0.1
+    assert np.allclose(costs[:, :4, 1], 0.5)
+
+
+def test_paths_are_those_of_the_definition():
+    """Against the recursion written out pixel by pixel; an edge of the picture lets depth jump."""
+    generator = np.random.default_rng(1)
+    costs = generator.uniform(0, 1, (4, 5, 6)).astype(np.float32)
+    image = generator.uniform(0.4, 0.55, (4, 5, 3)).astype(np.float32)
+    p1, p2 = 0.05, 0.6
+    total = np.zeros(costs.shape)
+    for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        path = np.zeros(costs.shape)
+        for y in range(4)[:: 1 if dy >= 0 else -1]:
+            for x in range(5)[:: 1 if dx >= 0 else -1]:
+                path[y, x] = costs[y, x]
+                py, px = y - dy, x - dx
+                if 0 <= py < 4 and 0 <= px < 5:
+                    jump = max(p2 * np.exp(-np.abs(image[y, x] - image[py, px]).max() / 0.06), 1.5 * p1)
+                    low = path[py, px].min()
+                    for d in range(6):
+                        options = [path[py, px, d], low + jump]
+                        options += [path[py, px, k] + p1 for k in (d - 1, d + 1) if 0 <= k < 6]
+                        path[y, x, d] += min(options) - low
+        total += path
+    assert np.allclose(aggregate(costs, image, p1, p2), total, atol=1e-5)
+
+
+def test_parabola_between_planes():
+    """The minimum of a sampled parabola is found between the samples; flat costs give the sample itself."""
+    inverses = np.linspace(0.1, 0.5, 9)
+    truth = np.array([[0.2, 0.237, 0.31]])
+    costs = ((inverses - truth[..., None]) ** 2).astype(np.float64)
+    assert np.allclose(best_inverse(costs, inverses), truth)
+    assert np.allclose(best_inverse(np.zeros((1, 1, 9)), inverses), inverses[1])
+
+
+def test_only_what_another_view_confirms_counts():
+    """True depths pass where a second view sees them, a wrong patch does not, nor does anything without parallax."""
+    views, depths = still_life()
+    inverses = [1 / d for d in depths]
+    config = SweepConfig()
+    right = confirm(views, inverses, 1, config)
+    assert right.coverage > 0.85 and np.allclose(right.depth[right.valid], depths[1][right.valid], rtol=1e-5)
+    wrong = [i.copy() for i in inverses]
+    wrong[1][40:60, 60:90] *= 1.2
+    patch = confirm(views, wrong, 1, config)
+    assert not patch.valid[42:58, 62:88].any() and np.array_equal(patch.valid[:38], right.valid[:38])
+    assert np.isinf(patch.sensitivity[~patch.valid]).all() and (patch.depth[~patch.valid] == 0).all()
+    still = confirm([views[0], views[0]], [inverses[0]] * 2, 0, config)
+    assert still.coverage == 0 and "agrees" in still.notes[0]
+
+
+def test_sensitivity_is_depth_per_pixel():
+    """Moving the depth by the sensitivity moves the match by a pixel, in the view where it moves most."""
+    views, depths = still_life()
+    found = confirm(views, [1 / d for d in depths], 1, SweepConfig())
+    pixels, z = pixel_grid(views[1].camera), depths[1].ravel()
+    moved = []
+    for j in (0, 2):
+        ends = [project_points(views[j].camera, back_project(views[1].camera, pixels, z + s))[0] for s in (1e-4, -1e-4)]
+        moved.append(np.linalg.norm(ends[0] - ends[1], axis=1) / 2e-4)
+    product = found.sensitivity.ravel() * np.maximum(*moved)
+    valid = found.valid.ravel()
+    # where only the other view confirms, that one decides
+    assert np.median(np.abs(product[valid] - 1)) < 1e-3 and product[valid].min() > 0.999
+
+
+def test_depth_of_a_known_scene():
+    """Ray-cast views: at least three quarters confirmed in each, half of that within 0.8 %, nine tenths within 5 %."""
+    views, depths = still_life()
+    for found, true in zip(sweep_depths(views, [(2, 12)] * 3, SweepConfig()), depths):
+        error = np.abs(found.depth / true - 1)[found.valid]
+        assert found.coverage > 0.75 and np.quantile(error, 0.5) < 0.008 and np.quantile(error, 0.9) < 0.05
+
+
+def test_large_images_are_swept_small_and_masks_hold():
+    """Above the limit of pixels the size is reduced and said; what a mask hides is not valid."""
+    views, depths = still_life()
+    mask = np.ones(depths[0].shape, bool)
+    mask[:, :50] = False
+    masked = [View(v.name, v.camera, v.image, mask) for v in views]
+    found = sweep_depths(masked, [(2, 12)] * 3, SweepConfig(max_pixels=10_000))
+    assert found[0].depth.shape == (120, 160) and "swept at 115 x 86 px" in found[0].notes
+    assert not any(f.valid[:, :50].any() for f in found)
+    error = np.abs(found[1].depth / depths[1] - 1)[found[1].valid]
+    assert found[1].valid[:, 50:].mean() > 0.6 and np.median(error) < 0.015
+
+
+@pytest.mark.parametrize("bad", [{"window": 4}, {"window": 1}, {"max_planes": 2}, {"spacing": np.nan}, {"near_count": 0}])
+def test_bad_settings_are_refused(bad):
+    """At once."""
+    with pytest.raises(UsageError):
+        SweepConfig(**bad)
+
+
+def test_completion_follows_the_picture():
+    """Two flat regions, a few confirmed pixels in each: each takes its own depth up to the edge between them."""
+    image = np.zeros((40, 60, 3), np.float32)
+    image[:, 30:] = 0.8
+    true = np.where(np.arange(60) < 30, 2.0, 5.0)[None].repeat(40, 0).astype(np.float32)
+    valid = np.zeros((40, 60), bool)
+    valid[5:10, 5:10] = valid[30:35, 45:55] = True
+    filled = complete(np.where(valid, true, 0), valid, image)
+    assert np.abs(filled / true - 1).max() < 0.02 and np.array_equal(filled[valid], true[valid])
+
+
+def test_completion_keeps_planes_and_bounds():
+    """A slanted plane with a hole is linear in inverse depth; nothing valid gives nothing; all valid changes nothing."""
+    x = np.arange(64)[None].repeat(48, 0)
+    true = (1 / (0.1 + 0.004 * x)).astype(np.float32)
+    valid = np.ones((48, 64), bool)
+    valid[18:30, 26:38] = False
+    image = np.full((48, 64, 3), 0.5, np.float32)
+    filled = complete(np.where(valid, true, 0), valid, image)
+    assert np.abs(filled / true - 1).max() < 0.05
+    assert filled.min() >= true.min() - 1e-5 and filled.max() <= true.max() + 1e-5
+    assert not complete(true, np.zeros_like(valid), image).any()
+    assert np.array_equal(complete(true, np.ones_like(valid), image), true)
