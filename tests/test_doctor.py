@@ -199,8 +199,3 @@ def test_colours_only_on_a_terminal():
     findings = [Finding("Python", OK, "3.12")]
     assert "\x1b[" in text_of(findings, terminal=True)[0]
     assert "\x1b" not in text_of(findings)[0]
-
-
-@pytest.mark.parametrize(("n", "text"), [(12, "12 B"), (3 * 2**20, "3.0 MiB"), (5 * 2**40, "5.0 TiB")])
-def test_sizes_read_well(n, text):
-    assert doctor._bytes(n) == text

@@ -66,7 +66,10 @@ def test_bands_make_the_same_picture(device, dtype, most):
     """In parts as small as a tile, pictures are the same bits and gradients the same numbers."""
     gaussians, cam, background = scene(dtype, device)
     whole = rasterize(gaussians, cam, RasterizeOptions(background=background))
-    banded = rasterize(gaussians, cam, RasterizeOptions(background=background, max_instances=most))
+    banded = rasterize(gaussians, cam, RasterizeOptions(background=background, max_instances=most, contributions=True))
+    weights = rasterize(gaussians, cam, RasterizeOptions(contributions=True))
+    assert torch.equal(weights.weight_maxima, banded.weight_maxima)
+    assert torch.allclose(weights.weight_sums, banded.weight_sums, rtol=1e-5, atol=1e-6)
     assert int(whole.tile_counts.sum()) > 2 * most and torch.equal(whole.splats, banded.splats)
     for name in ("rgb", "alpha", "depth"):
         assert torch.equal(getattr(whole, name), getattr(banded, name)), name
@@ -101,7 +104,7 @@ def test_sources_changed_before_the_gradient_are_noticed():
         r.rgb.sum().backward()
 
 
-@pytest.mark.parametrize("more", [{"contributions": True}, {"capacity": 100}, {"max_instances": 0}])
+@pytest.mark.parametrize("more", [{"capacity": 100}, {"max_instances": 0}])
 def test_options_that_bands_exclude_are_refused(more):
     """Said before anything is drawn."""
     gaussians, cam, _ = scene(torch.float32, "cpu")

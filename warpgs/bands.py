@@ -9,7 +9,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from warpgs.constants import Rule
-from warpgs.kernels.blend import blend
+from warpgs.kernels.blend import blend, contributions
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
 
@@ -112,6 +112,20 @@ class _Banded(torch.autograd.Function):
             v_splats += part
             v_backgrounds += part_background
         return v_splats, v_backgrounds, *(None for _ in range(1 + len(sources)))
+
+
+def contributions_in_bands(
+    splats: torch.Tensor, frame: Frame, sources: tuple[torch.Tensor, ...]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Sum and maximum of each record's weights, as `contributions` returns them, part by part."""
+    sums, maxima = torch.zeros_like(splats[..., 0]), torch.zeros_like(splats[..., 0])
+    for (x, y, width, height), counts in parts(frame, tuple(t.detach() for t in sources)):
+        how = {"width": width, "height": height, "rule": frame.rule, "origin": (x, y)}
+        tiles = bin_tiles(splats, counts, tile_size=frame.tile_size, **how)
+        part, part_maxima = contributions(splats, tiles, **how)
+        sums += part
+        maxima = torch.maximum(maxima, part_maxima)
+    return sums, maxima
 
 
 def blend_in_bands(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from warpgs import __version__
 from warpgs.errors import UsageError, WarpgsError
+from warpgs.sizes import parse_bytes
 
 if TYPE_CHECKING:
     from warpgs.pipeline.config import FitConfig
@@ -110,6 +111,8 @@ def _fit_arguments(arguments: list[str]):
         """A checkpoint may be written at multiples of this step."""
         checkpoint_seconds: float = base.checkpoint_seconds
         """Time from one checkpoint to the next at the least [s]."""
+        memory_limit: str | None = None
+        """Most memory that the fit's tensors may take on its device while it takes steps, such as 2GiB or 800MB."""
         cuda_graph: bool = base.cuda_graph
         """On CUDA, record a step once and replay it: the same bytes in less time."""
         init: InitConfig = field(default_factory=lambda: base.init)
@@ -140,6 +143,8 @@ def _fit_arguments(arguments: list[str]):
         "priors",
     )
     rooms = {n: getattr(a, n) for n in own}
+    if a.memory_limit is not None:
+        rooms["memory_limit"] = parse_bytes(a.memory_limit)
 
     def config(device: str) -> "FitConfig":
         return dataclasses.replace(base, steps=a.steps if a.steps is not None else DEFAULT_STEPS[device], **rooms)

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from warpgs.sizes import format_bytes
+
 OK, MISSING, NOTE = "ok", "missing", "note"
 PYTHON = ((3, 11), (3, 14))  # from, and below
 LOW_DISK = 2 * 2**30  # [bytes]; a run folder with checkpoints and a video fits well into this
@@ -62,15 +64,6 @@ PACKAGES = (
     Package("pyvista", "pyvista", False, "3D overviews in reports"),
     Package("vtk", "vtk", False, "3D overviews in reports"),
 )
-
-
-def _bytes(n: float) -> str:
-    """A size for people to read."""
-    for unit in ("B", "KiB", "MiB", "GiB"):
-        if n < 1024:
-            return f"{n:.0f} {unit}" if unit in ("B", "KiB") else f"{n:.1f} {unit}"
-        n /= 1024
-    return f"{n:.1f} TiB"
 
 
 def _reason(error: BaseException) -> str:
@@ -157,7 +150,7 @@ def _processor() -> Iterable[Finding]:
         yield Finding("Memory", NOTE, "the system does not say how much there is")
         return
     total, free = memory
-    detail = f"{_bytes(total)}, {_bytes(free)} available"
+    detail = f"{format_bytes(total)}, {format_bytes(free)} available"
     if free < LOW_MEMORY:
         yield Finding("Memory", NOTE, detail, "close other programs, or fit at a smaller image size")
     else:
@@ -189,7 +182,7 @@ def _cuda() -> Iterable[Finding]:
         return
     for i in range(torch.cuda.device_count()):
         p = torch.cuda.get_device_properties(i)
-        detail = f"{p.name}, {_bytes(p.total_memory)}, compute {p.major}.{p.minor}, torch for CUDA {torch.version.cuda}"
+        detail = f"{p.name}, {format_bytes(p.total_memory)}, compute {p.major}.{p.minor}, torch for CUDA {torch.version.cuda}"
         yield Finding(f"CUDA {i}", OK, detail)
     yield _warp_cuda()
 
@@ -244,7 +237,7 @@ def _prior_cache() -> Iterable[Finding]:
         remedy = "set WARPGS_CACHE to a folder that you may write to"
         yield Finding("Prior cache", NOTE, f"{folder} is not writable ({e.strerror}); networks run anew each time", remedy)
         return
-    yield Finding("Prior cache", OK, f"{folder}, {_bytes(_size(folder))}, writable")
+    yield Finding("Prior cache", OK, f"{folder}, {format_bytes(_size(folder))}, writable")
 
 
 def _kernel_cache() -> Iterable[Finding]:
@@ -265,7 +258,7 @@ def _kernel_cache() -> Iterable[Finding]:
         return
     size = _size(folder)
     first = "" if size else "; empty: the first fit compiles for a minute or two"
-    yield Finding(topic, OK, f"{folder}, {_bytes(size)}, writable{first}", required=True)
+    yield Finding(topic, OK, f"{folder}, {format_bytes(size)}, writable{first}", required=True)
 
 
 def _rendering() -> Iterable[Finding]:
@@ -309,7 +302,7 @@ def _video() -> Iterable[Finding]:
 def _disk() -> Iterable[Finding]:
     here = Path.cwd()
     free = shutil.disk_usage(here).free
-    detail = f"{_bytes(free)} free at {here}"
+    detail = f"{format_bytes(free)} free at {here}"
     if free < LOW_DISK:
         yield Finding("Disk", NOTE, detail, "free some, or work in a folder on another disk")
     else:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from warpgs.bands import Frame, blend_in_bands
+from warpgs.bands import Frame, blend_in_bands, contributions_in_bands
 from warpgs.constants import RULES, Rule
 from warpgs.errors import UsageError
 from warpgs.kernels.blend import blend, contributions
@@ -45,8 +45,7 @@ class RasterizeOptions:
     at multiples of ``tile_size`` or at the picture's. None for all."""
     max_instances: int | None = None
     """Draw a picture of more (Gaussian, tile) instances than this in bands that have no more, and each band again for its
-    gradients: the same picture in less memory and more time. None for all at once. Not with ``contributions`` or
-    ``capacity``."""
+    gradients: the same picture in less memory and more time. None for all at once. Not with ``capacity``."""
 
 
 def _checked_window(camera: Camera, options: RasterizeOptions) -> tuple[int, int, int, int]:
@@ -98,8 +97,8 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
     if options.tile_size not in TILE_SIZES:
         raise UsageError(f"tile size {options.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
     most = options.max_instances
-    if most is not None and (options.contributions or options.capacity is not None or most < 1):
-        raise UsageError("max_instances must be at least 1 and goes neither with contributions nor with a capacity")
+    if most is not None and (options.capacity is not None or most < 1):
+        raise UsageError("max_instances must be at least 1 and does not go with a capacity")
     viewmats, Ks = _as_batch(camera.viewmat, means, 4), _as_batch(camera.K, means, 3)
     background = means.new_zeros(3) if options.background is None else options.background
     background = torch.as_tensor(background, dtype=means.dtype, device=means.device)
@@ -115,8 +114,10 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
     if most is not None and int(tile_counts.sum()) > most:
         frame = Frame(camera.width, camera.height, window, degree, rule, options.tile_size, most, options.deterministic)
         factors = () if options.opacity_factors is None else (options.opacity_factors,)
-        pictures = blend_in_bands(splats, backgrounds, frame, (*gaussians.tensors().values(), viewmats, Ks, *factors))
-        return _render(camera, pictures, splats, tile_counts)
+        sources = (*gaussians.tensors().values(), viewmats, Ks, *factors)
+        pictures = blend_in_bands(splats, backgrounds, frame, sources)
+        weights = contributions_in_bands(splats, frame, sources) if options.contributions else (None, None)
+        return _render(camera, pictures, splats, tile_counts, *weights)
     overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=means.device)
     tiles = bin_tiles(
         splats, tile_counts, **size, tile_size=options.tile_size, rule=rule,

@@ -202,6 +202,12 @@ def test_checkpoint_that_is_not_whole_is_refused(tmp_path):
     path = save_checkpoint(tmp_path, {"a": torch.arange(50.0)}, {"step": 3})
     tensors, state = load_checkpoint(tmp_path)
     assert torch.equal(tensors["a"], torch.arange(50.0)) and state == {"step": 3}
+    save_checkpoint(tmp_path, {"b": torch.zeros(0, 3), "c": torch.tensor(7), "d": torch.arange(3, dtype=torch.uint8)}, {})
+    odd = load_checkpoint(tmp_path)[0]
+    assert (
+        odd["b"].shape == (0, 3) and odd["c"].item() == 7 and odd["c"].dtype == torch.int64 and odd["d"].tolist() == [0, 1, 2]
+    )
+    path = save_checkpoint(tmp_path, {"a": torch.arange(50.0)}, {"step": 3})
     whole = path.read_bytes()
     for broken in (whole[:-1], whole[:40], b"", whole[:100] + bytes([whole[100] ^ 1]) + whole[101:]):
         path.write_bytes(broken)

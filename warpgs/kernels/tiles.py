@@ -14,9 +14,11 @@ from warpgs.kernels import bridge
 from warpgs.kernels.functions import make_spans
 from warpgs.kernels.native import make_functions as make_native
 
-BYTES_PER_INSTANCE = 24 + 48 + 80
-"""Two sort buffers of (key, slot), owner and sorted id; of the backward pass on CUDA, the gradient slot and the share of
-the states that blending leaves (blend_cuda.CHUNK)."""
+LIST_BYTES = 20
+"""Of an instance while the lists are made: two sort buffers of (key, slot), and the owner."""
+BYTES_PER_INSTANCE = LIST_BYTES + 48 + 80
+"""The same and, of the backward pass on CUDA, the gradient slot and the share of the states that blending leaves
+(blend_cuda.CHUNKS)."""
 
 VISIBLE = 2**36
 """What a visible Gaussian adds to a running sum of tile counts, so that one sum has both; of either there are fewer."""

@@ -39,6 +39,9 @@ class FitConfig:
     """A checkpoint may be written at multiples of this step; one is written at the end in any case."""
     checkpoint_seconds: float = 20.0
     """Time from one checkpoint to the next at the least [s]: writing takes time too. No result depends on it."""
+    memory_limit: int | None = None
+    """Bytes that the fit's tensors may take on its device while it takes steps; None for no limit. With one, densification
+    stops where a step would not fit, and pictures are drawn in bands where a whole one would not."""
     cuda_graph: bool = True
     """On CUDA, record a step once and replay it; the same kernels and the same bytes as without, in less time."""
     init: InitConfig = field(default_factory=InitConfig)
@@ -53,6 +56,8 @@ class FitConfig:
         for name in ("steps", "sh_every", "checkpoint_every"):
             if getattr(self, name) < 1:
                 raise UsageError(f"{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
+        if self.memory_limit is not None and not self.memory_limit >= 1:
+            raise UsageError(f"memory-limit must be at least one byte, not {self.memory_limit}")
         if not self.checkpoint_seconds >= 0:
             raise UsageError(f"checkpoint-seconds must be at least 0, not {self.checkpoint_seconds}")
         if not 0 <= self.dropout < 1:

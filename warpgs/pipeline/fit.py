@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from collections.abc import Callable
@@ -13,12 +14,14 @@ import torch
 from warpgs import geometry
 from warpgs.errors import DataError, WarpgsError
 from warpgs.kernels.dropout import opacity_dropout
+from warpgs.kernels.tiles import available_bytes
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.density import DensityStats, Refinement, refine
-from warpgs.pipeline.graph import BURST, NOT_FINITE, Burst, StepGraph, Views
+from warpgs.pipeline.graph import BURST, NOT_FINITE, ROOM, Burst, OverLimitError, StepGraph, stack_views
 from warpgs.pipeline.init import initial_gaussians, initial_points
 from warpgs.pipeline.layers import COARSE, FINE, LONG_AGO, Layers
 from warpgs.pipeline.loss import masked_mse, photometric_loss
+from warpgs.pipeline.memory import layout_of, most_instances, plan
 from warpgs.pipeline.method import Event, TrainingView, sampling_event
 from warpgs.pipeline.optimizer import Optimizer
 from warpgs.pipeline.region import counted_region
@@ -65,14 +68,9 @@ class Fit:
     """The state of one fit: everything that changes from step to step, and nothing else."""
 
     def __init__(
-        self,
-        train: list[View],
-        points: PointCloud | None,
-        config: FitConfig,
-        device: torch.device,
-        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        priors: list[Prior] | None = None,
-    ):
+        self, train: list[View], points: PointCloud | None, config: FitConfig, device: torch.device,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0), priors: list[Prior] | None = None,
+    ):  # fmt: skip
         """Set up the first Gaussians.
 
         Args:
@@ -85,6 +83,7 @@ class Fit:
 
         Raises:
             DataError: There is nothing to start from.
+            UsageError: The memory limit is below what the smallest step needs.
         """
         if not train:
             raise DataError("there is no training view; name at least one in --split")
@@ -102,7 +101,7 @@ class Fit:
         self.order: list[int] = []
         self.on_event: Callable[[int, Event], None] | None = None
         self.graphs: dict[tuple, StepGraph] = {}
-        self.views = [self._on_device(v) for v in train]
+        self.views = [TrainingView.of(v, device) for v in train]
         if config.method.events:
             if priors is None:
                 regions = [counted_region(v)[0] for v in train]
@@ -110,8 +109,9 @@ class Fit:
                 self.notes += notes
             depths = start.depths or [None] * len(train)
             self.views = [v.scored(p, d, config.method) for v, p, d in zip(self.views, priors, depths, strict=True)]
-        if device.type == "cuda" and config.cuda_graph:
-            self._stack()
+        self.news: list[str] = []
+        """What the user must know of and was not told yet."""
+        self._plan()
 
     @staticmethod
     def _extent(cameras: list[Camera], cloud: PointCloud) -> float:
@@ -119,17 +119,6 @@ class Fit:
         extent = geometry.camera_extent(cameras)
         spread = float(np.linalg.norm(np.std(cloud.points, axis=0)))
         return max(extent, 0.1 * spread if extent < 1e-3 * spread else 0.0, 1e-6)
-
-    def _on_device(self, view: View) -> TrainingView:
-        camera = Camera(
-            torch.as_tensor(view.camera.viewmat, dtype=torch.float32, device=self.device),
-            torch.as_tensor(view.camera.K, dtype=torch.float32, device=self.device),
-            view.camera.width, view.camera.height,
-        )  # fmt: skip
-        mask = None
-        if view.mask is not None:
-            mask = torch.as_tensor(view.mask, dtype=torch.float32, device=self.device)
-        return TrainingView(camera, torch.as_tensor(view.image, dtype=torch.float32, device=self.device), mask)
 
     @property
     def gaussians(self) -> Gaussians:
@@ -156,7 +145,9 @@ class Fit:
         if c.dropout > 0:
             settings = torch.tensor(self._settings(self.step), dtype=torch.float32, device=self.device)
             factors = opacity_dropout(len(self.optimizer.gaussians), settings, c.seed)
-        options = RasterizeOptions(rule=c.rule, sh_degree=phase.degree, background=self.background, opacity_factors=factors)
+        options = RasterizeOptions(
+            rule=c.rule, sh_degree=phase.degree, background=self.background, opacity_factors=factors, max_instances=self.most
+        )
         render = rasterize(self.optimizer.gaussians, view.camera, options)
         render.splats.retain_grad()
         loss, _ = photometric_loss(render.rgb, view.photo, view.mask, c.loss)
@@ -170,9 +161,10 @@ class Fit:
         self.optimizer.step(self._progress(self.step), self._share(phase))
         if self._protects:
             self.layers.hold_up(self.optimizer.params["logit_opacities"].detach(), self.step, c.method.protect)
-        self._change_set(phase)
         with torch.no_grad():
             psnr = -10 * math.log10(max(masked_mse(render.rgb, view.photo, view.mask).item(), 1e-12))
+        del render, loss  # their graph holds the parameters, which are about to be replaced
+        self._change_set(phase)
         return StepReport(self.step, value, psnr, len(self.optimizer.gaussians), time.perf_counter() - begin)
 
     def burst(self, limit: int) -> list[StepReport]:
@@ -184,7 +176,7 @@ class Fit:
             NotFiniteError: A loss is not finite; the Gaussians are as before that step.
             ResourceError: The instances would not fit into memory.
         """
-        if self.device.type != "cuda" or not self.config.cuda_graph:
+        if not self.layout.recordings:
             return [self.advance()]
         begin = time.perf_counter()
         c, first = self.config, self.step + 1
@@ -196,7 +188,15 @@ class Fit:
         ):
             count += 1
         chosen = [self.next_view() for _ in range(count)]
-        graphs = [self._graph(self.places[i][0], phase) for i in chosen]
+        try:
+            graphs = [self._graph(self.places[i][0], phase) for i in chosen]
+        except OverLimitError as e:
+            self.order += reversed(chosen)
+            self.graphs.clear()
+            self.layout = dataclasses.replace(self.layout, recordings=0)
+            self._count_changed()
+            self.news.append(f"memory: steps are taken one by one from here on, because {e}")
+            return [self.advance()]
         steps = range(first, first + count)
         rates = [self.optimizer.schedule(self._progress(s), s) for s in steps]
         self.work.load([self.places[i][1] for i in chosen], rates, [self._settings(s) for s in steps])
@@ -240,6 +240,11 @@ class Fit:
         return self.phases.settle if c.phases.coarse + c.phases.stable > 0 else c.density.times(c.steps)[2]
 
     @property
+    def _room_for(self) -> int:
+        """Number of Gaussians that the settings and the memory limit allow."""
+        return min(self.config.density.max_gaussians, self.memory.cap)
+
+    @property
     def _protects(self) -> bool:
         return self.config.method.events and self.config.method.pm
 
@@ -258,21 +263,27 @@ class Fit:
                 self.stacks[kind], self.optimizer, self.stats if phase.densifying else None, self.work,
                 degree=phase.degree, rule=c.rule, loss=c.loss, background=self.background,
                 dropout_seed=c.seed if c.dropout > 0 else None, share=self._share(phase),
-                protected=(self.layers, c.method.protect) if self._protects else None,
+                protected=(self.layers, c.method.protect) if self._protects else None, most=self.most,
             )  # fmt: skip
         return self.graphs[key]
 
-    def _stack(self) -> None:
-        """Views by size and by whether they have a mask, as recorded steps take them."""
-        self.work, self.stacks = Burst(self.device), {}
-        kinds = [(v.camera.width, v.camera.height, v.mask is not None) for v in self.views]
-        for kind in dict.fromkeys(kinds):
-            same = [v for v, k in zip(self.views, kinds) if k == kind]
-            self.stacks[kind] = Views(
-                torch.stack([v.camera.viewmat for v in same]), torch.stack([v.camera.K for v in same]),
-                torch.stack([v.photo for v in same]), torch.stack([v.mask for v in same]) if kind[2] else None,
-            )  # fmt: skip
-        self.places = [(k, kinds[:i].count(k)) for i, k in enumerate(kinds)]
+    def _plan(self) -> None:
+        """Foretell the memory that steps need, and decide how they are taken."""
+        c = self.config
+        cameras, masked = [v.camera for v in self.views], [v.mask is not None for v in self.views]
+        layout = layout_of(self.gaussians, cameras, masked, scored=c.method.events, recorded=c.cuda_graph)
+        self.memory, self.layout = plan(
+            layout, count=len(self.optimizer.gaussians), instances=most_instances(self.gaussians, cameras, c.rule),
+            most=c.density.max_gaussians, limit=c.memory_limit, available=available_bytes(self.device), room=ROOM,
+        )  # fmt: skip
+        self._count_changed()
+        if self.layout.recordings:
+            self.work, (self.stacks, self.places) = Burst(self.device), stack_views(self.views)
+
+    def _count_changed(self) -> None:
+        """Set how many instances a step may have at a time: None where there is no limit."""
+        limit = self.config.memory_limit
+        self.most = None if limit is None else self.layout.most_instances(len(self.optimizer.gaussians), limit)
 
     def _refines_after(self, step: int) -> bool:
         start, every, _ = self.config.density.times(self.config.steps)
@@ -301,8 +312,9 @@ class Fit:
 
     def _refine(self, phase: Phase) -> None:
         c = self.config
+        density = dataclasses.replace(c.density, max_gaussians=self._room_for)
         change = refine(
-            self.gaussians, self.stats, c.density, extent=self.extent, after_reset=self.reset_done, generator=self.generator,
+            self.gaussians, self.stats, density, extent=self.extent, after_reset=self.reset_done, generator=self.generator,
             growing=self.layers.fine if phase.layered else None,
             protected=self.layers.young(self.step, c.method.protect) if self._protects else None,
         )  # fmt: skip
@@ -314,7 +326,7 @@ class Fit:
         c = self.config
         event = sampling_event(
             self.gaussians, self.layers, self.views, c.method, step=self.step, rule=c.rule, background=self.background,
-            room=c.density.max_gaussians - len(self.optimizer.gaussians), generator=self.generator,
+            room=self._room_for - len(self.optimizer.gaussians), generator=self.generator, max_instances=self.most,
         )  # fmt: skip
         self._apply(event.change, FINE, self.step)
         self.events.append({
@@ -330,6 +342,7 @@ class Fit:
         self.optimizer.apply(change)
         self.layers.apply(change, level=level, birth=birth)
         self.stats.apply(change)
+        self._count_changed()
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict]:
         """Tensors and plain values from which the fit goes on as if it had never stopped."""
@@ -356,6 +369,7 @@ class Fit:
         self.layers.load(tensors)
         self.events = plain["events"]
         self.graphs.clear()
+        self._plan()
         self.generator.set_state(tensors["generator"])
 
 

@@ -22,6 +22,7 @@ from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, available_by
 from warpgs.pipeline.density import DensityStats
 from warpgs.pipeline.layers import Layers, ProtectConfig
 from warpgs.pipeline.loss import LossConfig, masked_mse, photometric_loss
+from warpgs.pipeline.method import TrainingView
 from warpgs.pipeline.optimizer import Optimizer
 
 BURST = 100
@@ -46,6 +47,23 @@ class Views:
     """1 where a pixel counts, else 0, shape [V, H, W]; None where all count."""
 
 
+def stack_views(views: list[TrainingView]) -> tuple[dict[tuple, Views], list[tuple[tuple, int]]]:
+    """Views by size and by whether they have a mask, as recorded steps take them, and where to find each."""
+    kinds = [(v.camera.width, v.camera.height, v.mask is not None) for v in views]
+    stacks = {}
+    for kind in dict.fromkeys(kinds):
+        same = [v for v, k in zip(views, kinds) if k == kind]
+        stacks[kind] = Views(
+            torch.stack([v.camera.viewmat for v in same]), torch.stack([v.camera.K for v in same]),
+            torch.stack([v.photo for v in same]), torch.stack([v.mask for v in same]) if kind[2] else None,
+        )  # fmt: skip
+    return stacks, [(k, kinds[:i].count(k)) for i, k in enumerate(kinds)]
+
+
+class OverLimitError(ResourceError):
+    """A recording would not keep to the fit's memory limit."""
+
+
 class StepGraph:
     """A recorded step for one set of Gaussians, one image size and one degree.
 
@@ -55,7 +73,7 @@ class StepGraph:
     def __init__(
         self, views: Views, optimizer: Optimizer, stats: DensityStats | None, burst: Burst, *,
         degree: int, rule: str, loss: LossConfig, background: torch.Tensor, dropout_seed: int | None = None,
-        share: torch.Tensor | None = None, protected: tuple[Layers, ProtectConfig] | None = None,
+        share: torch.Tensor | None = None, protected: tuple[Layers, ProtectConfig] | None = None, most: int | None = None,
     ):  # fmt: skip
         """Record.
 
@@ -71,8 +89,10 @@ class StepGraph:
             dropout_seed: Seed of the opacity dropout; None for none.
             share: Part of its step that each mean takes, shape [N]; None for all of it.
             protected: What holds up the opacity of the young; None where nothing does.
+            most: Instances that the memory limit allows; None for no limit.
 
         Raises:
+            OverLimitError: There is room for more than ``most`` instances to be made.
             ResourceError: The instances would not fit into memory.
         """
         self.views, self.optimizer, self.stats, self.burst = views, optimizer, stats, burst
@@ -80,6 +100,8 @@ class StepGraph:
         self.dropout_seed, self.share, self.protected = dropout_seed, share, protected
         self.height, self.width = views.targets.shape[1:3]
         self.capacity = self._capacity()
+        if most is not None and self.capacity > most:
+            raise OverLimitError(f"a recorded step would need room for {self.capacity:,} instances, the limit allows {most:,}")
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         self.graph = torch.cuda.CUDAGraph()

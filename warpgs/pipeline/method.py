@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +15,7 @@ from warpgs.pipeline.importance import ImportanceConfig
 from warpgs.pipeline.layers import Layers, ProtectConfig
 from warpgs.pipeline.sampler import SamplerConfig, fine_gaussians, geometry_gate, sample_pixels, valid_pixels
 from warpgs.rasterizer import RasterizeOptions, rasterize
-from warpgs.scene import Camera, Gaussians, Prior, ViewDepth
+from warpgs.scene import Camera, Gaussians, Prior, View, ViewDepth
 
 MAX_VIEWS = 8
 """Views that one event looks at; drawn at random where there are more."""
@@ -74,6 +75,17 @@ class TrainingView:
     """S_geometry in [0, 1], shape [H, W]; None before `scored`."""
     confirmed: torch.Tensor | None = None
     """z-depth [u] that other views confirm, 0 where none does, shape [H, W]; None where nothing is confirmed."""
+
+    @staticmethod
+    def of(view: View, device: torch.device) -> TrainingView:
+        """A view's pixels, mask and camera in float32 on a device."""
+
+        def there(array):
+            return torch.as_tensor(array, dtype=torch.float32, device=device)
+
+        c = view.camera
+        camera = Camera(there(c.viewmat), there(c.K), c.width, c.height)
+        return TrainingView(camera, there(view.image), None if view.mask is None else there(view.mask))
 
     def scored(self, prior: Prior, depth: ViewDepth | None, config: MethodConfig) -> TrainingView:
         """The same view with the scores of its prior and the depth that other views confirm."""
@@ -164,6 +176,7 @@ def sampling_event(
     rule: str,
     background: torch.Tensor,
     generator: torch.Generator,
+    max_instances: int | None = None,
 ) -> Event:
     """Add fine Gaussians where the importance of the training views says.
 
@@ -180,11 +193,12 @@ def sampling_event(
         rule: Cut-offs of the rasterizer.
         background: Colour behind the scene, shape [3].
         generator: CPU generator; the same numbers on every device.
+        max_instances: As in RasterizeOptions.
 
     Returns:
         The change and what led to it.
     """
-    options = RasterizeOptions(rule=rule, background=background)
+    options = RasterizeOptions(rule=rule, background=background, max_instances=max_instances)
     numbers = list(range(len(views)))
     if len(views) > MAX_VIEWS:
         numbers = sorted(torch.randperm(len(views), generator=generator)[:MAX_VIEWS].tolist())
@@ -199,7 +213,7 @@ def sampling_event(
     freed = 0
     if over > 0:
         free = fine & ~layers.young(step, config.protect) if config.pm else fine
-        weigh = RasterizeOptions(rule=rule, background=background, contributions=True)
+        weigh = dataclasses.replace(options, contributions=True)
         ids = least_contributing(gaussians, free, over, views, weigh)
         keep[ids] = False
         freed = len(ids)

@@ -106,9 +106,9 @@ class Optimizer:
 
     def apply(self, change: Refinement) -> None:
         """Keep the named rows with their moments and append new rows with zero moments."""
-        for name, param in self.params.items():
-            added = change.added[name].to(param.dtype)
-            self.params[name] = torch.cat([param.detach()[change.keep], added]).requires_grad_()
+        for name in self.params:  # each old tensor is given up before the next is made
+            added = change.added[name].to(self.params[name].dtype)
+            self.params[name] = torch.cat([self.params[name].detach()[change.keep], added]).requires_grad_()
             for moments in (self.means, self.squares):
                 moments[name] = torch.cat([moments[name][change.keep], torch.zeros_like(added)])
 

@@ -41,9 +41,11 @@ SHOWN_VIEWS = 6
 """Held-out views with pictures in the report; all have files in the run folder."""
 
 
-def options_for(rule: str, background: tuple[float, float, float], gaussians: Gaussians) -> RasterizeOptions:
+def options_for(
+    rule: str, background: tuple[float, float, float], gaussians: Gaussians, max_instances: int | None = None
+) -> RasterizeOptions:
     """Rendering options of a run."""
-    return RasterizeOptions(rule=rule, background=gaussians.means.new_tensor(background))
+    return RasterizeOptions(rule=rule, background=gaussians.means.new_tensor(background), max_instances=max_instances)
 
 
 def file_stem(name: str) -> str:
@@ -69,15 +71,17 @@ def evaluate_run(
     rule: str,
     background: tuple[float, float, float],
     lpips: Lpips | None = None,
+    max_instances: int | None = None,
 ) -> dict:
     """Score held-out and training views, and save a picture and a depth map of each held-out view.
 
     Where no view is held out, the pictures are of the training views. LPIPS is measured on held-out views alone.
+    ``max_instances`` as in RasterizeOptions.
 
     Returns:
         Means over held-out and over training views, a row per held-out view, what guessing scores, and what each figure is.
     """
-    options = options_for(rule, background, gaussians)
+    options = options_for(rule, background, gaussians, max_instances)
     (out / "renders").mkdir(exist_ok=True)
     (out / "depth").mkdir(exist_ok=True)
     rows, train_rows = [], []

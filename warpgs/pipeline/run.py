@@ -168,47 +168,47 @@ def fit_scene(request: FitRequest) -> dict:
     began = time.perf_counter()
     out = request.out
     _prepare_folder(out, request.resume)
+    tensors, plain = {}, None
     try:
         device, where = choose_device(request.device)
         lpips = None if request.lpips_weights is None else load_lpips(request.lpips_weights, device)
         scene, split, notes = read_scene(request.scene)
+        train, test = train_views(scene, split.train), train_views(scene, split.test)
+        record = _record(request, scene, split, notes, device)
+        if request.resume:
+            _check_same(record, json.loads((out / CONFIG).read_text("utf-8")), out)
+            if (out / "checkpoint.safetensors").is_file():
+                tensors, plain = load_checkpoint(out)
+        if device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(device)  # earlier fits of this process are not this one's need
+        fit = Fit(train, scene.points, request.config, device, scene.background)
     except WarpgsError:
         if not request.resume:
             out.rmdir()  # nothing is in it yet
         raise
-    train, test = train_views(scene, split.train), train_views(scene, split.test)
-    record = _record(request, scene, split, notes, device)
-    tensors, plain = {}, None
-    if request.resume:
-        _check_same(record, json.loads((out / CONFIG).read_text("utf-8")), out)
-        if (out / "checkpoint.safetensors").is_file():
-            tensors, plain = load_checkpoint(out)
-    else:
+    if not request.resume:
         write_json(out / CONFIG, record)
-
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)  # earlier fits of this process are not this one's need
-    fit = Fit(train, scene.points, request.config, device, scene.background)
     if plain is not None:
         fit.load(tensors, plain)
         notes.append(f"continued from step {fit.step}")
-    notes += fit.notes
+    notes += [*fit.notes, fit.memory.sentence()]
     size = f"{train[0].camera.width} x {train[0].camera.height} px"
     print(f"{scene.path}: {scene.format}, {len(train)} views to fit, {len(test)} held out, {size}, {where}")
     for note in notes:
         print(f"  {note}")
 
     setup = time.perf_counter() - began
-    _train(fit, out)
+    _train(fit, out, notes)
     trained = time.perf_counter() - began - setup
     peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(device)} if device.type == "cuda" else {}
     write_ply(out / "point_cloud.ply", fit.gaussians, scene.normalization)
-    metrics = evaluate_run(out, fit.gaussians, train, test, request.config.rule, scene.background, lpips)
+    metrics = evaluate_run(out, fit.gaussians, train, test, request.config.rule, scene.background, lpips, fit.most)
     metrics |= {
         "protocol": protocol_of(scene, request.scene.split, request.scene.downscale, train, test),
         "steps": fit.step, "gaussians": len(fit.gaussians), "preset": request.config.preset, "seed": request.config.seed,
         "config_hash": request.config.fingerprint(), "fingerprint": scene.fingerprint, "device": where.removeprefix("on "),
         "seconds": {"setup": setup, "training": trained, "total": time.perf_counter() - began}, **peak,
+        "memory": fit.memory.to_json(),
     }  # fmt: skip
     write_json(out / "metrics.json", metrics)
     record["notes"] = notes
@@ -241,7 +241,7 @@ def _stop_signals():
             signal.signal(number, handler)
 
 
-def _train(fit: Fit, out: Path) -> None:
+def _train(fit: Fit, out: Path, notes: list[str]) -> None:
     log = EventLog(out / "metrics.jsonl", fit.step)
 
     def save(current: Fit) -> None:
@@ -253,6 +253,9 @@ def _train(fit: Fit, out: Path) -> None:
         def on_step(r: StepReport) -> None:
             progress.update(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count)
             log.write(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=round(r.seconds, 6))
+            while fit.news:
+                notes.append(fit.news.pop(0))
+                print(f"  {notes[-1]}")
 
         try:
             with _stop_signals() as stopped:
