@@ -42,6 +42,23 @@ def test_help_is_fast_and_imports_nothing_heavy():
     assert all(name in done.stdout for name in ("fit", "eval", "render", "export", "demo", "doctor"))
 
 
+def test_a_fit_starts_without_libraries_that_it_does_not_need_yet(scene, tmp_path):
+    """Up to the first step: no search trees, no metrics, no 3D overview, no networks, no compiler of torch's."""
+    code = (
+        "import sys\n"
+        "from warpgs.cli import main\n"
+        "from warpgs.pipeline import fit\n"
+        "def stop(*_): raise KeyboardInterrupt\n"
+        "fit.Fit.advance = stop\n"
+        f"flags = ['--out', {str(tmp_path / 'run')!r}, '--device', 'cpu', '--init.source', 'random']\n"
+        f"code = main(['fit', {str(scene)!r}, *flags])\n"
+        "late = {'scipy', 'skimage', 'pyvista', 'onnxruntime', 'torch._dynamo', 'torch._inductor'}\n"
+        "print(code, sorted(late & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip().endswith("130 []")
+
+
 def test_run_folder_holds_what_it_promises(run):
     """Configuration, logs, scores, checkpoint, PLY, pictures, report; and the scores are the same everywhere."""
     metrics = json.loads((run / "metrics.json").read_text())

@@ -20,7 +20,7 @@ from warpgs.pipeline.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.config import PRESETS, FitConfig
 from warpgs.pipeline.density import DensityConfig
 from warpgs.pipeline.fit import Fit, NotFiniteError
-from warpgs.pipeline.init import InitConfig, empty_votes, initial_gaussians, initial_points, random_points
+from warpgs.pipeline.init import InitConfig, empty_votes, initial_gaussians, initial_points, nearest, random_points
 from warpgs.pipeline.loss import LossConfig, photometric_loss
 from warpgs.pipeline.region import counted_region
 from warpgs.pipeline.schedule import log_linear, sh_degree
@@ -57,6 +57,15 @@ def test_random_points_stand_on_an_object_on_black():
     assert len(cloud) == 400 and (cloud.colors == np.float32(0.8)).all()
     # without votes, one point in six stands before some view's black
     assert (empty_votes(views, regions, cloud.points) == 0).all()
+
+
+def test_nearest_points():
+    """Against a search tree, over more pairs than are held at a time, the nearest first."""
+    from scipy.spatial import cKDTree
+
+    generator = np.random.default_rng(0)
+    points, queries = generator.uniform(0, 500, (700, 2)), generator.uniform(0, 500, (3000, 2))
+    assert np.array_equal(nearest(points, queries, 5), cKDTree(points).query(queries, k=5)[1])
 
 
 def test_same_seed_same_bits_and_threads_do_not_matter():

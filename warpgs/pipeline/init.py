@@ -27,6 +27,8 @@ MIN_MATCHES = 10
 """Matched points that a view must hold to guide its random points."""
 NEIGHBORS = 5
 """Matched points that a random pixel takes its depth from."""
+PAIRS = 2**20
+"""Distances that are held at a time while neighbours are looked for."""
 DEPTH_SPREAD = 0.1
 """Standard deviation of the logarithm of depth around a matched point."""
 
@@ -95,25 +97,35 @@ def camera_depths(views: list[View]) -> tuple[float, float]:
     return 0.1 * max(distance, 1e-3), 10 * max(distance, 1e-3)
 
 
+def nearest(points: np.ndarray, queries: np.ndarray, count: int) -> np.ndarray:
+    """Numbers of the ``count`` points [P, 2] nearest to each query [Q, 2], the nearest first, int64 [Q, count]."""
+    known, asked = torch.from_numpy(points), torch.from_numpy(queries)
+    found = []
+    # every pair, some rows at a time: a few hundred points take less time than importing a library of search trees
+    for rows in asked.split(max(1, PAIRS // max(1, len(known)))):
+        squares = sum((rows[:, i, None] - known[None, :, i]) ** 2 for i in range(2))
+        found.append(squares.topk(count, largest=False).indices)
+    return torch.cat(found).numpy()
+
+
 class _Depths:
     """Draws depths for pixels of one view: near those of matched points around the pixel, else anywhere the cameras allow."""
 
     def __init__(self, view: View, matched: PointCloud, bounds: tuple[float, float]):
-        from scipy.spatial import cKDTree
-
         seen = geometry.in_image(view.camera, matched.points)
         pixels, self.known = geometry.project_points(view.camera, matched.points)
-        self.known, self.bounds = self.known[seen], bounds
-        self.tree = cKDTree(pixels[seen]) if seen.sum() >= MIN_MATCHES else None
+        self.pixels, self.known, self.bounds = pixels[seen], self.known[seen], bounds
+        self.guided = len(self.known) >= MIN_MATCHES
 
-    def draw(self, pixels: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    def draw(self, pixels: np.ndarray, wanted: int, generator: np.random.Generator) -> np.ndarray:
+        """Depths [u] of the first ``wanted`` pixels. Random numbers are drawn for all, so one does not depend on how many."""
         count = len(pixels)
-        if self.tree is None:
+        if not self.guided:
             near, far = self.bounds
-            return 1 / generator.uniform(1 / far, 1 / near, size=count)
-        _, ids = self.tree.query(pixels, k=NEIGHBORS)
-        chosen = ids[np.arange(count), generator.integers(NEIGHBORS, size=count)]
-        return self.known[chosen] * np.exp(generator.normal(0, DEPTH_SPREAD, count))
+            return 1 / generator.uniform(1 / far, 1 / near, size=count)[:wanted]
+        which, spread = generator.integers(NEIGHBORS, size=count), generator.normal(0, DEPTH_SPREAD, count)
+        ids = nearest(self.pixels, pixels[:wanted], NEIGHBORS)
+        return self.known[ids[np.arange(wanted), which[:wanted]]] * np.exp(spread[:wanted])
 
 
 def empty_votes(views: list[View], regions: list[tuple[np.ndarray | None, str]], points: np.ndarray) -> np.ndarray:
@@ -152,9 +164,12 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
         chosen = generator.integers(len(rows), size=8 * wanted)
         rows, columns = rows[chosen], columns[chosen]
         pixels = np.stack([columns, rows], 1) + 0.5
-        candidates = geometry.back_project(view.camera, pixels, source.draw(pixels, generator))
+        elsewhere = not source.guided and len(views) > 1
+        # where none is better than another, the first are taken, and the others need no depth
+        useful = len(pixels) if elsewhere or any(name == "foreground" for _, name in regions) else wanted
+        candidates = geometry.back_project(view.camera, pixels[:useful], source.draw(pixels, useful, generator))
         worse = empty_votes(views, regions, candidates)
-        if source.tree is None and len(views) > 1:
+        if elsewhere:
             worse += sum(geometry.in_image(v.camera, candidates).astype(int) for v in views) < 2
         order = np.argsort(worse, kind="stable")
         candidates, rows, columns = candidates[order], rows[order], columns[order]
@@ -162,7 +177,7 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
         colors.append(view.image[rows[:wanted], columns[:wanted]])
     if not points:
         raise DataError("no random start: every pixel of the training views is masked out; check the masks' polarity")
-    guided = sum(s.tree is not None for s in sources)
+    guided = sum(s.guided for s in sources)
     how = f"{count:,} random points, {guided} of {len(views)} views guided by {len(matched):,} matched points"
     objects = sum(name == "foreground" for _, name in regions)
     if objects:
