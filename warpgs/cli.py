@@ -341,9 +341,15 @@ def _demo(arguments: list[str]) -> int:
 def _doctor(arguments: list[str]) -> int:
     @dataclass(frozen=True)
     class Doctor:
-        pass
+        warm: bool = False
+        """Instead, compile all kernels that a fit uses on this machine's devices, so that none waits for it."""
 
-    _parse(Doctor, "doctor", arguments)
+    a = _parse(Doctor, "doctor", arguments)
+    if a.warm:
+        with _importing():
+            from warpgs.warm import print_warming
+        print_warming()
+        return 0
     from warpgs.doctor import diagnose, print_report
 
     return print_report(diagnose())

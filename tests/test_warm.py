@@ -1,0 +1,73 @@
+"""Warming the kernel cache: all that a fit launches, compiled once."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from tests.scenes import photographs, priors, seeds
+from warpgs.kernels import bridge
+from warpgs.pipeline.config import FitConfig
+from warpgs.pipeline.density import DensityConfig
+from warpgs.pipeline.evaluate import render_view, score
+from warpgs.pipeline.fit import Fit
+from warpgs.pipeline.init import InitConfig
+from warpgs.pipeline.method import MethodConfig
+from warpgs.pipeline.sampler import SamplerConfig
+from warpgs.pipeline.schedule import PhaseConfig
+from warpgs.rasterizer import RasterizeOptions
+from warpgs.warm import fit_kernels
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+def test_a_fit_launches_nothing_else(device, recorded, monkeypatch):
+    """Start, steps with and without masks, density events and scores: every module and size of blocks is among the warmed."""
+    launched, launch = set(), bridge.launch
+
+    def note(kernel, count, inputs, where, *, block_dim=256, **more):
+        launched.add((where.type, kernel.module, 1 if where.type == "cpu" else block_dim))
+        launch(kernel, count, inputs, where, block_dim=block_dim, **more)
+
+    monkeypatch.setattr(bridge, "launch", note)
+    views = photographs(3)
+    views[0] = dataclasses.replace(views[0], mask=np.ones(views[0].image.shape[:2], bool))
+    method = MethodConfig(events=True, hier=True, pm=False, sampler=SamplerConfig(share=0.01, min_alpha=0.05, max_share=0.05))
+    config = FitConfig(
+        steps=20, dropout=0.2, cuda_graph=recorded, init=InitConfig(source="points"), method=method,
+        density=DensityConfig(start=2, every=2), phases=PhaseConfig(4, 6, every=2),
+    )  # fmt: skip
+    fit = Fit(views, seeds(), config, device, priors=priors(views))
+    while fit.step < 20:
+        fit.burst(100)
+    assert any(event["freed"] for event in fit.events)
+    score(views[1], render_view(fit.gaussians, views[1], RasterizeOptions())[0])
+    warmed = {(kind, k.module, block) for kind in ("cpu", "cuda") for k, block in fit_kernels(kind == "cuda")}
+    assert len(launched) > 8 and launched <= warmed
+
+
+def test_the_second_call_finds_all_in_the_cache(tmp_path):
+    """One small module in an empty cache: compiled by the first process, found by the second."""
+    code = (
+        "import sys; from warpgs import warm; from warpgs.cli import main; "
+        "from warpgs.kernels import tiles; import warp as wp; "
+        "warm.fit_kernels = lambda cuda: [] if cuda else [(tiles.make_kernels(wp.float32).find_ranges, 1)]; "
+        "sys.exit(main(['doctor', '--warm']))"
+    )
+    environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path), "CUDA_VISIBLE_DEVICES": ""}
+    said = [
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment).stdout
+        for _ in range(2)
+    ]
+    assert "cpu: tiles.find_ranges, " in said[0] and "1 modules: 1 compiled, 0 were there" in said[0]
+    assert "find_ranges" not in said[1] and "1 modules: 0 compiled, 1 were there" in said[1]
+
+
+def test_kernels_of_both_kinds_of_device_are_named():
+    """Also where there is no CUDA device: their sources are found and their factories called."""
+    assert all(block == 1 for _, block in fit_kernels(False))
+    blocks = {block for _, block in fit_kernels(True)}
+    assert {64, 128, 256, 1024} <= blocks and torch.float32 in bridge.REALS
