@@ -16,6 +16,7 @@ from tests.scenes import photographs, seeds
 from warpgs.demo import split_spec, write_demo
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import look_at
+from warpgs.kernels.knn import morton_codes
 from warpgs.pipeline.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.config import PRESETS, FitConfig
 from warpgs.pipeline.density import DensityConfig
@@ -91,6 +92,30 @@ def test_continued_fit_equals_uninterrupted_one(tmp_path):
     a, b = straight.state()[0], resumed.state()[0]
     assert len(straight.gaussians) != len(seeds())
     assert all(torch.equal(a[k], b[k]) for k in a)
+
+
+def test_order_of_the_gaussians_changes_nothing_but_their_order():
+    """Sorted along the curve at each event or not: the same rows with their moments, bit for bit, as long as none splits."""
+    results = []
+    for morton in (True, False):
+        density = DensityConfig(start=5, every=10, gradient=1e-5, clone_size=1e9, morton_order=morton)
+        fit = fitted(FitConfig(steps=60, sh_every=15, init=InitConfig(source="points"), density=density), 30)
+        assert bool((morton_codes(fit.gaussians.means).diff() >= 0).all()) == morton
+        tensors = [t.flatten(1) if t.ndim > 1 else t[:, None] for t in fit.optimizer.state().values()]
+        results.append(sorted(map(tuple, torch.cat(tensors, 1).tolist())))
+    assert len(results[0]) > 2 * len(seeds()) and results[0] == results[1]
+
+
+def test_all_that_goes_by_row_is_sorted_together():
+    """Parameters, moments and layers of a Gaussian stay together."""
+    fit = fitted(FitConfig(steps=9, init=InitConfig(source="points")), 3)
+    fit.layers.birth = torch.arange(len(fit.gaussians), dtype=torch.int32)
+    before = {name: t.clone() for name, t in fit.optimizer.state().items()}
+    fit.layers.reorder(fit.optimizer.sort_along_curve())
+    rows = fit.layers.birth.long()
+    assert not bool((rows.diff() > 0).all()) and bool((rows.sort().values.diff() == 1).all())
+    assert all(torch.equal(t, before[name][rows]) for name, t in fit.optimizer.state().items())
+    assert all(t.requires_grad for t in fit.optimizer.params.values())
 
 
 def test_masked_pixels_do_not_count():

@@ -33,6 +33,8 @@ class DensityConfig:
     rest of the fit does not win back (docs/decisions/002-no-opacity-reset.md)."""
     reset_opacity: float = 0.01
     """Largest opacity after a reset."""
+    morton_order: bool = True
+    """Whether the Gaussians are sorted along a Morton curve after each event (docs/decisions/012-morton-order.md)."""
     max_gaussians: int = 1_000_000
     """No Gaussian is added beyond this number."""
 

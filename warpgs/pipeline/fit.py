@@ -319,6 +319,8 @@ class Fit:
             protected=self.layers.young(self.step, c.method.protect) if self._protects else None,
         )  # fmt: skip
         self._apply(change, COARSE, LONG_AGO)
+        if c.density.morton_order:
+            self.layers.reorder(self.optimizer.sort_along_curve())
         self.stats = DensityStats(len(self.optimizer.gaussians), self.device)
 
     def _sample(self) -> None:

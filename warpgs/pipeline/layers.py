@@ -73,6 +73,10 @@ class Layers:
             )
             setattr(self, name, torch.cat([old[change.keep], grown.to(old.dtype)]))
 
+    def reorder(self, order: torch.Tensor) -> None:
+        """Row i becomes what row ``order[i]`` was."""
+        self.level, self.birth = self.level[order], self.birth[order]
+
     def state(self) -> dict[str, torch.Tensor]:
         """Both by name, for the checkpoint."""
         return {"layers.level": self.level, "layers.birth": self.birth}

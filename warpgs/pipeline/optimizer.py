@@ -8,6 +8,7 @@ import torch
 
 from warpgs.errors import UsageError
 from warpgs.kernels.adam import adam_scheduled, adam_step, scheduled_rates
+from warpgs.kernels.knn import morton_codes
 from warpgs.pipeline.density import Refinement
 from warpgs.pipeline.schedule import log_linear
 from warpgs.scene import Gaussians
@@ -111,6 +112,21 @@ class Optimizer:
             self.params[name] = torch.cat([self.params[name].detach()[change.keep], added]).requires_grad_()
             for moments in (self.means, self.squares):
                 moments[name] = torch.cat([moments[name][change.keep], torch.zeros_like(added)])
+
+    @torch.no_grad()
+    def sort_along_curve(self) -> torch.Tensor:
+        """Put the Gaussians in Morton order, each with its moments, so that neighbours in space are neighbours in memory.
+
+        Returns:
+            The number that each row had before, int64, shape [N].
+        """
+        order = torch.argsort(morton_codes(self.params["means"].detach()), stable=True)
+        for group in (self.params, self.means, self.squares):
+            for name in group:
+                group[name] = group[name].detach()[order]
+        for param in self.params.values():
+            param.requires_grad_()
+        return order
 
     def cap_opacity(self, opacity: float) -> None:
         """Lower every opacity to at most this and forget the moments of all opacities (the classic reset)."""
