@@ -142,23 +142,8 @@ def _fit_arguments(arguments: list[str]):
     a = _parse(Fit, "fit", arguments)
     if a.threads < 0:
         raise UsageError(f"--threads must be 0 or more, not {a.threads}")
-    own = (
-        "rule",
-        "seed",
-        "sh_every",
-        "dropout",
-        "checkpoint_every",
-        "checkpoint_seconds",
-        "cuda_graph",
-        "init",
-        "loss",
-        "optimizer",
-        "density",
-        "phases",
-        "method",
-        "priors",
-    )
-    rooms = {n: getattr(a, n) for n in own}
+    apart = ("preset", "steps", "memory_limit")  # these depend on the device, or are written otherwise
+    rooms = {f.name: getattr(a, f.name) for f in dataclasses.fields(base) if f.name not in apart}
     if a.memory_limit is not None:
         rooms["memory_limit"] = parse_bytes(a.memory_limit)
 

@@ -8,7 +8,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.allocations import Allocations
-from tests.scenes import photographs, seeds
+from tests.scenes import photographs, priors, seeds
 from tests.splats import camera, cloud, leaves
 from warpgs.cli import main
 from warpgs.demo import split_spec, write_demo
@@ -17,6 +17,9 @@ from warpgs.pipeline.density import DensityConfig
 from warpgs.pipeline.fit import Fit
 from warpgs.pipeline.init import InitConfig
 from warpgs.pipeline.memory import Layout, instance_bytes, most_instances, plan
+from warpgs.pipeline.method import MethodConfig
+from warpgs.pipeline.sampler import SamplerConfig
+from warpgs.pipeline.schedule import PhaseConfig
 from warpgs.rasterizer import RasterizeOptions, rasterize
 from warpgs.scene import View
 
@@ -79,6 +82,21 @@ def test_plan_covers_density_events():
     layout, after = fit.layout, len(fit.gaussians)
     assert after > 5000
     assert found <= layout.held(after) + layout.event(4000, after) <= 1.1 * found
+
+
+def test_plan_covers_sampling_events():
+    """Scores, renderings and contributions of all views, and the fine Gaussians that they lead to."""
+    views = photographs(3, 200, 150)
+    method = MethodConfig(events=True, hier=True, pm=False, sampler=SamplerConfig(share=0.01, min_alpha=0.05, max_share=0.2))
+    config = dataclasses.replace(STEADY, steps=40, method=method, phases=PhaseConfig(4, 6, every=2))
+    fit = Fit(views, seeds(1500), config, CPU, priors=priors(views))
+    for _ in range(6):
+        fit.advance()
+    before = len(fit.gaussians)
+    found, after = measured(fit, 4), len(fit.gaussians)
+    assert len(fit.events) > 2 and any(e["freed"] for e in fit.events) and before <= after
+    planned = max(fit.layout.step(after, instances(fit)), fit.layout.held(after) + fit.layout.event(before, after))
+    assert found <= planned <= 1.35 * found
 
 
 @pytest.mark.parametrize("most", [400, 3000])
