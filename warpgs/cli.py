@@ -184,8 +184,7 @@ def _eval(arguments: list[str]) -> int:
         """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
 
     a = _parse(Eval, "eval", arguments)
-    with _importing():
-        from warpgs.pipeline.reuse import evaluate
+    from warpgs.pipeline.reuse import evaluate
 
     for line in evaluate(a.run, a.device, a.lpips_weights):
         print(line)
@@ -211,8 +210,7 @@ def _render(arguments: list[str]) -> int:
         """auto, cpu or cuda."""
 
     a = _parse(Render, "render", arguments)
-    with _importing():
-        from warpgs.pipeline.reuse import render
+    from warpgs.pipeline.reuse import render
 
     print(render(a.run, a.path, a.out, a.frames, a.fps, a.device))
     return 0
@@ -229,8 +227,7 @@ def _export(arguments: list[str]) -> int:
         """File to write; its suffix says the format: .ply."""
 
     a = _parse(Export, "export", arguments)
-    with _importing():
-        from warpgs.pipeline.reuse import export
+    from warpgs.pipeline.reuse import export
 
     print(export(a.run, a.to))
     return 0
