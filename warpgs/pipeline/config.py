@@ -35,6 +35,8 @@ class FitConfig:
     dropout: float = 0.0
     """Probability, at the last step, that a Gaussian is hidden for a step; it grows linearly from 0 (DropGaussian, Park et
     al. 2025)."""
+    dropout_views: int = 6
+    """With more training views than this the probability is lower in proportion: they hold the Gaussians in place."""
     checkpoint_every: int = 1000
     """A checkpoint may be written at multiples of this step; one is written at the end in any case."""
     checkpoint_seconds: float = 20.0

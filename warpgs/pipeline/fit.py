@@ -96,6 +96,7 @@ class Fit:
         self.optimizer = Optimizer(initial_gaussians(cloud, config.init, self.extent, device), config.optimizer, self.extent)
         self.stats, self.layers = DensityStats(len(cloud), device), Layers(len(cloud), device)
         self.phases = plan_phases(config.phases, config.steps)
+        self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
         self.events: list[dict] = []
         self.step, self.reset_done = 0, False
         self.order: list[int] = []
@@ -142,7 +143,7 @@ class Fit:
         c, phase = self.config, self._phase(self.step)
         view = self.views[self.next_view()]
         factors = None
-        if c.dropout > 0:
+        if self.dropout > 0:
             settings = torch.tensor(self._settings(self.step), dtype=torch.float32, device=self.device)
             factors = opacity_dropout(len(self.optimizer.gaussians), settings, c.seed)
         options = RasterizeOptions(
@@ -227,7 +228,7 @@ class Fit:
 
     def _settings(self, step: int) -> tuple[float, int]:
         """Dropout probability and number of a step."""
-        return self.config.dropout * self._progress(step), step
+        return self.dropout * self._progress(step), step
 
     def _phase(self, step: int) -> Phase:
         c = self.config
@@ -262,7 +263,7 @@ class Fit:
             self.graphs[key] = StepGraph(
                 self.stacks[kind], self.optimizer, self.stats if phase.densifying else None, self.work,
                 degree=phase.degree, rule=c.rule, loss=c.loss, background=self.background,
-                dropout_seed=c.seed if c.dropout > 0 else None, share=self._share(phase),
+                dropout_seed=c.seed if self.dropout > 0 else None, share=self._share(phase),
                 protected=(self.layers, c.method.protect) if self._protects else None, most=self.most,
             )  # fmt: skip
         return self.graphs[key]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -38,8 +39,10 @@ class InitConfig:
     """Where the first Gaussians come from."""
 
     source: str = "auto"
-    """sweep or flow (a point per pixel whose depth other views confirm), points (the reconstruction's), random, or auto: points
-    where the scene has at least 100 that training views saw."""
+    """sweep or flow (a point per pixel whose depth other views confirm), points (the reconstruction's), random, or auto: sweep
+    for few views, else points where the scene has at least 100 that training views saw, else random."""
+    sweep_up_to: int = 0
+    """auto: most views that are swept, which takes some seconds a view."""
     random_count: int = 20_000
     """Number of random points."""
     opacity: float = 0.1
@@ -224,6 +227,8 @@ def initial_points(views: list[View], points: PointCloud | None, config: InitCon
         DataError: Points were asked for and the scene has none that the training views saw.
     """
     usable = seen_points(views, points)
+    if config.source == "auto" and 2 <= len(views) <= config.sweep_up_to:
+        return confirmed_points(views, usable, dataclasses.replace(config, source="sweep"), generator)
     if config.source in ("sweep", "flow"):
         return confirmed_points(views, usable, config, generator)
     if config.source == "points" and len(usable) == 0:

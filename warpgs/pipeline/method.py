@@ -36,7 +36,8 @@ class MethodConfig:
     s_geometry: bool = True
     """The geometric score has its weight in the importance; the gate uses it in any case."""
     ra: bool = True
-    """Reliability assessment: only pixels of high geometric score are drawn."""
+    """Reliability assessment: only pixels of high geometric score are drawn, and with ``sampler.depth`` confirmed only those
+    whose depth other views confirm."""
     agp: bool = True
     """Adaptive Gaussian placement: pixels are drawn at random by importance, not the highest ones."""
     pm: bool = True
@@ -140,8 +141,12 @@ def draw_from_view(
     """Score one view, draw its pixels, and make the fine Gaussians behind them."""
     c = config.sampler
     render = rasterize(gaussians, view.camera, options)
-    depth = view.confirmed if c.depth == "confirmed" and view.confirmed is not None else render.depth
-    valid = valid_pixels(render.alpha, depth, view.mask, c)
+    depth, alpha = render.depth, render.alpha
+    if c.depth == "confirmed" and view.confirmed is not None:
+        known = view.confirmed > 0
+        depth = torch.where(known, view.confirmed, depth)
+        alpha = torch.where(known, 1.0, 0.0 if config.ra else alpha)
+    valid = valid_pixels(alpha, depth, view.mask, c)
     known = view.semantic is not None
     semantic = view.semantic if known else torch.zeros_like(view.geometry)
     scores = (scoring.render_score(render.rgb, view.photo, valid), semantic, view.geometry)

@@ -19,8 +19,8 @@ class SamplerConfig:
     """How fine Gaussians are placed at one event."""
 
     depth: str = "rendered"
-    """Depth that Gaussians are placed at: rendered (the paper), or confirmed: what other views confirm of the depth, and
-    only there; a view of which nothing is confirmed takes the rendered one."""
+    """Depth that Gaussians are placed at: rendered (the paper), or confirmed: that of the start where other views confirm it.
+    With it, a pixel is reliable only where its depth is confirmed, if any of its view's is."""
     share: float = 0.005
     """Gaussians per event and view, as a share of the view's pixels."""
     gate_quantile: float = 0.6
