@@ -6,14 +6,9 @@ import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from warpgs import __version__
 from warpgs.errors import UsageError, WarpgsError
-from warpgs.sizes import parse_bytes
-
-if TYPE_CHECKING:
-    from warpgs.pipeline.config import FitConfig
 
 COMMANDS = {
     "fit": "fit Gaussians to a scene folder and fill a run folder",
@@ -60,114 +55,13 @@ def _parse(kind: type, name: str, arguments: list[str], default: object = None):
     return tyro.cli(kind, args=arguments, prog=f"warpgs {name}", description=COMMANDS[name.split(maxsplit=1)[0]], **extra)
 
 
-def _fit_arguments(arguments: list[str]):
-    """Parse `fit`, whose defaults depend on the preset and the device."""
-    import dataclasses
-
-    import tyro
-
-    from warpgs.pipeline.config import DEFAULT_STEPS, PRESETS
-    from warpgs.pipeline.density import DensityConfig
-    from warpgs.pipeline.init import InitConfig
-    from warpgs.pipeline.loss import LossConfig
-    from warpgs.pipeline.method import MethodConfig
-    from warpgs.pipeline.optimizer import OptimizerConfig
-    from warpgs.pipeline.schedule import PhaseConfig
-    from warpgs.priors.view_prior import PriorConfig
-
-    name = "3dgs"
-    for i, word in enumerate(arguments):
-        if word == "--preset" and i + 1 < len(arguments):
-            name = arguments[i + 1]
-        elif word.startswith("--preset="):
-            name = word.removeprefix("--preset=")
-    if name not in PRESETS:
-        raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
-    base = PRESETS[name]
-
-    @dataclass(frozen=True)
-    class Fit:
-        scene: tyro.conf.Positional[Path]
-        """Scene folder: COLMAP, transforms.json, LLFF, DTU or Middlebury."""
-        out: Path
-        """Run folder to fill; must not exist yet."""
-        split: str | None = None
-        """llff:K, mip360:K, dtu:3|6|9, blender:8, every:N, all, or train=NAMES;test=NAMES."""
-        downscale: int = 1
-        """Factor by which both image sides shrink."""
-        steps: int | None = None
-        """Optimisation steps; 7000 on CUDA and 1000 on a CPU where not given."""
-        preset: str = name
-        """Named settings that the flags below start from."""
-        device: str = "auto"
-        """auto, cpu or cuda."""
-        threads: int = 0
-        """CPU threads; 0 for as many as there are cores."""
-        seed: int = 0
-        """Decides every random choice."""
-        resume: bool = False
-        """Continue the run in --out from its last checkpoint."""
-        strict: bool = False
-        """A frame without an image file is an error."""
-        allow_outside: bool = False
-        """Let transforms.json name files outside the scene folder."""
-        invert_masks: bool = False
-        """White in a mask removes a pixel."""
-        score_masks: Path | None = None
-        """Folder of object masks for scoring, matched by image id; the scene's idrmasks where not given."""
-        lpips_weights: Path | None = None
-        """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
-        rule: str = base.rule
-        """Cut-offs of the rasterizer: exact, gsplat or inria."""
-        sh_every: int = base.sh_every
-        """Steps after which the spherical-harmonics degree rises by one."""
-        dropout: float = base.dropout
-        """Probability, at the last step, that a Gaussian is hidden for a step; it grows linearly from 0."""
-        checkpoint_every: int = base.checkpoint_every
-        """A checkpoint may be written at multiples of this step."""
-        checkpoint_seconds: float = base.checkpoint_seconds
-        """Time from one checkpoint to the next at the least [s]."""
-        memory_limit: str | None = None
-        """Most memory that the fit's tensors may take on its device while it takes steps, such as 2GiB or 800MB."""
-        cuda_graph: bool = base.cuda_graph
-        """On CUDA, record a step once and replay it: the same bytes in less time."""
-        init: InitConfig = field(default_factory=lambda: base.init)
-        loss: LossConfig = field(default_factory=lambda: base.loss)
-        optimizer: OptimizerConfig = field(default_factory=lambda: base.optimizer)
-        density: DensityConfig = field(default_factory=lambda: base.density)
-        phases: PhaseConfig = field(default_factory=lambda: base.phases)
-        method: MethodConfig = field(default_factory=lambda: base.method)
-        priors: tyro.conf.OmitArgPrefixes[PriorConfig] = field(default_factory=lambda: base.priors)
-
-    a = _parse(Fit, "fit", arguments)
-    if a.threads < 0:
-        raise UsageError(f"--threads must be 0 or more, not {a.threads}")
-    apart = ("preset", "steps", "memory_limit")  # these depend on the device, or are written otherwise
-    rooms = {f.name: getattr(a, f.name) for f in dataclasses.fields(base) if f.name not in apart}
-    if a.memory_limit is not None:
-        rooms["memory_limit"] = parse_bytes(a.memory_limit)
-
-    def config(device: str) -> "FitConfig":
-        return dataclasses.replace(base, steps=a.steps if a.steps is not None else DEFAULT_STEPS[device], **rooms)
-
-    return a, config
-
-
 def _fit(arguments: list[str]) -> int:
     with _importing():
-        a, config = _fit_arguments(arguments)
-        from warpgs.kernels.bridge import set_threads
-        from warpgs.pipeline.run import FitRequest, SceneRequest, choose_device, fit_scene
+        from warpgs.cli_fit import fit
 
-    if a.threads:
-        set_threads(a.threads)
-    device, _ = choose_device(a.device)
-    settings = config(device.type)
-    if a.steps is None:
-        print(f"preset {settings.preset}, {settings.steps} steps, as usual on {device.type}; --steps changes that")
-    masks = None if a.score_masks is None else str(a.score_masks.resolve())
-    scene = SceneRequest(str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.invert_masks, masks)
-    fit_scene(FitRequest(scene, a.out, settings, a.device, a.resume, a.lpips_weights))
+        request = fit(arguments, COMMANDS["fit"])
+        from warpgs.pipeline.run import fit_scene
+    fit_scene(request)
     return 0
 
 

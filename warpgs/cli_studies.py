@@ -62,7 +62,7 @@ def compare(arguments: list[str], description: str) -> int:
     from warpgs.pipeline.compare import preset_variants
 
     names = [n.strip() for n in a.presets.split(",") if n.strip()]
-    return _study(a, preset_variants(names, a.steps, a.device), {})
+    return _study(a, preset_variants(names, a.steps), {})
 
 
 def ablate(arguments: list[str], description: str) -> int:
@@ -79,7 +79,7 @@ def ablate(arguments: list[str], description: str) -> int:
     a = _parse(Ablate, "ablate", arguments, description)
     from warpgs.pipeline.compare import ablation_variants, preset_variants
 
-    (config,) = preset_variants([a.preset], a.steps, a.device).values()
+    (config,) = preset_variants([a.preset], a.steps).values()
     return _study(a, *ablation_variants(config))
 
 

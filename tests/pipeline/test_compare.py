@@ -279,9 +279,9 @@ def test_requests_that_make_no_sense(scene, tmp_path):
     with pytest.raises(UsageError, match="name at least one scene"):
         StudyRequest((), {"a": A, "b": B}, 2, tmp_path)
     with pytest.raises(UsageError, match="preset 'x' is not one of"):
-        preset_variants(["x"], None, "cpu")
+        preset_variants(["x"], None)
     with pytest.raises(UsageError, match="named twice"):
-        preset_variants([next(iter(config.PRESETS))] * 2, None, "cpu")
+        preset_variants([next(iter(config.PRESETS))] * 2, None)
     with pytest.raises(DataError, match="no view is held out"):
         run_study(StudyRequest((dataclasses.replace(scene, split="all"),), {"a": A, "b": B}, 1, tmp_path / "x", "cpu"))
     assert not (tmp_path / "x").exists()

@@ -8,7 +8,7 @@ import gc
 import torch
 
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.pipeline.config import DEFAULT_STEPS, PRESETS, FitConfig
+from warpgs.pipeline.config import PRESETS, FitConfig
 from warpgs.pipeline.fit import train_views
 from warpgs.pipeline.lpips import load_lpips
 from warpgs.pipeline.repeat import ensure_run
@@ -19,7 +19,7 @@ ABLATION_ROWS: dict[str, dict[str, bool]] = {"full": {}, **{f"no {name}": {name:
 """Rows of the ablation: all on, then each part off alone, last the whole sampling (the paper's ablation has no such row)."""
 
 
-def preset_variants(names: list[str], steps: int | None, device: str) -> dict[str, FitConfig]:
+def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]:
     """Presets as the variants of a study, in the order named; ``steps`` replaces the steps of all.
 
     Raises:
@@ -30,8 +30,7 @@ def preset_variants(names: list[str], steps: int | None, device: str) -> dict[st
             raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
         if names.count(name) > 1:
             raise UsageError(f"preset {name!r} is named twice")
-    kind = choose_device(device)[0].type
-    return {n: dataclasses.replace(PRESETS[n], steps=DEFAULT_STEPS[kind] if steps is None else steps) for n in names}
+    return {n: PRESETS[n] if steps is None else dataclasses.replace(PRESETS[n], steps=steps) for n in names}
 
 
 def ablation_variants(base: FitConfig) -> tuple[dict[str, FitConfig], dict[str, tuple[bool, ...]]]:

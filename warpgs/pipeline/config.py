@@ -14,6 +14,7 @@ from warpgs.pipeline.init import InitConfig
 from warpgs.pipeline.loss import LossConfig
 from warpgs.pipeline.method import MethodConfig
 from warpgs.pipeline.optimizer import OptimizerConfig
+from warpgs.pipeline.sampler import SamplerConfig
 from warpgs.pipeline.schedule import PhaseConfig
 from warpgs.priors.view_prior import PriorConfig
 
@@ -35,7 +36,7 @@ class FitConfig:
     dropout: float = 0.0
     """Probability, at the last step, that a Gaussian is hidden for a step; it grows linearly from 0 (DropGaussian, Park et
     al. 2025)."""
-    dropout_views: int = 6
+    dropout_views: int = 3
     """With more training views than this the probability is lower in proportion: they hold the Gaussians in place."""
     checkpoint_every: int = 1000
     """A checkpoint may be written at multiples of this step; one is written at the end in any case."""
@@ -90,29 +91,45 @@ def _compose(kind: type, values: dict):
     return kind(**{k: _compose(kinds[k], v) if dataclasses.is_dataclass(kinds[k]) else v for k, v in values.items()})
 
 
-_DENSE = InitConfig(source="sweep", max_sh_degree=1)
 _SPARSE = FitConfig(
-    preset="strong-3dgs", sh_every=500, dropout=0.2, init=_DENSE, optimizer=OptimizerConfig(scales_lr=0.03),
-    density=DensityConfig(gradient=5e-4), phases=PhaseConfig(coarse=2000, stable=3000),
+    preset="strong-3dgs", steps=3000, sh_every=500, dropout=0.6, phases=PhaseConfig(coarse=2000, stable=3000),
+    init=InitConfig(sweep_up_to=30, max_sh_degree=1, merge_px=8, fill_px=32),
+    optimizer=OptimizerConfig(scales_lr=0.1), density=DensityConfig(gradient=5e-4),
+)  # fmt: skip
+_PAPER = dataclasses.replace(
+    _SPARSE, preset="paper",
+    method=MethodConfig(
+        events=True, hier=True,
+        sampler=SamplerConfig(depth="confirmed", share=0.02, footprint=3.0, gate_quantile=0.0, max_share=2.0),
+    ),
+)  # fmt: skip
+_NEXUS = FitConfig(
+    preset="nexusgs", steps=10_000, sh_every=500, init=InitConfig(source="flow", merge_px=0, fill_px=0),
+    optimizer=OptimizerConfig(scales_lr=0.03),
+    density=DensityConfig(gradient=5e-4, stop_share=1.0, reset_every=3000, reset_opacity=0.05, prune_size=0),
 )  # fmt: skip
 
 PRESETS: dict[str, FitConfig] = {
-    "3dgs": FitConfig(),
-    "strong-3dgs": _SPARSE,
-    "paper": dataclasses.replace(_SPARSE, preset="paper", method=MethodConfig(events=True, hier=True)),
-    "nexusgs": FitConfig(
-        preset="nexusgs", sh_every=500, init=InitConfig(source="flow", merge_px=0, fill_px=0),
-        optimizer=OptimizerConfig(scales_lr=0.03),
-        density=DensityConfig(gradient=5e-4, stop_share=1.0, reset_every=3000, reset_opacity=0.05, prune_size=0),
+    "paper": _PAPER,
+    "quick": dataclasses.replace(
+        _PAPER, preset="quick", steps=600, init=dataclasses.replace(_SPARSE.init, sweep_up_to=12)
     ),
+    "strong-3dgs": _SPARSE,
+    "3dgs": FitConfig(),
+    "nexusgs": _NEXUS,
     "dropgaussian": FitConfig(
-        preset="dropgaussian", dropout=0.2, density=DensityConfig(gradient=5e-4, stop_share=1.0, prune_size=0),
-        optimizer=OptimizerConfig(scales_lr=0.005),
+        preset="dropgaussian", steps=10_000, dropout=0.2, optimizer=OptimizerConfig(scales_lr=0.005),
+        density=DensityConfig(gradient=5e-4, stop_share=1.0, prune_size=0),
+    ),
+    "paper-literal": dataclasses.replace(
+        _NEXUS, preset="paper-literal", steps=30_000, phases=PhaseConfig(coarse=2000, stable=3000),
+        method=MethodConfig(events=True, hier=True),
     ),
 }  # fmt: skip
-"""3dgs: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few. strong-3dgs: with the start, degree,
-scale rate, dropout and schedule of ``paper``, and none of the paper's parts. paper: the method. nexusgs: Zheng et al. 2025, a
-flow-epipolar start with every pixel, and its resets. dropgaussian: Park et al. 2025."""
+"""paper: the method, with the constants of docs/decisions/008-method.md. quick: the same in a fifth of the steps. strong-3dgs:
+the start, degree, rates, dropout and schedule of ``paper``, and none of the paper's parts. 3dgs: Kerbl et al. 2023 without
+opacity resets, which cost decibels when views are few. nexusgs: Zheng et al. 2025, a start from flow with every pixel, and its
+resets. dropgaussian: Park et al. 2025. paper-literal: the paper on ``nexusgs``, with what it leaves open as first proposed."""
 
-DEFAULT_STEPS = {"cuda": 7000, "cpu": 1000}
-"""Steps where the user names none: what a device gets through in minutes at sparse-view sizes."""
+DEFAULT_PRESET = {"cuda": "paper", "cpu": "quick"}
+"""Preset where the user names none, by kind of device."""

@@ -31,6 +31,9 @@ from warpgs.priors.view_prior import view_priors
 from warpgs.rasterizer import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians, PointCloud, Prior, Scene, View
 
+REST = 500
+"""Steps before the set is left alone in which no opacity is reset any more: what is transparent then stays so."""
+
 
 @dataclass(frozen=True)
 class StepReport:
@@ -292,7 +295,7 @@ class Fit:
 
     def _resets_after(self, step: int) -> bool:
         every = self.config.density.reset_every
-        return every > 0 and step <= self._densify_until and step % every == 0
+        return every > 0 and step <= self._densify_until - REST and step % every == 0
 
     def _samples_after(self, step: int) -> bool:
         return self.config.method.events and step in self.phases.events
