@@ -76,7 +76,7 @@ def test_run_folder_holds_what_it_promises(run):
     assert metrics["config_hash"] == config["config_hash"]
     page = (run / "report.html").read_text()
     assert "images as stored" in page and "not measured" in page and metrics["config_hash"] in page
-    assert f"{metrics['test']['psnr']:.2f} dB" in page and "points of the reconstruction" in page
+    assert f"{metrics['test']['psnr']:.2f} dB" in page and "pixels by sweep" in page
     assert len(read_ply(run / "point_cloud.ply")) == metrics["gaussians"]
     memory = metrics["memory"]
     assert 0 < memory["planned"] < memory["planned_at_cap"] and memory["limit"] is None and "planned for a step now" in page

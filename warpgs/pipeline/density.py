@@ -9,6 +9,9 @@ import torch
 from warpgs.errors import UsageError
 from warpgs.scene import Gaussians, Render
 
+REST = 500
+"""Steps before the set is left alone in which no opacity is reset any more: what is transparent then stays so."""
+
 
 @dataclass(frozen=True)
 class DensityConfig:
@@ -47,6 +50,12 @@ class DensityConfig:
     def times(self, steps: int) -> tuple[int, int, int]:
         """First event, interval and last event [steps] in a fit of that length; a short fit starts after a quarter of it."""
         return min(self.start, steps // 4), self.every, int(self.stop_share * steps)
+
+    def due(self, step: int, steps: int, until: int) -> tuple[bool, bool]:
+        """Whether the set is refined, and opacities reset, after a step of a fit in which ``until`` is the last such step."""
+        start, every, _ = self.times(steps)
+        refines = start < step <= until and step % every == 0
+        return refines, self.reset_every > 0 and step <= until - REST and step % self.reset_every == 0
 
 
 @dataclass(frozen=True)

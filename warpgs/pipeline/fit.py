@@ -31,9 +31,6 @@ from warpgs.priors.view_prior import view_priors
 from warpgs.rasterizer import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians, PointCloud, Prior, Scene, View
 
-REST = 500
-"""Steps before the set is left alone in which no opacity is reset any more: what is transparent then stays so."""
-
 
 @dataclass(frozen=True)
 class StepReport:
@@ -289,25 +286,18 @@ class Fit:
         limit = self.config.memory_limit
         self.most = None if limit is None else self.layout.most_instances(len(self.optimizer.gaussians), limit)
 
-    def _refines_after(self, step: int) -> bool:
-        start, every, _ = self.config.density.times(self.config.steps)
-        return start < step <= self._densify_until and step % every == 0
-
-    def _resets_after(self, step: int) -> bool:
-        every = self.config.density.reset_every
-        return every > 0 and step <= self._densify_until - REST and step % every == 0
-
     def _samples_after(self, step: int) -> bool:
         return self.config.method.events and step in self.phases.events
 
     def _changes_after(self, step: int) -> bool:
-        return self._refines_after(step) or self._resets_after(step) or self._samples_after(step)
+        return any(self.config.density.due(step, self.config.steps, self._densify_until)) or self._samples_after(step)
 
     def _change_set(self, phase: Phase) -> None:
         """Whatever changes the set of Gaussians after the step that was just taken: refinement, reset, sampling."""
-        if self._refines_after(self.step):
+        refines, resets = self.config.density.due(self.step, self.config.steps, self._densify_until)
+        if refines:
             self._refine(phase)
-        if self._resets_after(self.step):
+        if resets:
             self.graphs.clear()
             self.optimizer.cap_opacity(self.config.density.reset_opacity)
             self.reset_done = True
