@@ -37,7 +37,7 @@ class DensityConfig:
     reset_opacity: float = 0.01
     """Largest opacity after a reset."""
     morton_order: bool = True
-    """Whether the Gaussians are sorted along a Morton curve after each event (docs/decisions/012-morton-order.md)."""
+    """Whether the Gaussians are sorted along a Morton curve after each event (docs/decisions/009-morton-order.md)."""
     max_gaussians: int = 1_000_000
     """No Gaussian is added beyond this number."""
 

@@ -318,7 +318,7 @@ class Fit:
         self.stats = DensityStats(len(self.optimizer.gaussians), self.device)
 
     def _sample(self) -> None:
-        """Add fine Gaussians (docs/decisions/008-importance.md)."""
+        """Add fine Gaussians (docs/decisions/008-method.md)."""
         c = self.config
         event = sampling_event(
             self.gaussians, self.layers, self.views, c.method, step=self.step, rule=c.rule, background=self.background,

@@ -1,7 +1,7 @@
 """Where detail can be recovered: the paper's three scores of a training view, and their weighted sum.
 
 Paper, section "Multi-Modal Importance Assessment". What it leaves open (the scale of each score, the unit of depth, the
-weight of curvature) is settled here and in docs/decisions/008-importance.md.
+weight of curvature) is settled here and in docs/decisions/008-method.md.
 """
 
 from __future__ import annotations
