@@ -8,10 +8,13 @@ from types import SimpleNamespace
 
 import torch
 import warp as wp
+from torch.autograd.function import once_differentiable
 
-from warpgs.constants import Rule
+from warpgs.constants import RULES, Rule
 from warpgs.kernels import bridge
-from warpgs.kernels.tiles import Tiles, grid
+from warpgs.kernels.project import project
+from warpgs.kernels.tiles import Tiles, bin_tiles, grid
+from warpgs.scene import Camera, Gaussians
 
 
 @functools.cache
@@ -156,3 +159,23 @@ class Naive:
         arrays = [bridge.view(t.view(-1, t.shape[-1]), wp.float32) for t in (v_rgb.contiguous(), self.v_splats)]
         self._launch(self.kernels.backward, [*self.inputs, *self.state, *arrays])
         return self.v_splats
+
+
+class _Blend(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, splats, tiles, width, height):
+        ctx.naive = Naive(splats, tiles, splats.new_zeros(len(splats), 3), width, height, RULES["exact"])
+        return ctx.naive.forward()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, v_rgb):
+        return ctx.naive.backward(v_rgb), None, None, None
+
+
+def rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
+    """Pictures [C, H, W, 3] of a batch of cameras over black: our projection and lists, the naive blending."""
+    size = {"width": camera.width, "height": camera.height}
+    how = {"degree": gaussians.sh_degree, "rule": RULES["exact"]}
+    splats, counts = project(*gaussians.tensors().values(), camera.viewmat, camera.K, **size, **how)
+    return _Blend.apply(splats, bin_tiles(splats, counts, **size, rule=RULES["exact"]), *size.values())

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import functools
-import importlib
 import math
 
 import torch
 import torch.nn.functional as F
 from torch.utils.checkpoint import checkpoint
 
-from bench import inputs
+from bench import inputs, naive
 from warpgs.constants import RULES
 from warpgs.scene import Camera, Gaussians
 
@@ -120,7 +119,7 @@ def gsplat_rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
 
 def naive_rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
     """The same pictures by the straightforward kernel, one thread per pixel."""
-    return importlib.import_module("bench.naive").rasterize(gaussians, camera)
+    return naive.rasterize(gaussians, camera)
 
 
 RASTERIZERS = {DENSE: dense_rasterize, NAIVE: naive_rasterize, GSPLAT: gsplat_rasterize}

@@ -2,12 +2,14 @@
 
 import torch
 
-from bench.naive import Naive
+import warpgs
+from bench.naive import Naive, rasterize
 from tests.splats import camera, cloud
 from warpgs.constants import RULES
 from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
+from warpgs.scene import Gaussians
 
 
 def test_naive_kernels_equal_the_real_ones(device):
@@ -26,4 +28,16 @@ def test_naive_kernels_equal_the_real_ones(device):
     naive = Naive(splats, tiles, background, **size, rule=rule)
     # an alpha within a rounding of the cut may be drawn by one and not by the other
     for found, wanted in ((naive.forward(), rgb.detach()), (naive.backward(v_rgb), gradient)):
+        assert float((found - wanted).norm()) <= 1e-4 * float(wanted.norm())
+
+
+def test_naive_pictures_equal_the_real_ones(device):
+    """Behind the call of the harness, gradients of the parameters included."""
+    cam = camera(45, 37, cameras=2, dtype=torch.float32, device=device)
+    leaves = [t.requires_grad_() for t in cloud(300, torch.float32, device).tensors().values()]
+    gaussians = Gaussians(*leaves)
+    ours, theirs = warpgs.rasterize(gaussians, cam).rgb, rasterize(gaussians, cam)
+    v_rgb = torch.randn(ours.shape, generator=torch.Generator().manual_seed(2)).to(device)
+    pairs = zip(torch.autograd.grad(theirs, leaves, v_rgb), torch.autograd.grad(ours, leaves, v_rgb))
+    for found, wanted in [(theirs.detach(), ours.detach()), *pairs]:
         assert float((found - wanted).norm()) <= 1e-4 * float(wanted.norm())
