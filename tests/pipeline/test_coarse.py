@@ -156,3 +156,11 @@ def test_bad_settings_are_refused(bad):
     """Before any work, with the choices there are."""
     with pytest.raises(UsageError):
         InitConfig(**bad)
+
+
+def test_cells_too_many_to_number_are_the_same():
+    """An outlier so far away that cells have no single number each: the others share cells as they did without it."""
+    points = np.random.default_rng(0).uniform(-1, 1, (200, 3))
+    near = merge_cells(points, np.full(200, 0.25))
+    far = merge_cells(np.concatenate([points, [[1e14, -1e14, 1e14]]]), np.full(201, 0.25))
+    assert np.array_equal(far[:200][:, None] == far[:200], near[:, None] == near) and (far[200] != far[:200]).all()

@@ -6,6 +6,7 @@ docs/decisions/007-coarse-start.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -40,8 +41,13 @@ def merge_cells(points: np.ndarray, widths: np.ndarray) -> np.ndarray:
     Points of unequal width (far and near ones) live on grids of unequal fineness, so every cell is a few pixels wide.
     """
     level = np.round(np.log2(widths)).astype(np.int64)
-    cells = np.floor(points / np.exp2(level)[:, None]).astype(np.int64)
-    return np.unique(np.column_stack([level, cells]), axis=0, return_inverse=True)[1].ravel()
+    cells = np.column_stack([level, np.floor(points / np.exp2(level)[:, None]).astype(np.int64)])
+    if len(cells):
+        cells -= cells.min(0)
+        sides = [int(s) for s in cells.max(0) + 1]
+        if math.prod(sides) < 2**62:  # one number for all four sorts much faster than rows do, and in the same order
+            return np.unique(np.ravel_multi_index(cells.T, sides), return_inverse=True)[1].ravel()
+    return np.unique(cells, axis=0, return_inverse=True)[1].ravel()
 
 
 def merge(points: np.ndarray, colors: np.ndarray, cells: np.ndarray) -> PointCloud:

@@ -8,9 +8,11 @@ where another view's own sweep agrees. Compared with optical flow in docs/decisi
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from warpgs.errors import UsageError
 from warpgs.priors.epipolar import nearest_views, pixel_grid
@@ -22,6 +24,10 @@ EDGE = 0.06
 """Step of the picture at which the penalty for a jump in depth falls to 1/e."""
 NO_OPINION = 0.5
 """Cost of correlation 0: where a plane leaves the other image, or nothing has texture."""
+
+
+MAX_AT_ONCE = 4
+"""Views swept at a time; each takes memory for two volumes of costs."""
 
 
 @dataclass(frozen=True)
@@ -238,17 +244,18 @@ def sweep_depths(views: Sequence[View], bounds: Sequence[tuple[float, float]], c
     import cv2
 
     small = [_reduced(v, config.max_pixels) for v in views]
-    inverses = []
-    for i, (view, limits) in enumerate(zip(small, bounds)):
-        others = [small[j] for j in nearest_views(small, i, config.near_count)]
-        planes = plane_inverses(view.camera, [o.camera for o in others], limits, config.spacing, config.max_planes)
-        if others:
-            costs = aggregate(
-                matching_costs(view, others, planes, config.window), view.image, config.small_step, config.large_step
-            )
-            inverses.append(best_inverse(costs, planes))
-        else:
-            inverses.append(np.full(view.image.shape[:2], planes[0]))
+
+    def sweep(i: int) -> np.ndarray:
+        view, others = small[i], [small[j] for j in nearest_views(small, i, config.near_count)]
+        planes = plane_inverses(view.camera, [o.camera for o in others], bounds[i], config.spacing, config.max_planes)
+        if not others:
+            return np.full(view.image.shape[:2], planes[0])
+        costs = matching_costs(view, others, planes, config.window)
+        return best_inverse(aggregate(costs, view.image, config.small_step, config.large_step), planes)
+
+    # numpy and OpenCV let other threads run meanwhile
+    with ThreadPoolExecutor(min(MAX_AT_ONCE, torch.get_num_threads())) as pool:
+        inverses = list(pool.map(sweep, range(len(views))))
     out = []
     for i, view in enumerate(views):
         found, notes = confirm(small, inverses, i, config), []
