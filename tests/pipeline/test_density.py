@@ -122,3 +122,23 @@ def test_bad_settings_are_refused(bad):
     """A setting that cannot work is an error at once."""
     with pytest.raises(UsageError):
         DensityConfig(**bad)
+
+
+def test_protected_are_not_pruned_and_only_the_growing_grow():
+    """Two faint ones, one of them protected; two that are pulled at, one of which may grow."""
+    gaussians = gaussians_of([0.1] * 4, [0.001, 0.001, 0.5, 0.5])
+    stats = DensityStats(4, torch.device("cpu"))
+    stats.gradient[2:], stats.seen[:] = 1.0, 1.0
+    change = refine(
+        gaussians, stats, DensityConfig(clone_size=1.0), extent=1.0, after_reset=False, generator=torch.Generator(),
+        growing=torch.tensor([True, True, True, False]), protected=torch.tensor([True, False, False, False]),
+    )  # fmt: skip
+    assert change.keep.tolist() == [0, 2, 3] and change.parents.tolist() == [2]
+
+
+def test_statistics_follow_rows():
+    """What is known of a row that stays stays with it; of new rows nothing is known."""
+    stats = DensityStats(3, torch.device("cpu"))
+    stats.gradient[:], stats.seen[:] = torch.tensor([1.0, 2, 3]), torch.tensor([4.0, 5, 6])
+    stats.apply(Refinement(torch.tensor([2, 0]), {}, torch.tensor([-1])))
+    assert stats.gradient.tolist() == [3, 1, 0] and stats.seen.tolist() == [6, 4, 0]

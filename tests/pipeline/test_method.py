@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 
+import numpy as np
 import pytest
 import torch
 
@@ -12,11 +13,12 @@ from warpgs.pipeline.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.density import DensityConfig, Refinement
 from warpgs.pipeline.fit import Fit
-from warpgs.pipeline.init import InitConfig
+from warpgs.pipeline.init import InitConfig, initial_points
 from warpgs.pipeline.layers import COARSE, FINE, Layers, ProtectConfig
-from warpgs.pipeline.method import MethodConfig, sampling_event
+from warpgs.pipeline.method import MethodConfig, draw_from_view, sampling_event
 from warpgs.pipeline.sampler import SamplerConfig
 from warpgs.pipeline.schedule import PhaseConfig, plan_phases
+from warpgs.rasterizer import RasterizeOptions
 
 CPU = torch.device("cpu")
 SWITCHES = ("hier", "s_render", "s_semantic", "s_geometry", "ra", "agp", "pm")
@@ -152,3 +154,54 @@ def test_settings_travel_through_json():
     values["method"]["importance"]["colour"] = 1
     with pytest.raises(UsageError, match="another version"):
         FitConfig.from_json(values)
+
+
+@pytest.mark.parametrize("reliable", [True, False])
+def test_fine_gaussians_stand_at_confirmed_depths(reliable):
+    """Where other views confirm a depth it is used; elsewhere nothing is drawn, or the rendered depth without reliability."""
+    fit = fitted(steps=8)
+    view, confirmed = fit.views[0], torch.zeros(32, 40)
+    confirmed[:, :20] = 1.25
+    views = [dataclasses.replace(view, confirmed=confirmed)]
+    method = dataclasses.replace(
+        METHOD, ra=reliable, sampler=SamplerConfig(depth="confirmed", share=0.2, gate_quantile=0, max_share=50, min_alpha=0.05)
+    )
+    event = sampling_event(
+        fit.gaussians, fit.layers, views, method, step=9, room=10_000, rule="exact", background=torch.zeros(3),
+        generator=torch.Generator().manual_seed(0),
+    )  # fmt: skip
+    columns = event.views[0].at[:, 1]
+    points = event.change.added["means"]
+    z = points @ view.camera.viewmat[2, :3] + view.camera.viewmat[2, 3]
+    assert len(z) == len(columns) > 50
+    assert torch.allclose(z[columns < 20], torch.tensor(1.25), atol=1e-4)
+    assert bool((columns >= 20).any()) != reliable and not torch.allclose(
+        z[columns >= 20].mean(), torch.tensor(1.25), atol=0.05
+    )
+
+
+def test_unknown_semantics_leave_the_weights_to_the_others():
+    """A view of which semantics say nothing is scored by the other two, whose weights sum to 1."""
+    blank = [dataclasses.replace(p, boundary=p.boundary * 0, foreground=p.foreground * 0) for p in priors(photographs(3))]
+    fit = Fit(photographs(3), seeds(), CONFIG, CPU, priors=blank)
+    drawn, _ = draw_from_view(
+        fit.gaussians, fit.views[0], 0, METHOD, RasterizeOptions(background=torch.zeros(3)), torch.Generator().manual_seed(0)
+    )
+    assert fit.views[0].semantic is None
+    assert torch.allclose(drawn.score, 0.5 * drawn.scores[0] + 0.5 * drawn.scores[2])
+
+
+def test_dropout_falls_with_the_number_of_views():
+    """Full up to `dropout_views` training views, then in proportion; it grows over the fit from 0."""
+    few = Fit(photographs(3), seeds(), dataclasses.replace(CONFIG, method=MethodConfig()), CPU)
+    many = Fit(photographs(6), seeds(), dataclasses.replace(CONFIG, method=MethodConfig()), CPU)
+    assert few.dropout == pytest.approx(0.2) and many.dropout == pytest.approx(0.1)
+    assert few._settings(1) == (0, 1) and few._settings(40) == (pytest.approx(0.2), 40)
+
+
+def test_auto_start_sweeps_few_views():
+    """Up to `sweep_up_to` views the start comes from confirmed depths; beyond it from points or at random."""
+    views = photographs(3, 64, 48)
+    for most, word in ((3, "sweep"), (2, "random")):
+        start = initial_points(views, None, InitConfig(sweep_up_to=most, random_count=200), np.random.default_rng(0))
+        assert word in start.how and (start.depths is not None) == (most == 3)
