@@ -91,7 +91,7 @@ class Fit:
         self.background = torch.tensor(background, dtype=torch.float32, device=device)
         self.generator = torch.Generator().manual_seed(config.seed)
         start = initial_points(train, points, config.init, np.random.default_rng(config.seed))
-        cloud, self.notes = start.cloud, [f"start: {start.how}"]
+        cloud, self.notes = start.cloud, [line.strip() for line in f"start: {start.how}".splitlines()]
         self.extent = self._extent([v.camera for v in train], cloud)
         self.optimizer = Optimizer(initial_gaussians(cloud, config.init, self.extent, device), config.optimizer, self.extent)
         self.stats, self.layers = DensityStats(len(cloud), device), Layers(len(cloud), device)
