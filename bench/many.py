@@ -45,7 +45,8 @@ def train(path: str, count: int, width: int, height: int, steps: int) -> dict:
     losses, begin = [], time.perf_counter()
     while len(losses) < steps:
         wanted = min(BURST, steps - len(losses))
-        burst.load([0] * wanted, [optimizer.schedule(0.0, len(losses) + k + 1) for k in range(wanted)])
+        numbers = range(len(losses) + 1, len(losses) + wanted + 1)
+        burst.load([0] * wanted, [optimizer.schedule(0.0, n) for n in numbers], [(0.0, n) for n in numbers])
         for _ in range(wanted):
             graph.replay()
         done, stop, history = burst.result()

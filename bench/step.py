@@ -28,7 +28,7 @@ from warpgs.pipeline.run import choose_device
 def stages(fit: Fit) -> dict[str, dict[str, float]]:
     """Time each stage on the first training view, with SH degree 3, and the whole step."""
     device, rule = fit.device, RULES[fit.config.rule]
-    camera, target, _ = fit.views[0]
+    camera, target = fit.views[0].camera, fit.views[0].photo
     size = {"width": camera.width, "height": camera.height}
     inputs = [*fit.optimizer.gaussians.tensors().values(), camera.viewmat[None], camera.K[None]]
     background = fit.background[None]

@@ -1,0 +1,42 @@
+"""The benches that are programs of their own still run on tiny sizes; how long things take is nobody's test."""
+
+import numpy as np
+import pytest
+import torch
+
+from bench import many, step
+from tests.scenes import photographs, seeds
+from warpgs.pipeline.config import FitConfig
+from warpgs.pipeline.fit import Fit
+from warpgs.pipeline.init import InitConfig
+
+
+def test_stages_of_a_step(device):
+    """Every stage has a positive time, the whole step among them."""
+    fit = Fit(photographs(2), seeds(), FitConfig(init=InitConfig(source="points")), device)
+    table = step.stages(fit)
+    assert table.pop("instances")["count"] > 0
+    assert len(table) == 9 and all(row["median_ms"] > 0 for row in table.values())
+
+
+@pytest.mark.cuda
+def test_many_gaussians_train(tmp_path):
+    """The program that trains ten million trains a few hundred too: the loss falls."""
+    generator = np.random.default_rng(0)
+    path = tmp_path / "points.npz"
+    K = np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]], np.float32)
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[2, 3] = 3
+    np.savez(
+        path, means3d=generator.uniform(-1, 1, (400, 3)).astype(np.float32), colors=generator.integers(0, 255, (400, 3)),
+        viewmats=viewmat[None], Ks=K[None], width=64, height=48,
+    )  # fmt: skip
+    result = many.train(str(path), 300, 64, 48, 120)
+    assert result["loss_last"] < result["loss_first"] and result["gaussians"] == 300
+
+
+def test_the_smooth_picture_is_a_picture():
+    """Colours in [0, 1] that change slowly."""
+    picture = many.smooth_picture(40, 30, torch.device("cpu"))
+    assert picture.shape == (30, 40, 3) and 0 <= picture.min() and picture.max() <= 1
+    assert float((picture[:, 1:] - picture[:, :-1]).abs().max()) < 0.15
