@@ -26,6 +26,8 @@ NO_OPINION = 0.5
 """Cost of correlation 0: where a plane leaves the other image, or nothing has texture."""
 
 
+PLANES_AT_ONCE = 16
+"""Planes whose costs are written together: 64 bytes of each pixel."""
 MAX_AT_ONCE = 4
 """Views swept at a time; each takes memory for two volumes of costs."""
 
@@ -120,6 +122,7 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
     mean = cv2.blur(own, box)
     variance = np.maximum(cv2.blur(own * own, box) - mean * mean, 0) + NOISE
     out = np.empty((size[1], size[0], len(inverses)), np.float32)
+    planes = np.empty((PLANES_AT_ONCE, size[1], size[0]), np.float32)  # neighbours in memory are written together
     for d, inverse in enumerate(inverses):
         least, total = None, 0
         for other, gray in zip(others, grays):
@@ -131,7 +134,10 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
             cost[~(warped >= 0)] = NO_OPINION
             total = total + cost
             least = cost if least is None else np.minimum(least, cost)
-        out[..., d] = 0.5 * least + total * (0.5 / len(others))
+        at = d % PLANES_AT_ONCE
+        planes[at] = 0.5 * least + total * (0.5 / len(others))
+        if at == PLANES_AT_ONCE - 1 or d == len(inverses) - 1:
+            out[..., d - at : d + 1] = planes[: at + 1].transpose(1, 2, 0)
     return out
 
 
@@ -256,9 +262,10 @@ def sweep_depths(views: Sequence[View], bounds: Sequence[tuple[float, float]], c
     # numpy and OpenCV let other threads run meanwhile
     with ThreadPoolExecutor(min(MAX_AT_ONCE, torch.get_num_threads())) as pool:
         inverses = list(pool.map(sweep, range(len(views))))
+        confirmed = list(pool.map(lambda i: confirm(small, inverses, i, config), range(len(views))))
     out = []
     for i, view in enumerate(views):
-        found, notes = confirm(small, inverses, i, config), []
+        found, notes = confirmed[i], []
         depth, valid, sensitivity = found.depth, found.valid, found.sensitivity
         size = (view.camera.width, view.camera.height)
         if small[i] is not view:
