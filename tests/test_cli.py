@@ -78,6 +78,9 @@ def test_run_folder_holds_what_it_promises(run):
     assert "images as stored" in page and "not measured" in page and metrics["config_hash"] in page
     assert f"{metrics['test']['psnr']:.2f} dB" in page and "pixels by sweep" in page
     assert len(read_ply(run / "point_cloud.ply")) == metrics["gaussians"]
+    events, layers = metrics["events"], metrics["layers"]
+    assert 0 < events["added"] <= 0.03 * 6 * 64 * 48 * events["count"] and sum(layers.values()) == metrics["gaussians"]
+    assert "Why Gaussians were placed" in page and len(list((run / "sampling").glob("*.png"))) == 2
     memory = metrics["memory"]
     assert 0 < memory["planned"] < memory["planned_at_cap"] and memory["limit"] is None and "planned for a step now" in page
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from warpgs.report.curve import curve
-from warpgs.report.page import ViewPictures, write_page
+from warpgs.report.page import SamplingStory, ViewPictures, write_page
 from warpgs.report.pictures import png
 
 VOID = {"meta", "img", "input", "br", "hr", "link"}
@@ -60,6 +60,7 @@ def write(path, **changes):
         "notes": ["every 8th view held out", "downscaled by 2"],
         "table": [["view", "PSNR [dB]"], ["images/0.png", "20.25"], ["images/1.png", "21.25"]],
         "views": views, "curves": [curve("Training loss", [1, 2, 3], [0.3, 0.2, 0.1])],
+        "sampling": SamplingStory("Two sentences.", [("first", picture(0.31)), ("later", picture(0.32))], [["added"], ["12"]]),
         "overview": picture(0.7), "protocol": {"ground truth": "images_8 as stored", "LPIPS": "not measured"},
         "details": {"config": {"steps": 2000}, "versions": {"torch": "2"}},
     }  # fmt: skip
@@ -81,7 +82,8 @@ def test_nothing_is_loaded_from_anywhere(tmp_path):
 def test_all_pictures_are_embedded_byte_for_byte(tmp_path):
     values, _, page = write(tmp_path / "report.html")
     embedded = [base64.b64decode(a["src"].split(",", 1)[1], validate=True) for a in page.all("img")]
-    given = [b for v in values["views"] for b in (v.truth, v.render, v.error, v.depth)] + [values["overview"]]
+    given = [b for v in values["views"] for b in (v.truth, v.render, v.error, v.depth)]
+    given += [values["overview"], *(data for _, data in values["sampling"].pictures)]
     assert sorted(embedded) == sorted(given)
     for data in embedded:
         assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).shape == (6, 8, 3)
@@ -94,7 +96,7 @@ def test_every_number_given_is_shown_as_given(tmp_path):
     shown = page.text("b")
     assert [t for t in shown if t in figures] == list(figures)
     assert [t for t in page.text("span") if t in labels] == list(labels)
-    cells = [c for row in values["table"] for c in row]
+    cells = [c for table in (values["table"], values["sampling"].table) for row in table for c in row]
     assert page.text("th", "td") == cells
     assert page.text("li") == values["notes"]
     assert dict(zip(page.text("dt"), page.text("dd"))) == values["protocol"]
@@ -116,15 +118,27 @@ def test_names_from_files_cannot_become_markup(tmp_path):
     _, _, page = write(
         tmp_path / "report.html", title=evil, subtitle=evil, figures=[(evil, evil)], notes=[evil],
         table=[["view"], [evil]], views=[view], details={evil: evil},
+        sampling=SamplingStory(evil, [(evil, picture(0.5))], [[evil]]),
     )  # fmt: skip
     assert len(page.all("script")) == 1
-    assert page.text("h1", "p", "li", "td") == [evil] * 4
+    assert page.text("h1", "p", "li", "td") == [evil] * 5
     assert page.all("input")[0]["aria-label"].endswith(evil)
 
 
 def test_parts_that_are_not_there_leave_no_empty_heading(tmp_path):
-    _, _, page = write(tmp_path / "report.html", notes=[], table=[["view"]], views=[], curves=[], overview=None, protocol={})
+    _, _, page = write(
+        tmp_path / "report.html", notes=[], table=[["view"]], views=[], curves=[], sampling=None, overview=None, protocol={}
+    )
     assert page.text("h2") == ["Settings"] and not page.all("img")
+
+
+def test_sampling_shows_the_first_picture_and_the_others_on_request(tmp_path):
+    """The first event stands open under its words, later ones in a fold with their caption."""
+    _, text, page = write(tmp_path / "report.html")
+    assert "Why Gaussians were placed" in page.text("h2") and "Two sentences." in page.text("p")
+    section = text[text.index("Why Gaussians") : text.index("Cameras and Gaussians")]
+    assert section.count("<details>") == 1 and section.index('alt="first"') < section.index("<details>")
+    assert section.index("<summary>later</summary>") < section.index('alt="later"')
 
 
 @pytest.mark.parametrize(

@@ -108,6 +108,8 @@ class Fit:
                 regions = [counted_region(v)[0] for v in train]
                 priors, notes = view_priors(train, config.priors, depths=start.depths, regions=regions, cache=cache_folder())
                 self.notes += notes
+            self.disparities = [p.disparity for p in priors]
+            """Relative inverse depth of each view in [0, 1], [H, W]: only pictures of events show it."""
             depths = start.depths or [None] * len(train)
             self.views = [v.scored(p, d, config.method) for v, p, d in zip(self.views, priors, depths, strict=True)]
         self.news: list[str] = []

@@ -14,7 +14,7 @@ from warpgs.rasterizer import RasterizeOptions
 from warpgs.report.curve import curve
 from warpgs.report.events import read_events
 from warpgs.report.overview import render_overview
-from warpgs.report.page import ViewPictures, write_page
+from warpgs.report.page import SamplingStory, ViewPictures, write_page
 from warpgs.report.pictures import depth_map, error_map, png, side_by_side
 from warpgs.scene import Gaussians, Scene, View
 
@@ -115,8 +115,10 @@ def _pictures(views: list[View], gaussians: Gaussians, options: RasterizeOptions
     return result
 
 
-def write_report(out: Path, scene: Scene, split: Split, gaussians: Gaussians, metrics: dict, record: dict) -> None:
-    """Write report.html for a run whose scores are known."""
+def write_report(
+    out: Path, scene: Scene, split: Split, gaussians: Gaussians, metrics: dict, record: dict, sampling: SamplingStory | None
+) -> None:
+    """Write report.html for a run whose scores are known; ``sampling`` is what it says of sampling events, if any."""
     train, test = [scene.view(n) for n in split.train], [scene.view(n) for n in split.test]
     notes = list(record["notes"])
     means = gaussians.means.cpu().numpy()
@@ -161,6 +163,7 @@ def write_report(out: Path, scene: Scene, split: Split, gaussians: Gaussians, me
         title=Path(scene.path).resolve().name,
         subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
         f"{camera.width} x {camera.height} px, {metrics['device']}",
-        figures=figures, notes=notes, table=table, views=pictures, curves=curves, overview=overview, details=details,
+        figures=figures, notes=notes, table=table, views=pictures, curves=curves, sampling=sampling, overview=overview,
+        details=details,
         protocol=protocol | {LABELS.get(k, k): v for k, v in metrics["variants"].items()},
     )  # fmt: skip

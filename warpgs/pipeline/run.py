@@ -23,6 +23,7 @@ from warpgs.io.load import load_scene
 from warpgs.io.splits import Split, default_split, split_views, twins
 from warpgs.pipeline.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.config import FitConfig
+from warpgs.pipeline.event_sheet import event_figures, keep_pictures, sampling_story
 from warpgs.pipeline.fit import Fit, StepReport, run, train_views
 from warpgs.pipeline.lpips import load_lpips
 from warpgs.pipeline.results import evaluate_run, protocol_of, score_line, write_report
@@ -197,6 +198,7 @@ def fit_scene(request: FitRequest) -> dict:
     for note in notes:
         print(f"  {note}")
 
+    keep_pictures(fit, [v.name for v in train], out)
     setup = time.perf_counter() - began
     _train(fit, out, notes)
     trained = time.perf_counter() - began - setup
@@ -208,11 +210,11 @@ def fit_scene(request: FitRequest) -> dict:
         "steps": fit.step, "gaussians": len(fit.gaussians), "preset": request.config.preset, "seed": request.config.seed,
         "config_hash": request.config.fingerprint(), "fingerprint": scene.fingerprint, "device": where.removeprefix("on "),
         "seconds": {"setup": setup, "training": trained, "total": time.perf_counter() - began}, **peak,
-        "memory": fit.memory.to_json(),
+        "memory": fit.memory.to_json(), **event_figures(fit),
     }  # fmt: skip
     write_json(out / "metrics.json", metrics)
     record["notes"] = notes
-    write_report(out, scene, split, fit.gaussians, metrics, record)
+    write_report(out, scene, split, fit.gaussians, metrics, record, sampling_story(fit, out))
     _print_result(out, metrics)
     return metrics
 

@@ -7,12 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warpgs.report.pictures import colored
+from warpgs.report.pictures import colored, resized
 
 PAPER, INK, SOFT, LINE = (251, 251, 249), (27, 29, 33), (102, 108, 118), (223, 226, 231)
 LABEL_SIZE, TEXT_SIZE, TITLE_SIZE = 15, 13, 22  # [px]
 MARGIN, GAP, HEAD = 28, 18, 30  # [px]; HEAD is the height of a label
 LEGEND = (72, 8)  # width and height of a colour bar [px]
+DOT = (240, 78, 35)
+"""Colour of dots."""
+DOTTED = 0.08
+"""Share of a picture that dots may cover: many are drawn smaller."""
 
 
 @dataclass(frozen=True)
@@ -27,20 +31,37 @@ class Tile:
     """Colour map of values."""
     largest: float = 1.0
     """Value of the map's last colour; the first is 0."""
+    dots: np.ndarray | None = None
+    """Rows and columns of pixels to mark, shape [S, 2]."""
 
 
 def _picture(tile: Tile, size: tuple[int, int]):
     """A tile's pixels at a size (width, height), as a Pillow image."""
-    from PIL import Image
-
     values = tile.values
     if values.ndim == 2:
         values = colored(values / tile.largest, tile.colors)
-    pixels = np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
-    return Image.fromarray(pixels).resize(size, Image.Resampling.LANCZOS)
+    picture = resized(values, *size)
+    return picture if tile.dots is None else _dotted(picture, (tile.dots + 0.5) * (size[0] / tile.values.shape[1]))
 
 
-def contact_sheet(title: str, lines: list[str], tiles: list[Tile], *, columns: int = 4, tile_width: int = 440) -> np.ndarray:
+def _dotted(picture, centers: np.ndarray):
+    """A picture with small discs at rows and columns [px], shape [S, 2]; drawn large and shrunk, for their edges."""
+    from PIL import Image, ImageDraw
+
+    least, most = 0.9, max(1.4, picture.width / 220)
+    radius = min(most, max(least, (DOTTED * picture.width * picture.height / (np.pi * max(1, len(centers)))) ** 0.5))
+    fine = 4
+    cover = Image.new("L", (fine * picture.width, fine * picture.height))
+    draw = ImageDraw.Draw(cover)
+    for y, x in fine * centers:
+        draw.ellipse((x - fine * radius, y - fine * radius, x + fine * radius, y + fine * radius), 255)
+    picture.paste(DOT, mask=cover.reduce(fine))
+    return picture
+
+
+def contact_sheet(
+    title: str, lines: list[str], tiles: list[Tile], *, columns: int = 4, tile_width: int = 440, text: float = 1.0
+) -> np.ndarray:
     """Draw labelled tiles in rows, a colour bar with its range at each map, and lines of text in the place after the last.
 
     Args:
@@ -49,6 +70,7 @@ def contact_sheet(title: str, lines: list[str], tiles: list[Tile], *, columns: i
         tiles: At least one; all of one shape [H, W].
         columns: Tiles per row.
         tile_width: Width of a tile [px].
+        text: Factor on the sizes of letters, for a sheet that is shown smaller than it is.
 
     Returns:
         The sheet, colours in [0, 1], float32, shape [rows, columns, 3].
@@ -58,32 +80,33 @@ def contact_sheet(title: str, lines: list[str], tiles: list[Tile], *, columns: i
     height, width = tiles[0].values.shape[:2]
     tile_height = max(1, round(tile_width * height / width))
     rows = -(-(len(tiles) + 1) // columns)
-    top = MARGIN + TITLE_SIZE + 18
+    label_size, text_size, title_size, head = (round(text * v) for v in (LABEL_SIZE, TEXT_SIZE, TITLE_SIZE, HEAD))
+    top = MARGIN + title_size + 18
     size = (
         2 * MARGIN + columns * tile_width + (columns - 1) * GAP,
-        top + rows * (HEAD + tile_height) + (rows - 1) * GAP + MARGIN,
+        top + rows * (head + tile_height) + (rows - 1) * GAP + MARGIN,
     )
     sheet = Image.new("RGB", size, PAPER)
     draw = ImageDraw.Draw(sheet)
-    fonts = {s: ImageFont.load_default(s) for s in (LABEL_SIZE, TEXT_SIZE, TITLE_SIZE)}
-    draw.text((MARGIN, MARGIN - 4), title, INK, fonts[TITLE_SIZE])
+    fonts = {s: ImageFont.load_default(s) for s in (label_size, text_size, title_size)}
+    draw.text((MARGIN, MARGIN - 4), title, INK, fonts[title_size])
     for i in range(len(tiles) + 1):
-        x, y = MARGIN + (i % columns) * (tile_width + GAP), top + (i // columns) * (HEAD + tile_height + GAP)
+        x, y = MARGIN + (i % columns) * (tile_width + GAP), top + (i // columns) * (head + tile_height + GAP)
         if i == len(tiles):
-            draw.line((x, y + HEAD, x + tile_width - 1, y + HEAD), LINE)
-            characters = int(tile_width / (0.5 * TEXT_SIZE))
-            text = "\n\n".join(textwrap.fill(line, characters) for line in lines)
-            draw.multiline_text((x, y + HEAD + 14), text, SOFT, fonts[TEXT_SIZE], spacing=5)
+            draw.line((x, y + head, x + tile_width - 1, y + head), LINE)
+            characters = int(tile_width / (0.5 * text_size))
+            words = "\n\n".join(textwrap.fill(line, characters) for line in lines)
+            draw.multiline_text((x, y + head + 14), words, SOFT, fonts[text_size], spacing=5)
             break
         tile = tiles[i]
-        draw.text((x, y + 6), tile.label, INK, fonts[LABEL_SIZE])
-        sheet.paste(_picture(tile, (tile_width, tile_height)), (x, y + HEAD))
+        draw.text((x, y + head // 5), tile.label, INK, fonts[label_size])
+        sheet.paste(_picture(tile, (tile_width, tile_height)), (x, y + head))
         if tile.values.ndim == 2:
-            right = x + tile_width
+            middle, right = y + head // 2, x + tile_width
             largest = f"{tile.largest:g}"
-            room = round(draw.textlength(largest, fonts[TEXT_SIZE]))
+            room = round(draw.textlength(largest, fonts[text_size]))
             bar = Tile("", np.linspace(0, 1, LEGEND[0], dtype=np.float32)[None].repeat(LEGEND[1], 0), tile.colors)
-            draw.text((right, y + 8), largest, SOFT, fonts[TEXT_SIZE], anchor="ra")
-            sheet.paste(_picture(bar, LEGEND), (right - room - 6 - LEGEND[0], y + 11))
-            draw.text((right - room - 12 - LEGEND[0], y + 8), "0", SOFT, fonts[TEXT_SIZE], anchor="ra")
+            draw.text((right, middle), largest, SOFT, fonts[text_size], anchor="rm")
+            sheet.paste(_picture(bar, LEGEND), (right - room - 6 - LEGEND[0], middle - LEGEND[1] // 2))
+            draw.text((right - room - 12 - LEGEND[0], middle), "0", SOFT, fonts[text_size], anchor="rm")
     return np.asarray(sheet, np.float32) / 255

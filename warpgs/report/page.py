@@ -29,6 +29,7 @@ table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums}
 th,td{padding:7px 14px 7px 0;text-align:right;border-bottom:1px solid var(--line)}
 th{font-weight:500;color:var(--soft);font-size:13px}th:first-child,td:first-child{text-align:left;overflow-wrap:anywhere}
 .view{margin:0 0 40px}.row{display:grid;grid-template-columns:2fr 1fr;gap:10px;align-items:start}
+.wide{margin:14px calc(50% - min(50vw - 24px,800px))}.wide figcaption{padding-left:16px}
 .stack{display:grid;gap:10px}img{display:block;width:100%;height:auto;border-radius:6px}
 figure{margin:0}figcaption{font-size:13px;padding:5px 0 0}
 .slider{position:relative;border-radius:6px;overflow:hidden;touch-action:none;cursor:ew-resize;--cut:50%}
@@ -66,6 +67,18 @@ class ViewPictures:
     depth: bytes
 
 
+@dataclass(frozen=True)
+class SamplingStory:
+    """What the page says of the sampling events of a fit."""
+
+    words: str
+    """Sentences that say what the pictures show."""
+    pictures: list[tuple[str, bytes]]
+    """Caption and PNG of each pictured event, the first shown, the others on request."""
+    table: list[list[str]]
+    """Header row, then rows."""
+
+
 def _embed(data: bytes, alternative: str, style: str = "") -> str:
     source = base64.b64encode(data).decode()
     return f'<img alt="{html.escape(alternative)}"{style} src="data:image/png;base64,{source}">'
@@ -89,6 +102,14 @@ def _view(v: ViewPictures) -> str:
     )
 
 
+def _sampling(s: SamplingStory) -> str:
+    parts = [f"<h2>Why Gaussians were placed</h2><p>{html.escape(s.words)}</p>{_table(s.table)}"]
+    for i, (caption, data) in enumerate(s.pictures):
+        picture = f'<figure class="wide">{_embed(data, caption)}<figcaption>{html.escape(caption)}</figcaption></figure>'
+        parts.append(picture if i == 0 else f"<details><summary>{html.escape(caption)}</summary>{picture}</details>")
+    return "".join(parts)
+
+
 def _table(rows: list[list[str]]) -> str:
     head, *body = ["".join(f"<{t}>{html.escape(c)}</{t}>" for c in row) for t, row in zip(["th"] + ["td"] * len(rows), rows)]
     return f"<table><tr>{head}</tr>{''.join(f'<tr>{r}</tr>' for r in body)}</table>"
@@ -104,6 +125,7 @@ def write_page(
     table: list[list[str]],
     views: list[ViewPictures],
     curves: list[str],
+    sampling: SamplingStory | None,
     overview: bytes | None,
     protocol: dict[str, str],
     details: dict,
@@ -119,6 +141,7 @@ def write_page(
         table: Header row, then a row per held-out view.
         views: Pictures of held-out views.
         curves: SVG charts.
+        sampling: The fit's sampling events, or None where it had none.
         overview: Picture of cameras and points, or None.
         protocol: What scores must agree in to be compared, and what each figure is, by name.
         details: Configuration, versions and data, shown as JSON on request.
@@ -142,6 +165,8 @@ def write_page(
         sections.append(f"<h2>How it was scored</h2><dl>{items}</dl>")
     if curves:
         sections.append(f'<h2>The fit</h2><div class="curves">{"".join(curves)}</div>')
+    if sampling:
+        sections.append(_sampling(sampling))
     if overview:
         sections.append("<h2>Cameras and Gaussians</h2>" + _figure(overview, "training cameras teal, held-out cameras orange"))
     settings = html.escape(json.dumps(details, indent=1))

@@ -20,6 +20,15 @@ def png(image: np.ndarray) -> bytes:
     return data.tobytes()
 
 
+def resized(image: np.ndarray, width: int, height: int):
+    """Colours in [0, 1], [H, W, 3], at another size, as a Pillow image; every pixel counts where it shrinks."""
+    from PIL import Image
+
+    pixels = Image.fromarray(np.round(np.clip(image, 0, 1) * 255).astype(np.uint8))
+    way = Image.Resampling.BOX if width < image.shape[1] else Image.Resampling.BICUBIC
+    return pixels.resize((width, height), way)
+
+
 def colored(values: np.ndarray, name: str) -> np.ndarray:
     """Colours [H, W, 3] of values in [0, 1], [H, W], by one of OpenCV's colour maps: INFERNO, TURBO, VIRIDIS and so on."""
     import cv2

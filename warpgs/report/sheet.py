@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from warpgs.report.pictures import resized
+
 INK, SOFT, PAPER = (27, 29, 33), (102, 108, 118), (255, 255, 255)
 BOXES = ((240, 78, 35), (0, 158, 190), (240, 190, 0))
 """Colours of the boxes and of the frames of their crops."""
@@ -63,11 +65,6 @@ def sheet(headings: list[str], strips: list[Strip]) -> bytes:
             text = text[:-2].rstrip("…") + "…" if len(text) > 2 else ""
         return text
 
-    def scaled(pixels: np.ndarray, width: int, height: int):
-        data = Image.fromarray(np.round(np.clip(pixels, 0, 1) * 255).astype(np.uint8))
-        way = Image.Resampling.BOX if width < pixels.shape[1] else Image.Resampling.BICUBIC
-        return data.resize((width, height), way)
-
     heights = []
     for s in strips:
         H, W = s.cells[0].image.shape[:2]
@@ -91,14 +88,14 @@ def sheet(headings: list[str], strips: list[Strip]) -> bytes:
         factor = column / s.cells[0].image.shape[1]
         for i, cell in enumerate(s.cells):
             x = MARGIN + i * (column + GAP)
-            canvas.paste(scaled(cell.image, column, tall), (x, y))
+            canvas.paste(resized(cell.image, column, tall), (x, y))
             for k, (cx, cy, w, h) in enumerate(s.crops):
                 inner = (column - GAP * (len(s.crops) - 1)) // len(s.crops)
                 color = BOXES[k % len(BOXES)]
                 box = [x + cx * factor, y + cy * factor, x + (cx + w) * factor - 1, y + (cy + h) * factor - 1]
                 draw.rectangle([round(v) for v in box], outline=color, width=3)
                 left, top = x + k * (inner + GAP), y + tall + GAP
-                canvas.paste(scaled(cell.image[cy : cy + h, cx : cx + w], inner, round(inner * h / w)), (left, top))
+                canvas.paste(resized(cell.image[cy : cy + h, cx : cx + w], inner, round(inner * h / w)), (left, top))
                 draw.rectangle([left, top, left + inner - 1, top + round(inner * h / w) - 1], outline=color, width=3)
             words = fitted(cell.caption, small, column)
             draw.text((x + column / 2, y + tall + zoom + 20), words, SOFT, small, anchor="ms")

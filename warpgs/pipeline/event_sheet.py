@@ -1,0 +1,156 @@
+"""Why Gaussians were placed where they are: a picture of a sampling event, and what the report says of all of a fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from warpgs.files import write_bytes
+from warpgs.pipeline.fit import Fit
+from warpgs.pipeline.method import Drawn, Event, MethodConfig, TrainingView
+from warpgs.pipeline.sampler import SUPPORT
+from warpgs.pipeline.schedule import Phases
+from warpgs.report.contact_sheet import Tile, contact_sheet
+from warpgs.report.page import SamplingStory
+from warpgs.report.pictures import png
+
+FOLDER = "sampling"
+"""Subfolder of a run with the pictures, ``STEP.png``."""
+SHOWN = 3
+"""Views in a picture."""
+OPEN, CLOSED = (0.97, 0.97, 0.95), (0.17, 0.19, 0.22)
+"""Colours of the gate."""
+FADED = 0.45
+"""Contrast of the photograph under the dots."""
+
+
+def pictured(phases: Phases) -> set[int]:
+    """Steps of the events that get a picture: the first, and the first of the second half of phase 2."""
+    middle = 0.5 * (phases.refine + phases.settle)
+    late = [e for e in phases.events if e >= middle]
+    return {*phases.events[:1], *late[:1]}
+
+
+def _open_pixels(confirmed: bool, quantile: float) -> str:
+    """The pixels that a gate leaves open, in words."""
+    parts = ["whose depth other views confirm"] * confirmed
+    parts += [f"whose S_geometry is above its {quantile:g} quantile"] * (quantile > 0)
+    return f"pixels {' and '.join(parts)}" if parts else "all pixels where something is drawn"
+
+
+def _asked(method: MethodConfig) -> float:
+    """Quantile of S_geometry that the gate of a fit starts from."""
+    return method.sampler.gate_quantile if method.ra else 0.0
+
+
+def view_sheet(
+    name: str, step: int, view: TrainingView, disparity: np.ndarray, drawn: Drawn, config: MethodConfig
+) -> np.ndarray:
+    """One view at one event, colours [rows, columns, 3] in [0, 1]: what there was, its scores, the gate, the drawn pixels.
+
+    Args:
+        name: Of the view.
+        step: Steps done.
+        view: The view.
+        disparity: Its relative inverse depth, shape [H, W].
+        drawn: What the event saw and did there.
+        config: Switches and settings of the fit.
+    """
+    photo, rendered, score = (t.cpu().numpy() for t in (view.photo, drawn.rendered, drawn.score))
+    render, semantic, geometry = (t.cpu().numpy() for t in drawn.scores)
+    at, gate = drawn.at.cpu().numpy(), drawn.gate.cpu().numpy()
+    weights = config.weights(view.semantic is not None)
+    # each score stands below what it comes from
+    tiles = [
+        Tile("rendering before", rendered),
+        Tile("photograph", photo),
+        Tile("disparity, near is 1", disparity, "TURBO"),
+        Tile("gate", np.where(gate[..., None], OPEN, CLOSED).astype(np.float32)),
+        Tile("drawn pixels", 1 - FADED * (1 - photo.mean(-1, keepdims=True).repeat(3, -1)), dots=at),
+        Tile(f"{weights[0]:.2f} S_render", render),
+        Tile(f"{weights[1]:.2f} S_semantic", semantic),
+        Tile(f"{weights[2]:.2f} S_geometry", geometry),
+        Tile("S_importance", score),
+    ]
+    confirmed = config.ra and config.sampler.depth == "confirmed" and view.confirmed is not None
+    widened = f"; too few passed at the {_asked(config):g} quantile" if drawn.quantile < _asked(config) else ""
+    lines = [
+        f"{len(at):,} pixels drawn of the {gate.sum():,} that the gate leaves open, {gate.mean():.0%} of the view.",
+        f"Gate: {_open_pixels(confirmed, drawn.quantile)}{widened}.",
+        f"Their mean importance is {score[at[:, 0], at[:, 1]].mean() if len(at) else 0:.2f}, the view's {score.mean():.2f}.",
+    ]
+    return contact_sheet(f"{name}, step {step:,}", lines, tiles, columns=5, tile_width=320, text=1.25)
+
+
+def event_sheet(
+    names: list[str], step: int, views: list[TrainingView], disparities: list[np.ndarray], event: Event, config: MethodConfig
+) -> np.ndarray:
+    """Up to three of an event's views below each other, colours [rows, columns, 3] in [0, 1]; arguments as in `view_sheet`."""
+    count = len(event.views)
+    chosen = [event.views[i] for i in np.unique(np.linspace(0, count - 1, min(SHOWN, count)).round().astype(int))]
+    return np.concatenate([view_sheet(names[d.view], step, views[d.view], disparities[d.view], d, config) for d in chosen])
+
+
+def keep_pictures(fit: Fit, names: list[str], out: Path) -> None:
+    """Have a fit write the picture of an event into its run folder when it happens.
+
+    Args:
+        fit: The fit, not yet run.
+        names: Of its training views.
+        out: Run folder; pictures are ``sampling/STEP.png``.
+    """
+    steps = pictured(fit.phases)
+
+    def on_event(step: int, event: Event) -> None:
+        if step in steps:
+            (out / FOLDER).mkdir(exist_ok=True)
+            sheet = event_sheet(names, step, fit.views, fit.disparities, event, fit.config.method)
+            write_bytes(out / FOLDER / f"{step:06d}.png", png(sheet))
+
+    fit.on_event = on_event
+
+
+def event_figures(fit: Fit) -> dict:
+    """What the events of a fit amount to, and its two layers, for metrics.json.
+
+    Returns:
+        ``events``: their number, the Gaussians added and freed, the draws (views over all events) and those for which the
+        gate was widened; ``layers``: Gaussians in the coarse and the fine one.
+    """
+    asked = _asked(fit.config.method)
+    quantiles = [q for e in fit.events for q in e["quantiles"]]
+    fine = int(fit.layers.fine.sum())
+    return {
+        "events": {
+            "count": len(fit.events), **{k: sum(e[k] for e in fit.events) for k in ("added", "freed")},
+            "draws": len(quantiles), "widened": sum(q < asked for q in quantiles),
+        },
+        "layers": {"coarse": len(fit.gaussians) - fine, "fine": fine},
+    }  # fmt: skip
+
+
+def sampling_story(fit: Fit, out: Path) -> SamplingStory | None:
+    """What the report of a finished fit says of its sampling events; None where there were none."""
+    method, figures = fit.config.method, event_figures(fit)
+    events, layers = figures["events"], figures["layers"]
+    if not events["count"]:
+        return None
+    how = "drawn at random, the likelier the higher their S_importance," if method.agp else "the highest in S_importance"
+    confirmed = method.sampler.depth == "confirmed"
+    words = (
+        f"Each dot is a pixel behind which a fine Gaussian was put at the {method.sampler.depth} depth, as far as the layer "
+        f"had room. These pixels are {how} among {_open_pixels(confirmed and method.ra, _asked(method))} (the gate); "
+        "S_importance is the weighted sum of the three scores, and each score stands below what it comes from."
+    )
+    if events["widened"]:
+        words += (
+            f" In {events['widened']:,} of {events['draws']:,} draws the gate was widened: fewer than {SUPPORT} times as many "
+            f"pixels as are drawn passed at the {_asked(method):g} quantile."
+        )
+    table = [
+        ["sampling events", "Gaussians added", "removed to make room", "coarse at the end", "fine at the end"],
+        [f"{n:,}" for n in (events["count"], events["added"], events["freed"], layers["coarse"], layers["fine"])],
+    ]
+    pictures = [(f"sampling after step {int(p.stem):,}", p.read_bytes()) for p in sorted((out / FOLDER).glob("*.png"))]
+    return SamplingStory(words, pictures, table)
