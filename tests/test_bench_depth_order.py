@@ -73,6 +73,8 @@ def test_a_run_is_measured(scene, tmp_path, capsys):
     assert [line.split(":")[0] for line in lines] == held_out and mean.startswith("mean of 3 views")
     values = [float(re.search(r"correlation (\S+) over", line)[1]) for line in lines]
     assert min(values) > 0.8 and float(mean.split()[-1]) == pytest.approx(np.mean(values), abs=1e-4)
+    tracks = load_scene(str(scene)).points.tracks
+    assert [int(line.split()[-2]) for line in lines] == [sum(name in t for t in tracks) for name in held_out]
     record = json.loads((run / "config.json").read_text())
     (run / "config.json").write_text(json.dumps(record | {"test": []}))
     assert main([str(run), str(scene)]) == 3 and "holds no view out" in capsys.readouterr().err
