@@ -187,6 +187,21 @@ def test_output_below_a_file(scene, capsys):
     assert "cannot be written" in failure(capsys, 4, "fit", str(scene), "--out", str(below))
 
 
+CUDA_FULL = "CUDA out of memory. Tried to allocate 48.00 MiB. GPU 0 has a total capacity of 139.80 GiB."
+
+
+@pytest.mark.parametrize("error", [RuntimeError(CUDA_FULL), MemoryError()], ids=["CUDA", "Python"])
+def test_no_memory_left_is_no_defect(error, capsys, monkeypatch):
+    """Where memory runs out, one line says so and how to need less."""
+
+    def full(*_):
+        raise error
+
+    monkeypatch.setattr("warpgs.pipeline.reuse.export", full)
+    line = failure(capsys, 4, "export", "run", "--to", "x.ply")
+    assert "--memory-limit" in line and "--resume" in line and "total capacity" not in line
+
+
 def test_defects_are_called_defects(tmp_path, capsys, monkeypatch):
     """An unexpected error is one line with a file that holds the details."""
     monkeypatch.setattr("warpgs.pipeline.reuse.export", lambda *a: 1 / 0)

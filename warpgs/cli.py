@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from warpgs import __version__
-from warpgs.errors import UsageError, WarpgsError
+from warpgs.errors import ResourceError, UsageError, WarpgsError
 
 COMMANDS = {
     "fit": "fit Gaussians to a scene folder and fill a run folder",
@@ -272,7 +272,19 @@ def main(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as e:
-        return _internal_error(e, arguments)
+        ran_out = isinstance(e, MemoryError) or "out of memory" in str(e).lower()
+        return _out_of_memory(e) if ran_out else _internal_error(e, arguments)
+
+
+def _out_of_memory(error: Exception) -> int:
+    """What torch, the driver or Python says when there is no room, in words that say what to do; returns the exit code."""
+    reason = (str(error).strip() or "MemoryError").splitlines()[0].partition(" GPU ")[0].rstrip(".")
+    print(
+        f"warpgs: no memory is left ({reason}). Give the fit less with --memory-limit, fit smaller images with "
+        "--downscale, or end other programs; --resume continues from the last checkpoint",
+        file=sys.stderr,
+    )
+    return ResourceError.exit_code
 
 
 def _internal_error(error: Exception, arguments: list[str]) -> int:

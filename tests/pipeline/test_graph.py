@@ -63,6 +63,20 @@ def test_recorded_method_equals_single_steps():
     assert all(torch.equal(a[k], b[k]) for k in a) and [r.count for r in said] == [r.count for r in reports]
 
 
+def test_recordings_do_not_pile_up(monkeypatch):
+    """Memory of recordings that are no longer used goes back: a long fit holds no more than a short one of its size."""
+    torch.cuda.empty_cache()
+    monkeypatch.setattr(graph, "DEAD_BYTES", 2**22)
+    fit, _ = fitted(photographs(4), recorded=True)
+    held = []
+    for _ in range(40):
+        fit.graphs.clear()
+        fit.step -= 1
+        fit.burst(1)
+        held.append(torch.cuda.memory_reserved())
+    assert max(held[20:]) <= max(held[:10]) + 2**22
+
+
 def test_too_little_room_is_found_and_mended(monkeypatch):
     """Steps that would overflow change nothing; they are recorded anew and taken, and the result is the same."""
     reference, _ = fitted(photographs(4), recorded=False)

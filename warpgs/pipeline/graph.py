@@ -29,6 +29,8 @@ BURST = 100
 """Most steps between two looks at the device."""
 ROOM = 1.3
 """Instances that a recording has room for, as a multiple of the most that any view has when it is recorded."""
+DEAD_BYTES = 2**30
+"""Memory of recordings no longer used that may pile up. To give it back takes milliseconds, in which the device waits."""
 NOT_FINITE = 2
 """Value of the stop flag after a loss that is no number; 1 after more instances than there is room for."""
 
@@ -102,7 +104,8 @@ class StepGraph:
         self.capacity = self._capacity()
         if most is not None and self.capacity > most:
             raise OverLimitError(f"a recorded step would need room for {self.capacity:,} instances, the limit allows {most:,}")
-        stream = torch.cuda.Stream()
+        burst.give_back(0 if most is not None else DEAD_BYTES)
+        stream = burst.stream
         stream.wait_stream(torch.cuda.current_stream())
         self.graph = torch.cuda.CUDAGraph()
         with torch.cuda.stream(stream):
@@ -183,6 +186,10 @@ class Burst:
 
     def __init__(self, device: torch.device):
         self.device = device
+        self.stream = torch.cuda.Stream(device)
+        """Where steps are recorded: always the same one, since torch keeps freed memory for the stream that it was used on."""
+        self.kept = torch.cuda.memory_reserved(device)
+        """Bytes that torch held after `give_back` last gave something back."""
         self.view_rows = torch.zeros(BURST, dtype=torch.int64, device=device)
         """Number of each step's view among those of its size."""
         self.rate_rows = torch.ones(BURST, 15, device=device)
@@ -195,6 +202,15 @@ class Burst:
         """0 while all is well, else why the burst stopped."""
         self.history = torch.zeros(BURST, 2, device=device)
         """Loss and mean squared error of each step."""
+
+    def give_back(self, dead: int) -> None:
+        """Return to the device what torch keeps for nobody, once that may be more than ``dead`` bytes.
+
+        A recording has memory of its own, which torch keeps after the recording is gone and lends to no other.
+        """
+        if torch.cuda.memory_reserved(self.device) - self.kept > dead:
+            torch.cuda.empty_cache()
+            self.kept = torch.cuda.memory_reserved(self.device)
 
     def hold(self) -> None:
         """Until `release`, steps change nothing that lasts; they see the first view."""

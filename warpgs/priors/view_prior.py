@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -159,10 +161,9 @@ def _classical(views: Sequence[View], notes: list[str]) -> SemanticsSource:
         "semantics: no network, so saliency stands for foreground and edges for boundaries; --segmentation-model takes one"
     )
 
-    def maps(i: int) -> tuple[SemanticMaps, str]:
-        return classical_semantics(views[i].image), "saliency and edges"
-
-    return maps
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:  # OpenCV lets other threads run meanwhile
+        found = list(pool.map(lambda v: classical_semantics(v.image), views))
+    return lambda i: (found[i], "saliency and edges")
 
 
 def _stands_out(region: np.ndarray | None) -> bool:
