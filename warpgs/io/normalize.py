@@ -58,7 +58,9 @@ def fingerprint(views: list[View]) -> str:
     """SHA-256, hexadecimal, over names, cameras and pixels of the views in their order."""
     digest = hashlib.sha256()
     for v in views:
-        arrays = [v.camera.viewmat, v.camera.K, v.image] + [m for m in (v.mask, v.score_mask) if m is not None]
+        # cameras to 1e-9: their last bits depend on the machine's linear algebra
+        cameras = [np.round(m, 9) + 0.0 for m in (v.camera.viewmat, v.camera.K)]
+        arrays = [*cameras, v.image] + [m for m in (v.mask, v.score_mask) if m is not None]
         # name and shapes are delimited, so that bytes moved from one field to the next cannot give the same hash
         digest.update(repr((v.name, [(a.shape, str(a.dtype)) for a in arrays])).encode("utf-8", "surrogateescape"))
         for array in arrays:
