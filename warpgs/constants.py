@@ -19,6 +19,25 @@ LOW_PASS = 0.3
 NEAR = 0.01
 """Nearest depth that is drawn [u]."""
 
+FAR = 1e10
+"""Farthest depth that is drawn [u]. This and the next five are wide of anything seen, and narrow enough that no product on the
+way to a gradient leaves float32 (docs/extremes.md): what is drawn has finite gradients, and float64 draws the same."""
+
+FARTHEST_PIXEL = 1e9
+"""Largest coordinate of a projected mean [px]. Beyond, floats are 64 px and more apart."""
+
+LARGEST_AXIS = 1e30
+"""Largest component of a projected axis [px]."""
+
+SMALLEST_DETERMINANT = 1e-36
+"""Smallest determinant of a shrunk covariance, and smallest of its entries (docs/project.md, section 4)."""
+
+SHORTEST_QUAT = 1e-15
+"""Shortest quaternion that gives a rotation; the longest is 1 / SHORTEST_QUAT. Its gradient is divided by the length."""
+
+LARGEST_COEFFICIENT = 1e6
+"""Largest magnitude of a spherical-harmonics coefficient that is read."""
+
 FRUSTUM_MARGIN = 0.15
 """The Jacobian is taken at the projected mean clamped to the image grown by this share of its size on every side,
 which is the factor 1.3 on tan(fov / 2) of Kerbl et al. 2023 for a centred principal point."""

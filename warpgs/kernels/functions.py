@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from warpgs.constants import FRUSTUM_MARGIN
+from warpgs.constants import FAR, FARTHEST_PIXEL, FRUSTUM_MARGIN, LARGEST_AXIS, SHORTEST_QUAT, SMALLEST_DETERMINANT
 
 
 @functools.cache
@@ -112,22 +112,19 @@ def make_projection(real):
         y = e.position[1]
         z = e.position[2]
         # Guards are phrased so that a NaN fails them.
-        if not (z >= near and wp.isfinite(z)):
+        if not (z >= near and z <= real(FAR)):
             return e
         px = K[0, 0] * x / z + K[0, 2]
         py = K[1, 1] * y / z + K[1, 2]
-        if not (wp.isfinite(px) and wp.isfinite(py)):
-            return e
-        if not (wp.isfinite(q[0]) and wp.isfinite(q[1]) and wp.isfinite(q[2]) and wp.isfinite(q[3])):
+        if not (wp.abs(px) <= real(FARTHEST_PIXEL) and wp.abs(py) <= real(FARTHEST_PIXEL)):
             return e
         e.quat_length = r.quat_length(q)
-        if not (e.quat_length > real(1.0e-30) and wp.isfinite(e.quat_length)):
+        if not (e.quat_length >= real(SHORTEST_QUAT) and e.quat_length * real(SHORTEST_QUAT) <= real(1.0)):
+            return e
+        if not finite3(log_scale):  # -inf would be an axis of length 0, which log 0 is not meant to say
             return e
         e.quat = q / e.quat_length
         e.scales = vec3(wp.exp(log_scale[0]), wp.exp(log_scale[1]), wp.exp(log_scale[2]))
-        if not finite3(e.scales):
-            return e
-
         e.pixel = vec2(px, py)
         margin = real(FRUSTUM_MARGIN)
         e.clamped = vec2(
@@ -153,6 +150,8 @@ def make_projection(real):
             return e
         # det grows with the fourth power of the axes: shrink them below 2^16 px by exact powers of two.
         largest = wp.max(wp.max(wp.abs(m1)), wp.max(wp.abs(m2)))
+        if not (largest <= real(LARGEST_AXIS)):
+            return e
         shrink = real(1.0)
         while largest > real(65536.0):
             largest *= real(1.0 / 65536.0)
@@ -169,7 +168,7 @@ def make_projection(real):
         e.a = aa + blur
         e.b = wp.dot(e.m1, e.m2)
         e.c = cc + blur
-        if e.det > real(0.0) and e.c > real(0.0):
+        if e.det >= real(SMALLEST_DETERMINANT) and e.c >= real(SMALLEST_DETERMINANT):
             e.valid = 1
         return e
 

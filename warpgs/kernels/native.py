@@ -56,29 +56,35 @@ _CLEAR = """
                 from[i] = 0.0f;
 """
 
-# Rows of K x 3 floats are a multiple of 16 bytes for K = 4 and 16. Weights past the count are zero.
+# Rows of K x 3 floats are a multiple of 16 bytes for K = 4 and 16. What lies past the count is loaded along, and not used:
+# it may be anything, a NaN too.
 _COLOR = """
     const int size = sh.shape[1];
     const float* row = reinterpret_cast<const float*>(sh.data) + 3ll * size * n;
-    float sum[3] = {0.0f, 0.0f, 0.0f};
+    float sum[3] = {0.0f, 0.0f, 0.0f}, largest = 0.0f;
+    auto take = [&](int i, float c) {
+        if (i < 3 * count) {
+            sum[i % 3] += weights[i / 3] * c;
+            largest = fmaxf(largest, fabsf(c));
+        }
+    };
     if (size % 4 == 0) {
         #pragma unroll
         for (int q = 0; q < 12; ++q)
             if (4 * q < 3 * count) {
                 const float4 v = reinterpret_cast<const float4*>(row)[q];
-                sum[(4 * q) % 3] += weights[(4 * q) / 3] * v.x;
-                sum[(4 * q + 1) % 3] += weights[(4 * q + 1) / 3] * v.y;
-                sum[(4 * q + 2) % 3] += weights[(4 * q + 2) / 3] * v.z;
-                sum[(4 * q + 3) % 3] += weights[(4 * q + 3) / 3] * v.w;
+                take(4 * q, v.x);
+                take(4 * q + 1, v.y);
+                take(4 * q + 2, v.z);
+                take(4 * q + 3, v.w);
             }
     } else {
         #pragma unroll
-        for (int k = 0; k < 16; ++k)
-            if (k < count)
-                for (int channel = 0; channel < 3; ++channel)
-                    sum[channel] += weights[k] * row[3 * k + channel];
+        for (int i = 0; i < 48; ++i)
+            if (i < 3 * count)
+                take(i, row[i]);
     }
-    return wp::vec3(sum[0], sum[1], sum[2]);
+    return wp::vec4(sum[0], sum[1], sum[2], largest);
 """
 
 _COLOR_BACKWARD = """
@@ -86,21 +92,23 @@ _COLOR_BACKWARD = """
     const float* row = reinterpret_cast<const float*>(sh.data) + 3ll * size * n;
     float* v_row = reinterpret_cast<float*>(v_sh.data) + 3ll * size * n;
     wp::vec_t<16, float> w;
+    auto give = [&](int i, float c, float& sum) {
+        if (i < 3 * count) {
+            w[i / 3] += c * v[i % 3];
+            sum += weights[i / 3] * v[i % 3];
+        }
+    };
     if (size % 4 == 0) {
         #pragma unroll
         for (int q = 0; q < 12; ++q) {
             float4* to = reinterpret_cast<float4*>(v_row) + q;
             if (4 * q < 3 * count) {
                 const float4 c = reinterpret_cast<const float4*>(row)[q];
-                w[(4 * q) / 3] += c.x * v[(4 * q) % 3];
-                w[(4 * q + 1) / 3] += c.y * v[(4 * q + 1) % 3];
-                w[(4 * q + 2) / 3] += c.z * v[(4 * q + 2) % 3];
-                w[(4 * q + 3) / 3] += c.w * v[(4 * q + 3) % 3];
                 float4 sum = add ? *to : make_float4(0.0f, 0.0f, 0.0f, 0.0f);
-                sum.x += weights[(4 * q) / 3] * v[(4 * q) % 3];
-                sum.y += weights[(4 * q + 1) / 3] * v[(4 * q + 1) % 3];
-                sum.z += weights[(4 * q + 2) / 3] * v[(4 * q + 2) % 3];
-                sum.w += weights[(4 * q + 3) / 3] * v[(4 * q + 3) % 3];
+                give(4 * q, c.x, sum.x);
+                give(4 * q + 1, c.y, sum.y);
+                give(4 * q + 2, c.z, sum.z);
+                give(4 * q + 3, c.w, sum.w);
                 *to = sum;
             } else if (!add && 4 * q < 3 * size)
                 *to = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
@@ -177,8 +185,8 @@ def make_functions():
         ...
 
     @wp.func_native(_COLOR)
-    def color(sh: wp.array2d(dtype=wp.vec3), n: int, count: int, weights: vec16) -> wp.vec3:
-        """Weighted sum of the first ``count`` coefficients of row n; the other weights must be 0."""
+    def color(sh: wp.array2d(dtype=wp.vec3), n: int, count: int, weights: vec16) -> wp.vec4:
+        """Weighted sum of the first ``count`` coefficients of row n, and the largest of their magnitudes (NaN aside)."""
         ...
 
     @wp.func_native(_COLOR_BACKWARD)

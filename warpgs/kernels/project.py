@@ -6,7 +6,7 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from warpgs.constants import Rule
+from warpgs.constants import LARGEST_COEFFICIENT, Rule
 from warpgs.kernels import bridge, sh
 from warpgs.kernels.functions import make_projection, make_spans
 from warpgs.kernels.native import BLOCK
@@ -55,6 +55,8 @@ def make_forward(real, native: bool):
         opacity = m.sigmoid(logit_opacities[n])
         if opacity_factors.shape[0] > 0:
             opacity *= opacity_factors[n]
+        if not (wp.isfinite(logit_opacities[n]) and wp.isfinite(opacity)):
+            return 0
         if not (opacity > real(0.0) and opacity >= alpha_cut):
             return 0
 
@@ -90,16 +92,17 @@ def make_forward(real, native: bool):
         d = m.direction(means[n], view)
         y = basis(vec3(d[0], d[1], d[2]))
         color = vec3(real(0.5), real(0.5), real(0.5))
+        largest = real(0.0)
         if wp.static(native):
-            for k in range(16):
-                if k >= sh_count:
-                    y[k] = real(0.0)
-            color += color_of(coefficients, n, sh_count, y)
+            shaded = color_of(coefficients, n, sh_count, y)
+            color += vec3(shaded[0], shaded[1], shaded[2])
+            largest = shaded[3]
         else:
             for k in range(16):
                 if k < sh_count:
                     color += y[k] * coefficients[n, k]
-        if not m.finite3(color):
+                    largest = wp.max(largest, wp.max(wp.abs(coefficients[n, k])))
+        if not (m.finite3(color) and largest <= real(LARGEST_COEFFICIENT)):  # the maximum passes a NaN by, the colour has it
             return 0
         record = vec12()
         record[0] = e.pixel[0]
@@ -227,13 +230,13 @@ def project(
     """Project N Gaussians into C cameras (EWA, first order).
 
     Differentiable in every tensor. A Gaussian is culled, with an all-zero record and zero gradients, where its depth is
-    below ``rule.near``, its opacity below the cut, its box outside the image, or anything it needs is not finite. The
-    largest scale that renders is the one whose projected axes are finite in the scalar type: 3.4e38 px in float32.
+    below ``rule.near``, its opacity below the cut, its box outside the image, a parameter that is read not finite, or
+    outside the ranges of docs/conventions.md (depth 1e10 u, projected mean 1e9 px, axes 1e30 px, coefficients 1e6).
     Derivation of the backward pass: docs/project.md.
 
     Args:
         means: World positions [u], shape [N, 3].
-        quats: Rotations wxyz of any non-zero length, shape [N, 4].
+        quats: Rotations wxyz of any length from 1e-15 to 1e15, shape [N, 4].
         log_scales: Logarithm of the axis lengths [u], shape [N, 3].
         logit_opacities: Inverse sigmoid of the opacity, shape [N].
         sh_coefficients: Colour coefficients, shape [N, K, 3].

@@ -84,16 +84,16 @@ def make_backward(real, native: bool):
                 t11 = v_splats[i, 2] * e.shrink * (e.c * inv_c * inv_det)
                 t12 = v_splats[i, 3] * e.shrink * (-e.b * inv_c * inv_det)
                 t22 = v_splats[i, 4] * e.shrink * inv_c
-                v_det = real(-0.5) * (t11 + t12) / e.det
-                v_c = real(0.5) * (t11 - t12 - t22) / e.c
-                v_b = -v_splats[i, 3] * e.shrink * inv_c * inv_det
+                # twice v_det det and v_c c, times shrink; det and c divide vectors of their own size, or needles overflow
+                s_det = -(t11 + t12) * e.shrink
+                s_c = (t11 - t12 - t22) * e.shrink
+                v_b = -v_splats[i, 3] * e.shrink * inv_c * (e.shrink * inv_det)
                 blur = low_pass * e.shrink * e.shrink
                 normal = wp.cross(e.m1, e.m2)
-                two = real(2.0)
-                v_m1 = two * v_det * (wp.cross(e.m2, normal) + blur * e.m1) + v_b * e.m2
-                v_m2 = two * v_det * (wp.cross(normal, e.m1) + blur * e.m2) + v_b * e.m1 + two * v_c * e.m2
-                v_m1 = v_m1 * e.shrink
-                v_m2 = v_m2 * e.shrink
+                per_det = real(1.0) / e.det
+                per_c = real(1.0) / e.c
+                v_m1 = s_det * (per_det * (wp.cross(e.m2, normal) + blur * e.m1)) + v_b * e.m2
+                v_m2 = s_det * (per_det * (wp.cross(normal, e.m1) + blur * e.m2)) + v_b * e.m1 + s_c * (per_c * e.m2)
 
                 # projected axes -> camera axes and Jacobian (section 3)
                 fx = K[0, 0]
@@ -158,9 +158,6 @@ def make_backward(real, native: bool):
                         v_color[channel] = real(0.0)
                 w = vec16()
                 if wp.static(native):
-                    for k in range(16):
-                        if k >= sh_count:
-                            basis[k] = real(0.0)
                     w = color_backward(coefficients, n, sh_count, basis, v_color, stored, v_coefficients)
                     stored += 1
                 else:

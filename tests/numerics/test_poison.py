@@ -1,0 +1,77 @@
+"""The poison fuzz in small: non-finite Gaussians are not there at all, finite extremes are drawn right or not at all."""
+
+import pytest
+import torch
+
+from tests.numerics.fuzz import TWIN_LIMIT, fuzz, load, save
+from tests.numerics.poison import SLOTS, VALUES, Case, failures, make_case, non_finite, twin_error
+from tests.splats import camera, cloud
+from warpgs.scene import Gaussians
+
+
+def test_the_fuzz_is_as_wide_as_it_says():
+    """14 slots, 22 values, and each value reaches each slot."""
+    assert len(SLOTS) == 14 and len(VALUES) == 22
+    case = make_case(0, 3)
+    again = make_case(0, 3)
+    same = zip(case.gaussians.tensors().values(), again.gaussians.tensors().values())
+    assert all(torch.equal(a.view(torch.int32), b.view(torch.int32)) for a, b in same)
+    assert bool(non_finite(case.gaussians).any()) and not bool((non_finite(case.gaussians) & ~case.poisoned).any())
+
+
+@pytest.mark.parametrize("slot", range(len(SLOTS)), ids=[f"{n}{k}" for n, k in SLOTS])
+def test_every_value_in_every_slot(device, slot):
+    """22 Gaussians of a cloud, each with one value of the list in this slot, one after the other and all together."""
+    name, column = SLOTS[slot]
+    gaussians = cloud(3 * len(VALUES))
+    gaussians.tensors()[name].view(3 * len(VALUES), -1)[1::3, column] = torch.tensor(VALUES)
+    poisoned = torch.zeros(3 * len(VALUES), dtype=torch.bool)
+    poisoned[1::3] = True
+    for rule in ("exact", "gsplat", "inria"):
+        case = Case(gaussians, poisoned, camera(40, 30, cameras=2, dtype=torch.float32), rule)
+        assert int(non_finite(gaussians).sum()) == 4
+        assert failures(case, device)[0] == []
+
+
+def test_random_scenes(device):
+    """Ten scenes, a poisoned share of up to 95 %."""
+    for number in range(10):
+        assert failures(make_case(1, number, largest=2000), device)[0] == [], number
+
+
+def test_finite_extremes_equal_float64(device):
+    """What is drawn of finite extremes is what float64 draws; the same Gaussians are culled."""
+    drawn = 0
+    for number in range(20):
+        error, _, visible = twin_error(2, number, device)
+        assert error <= TWIN_LIMIT, number
+        drawn += visible
+    assert drawn > 100
+
+
+def test_a_failure_can_be_replayed(tmp_path, monkeypatch, capsys):
+    """A broken scene is kept, counted, and reads back as it was; the last line says how many there were."""
+    monkeypatch.setattr("tests.numerics.fuzz.failures", lambda case, device: (["all of it"], 0))
+    monkeypatch.setattr("tests.numerics.fuzz.twin_error", lambda *_: (0.0, 0, 0))
+    assert fuzz("cpu", 1, 5, 100, tmp_path) == 1
+    out = capsys.readouterr().out
+    assert "all of it" in out and out.splitlines()[-1].startswith("1 failures in ")
+    case, kept = make_case(5, 0, 100), load(tmp_path / "fuzz-5-0.safetensors")
+    for a, b in zip(case.gaussians.tensors().values(), kept.gaussians.tensors().values()):
+        assert torch.equal(a.view(torch.int32), b.view(torch.int32))
+    assert kept.rule == case.rule and kept.camera.width == case.camera.width
+    save(kept, tmp_path / "again.safetensors", [])
+
+
+def test_the_fuzz_sees_a_gaussian_that_is_painted():
+    """The checks themselves: a Gaussian taken for non-finite although it is drawn is reported in every picture."""
+    case = make_case(0, 3, 200)
+    quiet = Gaussians(**{n: t.nan_to_num(0.1, 0.1, 0.1) for n, t in case.gaussians.tensors().items()})
+    assert failures(Case(quiet, case.poisoned, case.camera, case.rule), "cpu")[0] == []
+    import tests.numerics.poison as module
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "non_finite", lambda g: torch.arange(len(g)) % 2 == 0)
+        wrong, _ = failures(Case(quiet, case.poisoned, case.camera, case.rule), "cpu")
+    assert any("were drawn" in w for w in wrong) and any("rgb changes" in w for w in wrong)
+    assert any("v_means is not zero" in w for w in wrong)
