@@ -168,7 +168,7 @@ class Gaussians:
     means: torch.Tensor
     """World positions [u], shape [N, 3]."""
     quats: torch.Tensor
-    """Rotations wxyz, any non-zero length, shape [N, 4]."""
+    """Rotations wxyz, any length from 1e-15 to 1e15, shape [N, 4]."""
     log_scales: torch.Tensor
     """Natural logarithm of the axis lengths [u], shape [N, 3]."""
     logit_opacities: torch.Tensor

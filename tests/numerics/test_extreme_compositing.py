@@ -99,7 +99,7 @@ def test_gradient_on_either_side_of_the_clamp(device, opacity, passes):
     def alpha_at(step):
         moved = gaussians.logit_opacities.detach().clone()
         moved[0] += step
-        return float(pictures(Gaussians(**(gaussians.tensors() | {"logit_opacities": moved})), cam)[1].sum())
+        return float(pictures(Gaussians(**(gaussians.tensors() | {"logit_opacities": moved})), cam)[1].detach().sum())
 
     numeric = (alpha_at(1e-5) - alpha_at(-1e-5)) / 2e-5
     assert abs(float(found) - numeric) <= 1e-6 * abs(numeric)
@@ -313,8 +313,9 @@ def test_exponential_in_ulps(device):
     inside = radii <= math.sqrt(2 * math.log(255))
     ulps = ((found - exact).abs() / exact / 2.0**-24)[inside]
     shares = [float((ulps > limit).double().mean()) for limit in (1, 2, 4, 8, 16)]
-    assert float(ulps.max()) <= 16, shares  # measured 13.3 on a CPU, mean 1.7
-    assert float(ulps.mean()) <= 3, shares
+    # measured 13.3 on a CPU, mean 1.7. CUDA scales the factor once more and has an exponential of 2 units itself
+    most, average = (32, 6) if device.type == "cuda" else (16, 3)
+    assert float(ulps.max()) <= most and float(ulps.mean()) <= average, (float(ulps.max()), float(ulps.mean()), shares)
     # beyond, only what is too small for anything to be seen may differ; measured 2.7e-9
     assert float((found - exact)[~inside].abs().max()) <= 1e-8
     assert bool((found[-2:] <= 1e-33).all())

@@ -1,6 +1,7 @@
 """Projection at the ends of what numbers can say; docs/extremes.md lists the rows (P1 to P14) and what else holds them."""
 
 import functools
+import itertools
 import math
 
 import numpy as np
@@ -368,3 +369,28 @@ def test_documented_ranges_are_those_of_the_kernel(device, dtype):
         assert finite(found), i
         moved = Gaussians(**{n: t.cpu() for n, t in g.tensors().items()})
         assert bool(documented(moved, on_cpu, EXACT.near)[0][0]) == (i % 2 == 0), i
+
+
+def test_corners_of_the_ranges_are_finite(device):
+    """Every combination of ends: mean on screen or 1e9 px off, at `near` or FAR, axes of 1e-30 to 1e30 px, quaternions and
+    coefficients at their limits. Pictures and gradients are finite, those of pose and intrinsics too, and many are drawn.
+    """
+    cam = camera(20, 16, cameras=1, dtype=torch.float32, device=device)
+    focal, count = float(cam.K[0, 0, 0]), 0
+    weights = torch.randn(16, 20, 5, generator=torch.Generator().manual_seed(0)).to(device)
+    lengths = (1e-30, 30.0, 1e9, 3e19, 0.5 * LARGEST_AXIS)  # 30 by 3e19 px has nearly the smallest determinant
+    corners = itertools.product((0.0, 0.9 * FARTHEST_PIXEL), (0.0101, 0.99 * FAR), itertools.product(lengths, repeat=3))
+    for number, (off, z, axes) in enumerate(corners):
+        log_scales = [math.log(a) + math.log(z / focal) for a in axes]
+        length = (1.0, 1.1 * SHORTEST_QUAT, 0.9 / SHORTEST_QUAT)[number % 3]
+        g = one(
+            (off / focal * z, 0.1 * z, z), log_scales, (0.8 * length, 0.1 * length, 0.5 * length, 0.3 * length), device=device
+        )
+        g.sh[0, number % 4] = 0.99 * LARGEST_COEFFICIENT
+        moving, view, K = leaves(g), cam.viewmat.clone().requires_grad_(), cam.K.clone().requires_grad_()
+        r = rasterize(moving, Camera(view, K, 20, 16), RasterizeOptions(background=(0.2, 0.5, 0.8)))
+        loss = (torch.cat([r.rgb, r.alpha[..., None], r.depth[..., None]], -1) * weights).sum()
+        found = torch.autograd.grad(loss, [*moving.tensors().values(), view, K])
+        assert finite([r.rgb, r.alpha, r.depth, *found]), (off, z, axes)
+        count += int(r.visible.sum())
+    assert count > 100, count
