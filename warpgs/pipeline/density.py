@@ -44,8 +44,14 @@ class DensityConfig:
     def __post_init__(self):
         if self.every < 1 or self.start < 0 or self.reset_every < 0 or self.max_gaussians < 1:
             raise UsageError("density: every and max gaussians must be at least 1, start and reset every at least 0")
-        if not 0 <= self.stop_share <= 1:
-            raise UsageError(f"density stop share {self.stop_share} must lie between 0 and 1")
+        for name in ("stop_share", "prune_opacity"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise UsageError(f"density {name.replace('_', ' ')} {getattr(self, name)} must lie between 0 and 1")
+        for name in ("gradient", "clone_size", "prune_size"):
+            if not getattr(self, name) >= 0:
+                raise UsageError(f"density {name.replace('_', ' ')} must be at least 0, not {getattr(self, name)}")
+        if not 0 < self.reset_opacity < 1:
+            raise UsageError(f"density reset opacity {self.reset_opacity} must lie between 0 and 1")
 
     def times(self, steps: int) -> tuple[int, int, int]:
         """First event, interval and last event [steps] in a fit of that length; a short fit starts after a quarter of it."""

@@ -12,7 +12,7 @@ import torch
 from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.kernels.knn import mean_square_distances
-from warpgs.kernels.sh import C0, coefficient_count
+from warpgs.kernels.sh import C0, MAX_DEGREE, coefficient_count
 from warpgs.pipeline.coarse import coarse_points, depth_bounds
 from warpgs.pipeline.region import counted_region
 from warpgs.priors.epipolar import EpipolarConfig, flow_depth
@@ -75,6 +75,8 @@ class InitConfig:
         self.epipolar()  # its own checks
         if not 0 < self.opacity < 1:
             raise UsageError(f"init opacity {self.opacity} must lie between 0 and 1")
+        if not 0 <= self.max_sh_degree <= MAX_DEGREE:
+            raise UsageError(f"init max sh degree {self.max_sh_degree} must lie between 0 and {MAX_DEGREE}")
         if self.random_count < 1:
             raise UsageError(f"init random count {self.random_count} must be at least 1")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -35,8 +36,8 @@ class OptimizerConfig:
 
     def __post_init__(self):
         for name, value in vars(self).items():
-            if not value > 0:
-                raise UsageError(f"optimizer {name} must be positive, not {value}")
+            if not 0 < value < math.inf:
+                raise UsageError(f"optimizer {name} must be positive and finite, not {value}")
 
 
 class Optimizer:
