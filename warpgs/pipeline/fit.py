@@ -48,6 +48,7 @@ class StepReport:
     """Wall time of the step [s]."""
 
 
+@dataclass(frozen=True)
 class Phase:
     """What a step does beyond rendering, comparing and updating; steps of one phase can share a recording."""
 
