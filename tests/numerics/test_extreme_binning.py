@@ -1,4 +1,4 @@
-"""Binning and sorting at the limits of their numbers, and pictures of extreme sizes (docs/extremes.md, section 3)."""
+"""Binning and sorting at the limits of their numbers, and pictures of extreme sizes (docs/extremes.md)."""
 
 import dataclasses
 

@@ -214,7 +214,8 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
         return
     inputs = [a.array() if isinstance(a, View) else a for a in inputs]
     threads = torch.get_num_threads()
-    if threads == 1 or count == 1 or count * cost < SERIAL_WORK:
+    # A kernel of Warp 1.19 for x86 keeps a pointer into its stack in a static variable, which only optimised code leaves out.
+    if threads == 1 or count == 1 or count * cost < SERIAL_WORK or wp.config.mode == "debug":
         wp.launch(kernel, count, inputs=[0, *inputs], device="cpu", record_tape=False)
         return
     # Compiling from several threads at once is not safe; launches on a CPU are compiled for blocks of one thread.

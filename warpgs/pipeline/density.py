@@ -30,7 +30,8 @@ class DensityConfig:
     prune_opacity: float = 0.005
     """Gaussians below this opacity are removed."""
     prune_size: float = 0.1
-    """Gaussians larger than this share of the extent are removed, once an opacity reset has happened; 0 for never."""
+    """Gaussians larger than this share of the extent are removed, once an opacity reset has happened, but not where more than
+    half of all are; 0 for never."""
     reset_every: int = 0
     """Steps between opacity resets, 3000 in Kerbl et al. 2023; 0 for none. With few views a reset costs decibels that the
     rest of the fit does not win back (docs/decisions/002-no-opacity-reset.md)."""
@@ -168,7 +169,9 @@ def refine(
         small = scales <= config.clone_size * extent
         faint = ~(opacities >= config.prune_opacity)
         if after_reset and config.prune_size > 0:
-            faint |= scales > config.prune_size * extent
+            huge = scales > config.prune_size * extent
+            if 2 * int(huge.sum()) <= len(gaussians):  # else it is the extent that is small: the cameras stand close together
+                faint |= huge
         if protected is not None:
             faint &= ~protected
         if bool(faint.all()):

@@ -96,10 +96,14 @@ class Start(NamedTuple):
 
 
 def camera_depths(views: list[View]) -> tuple[float, float]:
-    """Near and far depth [u] where nothing else is known: 0.1 and 10 times the distance to the cameras' focus point."""
+    """Near and far depth [u] where nothing else is known: 0.1 and 10 times the distance to the cameras' focus point.
+
+    Cameras in one place with one direction have no such point; then it is one unit, which the scene's scale was chosen for.
+    """
     focus = geometry.focus_point([v.camera for v in views])
     distance = float(np.median([np.linalg.norm(v.camera.center - focus) for v in views]))
-    return 0.1 * max(distance, 1e-3), 10 * max(distance, 1e-3)
+    distance = distance if distance > 1e-3 else 1.0
+    return 0.1 * distance, 10 * distance
 
 
 def nearest(points: np.ndarray, queries: np.ndarray, count: int) -> np.ndarray:
