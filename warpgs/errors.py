@@ -22,6 +22,10 @@ class DataError(WarpgsError):
     exit_code = 3
 
 
+class NotFiniteError(WarpgsError):
+    """The loss or a parameter of a fit stopped being a number."""
+
+
 class ResourceError(WarpgsError):
     """Memory, disk or a device does not suffice; the message names the need and what there is."""
 

@@ -42,7 +42,10 @@ def _source(name: str, tile_size: int, **numbers) -> str:
 
 @functools.cache
 def make_kernels(tile_size: int):
-    """Forward and contribution kernels for one tile size. Images and records are flat."""
+    """Forward and contribution kernels for one tile size.
+
+    Images and records are flat; what there is per instance has rows, as a flat array could be too long for 32-bit sizes.
+    """
 
     @wp.func_native(_source("forward", tile_size))
     def forward_body(
@@ -52,7 +55,7 @@ def make_kernels(tile_size: int):
         alpha_cut: float, alpha_max: float, whole_tiles: int, stop: float, inclusive: int, chunk: int,
         rgb: wp.array(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
         transmittances: wp.array(dtype=float), weights: wp.array(dtype=float), ends: wp.array(dtype=int),
-        states: wp.array(dtype=float),
+        states: wp.array2d(dtype=float),
     ): ...  # fmt: skip
 
     @wp.func_native(source("blend_order.cu"))
@@ -77,7 +80,7 @@ def make_kernels(tile_size: int):
         # outputs
         rgb: wp.array(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
         transmittances: wp.array(dtype=float), weights: wp.array(dtype=float), ends: wp.array(dtype=int),
-        states: wp.array(dtype=float),
+        states: wp.array2d(dtype=float),
     ):  # fmt: skip
         forward_body(
             wp.tid() // 32, splats, order, ranges, splat_ids, backgrounds, origin_x, origin_y, width, height, columns, tiles,
@@ -125,15 +128,15 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
         origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int, no_tile: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int,
         rgb: wp.array(dtype=float), depth: wp.array(dtype=float), transmittances: wp.array(dtype=float),
-        weights: wp.array(dtype=float), ends: wp.array(dtype=int), states: wp.array(dtype=float),
+        weights: wp.array(dtype=float), ends: wp.array(dtype=int), states: wp.array2d(dtype=float),
         v_rgb: wp.array(dtype=float), v_alpha: wp.array(dtype=float), v_depth: wp.array(dtype=float),
-        v_slots: wp.array(dtype=float),
+        v_slots: wp.array2d(dtype=float),
     ): ...  # fmt: skip
 
     @wp.func_native(_source("gather", tile_size, **numbers))
     def gather_body(
         i: int, splats: wp.array(dtype=float), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
-        v_slots: wp.array(dtype=float), v_splats: wp.array(dtype=float),
+        v_slots: wp.array2d(dtype=float), v_splats: wp.array(dtype=float),
     ): ...  # fmt: skip
 
     name = f"warpgs.kernels.blend_cuda.backward.{tile_size}.{int(with_depth)}.{chunk}.{int(atomic)}"
@@ -149,10 +152,10 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
         origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int, no_tile: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int,
         rgb: wp.array(dtype=float), depth: wp.array(dtype=float), transmittances: wp.array(dtype=float),
-        weights: wp.array(dtype=float), ends: wp.array(dtype=int), states: wp.array(dtype=float),
+        weights: wp.array(dtype=float), ends: wp.array(dtype=int), states: wp.array2d(dtype=float),
         v_rgb: wp.array(dtype=float), v_alpha: wp.array(dtype=float), v_depth: wp.array(dtype=float),
         # outputs
-        v_slots: wp.array(dtype=float),
+        v_slots: wp.array2d(dtype=float),
     ):  # fmt: skip
         backward_body(
             wp.tid() // 32, splats, keys, ranges, splat_ids, slots, totals, capacity, backgrounds,
@@ -163,7 +166,7 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
     @wp.kernel(**options)
     def gather(
         begin: int, splats: wp.array(dtype=float), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
-        v_slots: wp.array(dtype=float),
+        v_slots: wp.array2d(dtype=float),
         # outputs
         v_splats: wp.array(dtype=float),
     ):  # fmt: skip
@@ -202,7 +205,7 @@ def forward(
     ends = torch.empty(shape, dtype=torch.int32, device=device)
     pixels = tiles.size * tiles.size
     chunk = chunk_of(tiles, deterministic) if keep else 0
-    states = splats.new_empty((tiles.slots.shape[0] // chunk + 1) * STATE * pixels if keep else 0)
+    states = splats.new_empty(tiles.slots.shape[0] // chunk + 1 if keep else 0, STATE * pixels)
     k, count = make_kernels(tiles.size), tiles.ranges.shape[0]
     order = torch.empty(count, dtype=torch.int32, device=device)
     bridge.launch(k.order_tiles, 1024, [*_ints(tiles.ranges), count, *_ints(order)], device, block_dim=1024)
@@ -210,7 +213,7 @@ def forward(
         *_floats(splats), *_ints(order, tiles.ranges, tiles.splat_ids), *_floats(backgrounds),
         *_frame(origin, width, height, tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
         rule.transmittance_stop, int(rule.inclusive_stop), chunk,
-        *_floats(rgb, alpha, depth, transmittances, weights), *_ints(ends), *_floats(states),
+        *_floats(rgb, alpha, depth, transmittances, weights), *_ints(ends), bridge.view(states, wp.float32),
     ]  # fmt: skip
     bridge.launch(k.forward, count * pixels, inputs, device, block_dim=32 * WARPS)
     return rgb, alpha, depth, transmittances, weights, ends, states
@@ -231,16 +234,16 @@ def backward(
     else:
         v_alpha = v_depth = depth  # never read
     v_splats = torch.empty_like(splats) if deterministic else torch.zeros_like(splats)
-    v_slots = splats.new_empty(count, STRIDE) if deterministic else v_splats
+    v_slots = splats.new_empty(count, STRIDE) if deterministic else v_splats.view(-1, STRIDE)
     inputs = [
         *_floats(splats), *_ints(tiles.tile_ids, tiles.ranges, tiles.splat_ids, tiles.slots),
         bridge.view(tiles.total, wp.int64), count, *_floats(backgrounds), *_frame(origin, width, height, tiles.size),
         tiles.ranges.shape[0], rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
-        *_floats(rgb, depth, transmittances, weights), *_ints(ends), *_floats(states),
-        *_floats(v_rgb.contiguous(), v_alpha, v_depth, v_slots),
+        *_floats(rgb, depth, transmittances, weights), *_ints(ends), bridge.view(states, wp.float32),
+        *_floats(v_rgb.contiguous(), v_alpha, v_depth), bridge.view(v_slots, wp.float32),
     ]  # fmt: skip
     bridge.launch(k.backward, 32 * -(-count // chunk), inputs, device, block_dim=32 * WARPS)
-    inputs = [*_floats(splats), *_ints(tiles.starts, tiles.counts), *_floats(v_slots, v_splats)]
+    inputs = [*_floats(splats), *_ints(tiles.starts, tiles.counts), bridge.view(v_slots, wp.float32), *_floats(v_splats)]
     bridge.launch(k.gather, -(-tiles.counts.shape[0] // 256) * 256, inputs, device)
     return v_splats
 

@@ -14,6 +14,8 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
+from warpgs.errors import ResourceError
+
 wp.config.log_level = wp.LOG_WARNING  # its banner and compile notes are not for our users
 
 
@@ -49,6 +51,18 @@ SERIAL_WORK = 20_000
 """Launches with less work than this (items times cost) stay on the calling thread: a hand-over costs about 50 us."""
 
 
+MAX_SIZE = 2**31 - 1
+"""Warp numbers the entries of an axis, and the items of a launch, in signed 32 bits."""
+
+
+def _check_size(size: int) -> None:
+    if size > MAX_SIZE:
+        raise ResourceError(
+            f"an array of {size:,} entries is beyond the {MAX_SIZE:,} that kernels can number; use fewer Gaussians or "
+            "coefficients, smaller images, or fewer cameras at once"
+        )
+
+
 def real_of(tensor: torch.Tensor) -> type:
     """Warp scalar type of a tensor: float32 or float64; TypeError for any other."""
     if tensor.dtype not in REALS:
@@ -74,6 +88,8 @@ class View(NamedTuple):
 
     def array(self) -> wp.array:
         """The same memory as a Warp array, without a copy and without gradient."""
+        for size in self.tensor.shape:
+            _check_size(size)
         return wp.from_torch(self.tensor.detach(), dtype=self.dtype, requires_grad=False)
 
 
@@ -158,6 +174,7 @@ class _Recorded:
                 packed = command.params[i + 2]  # after the bounds and ``begin``
                 packed.data = now[0]
                 for axis in range(packed.ndim):
+                    _check_size(now[1][axis])  # it would wrap around
                     packed.shape[axis] = now[1][axis]
                 if packed.ndim == 2:
                     packed.strides[0] = tensor.stride(0) * tensor.element_size()
@@ -185,15 +202,20 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
         device: Where the arrays live.
         cost: Rough work of an item in units of 10 ns, to decide whether threads pay.
         block_dim: CUDA threads per block.
+
+    Raises:
+        ResourceError: There are more items, or entries along an axis, than 32 bits can number.
     """
     if count == 0:
         return
+    _check_size(count)
     if device.type == "cuda":
         _recorded(kernel, device, block_dim).launch(count, inputs, warp_stream(device))
         return
     inputs = [a.array() if isinstance(a, View) else a for a in inputs]
     threads = torch.get_num_threads()
-    if threads == 1 or count == 1 or count * cost < SERIAL_WORK:
+    # A kernel of Warp 1.19 for x86 keeps a pointer into its stack in a static variable, which only optimised code leaves out.
+    if threads == 1 or count == 1 or count * cost < SERIAL_WORK or wp.config.mode == "debug":
         wp.launch(kernel, count, inputs=[0, *inputs], device="cpu", record_tape=False)
         return
     # Compiling from several threads at once is not safe; launches on a CPU are compiled for blocks of one thread.

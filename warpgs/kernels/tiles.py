@@ -21,13 +21,15 @@ BYTES_PER_INSTANCE = LIST_BYTES + 48 + 80
 (blend_cuda.CHUNKS)."""
 
 VISIBLE = 2**36
-"""What a visible Gaussian adds to a running sum of tile counts, so that one sum has both; of either there are fewer."""
+"""What a visible Gaussian adds to a running sum of tile counts, so that one sum has both; more are counted apart first."""
+MAX_VISIBLE = 2**63 // VISIBLE - 1
+"""Visible Gaussians that such a sum has room for."""
 
 SMALL = 32
 """Tiles of a Gaussian that one CUDA thread lists alone."""
 
-MAX_INSTANCES = 2**31 - 1
-"""Warp's array sizes and thread numbers are signed 32-bit."""
+MAX_INSTANCES = bridge.MAX_SIZE // 2
+"""A radix sort wants one array of twice that size."""
 
 
 @dataclass(frozen=True)
@@ -263,12 +265,13 @@ def installed_bytes(device: torch.device) -> int:
 def _check_total(total: int, visible: int, device: torch.device, tiles: int, budget_bytes: int | None) -> None:
     needed = total * BYTES_PER_INSTANCE
     # asking what is free costs 0.1 ms or more: not worth it for a twentieth of the machine
-    if total <= MAX_INSTANCES and budget_bytes is None and needed < installed_bytes(device) // 20:
+    countable = total <= MAX_INSTANCES and visible <= MAX_VISIBLE
+    if countable and budget_bytes is None and needed < installed_bytes(device) // 20:
         return
     budget = available_bytes(device) * 4 // 5 if budget_bytes is None else budget_bytes
-    if total <= MAX_INSTANCES and needed <= budget:
+    if countable and needed <= budget:
         return
-    limit = f"{MAX_INSTANCES:,} instances" if total > MAX_INSTANCES else f"{budget / 2**30:.2f} GiB"
+    limit = f"{budget / 2**30:.2f} GiB" if countable else f"{MAX_INSTANCES:,} instances of {MAX_VISIBLE:,} Gaussians"
     raise ResourceError(
         f"binning {visible:,} visible Gaussians into tiles makes {total:,} (Gaussian, tile) instances, "
         f"{total / max(visible, 1):.0f} of {tiles} tiles each on average, which needs {needed / 2**30:.2f} GiB; the limit is "
@@ -310,7 +313,8 @@ def bin_tiles(
         The sorted instances; M is ``capacity`` where one is given.
 
     Raises:
-        ResourceError: The instances, counted in 64 bits before anything is allocated, exceed the budget or 2^31 - 1.
+        ResourceError: The instances, counted in 64 bits before anything is allocated, exceed the budget or 2^30 - 1; or
+            there are 2^31 tiles or 2^27 visible Gaussians or more.
         TypeError: A scalar type is neither float32 nor float64.
         ValueError: A shape disagrees.
     """
@@ -322,6 +326,11 @@ def bin_tiles(
     columns, rows = grid(width, height, tile_size)
     tiles, count = columns * rows, sizes["C"] * sizes["N"]
     no_tile = sizes["C"] * tiles
+    if no_tile > bridge.MAX_SIZE:
+        raise ResourceError(
+            f"{sizes['C']:,} images of {width} x {height} px have {no_tile:,} tiles of {tile_size} px, beyond the "
+            f"{bridge.MAX_SIZE:,} that can be numbered; draw fewer cameras at once, or a window of each"
+        )
     counts = tile_counts.contiguous().view(-1)
     ranges = torch.zeros(no_tile, 2, dtype=torch.int32, device=device)
     ints = functools.partial(torch.empty, dtype=torch.int32, device=device)
@@ -338,6 +347,9 @@ def bin_tiles(
         if fixed:
             visible, total = count, capacity
         else:
+            if count * tiles >= VISIBLE or count > MAX_VISIBLE:
+                many = torch.stack([(counts > 0).sum(), counts.sum(dtype=torch.int64)])
+                _check_total(*reversed(many.tolist()), device, tiles, budget_bytes)
             # One look at the device, before the sorts, tells how many are visible and how many tiles they touch.
             packed = longs(count)
             bridge.launch(k.pack_counts, count, [counts_view, bridge.view(packed, wp.int64)], device)

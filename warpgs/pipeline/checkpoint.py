@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from pathlib import Path
 
 import torch
 
-from warpgs.errors import DataError
+from warpgs.errors import DataError, NotFiniteError
 from warpgs.files import write_bytes
 
 TENSORS = "checkpoint.safetensors"
@@ -44,9 +45,18 @@ def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict)
         The file's path.
 
     Raises:
+        NotFiniteError: A tensor holds a NaN or an infinity; the last checkpoint is untouched.
         ResourceError: The disk is full or not writable; the last checkpoint is untouched.
     """
     path = folder / TENSORS
+    for name, t in tensors.items():
+        # the extremes tell without a copy, since torch lets a NaN win
+        if t.is_floating_point() and t.numel() and not all(math.isfinite(float(v)) for v in t.aminmax()):
+            raise NotFiniteError(
+                f"{path} was not written: {name} holds numbers that are not finite, so nothing after the last checkpoint, if "
+                "there is one, can be trusted. A fit repeats exactly: continued with --resume, it comes to the same place; "
+                "other settings, lower learning rates above all, lead elsewhere"
+            )
     chunks = _chunks(tensors, {"format": str(FORMAT), "state": json.dumps(state)})
     digest = hashlib.sha256()
     for chunk in chunks:

@@ -56,9 +56,11 @@ class FitConfig:
     priors: PriorConfig = field(default_factory=PriorConfig)
 
     def __post_init__(self):
-        for name in ("steps", "sh_every", "checkpoint_every"):
+        for name in ("steps", "sh_every", "checkpoint_every", "dropout_views"):
             if getattr(self, name) < 1:
                 raise UsageError(f"{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
+        if not 0 <= self.seed < 2**31:
+            raise UsageError(f"seed must be a whole number from 0 to 2^31 - 1, not {self.seed}")
         if self.memory_limit is not None and not self.memory_limit >= 1:
             raise UsageError(f"memory-limit must be at least one byte, not {self.memory_limit}")
         if not self.checkpoint_seconds >= 0:

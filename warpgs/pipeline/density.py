@@ -30,7 +30,8 @@ class DensityConfig:
     prune_opacity: float = 0.005
     """Gaussians below this opacity are removed."""
     prune_size: float = 0.1
-    """Gaussians larger than this share of the extent are removed, once an opacity reset has happened; 0 for never."""
+    """Gaussians larger than this share of the extent are removed, once an opacity reset has happened, but not where more than
+    half of all are; 0 for never."""
     reset_every: int = 0
     """Steps between opacity resets, 3000 in Kerbl et al. 2023; 0 for none. With few views a reset costs decibels that the
     rest of the fit does not win back (docs/decisions/002-no-opacity-reset.md)."""
@@ -44,8 +45,14 @@ class DensityConfig:
     def __post_init__(self):
         if self.every < 1 or self.start < 0 or self.reset_every < 0 or self.max_gaussians < 1:
             raise UsageError("density: every and max gaussians must be at least 1, start and reset every at least 0")
-        if not 0 <= self.stop_share <= 1:
-            raise UsageError(f"density stop share {self.stop_share} must lie between 0 and 1")
+        for name in ("stop_share", "prune_opacity"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise UsageError(f"density {name.replace('_', ' ')} {getattr(self, name)} must lie between 0 and 1")
+        for name in ("gradient", "clone_size", "prune_size"):
+            if not getattr(self, name) >= 0:
+                raise UsageError(f"density {name.replace('_', ' ')} must be at least 0, not {getattr(self, name)}")
+        if not 0 < self.reset_opacity < 1:
+            raise UsageError(f"density reset opacity {self.reset_opacity} must lie between 0 and 1")
 
     def times(self, steps: int) -> tuple[int, int, int]:
         """First event, interval and last event [steps] in a fit of that length; a short fit starts after a quarter of it."""
@@ -162,7 +169,9 @@ def refine(
         small = scales <= config.clone_size * extent
         faint = ~(opacities >= config.prune_opacity)
         if after_reset and config.prune_size > 0:
-            faint |= scales > config.prune_size * extent
+            huge = scales > config.prune_size * extent
+            if 2 * int(huge.sum()) <= len(gaussians):  # else it is the extent that is small: the cameras stand close together
+                faint |= huge
         if protected is not None:
             faint &= ~protected
         if bool(faint.all()):

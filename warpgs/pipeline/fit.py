@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from warpgs import geometry
-from warpgs.errors import DataError, WarpgsError
+from warpgs.errors import DataError, NotFiniteError
 from warpgs.kernels.dropout import opacity_dropout
 from warpgs.kernels.tiles import available_bytes
 from warpgs.pipeline.config import FitConfig
@@ -46,10 +46,6 @@ class StepReport:
     """Number of Gaussians."""
     seconds: float
     """Wall time of the step [s]."""
-
-
-class NotFiniteError(WarpgsError):
-    """The loss stopped being a number."""
 
 
 @dataclass(frozen=True)
@@ -380,6 +376,7 @@ def run(fit: Fit, on_step: Callable[[StepReport], None], save: Callable[[Fit], N
     """Take all remaining steps, reporting each and saving now and then and at the end.
 
     Raises:
+        NotFiniteError: The loss or, when it is to be saved, a number of the state is not finite; nothing of it is saved.
         KeyboardInterrupt: ``stopped`` said so after a step; the state after it is saved.
     """
     every, saved = fit.config.checkpoint_every, time.monotonic()

@@ -6,11 +6,13 @@ weight of curvature) is settled here and in docs/decisions/008-method.md.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 
 from warpgs.errors import UsageError
+from warpgs.pipeline.quantiles import quantiles
 
 PERCENTILES = (0.02, 0.98)
 """Quantiles of a view's score that become 0 and 1: a few extreme pixels must not flatten the rest."""
@@ -33,8 +35,8 @@ class ImportanceConfig:
 
     def __post_init__(self):
         for name, value in vars(self).items():
-            if not value >= 0:
-                raise UsageError(f"importance {name} must be at least 0, not {value}")
+            if not 0 <= value < math.inf:
+                raise UsageError(f"importance {name} must be at least 0 and finite, not {value}")
 
 
 def blur(image: torch.Tensor, sigma: float = BLUR) -> torch.Tensor:
@@ -53,7 +55,7 @@ def normalized(score: torch.Tensor, valid: torch.Tensor | None = None) -> torch.
     values = score.flatten() if valid is None else score[valid]
     if len(values) == 0:
         return torch.zeros_like(score)
-    low, high = torch.quantile(values, torch.tensor(PERCENTILES, dtype=score.dtype, device=score.device))
+    low, high = quantiles(values, *PERCENTILES)
     if not high > low:
         return torch.zeros_like(score)
     return ((score - low) / (high - low)).clamp(0, 1)

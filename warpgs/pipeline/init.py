@@ -12,7 +12,7 @@ import torch
 from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.kernels.knn import mean_square_distances
-from warpgs.kernels.sh import C0, coefficient_count
+from warpgs.kernels.sh import C0, MAX_DEGREE, coefficient_count
 from warpgs.pipeline.coarse import coarse_points, depth_bounds
 from warpgs.pipeline.region import counted_region
 from warpgs.priors.epipolar import EpipolarConfig, flow_depth
@@ -75,6 +75,8 @@ class InitConfig:
         self.epipolar()  # its own checks
         if not 0 < self.opacity < 1:
             raise UsageError(f"init opacity {self.opacity} must lie between 0 and 1")
+        if not 0 <= self.max_sh_degree <= MAX_DEGREE:
+            raise UsageError(f"init max sh degree {self.max_sh_degree} must lie between 0 and {MAX_DEGREE}")
         if self.random_count < 1:
             raise UsageError(f"init random count {self.random_count} must be at least 1")
 
@@ -94,10 +96,14 @@ class Start(NamedTuple):
 
 
 def camera_depths(views: list[View]) -> tuple[float, float]:
-    """Near and far depth [u] where nothing else is known: 0.1 and 10 times the distance to the cameras' focus point."""
+    """Near and far depth [u] where nothing else is known: 0.1 and 10 times the distance to the cameras' focus point.
+
+    Cameras in one place with one direction have no such point; then it is one unit, which the scene's scale was chosen for.
+    """
     focus = geometry.focus_point([v.camera for v in views])
     distance = float(np.median([np.linalg.norm(v.camera.center - focus) for v in views]))
-    return 0.1 * max(distance, 1e-3), 10 * max(distance, 1e-3)
+    distance = distance if distance > 1e-3 else 1.0
+    return 0.1 * distance, 10 * distance
 
 
 def nearest(points: np.ndarray, queries: np.ndarray, count: int) -> np.ndarray:

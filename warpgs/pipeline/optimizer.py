@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -12,6 +13,9 @@ from warpgs.kernels.knn import morton_codes
 from warpgs.pipeline.density import Refinement
 from warpgs.pipeline.schedule import log_linear
 from warpgs.scene import Gaussians
+
+HIGHEST_RATE = 1e6
+"""No rate is higher: far above what trains, far below what overflows within a fit."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +39,8 @@ class OptimizerConfig:
 
     def __post_init__(self):
         for name, value in vars(self).items():
-            if not value > 0:
-                raise UsageError(f"optimizer {name} must be positive, not {value}")
+            if not 0 < value <= HIGHEST_RATE:
+                raise UsageError(f"optimizer {name} must be positive and at most {HIGHEST_RATE:g}, not {value}")
 
 
 class Optimizer:
@@ -130,7 +134,7 @@ class Optimizer:
 
     def cap_opacity(self, opacity: float) -> None:
         """Lower every opacity to at most this and forget the moments of all opacities (the classic reset)."""
-        limit = torch.logit(torch.tensor(opacity)).item()
+        limit = math.log(opacity / (1 - opacity))  # in float64: the smallest float32 opacity would be 0
         self.params["logit_opacities"] = self.params["logit_opacities"].detach().clamp(max=limit).requires_grad_()
         self.means["logit_opacities"].zero_()
         self.squares["logit_opacities"].zero_()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 
 from warpgs.errors import UsageError
 from warpgs.kernels.sh import C0
+from warpgs.pipeline.quantiles import quantiles
 from warpgs.scene import Camera
 
 SUPPORT = 4
@@ -41,7 +43,12 @@ class SamplerConfig:
             raise UsageError(f"sampler depth {self.depth!r} is not one of rendered, confirmed")
         if not 0 < self.share <= 1 or not 0 <= self.gate_quantile < 1 or not 0 <= self.min_alpha < 1:
             raise UsageError("sampler: share must lie in (0, 1], gate quantile and min alpha in [0, 1)")
-        if not 0 < self.opacity < 1 or not self.footprint > 0 or self.border < 0 or not self.max_share >= 0:
+        if (
+            not 0 < self.opacity < 1
+            or not 0 < self.footprint < math.inf
+            or self.border < 0
+            or not 0 <= self.max_share < math.inf
+        ):
             raise UsageError("sampler: opacity must lie in (0, 1), footprint above 0, border and max share at 0 or above")
 
 
@@ -70,7 +77,7 @@ def geometry_gate(geometry: torch.Tensor, valid: torch.Tensor, quantile: float, 
     """
     values = geometry[valid]
     while quantile > 0 and len(values) > 0:
-        gate = valid & (geometry > torch.quantile(values, quantile))
+        gate = valid & (geometry > quantiles(values, quantile)[0])
         if int(gate.sum()) >= SUPPORT * wanted:
             return gate, quantile
         quantile = quantile - 0.2 if quantile > 0.2 else 0.0
@@ -144,7 +151,7 @@ def fine_gaussians(
     return {
         "means": means,
         "quats": quats,
-        "log_scales": (config.footprint * depths / focal).log()[:, None].repeat(1, 3),
-        "logit_opacities": torch.logit(torch.full_like(depths, config.opacity)),
+        "log_scales": (math.log(config.footprint) + (depths / focal).log())[:, None].repeat(1, 3),
+        "logit_opacities": torch.full_like(depths, math.log(config.opacity / (1 - config.opacity))),
         "sh": sh,
     }

@@ -36,8 +36,8 @@ class PhaseConfig:
     """Growth of that interval over phase 2 (gamma, with the time t from 0 to 1): T_sample(t) = T_base (1 + gamma t)."""
 
     def __post_init__(self):
-        if self.coarse < 0 or self.stable < 0 or not self.every >= 1 or not self.growth >= 0:
-            raise UsageError("phases: coarse, stable and growth must be at least 0, every at least 1")
+        if self.coarse < 0 or self.stable < 0 or not 1 <= self.every < math.inf or not 0 <= self.growth < math.inf:
+            raise UsageError("phases: coarse, stable and growth must be at least 0, every at least 1, and all finite")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,277 @@
+"""Binning and sorting at the limits of their numbers, and pictures of extreme sizes (docs/extremes.md)."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from tests.splats import SMOOTH, camera, cloud, leaves
+from warpgs.constants import RULES
+from warpgs.errors import ResourceError
+from warpgs.kernels import bridge
+from warpgs.kernels.project import project
+from warpgs.kernels.tiles import bin_tiles
+from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.scene import Camera, Gaussians
+
+EXACT = RULES["exact"]
+FOCAL = 1e4
+"""So long [px] that a Gaussian at the edge of any picture here is as round as one in the middle."""
+
+
+def spots(pixels: list[tuple[float, float]], sigma: float, device) -> Gaussians:
+    """Round Gaussians of ``sigma`` px at picture positions, one unit before `plain`."""
+    at = torch.tensor(pixels, dtype=torch.float64)
+    count = len(at)
+    quats = torch.zeros(count, 4, dtype=torch.float64)
+    quats[:, 0] = 1
+    tensors = {
+        "means": torch.cat([at / FOCAL, torch.ones(count, 1, dtype=torch.float64)], 1),
+        "quats": quats,
+        "log_scales": torch.full((count, 3), float(np.log(sigma / FOCAL)), dtype=torch.float64),
+        "logit_opacities": torch.full((count,), 2.0, dtype=torch.float64),
+        "sh": torch.ones(count, 1, 3, dtype=torch.float64),
+    }
+    return Gaussians(**{n: t.to(device, torch.float32) for n, t in tensors.items()})
+
+
+def plain(width: int, height: int, device) -> Camera:
+    """A camera at the origin whose principal point is the picture's corner."""
+    K = torch.tensor([[FOCAL, 0, 0], [0, FOCAL, 0], [0, 0, 1.0]], device=device)
+    return Camera(torch.eye(4, device=device), K, width, height)
+
+
+def binned(gaussians: Gaussians, cam: Camera, rule=EXACT, tile_size: int = 16, **options):
+    """Records, counts and tiles of one camera."""
+    size = {"width": cam.width, "height": cam.height, "tile_size": tile_size, "rule": rule}
+    splats, counts = project(*gaussians.tensors().values(), cam.viewmat[None], cam.K[None], degree=0, **size)
+    return splats, counts, bin_tiles(splats, counts, **size, **options)
+
+
+# B1: counts of more than 32 bits
+
+
+def test_counts_beyond_the_packed_sum_are_told_exactly(device):
+    """140,000 Gaussians over all tiles of an 8K picture are more than 2^36 instances, and 2^36 is what counts as a Gaussian.
+
+    In one running sum the two numbers would run into each other; the error has both right, and nothing is allocated.
+    """
+    splats = torch.zeros(1, 140_000, 12, device=device)
+    counts = torch.full((1, 140_000), 518_400, dtype=torch.int32, device=device)
+    with pytest.raises(ResourceError, match=r"140,000 visible .* 72,576,000,000 .* 518400 of 518400 tiles"):
+        bin_tiles(splats, counts, width=7680, height=4320, tile_size=8, rule=EXACT)
+
+
+def test_full_screen_gaussians_at_4k_are_counted(device):
+    """3000 Gaussians over the whole picture: 97 million instances, 4.6 GiB by the budget's reckoning, and refused beyond it."""
+    gaussians = spots([(1920.0, 1080.0)] * 3000, 4000.0, device)
+    with pytest.raises(ResourceError, match=r"3,000 visible .* 97,200,000 .* 32400 of 32400 tiles"):
+        binned(gaussians, plain(3840, 2160, device), budget_bytes=2**30)
+
+
+@pytest.mark.slow
+def test_full_screen_gaussians_at_4k_are_listed(device):
+    """The same with memory enough (2 GB): every tile lists all 3000, in order."""
+    gaussians = spots([(1920.0, 1080.0)] * 3000, 4000.0, device)
+    _, counts, tiles = binned(gaussians, plain(3840, 2160, device), budget_bytes=2**40)
+    assert int(counts.sum()) == len(tiles.slots) == 97_200_000
+    lengths = tiles.ranges[:, 1] - tiles.ranges[:, 0]
+    assert bool((lengths == 3000).all())
+    ids = tiles.splat_ids.view(-1, 3000)
+    assert bool((ids == torch.arange(3000, dtype=torch.int32, device=device)).all())
+
+
+def test_sizes_beyond_32_bits_are_refused(device):
+    """An axis, a launch and a number of tiles that would wrap around are errors that say what to do."""
+    huge = torch.zeros(1, device=device).expand(2**31)
+    with pytest.raises(ResourceError, match=r"2,147,483,648 entries .* fewer Gaussians"):
+        bridge.view(huge, torch.float32).array()
+    with pytest.raises(ResourceError, match=r"2,147,483,648 entries"):
+        bridge.launch(None, 2**31, [], device)
+    splats, counts = torch.zeros(1, 0, 12, device=device), torch.zeros(1, 0, dtype=torch.int32, device=device)
+    with pytest.raises(ResourceError, match=r"2,147,483,648 tiles of 8 px.* fewer cameras"):
+        bin_tiles(splats, counts, width=8 * 2**16, height=8 * 2**15, tile_size=8, rule=EXACT)
+
+
+# B2: numbers of tiles around powers of two
+
+
+@pytest.mark.parametrize("tiles", [1, 2, 3, 4, 5, 127, 128, 129, 255, 256, 257])
+def test_tile_numbers_of_every_bit_length(device, tiles):
+    """A row of tiles, one Gaussian in each: each tile lists its own, the first and the last tile too."""
+    gaussians = spots([(8.0 + 16 * i, 8.0) for i in range(tiles)], 1.0, device)
+    _, counts, lists = binned(gaussians, plain(16 * tiles, 16, device))
+    assert bool((counts == 1).all())
+    assert torch.equal(lists.splat_ids.cpu(), torch.arange(tiles, dtype=torch.int32))
+    assert lists.ranges.tolist() == [[i, i + 1] for i in range(tiles)]
+
+
+@pytest.mark.parametrize("cameras", [3, 4, 5])
+def test_cameras_times_tiles_of_every_bit_length(device, cameras):
+    """C cameras of 5 tiles: each camera's tile lists that camera's copy."""
+    gaussians = spots([(8.0 + 16 * i, 8.0) for i in range(5)], 1.0, device)
+    cam = plain(80, 16, device)
+    size = {"width": 80, "height": 16, "rule": EXACT}
+    many = cam.viewmat.expand(cameras, 4, 4), cam.K.expand(cameras, 3, 3)
+    splats, counts = project(*gaussians.tensors().values(), *many, degree=0, **size)
+    lists = bin_tiles(splats, counts, **size)
+    assert torch.equal(lists.splat_ids.cpu(), torch.arange(5 * cameras, dtype=torch.int32))
+
+
+# B3 and B4: order
+
+
+def test_depths_are_sorted_as_numpy_sorts_them(device, dtype):
+    """Depths one rounding apart, in float64 too, in the order of a stable sort; the near plane is positive, so all bits are."""
+    count = 5000
+    generator = torch.Generator().manual_seed(0)
+    gaussians = spots([(8.0, 8.0)] * count, 1.0, device)
+    step = torch.finfo(dtype).eps
+    depths = (1 + step * torch.randint(0, 64, (count,), generator=generator).to(dtype)).to(device)
+    tensors = {n: t.to(dtype) for n, t in gaussians.tensors().items()}
+    tensors["means"] = tensors["means"].clone()
+    tensors["means"][:, 2] = depths
+    cam = plain(16, 16, device)
+    cam = dataclasses.replace(cam, viewmat=cam.viewmat.to(dtype), K=cam.K.to(dtype))
+    _, _, lists = binned(Gaussians(**tensors), cam)
+    assert np.array_equal(lists.splat_ids.cpu().numpy(), np.argsort(depths.cpu().numpy(), kind="stable"))
+
+
+def test_coplanar_gaussians_keep_their_order_100_times(device):
+    """1000 Gaussians at one depth: by number in every tile, and the same bits of pictures in 100 runs."""
+    gaussians, cam = cloud(1000, device=device), camera(64, 48, dtype=torch.float32, device=device)
+    gaussians.means[:, 2] = 4.0
+    _, _, lists = binned(dataclasses.replace(gaussians, sh=gaussians.sh[:, :1]), cam)
+    for begin, end in lists.ranges.tolist():
+        assert bool((lists.splat_ids[begin:end].diff() > 0).all())
+    first = rasterize(gaussians, cam)
+    for _ in range(99):
+        again = rasterize(gaussians, cam)
+        assert torch.equal(first.rgb, again.rgb) and torch.equal(first.depth, again.depth)
+
+
+def test_permuting_ties_is_the_order_of_numbers(device):
+    """Which of two coplanar Gaussians lies in front is decided by their numbers alone."""
+    gaussians = spots([(8.0, 8.0)] * 2, 4.0, device)
+    gaussians.sh[0], gaussians.sh[1] = 1.0, -1.0
+    swapped = Gaussians(**{n: t.flip(0) for n, t in gaussians.tensors().items()})
+    light, dark = (float(rasterize(g, plain(16, 16, device)).rgb[8, 8, 0]) for g in (gaussians, swapped))
+    assert light > dark + 0.3
+
+
+# B5: counted and emitted
+
+
+def test_emitted_equals_counted(device):
+    """A million random Gaussians, 1e-7 to 1e4 px large, on and off the picture: no slot is left over, none is missing."""
+    total, generator = 0, torch.Generator().manual_seed(1)
+    for _ in range(4):
+        count = 250_000
+
+        def rand(*shape):
+            return torch.rand(*shape, generator=generator)
+
+        size = torch.pow(10.0, rand(count, 1) ** 4 * 9 - 7)
+        tensors = {
+            "means": (rand(count, 3) - 0.5) * torch.tensor([6.0, 5.0, 2.0]) + torch.tensor([0.0, 0.0, 3.0]),
+            "quats": rand(count, 4) - 0.5,
+            "log_scales": torch.log(size * (0.01 + rand(count, 3)) / 100),
+            "logit_opacities": 8 * rand(count) - 6,
+            "sh": rand(count, 1, 3),
+        }
+        gaussians = Gaussians(**{n: t.to(device) for n, t in tensors.items()})
+        cam = camera(97, 65, dtype=torch.float32, device=device)
+        _, counts, lists = binned(gaussians, cam)
+        tiles = len(lists.ranges)
+        assert len(lists.slots) == int(counts.sum())
+        lengths = lists.ranges[:, 1] - lists.ranges[:, 0]
+        # what was counted and not found again carries the number past the last tile; on one device both are one function
+        unfound = int((lists.tile_ids == tiles).sum())
+        assert int(lengths.sum()) + unfound == len(lists.slots) and unfound <= len(lists.slots) // 10**5
+        seen = torch.bincount(lists.splat_ids[: int(lengths.sum())].long(), minlength=count)
+        assert int((seen - counts[0]).abs().sum()) == unfound
+        total += int(counts.sum())
+    assert total > 200_000
+
+
+# B6: few instances
+
+
+def test_a_single_intersection_is_drawn(device):
+    """One Gaussian in one tile of a picture of many: first, last, and in between."""
+    for at in [(8.0, 8.0), (72.0, 40.0), (40.0, 24.0)]:
+        gaussians = spots([at], 1.0, device)
+        _, counts, lists = binned(gaussians, plain(80, 48, device))
+        tile = int(at[1] // 16) * 5 + int(at[0] // 16)
+        assert int(counts.sum()) == 1 and lists.ranges[tile].tolist() == [0, 1]
+        picture = rasterize(leaves(gaussians), plain(80, 48, device))
+        rows, columns = torch.nonzero(picture.alpha.detach() > 0, as_tuple=True)
+        assert bool((rows // 16 == at[1] // 16).all()) and bool((columns // 16 == at[0] // 16).all())
+        picture.rgb.sum().backward()
+
+
+def test_three_gaussians_on_512_pixels(device):
+    """Fewer instances than tiles: every tile has a range, all but two are empty, and the picture is finite."""
+    gaussians = spots([(5.0, 5.0), (7.0, 6.0), (500.0, 505.0)], 1.0, device)
+    _, counts, lists = binned(gaussians, plain(512, 512, device))
+    assert len(lists.ranges) == 1024 and int(counts.sum()) == 3
+    lengths = (lists.ranges[:, 1] - lists.ranges[:, 0]).tolist()
+    assert lengths[0] == 2 and lengths[-1] == 1 and sum(lengths) == 3
+    moving = leaves(gaussians)
+    picture = rasterize(moving, plain(512, 512, device))
+    picture.rgb.sum().backward()
+    assert bool(torch.isfinite(picture.rgb).all()) and all(bool(t.grad.any()) for t in (moving.sh, moving.logit_opacities))
+
+
+# B7: very many cameras
+
+
+def test_70_000_cameras_of_one_pixel(device):
+    """More than a second grid axis would take: each draws its own pixel, the same as alone."""
+    count = 70_000
+    gaussians = spots([(0.5, 0.5)], 0.5, device)
+    cam = plain(1, 1, device)
+    shift = torch.linspace(-1.0, 1.0, count, device=device) / FOCAL
+    viewmats = torch.eye(4, device=device).repeat(count, 1, 1)
+    viewmats[:, 0, 3] = shift
+    batch = rasterize(gaussians, Camera(viewmats, cam.K.repeat(count, 1, 1), 1, 1))
+    assert batch.rgb.shape == (count, 1, 1, 3)
+    for i in (0, 1, 65_535, 65_536, count - 1):
+        alone = rasterize(gaussians, dataclasses.replace(cam, viewmat=viewmats[i]))
+        assert torch.equal(alone.rgb, batch.rgb[i]) and float(alone.alpha) > 0
+    assert len(batch.alpha.unique()) > 1000
+
+
+# B9: sizes
+
+SIZES = [(1, 1), (1, 17), (17, 1), (15, 15), (16, 16), (17, 17), (33, 47), (97, 129), (257, 257), (1, 8192), (8192, 1)]
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_pictures_of_any_size_are_crops_of_a_larger_one(device, width, height):
+    """Same intrinsics, larger picture: the same pixels. Bit for bit but for the clamp of the Jacobian, which is kept off."""
+    gaussians = cloud(200, device=device)
+    gaussians.means[:, :2] *= 0.3  # far inside the grown frustum of both pictures
+    focal = 40.0
+    K = torch.tensor([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]], device=device)
+    large = 16 * (-(-width // 16) + 3), 16 * (-(-height // 16) + 2)
+    near = torch.eye(4, device=device)
+    if min(width, height) < 16:  # a picture so thin has hardly a frustum: look at Gaussians on its axis
+        gaussians.means[:, :2] *= 0.01
+    small = rasterize(gaussians, Camera(near, K, width, height))
+    whole = rasterize(gaussians, Camera(near, K, *large))
+    assert float(small.alpha.max()) > 0.1
+    for name in ("rgb", "alpha", "depth"):
+        assert torch.equal(getattr(small, name), getattr(whole, name)[:height, :width]), name
+
+
+def test_a_long_thin_picture_in_every_part(device):
+    """1 x 8192: Gaussians in its first and its last tile are drawn there, gradients too; also without any cut."""
+    gaussians = spots([(0.5, 4.0), (0.5, 8190.0)], 2.0, device)
+    for rule in (EXACT, dataclasses.replace(SMOOTH, low_pass=0.3)):
+        moving = leaves(gaussians)
+        picture = rasterize(moving, plain(1, 8192, device), RasterizeOptions(rule=rule))
+        assert float(picture.alpha.detach()[3:5].min()) > 0.5 and float(picture.alpha.detach()[8189:8191].min()) > 0.5
+        picture.rgb.sum().backward()
+        assert bool((moving.logit_opacities.grad != 0).all())

@@ -1,0 +1,439 @@
+"""Starting, densifying, losing and saving at the extremes of data and settings (docs/extremes.md)."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.reference.knn import mean_square_distances_reference
+from tests.scenes import photographs, priors, ring, seeds
+from tests.splats import cloud
+from warpgs.errors import DataError, NotFiniteError, UsageError
+from warpgs.export.ply import write_ply
+from warpgs.io.normalize import normalization_of, normalize_points, normalize_view
+from warpgs.kernels.adam import adam_step
+from warpgs.kernels.knn import mean_square_distances
+from warpgs.kernels.ssim import differences, ssim
+from warpgs.pipeline.checkpoint import TENSORS, load_checkpoint, save_checkpoint
+from warpgs.pipeline.config import FitConfig
+from warpgs.pipeline.density import DensityConfig, DensityStats, Refinement, refine
+from warpgs.pipeline.fit import Fit, run
+from warpgs.pipeline.importance import ImportanceConfig, normalized
+from warpgs.pipeline.init import InitConfig, initial_gaussians, initial_points
+from warpgs.pipeline.layers import ProtectConfig
+from warpgs.pipeline.loss import LossConfig, photometric_loss
+from warpgs.pipeline.method import MethodConfig
+from warpgs.pipeline.optimizer import Optimizer, OptimizerConfig
+from warpgs.pipeline.quantiles import quantiles
+from warpgs.pipeline.sampler import SamplerConfig, geometry_gate, sample_pixels
+from warpgs.pipeline.schedule import PhaseConfig
+from warpgs.rasterizer import rasterize
+from warpgs.scene import Normalization, PointCloud, View
+
+POINTS = InitConfig(source="points", max_sh_degree=0)
+few = settings(
+    max_examples=40, derandomize=True, deadline=None, database=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+
+
+def gray(points) -> PointCloud:
+    """Gray points."""
+    points = np.asarray(points, float).reshape(-1, 3)
+    return PointCloud(points, np.full((len(points), 3), 0.5, np.float32))
+
+
+def taken(views, cloud_, device, steps: int = 3, **more) -> Fit:
+    """A fit after some steps, all of whose numbers are finite."""
+    fit = Fit(views, cloud_, FitConfig(steps=steps, init=POINTS, **more), device)
+    for _ in range(steps):
+        assert math.isfinite(fit.advance().loss)
+    assert all(bool(torch.isfinite(t).all()) for t in fit.state()[0].values() if t.is_floating_point())
+    return fit
+
+
+# T1: points that coincide
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 4])
+@pytest.mark.parametrize("identical", [False, True])
+def test_few_points_and_identical_ones_get_a_width(device, count, identical):
+    """As many neighbours as there are; a floor of 1e-6 and a ceiling of a tenth of the scene's extent."""
+    points = np.zeros((count, 3)) if identical else np.eye(4, 3)[:count] * 2.0
+    g = initial_gaussians(gray(points), POINTS, 5.0, device)
+    assert g.means.shape == (count, 3) and bool(torch.isfinite(g.log_scales).all())
+    widths = g.log_scales.exp()
+    if count:
+        wanted = 1e-6 * 5.0 if identical or count == 1 else 0.1 * 5.0
+        assert torch.allclose(widths, torch.full_like(widths, wanted), rtol=1e-5)
+
+
+def test_clusters_closer_than_squares_can_tell(device, dtype):
+    """Two clusters 1e-20 apart: distances finite, exact where their squares are, and a width above zero."""
+    points = torch.zeros(8, 3, dtype=dtype)
+    points[4:, 0] = 1e-20
+    found = mean_square_distances(points.to(device)).cpu()
+    assert not bool(found.any())  # three neighbours coincide
+    spread = torch.zeros(4, 3, dtype=dtype)
+    spread[:, 0] = torch.tensor([0.0, 1e-20, 2e-20, 3e-20])
+    found = mean_square_distances(spread.to(device)).cpu()
+    wanted = mean_square_distances_reference(spread.double(), 3)
+    assert torch.allclose(found.double(), wanted, rtol=1e-4 if dtype is torch.float32 else 1e-12, atol=2e-45)
+    g = initial_gaussians(gray(spread.numpy()), POINTS, 1.0, device)
+    assert torch.allclose(g.log_scales.exp(), torch.full((4, 3), 1e-6, device=device), rtol=1e-5)
+
+
+def test_a_fit_from_coincident_points(device):
+    """All points in one place: steps are taken, nothing becomes infinite."""
+    taken(photographs(2), gray(np.zeros((6, 3))), device)
+
+
+# T2 and T3: nothing to start from, no extent
+
+
+def test_an_empty_cloud_is_an_error_or_a_random_start():
+    """Zero rows: an error that names the way out, or by itself a random start that says why."""
+    views = photographs(3)
+    with pytest.raises(DataError, match=r"no 3D points .* --init.source random"):
+        initial_points(views, gray([]), POINTS, np.random.default_rng(0))
+    start = initial_points(views, gray([]), InitConfig(random_count=50), np.random.default_rng(0))
+    assert len(start.cloud) == 50 and "only 0 points" in start.how
+
+
+def standing(kind: str) -> list[View]:
+    """One camera, two in one place, or three on a line."""
+    views = photographs(3)
+    if kind == "one":
+        return views[:1]
+    if kind == "twins":
+        return [views[0], dataclasses.replace(views[0], name="twin.png")]
+    cameras = ring(1) * 3
+    moved = []
+    for i, c in enumerate(cameras):
+        pose = c.viewmat.copy()
+        pose[0, 3] += 0.2 * i
+        moved.append(View(f"{i}.png", dataclasses.replace(c, viewmat=pose), views[0].image))
+    return moved
+
+
+@pytest.mark.parametrize("kind", ["one", "twins", "line"])
+@pytest.mark.parametrize("source", ["points", "random"])
+def test_cameras_without_extent(device, kind, source):
+    """The extent, which rates and thresholds are shares of, stays positive; no Gaussian is pruned for being too large."""
+    views = standing(kind)
+    n = normalization_of(views, seeds())
+    points = normalize_points(seeds(), n)
+    assert 0 < n.scale < math.inf
+    views = [normalize_view(v, n) for v in views]
+    density = DensityConfig(start=1, every=1, stop_share=1.0)
+    init = InitConfig(source=source, random_count=60, max_sh_degree=0)
+    fit = Fit(views, points, FitConfig(steps=4, init=init, density=density), device)
+    assert 0 < fit.extent < math.inf and fit.optimizer.rates(0.0)["means"] > 0
+    # what stands before the near plane would never be drawn, and never be moved
+    assert int(rasterize(fit.gaussians, fit.views[0].camera).visible.sum()) >= 20
+    fit.reset_done = True  # size pruning is on
+    for _ in range(4):
+        assert math.isfinite(fit.advance().loss)
+    assert len(fit.gaussians) >= 30
+
+
+# T4, T5, T6: everything pruned, rows and moments
+
+
+def test_pruning_everything_leaves_one_and_the_fit_goes_on(device):
+    """A threshold that no opacity reaches: one Gaussian stays at each event, and later steps still work."""
+    density = DensityConfig(start=1, every=2, stop_share=1.0, prune_opacity=1.0, gradient=math.inf)
+    fit = taken(photographs(2), seeds(), device, steps=8, density=density)
+    assert len(fit.gaussians) == 1
+
+
+def test_a_set_of_none_is_legal(device):
+    """No rows: optimizer, refinement and statistics work on nothing."""
+    g = cloud(0, device=device)
+    optimizer = Optimizer(g, OptimizerConfig(), 1.0)
+    for t in optimizer.params.values():
+        t.grad = torch.zeros_like(t)
+    optimizer.step(0.0)
+    optimizer.apply(
+        Refinement(torch.zeros(0, dtype=torch.int64, device=device), g.tensors(), torch.zeros(0, dtype=torch.int64))
+    )
+    assert all(t.shape[0] == 0 for t in optimizer.state().values())
+
+
+def test_rows_follow_any_chain_of_changes(device):
+    """Ten random refinements, the first before any step, some of them empty: every row keeps its moments and its tag."""
+    count, generator = 40, torch.Generator().manual_seed(0)
+    optimizer, stats = Optimizer(cloud(count, device=device), OptimizerConfig(), 1.0), DensityStats(count, device)
+    for event in range(10):
+        rows = len(optimizer.gaussians)
+        tags = torch.arange(rows, dtype=torch.float32, device=device)
+        for group in (optimizer.params, optimizer.means, optimizer.squares):
+            for t in group.values():
+                t.detach().copy_((tags + 1000 * event).view(-1, *[1] * (t.ndim - 1)).expand_as(t))
+        stats.seen.copy_(tags)
+        kept = torch.nonzero(torch.rand(rows, generator=generator) < (1.0 if event == 4 else 0.7)).squeeze(1).to(device)
+        fresh = cloud(0 if event == 4 else event, device=device, seed=event)
+        change = Refinement(kept, fresh.tensors(), torch.full((len(fresh),), -1, device=device))
+        before = {k: v.clone() for k, v in optimizer.state().items()}
+        optimizer.apply(change)
+        stats.apply(change)
+        for name, t in optimizer.state().items():
+            assert len(t) == len(kept) + len(fresh) == len(stats.seen)
+            assert torch.equal(t[: len(kept)], before[name][kept])
+            if not name.startswith("param"):
+                assert not bool(t[len(kept) :].any())
+        assert torch.equal(stats.seen[: len(kept)], tags[kept])
+
+
+def test_refinement_that_changes_nothing_changes_no_bit(device):
+    """Nothing pulled at and nothing faint: all rows stay, with their moments."""
+    g = cloud(30, device=device)
+    g.logit_opacities[:] = 1.0
+    change = refine(g, DensityStats(30, device), DensityConfig(), extent=1.0, after_reset=False, generator=torch.Generator())
+    assert torch.equal(change.keep.cpu(), torch.arange(30)) and len(change.parents) == 0
+
+
+# T7: numbers that are none
+
+
+def bad_photographs(value: float) -> list[View]:
+    """Two photographs, one pixel of the first of which has one channel of that value."""
+    views = photographs(2)
+    image = views[0].image.copy()
+    image[3, 4, 1] = value
+    return [View(views[0].name, views[0].camera, image), views[1]]
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_one_bad_pixel_stops_the_fit_before_it_harms(device, value):
+    """The step that looks at it is not taken, and the Gaussians are finite."""
+    fit = Fit(bad_photographs(value), seeds(), FitConfig(steps=4, init=POINTS, cuda_graph=False), device)
+    with pytest.raises(NotFiniteError, match=r"loss became (nan|inf)"):
+        for _ in range(4):
+            fit.advance()
+    assert all(bool(torch.isfinite(t).all()) for t in fit.gaussians.tensors().values())
+
+
+def poison(fit: Fit, name: str, where: str, value: float) -> None:
+    """Put a value into the gradient of a tensor's first row from the next step on, or into the tensor itself."""
+    if where == "gradient":
+
+        def spoil(gradient: torch.Tensor) -> torch.Tensor:
+            gradient = gradient.clone()
+            gradient[0] = value
+            return gradient
+
+        fit.optimizer.params[name].register_hook(spoil)
+    else:
+        fit.optimizer.params[name].detach()[0] = value
+
+
+@pytest.mark.parametrize(
+    ("name", "where", "value"),
+    [
+        ("means", "gradient", math.nan), ("sh", "gradient", math.inf), ("logit_opacities", "gradient", math.nan),
+        ("log_scales", "parameter", math.inf), ("quats", "parameter", math.nan),
+    ],
+)  # fmt: skip
+def test_what_is_no_number_is_never_saved(device, tmp_path, name, where, value):
+    """The Gaussian is culled, so the loss stays finite; the next checkpoint is refused by name, and the last one is whole."""
+    config = FitConfig(
+        steps=6, init=POINTS, density=DensityConfig(start=100), checkpoint_every=2, checkpoint_seconds=0, cuda_graph=False
+    )
+    fit, saved = Fit(photographs(2), seeds(), config, device), []
+
+    def save(current: Fit) -> None:
+        save_checkpoint(tmp_path, *current.state())
+        saved.append(current.step)
+
+    def on_step(report) -> None:
+        assert math.isfinite(report.loss)
+
+    original = fit.burst
+
+    def burst(limit: int):
+        if fit.step == 3:
+            poison(fit, name, where, value)
+        return original(limit)
+
+    fit.burst = burst
+    with pytest.raises(NotFiniteError, match=rf"(param|mean|square)\.{name} holds numbers that are not finite.*--resume"):
+        run(fit, on_step, save, lambda: False)
+    tensors, state = load_checkpoint(tmp_path)
+    assert saved == [2] and state["step"] == 2
+    assert all(bool(torch.isfinite(t).all()) for t in tensors.values() if t.is_floating_point())
+    with pytest.raises(DataError, match="finite"):
+        write_ply(tmp_path / "model.ply", fit.gaussians, Normalization(np.zeros(3), 1.0))
+    assert sorted(p.name for p in tmp_path.iterdir()) == [TENSORS]
+
+
+def test_adam_keeps_a_bad_row_to_itself(device, dtype):
+    """A gradient that is no number spoils its own element; every other has the bits it would have had."""
+    generator = torch.Generator().manual_seed(0)
+    param, grad = torch.randn(2, 300, 3, generator=generator, dtype=torch.float64).to(device, dtype)
+    grad[17, 1] = math.nan
+    found = []
+    for g in (grad, grad.nan_to_num(nan=0.5)):
+        p, mean, square = param.clone(), torch.zeros_like(param), torch.zeros_like(param)
+        adam_step(p, g.contiguous(), mean, square, lr=0.1, step=1)
+        found.append(p)
+    same = found[0] == found[1]
+    assert not bool(same[17, 1]) and int((~same).sum()) == 1
+
+
+# T8: drawing by weight
+
+WEIGHTS = st.lists(st.sampled_from([0.0, -0.0, 1e-38, 0.5, 1.0, 3e38, math.nan, math.inf, -1.0]), min_size=1, max_size=30)
+
+
+@few
+@given(WEIGHTS, st.integers(0, 40), st.booleans())
+def test_sampling_weights_of_any_kind(device, weights, count, random):
+    """Zero, negative and NaN are never drawn, infinite ones first; as many come back as could be drawn, none twice."""
+    score = torch.tensor([weights], device=device)
+    gate = torch.ones_like(score, dtype=torch.bool)
+    at = sample_pixels(score, gate, count, torch.Generator().manual_seed(0), random=random)
+    allowed = [i for i, w in enumerate(weights) if w > 0]
+    columns = at[:, 1].tolist()
+    assert len(columns) == len(set(columns)) == min(count, len(allowed)) and set(columns) <= set(allowed)
+    infinite = {i for i in allowed if math.isinf(weights[i])}
+    assert infinite <= set(columns) or set(columns) <= infinite
+
+
+def test_more_pixels_than_2_to_the_24(device):
+    """A photograph of 24 megapixels has more numbers than torch.quantile takes; gate and draw work on it."""
+    count = 2**24 + 16
+    score = torch.linspace(0, 1, count, device=device).view(16, -1)
+    gate, used = geometry_gate(score, torch.ones_like(score, dtype=torch.bool), 0.6, 100)
+    assert used == 0.6 and abs(float(gate.float().mean()) - 0.4) < 1e-3
+    at = sample_pixels(score, gate, 100, torch.Generator().manual_seed(0), random=True)
+    assert len(at) == 100 and bool(gate[at[:, 0], at[:, 1]].all())
+    assert float(normalized(score).max()) == 1.0
+
+
+@few
+@given(st.lists(st.floats(-1e6, 1e6, width=32), min_size=1, max_size=60), st.floats(0, 1))
+def test_quantiles_are_those_of_numpy(values, share):
+    """Linear between neighbours."""
+    found = quantiles(torch.tensor(values, dtype=torch.float64), share)[0]
+    assert math.isclose(float(found), float(np.quantile(np.array(values), share)), rel_tol=1e-12, abs_tol=1e-9)
+
+
+# T10: similarity of constant and tiny images
+
+
+@pytest.mark.parametrize("value", [0.0, 0.5, 0.6, 1.0])
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (5, 7), (10, 11), (40, 50)])
+def test_constant_images_of_any_size(device, dtype, value, height, width):
+    """Equal: exactly 1. A hair apart: at most 1, with a finite gradient. The summed form agrees."""
+    image = torch.full((height, width, 3), value, dtype=dtype, device=device)
+    assert bool((ssim(image, image) == 1).all())
+    assert float(differences(image, image).abs().max()) == 0
+    for step in (1e-7, 1e-3, -1e-3):
+        leaf = (image + step).requires_grad_()
+        similar = ssim(leaf, image)
+        similar.sum().backward()
+        assert float(similar.detach().max()) <= 1 and float(similar.detach().min()) > 0.9 - 1e4 * abs(step) * (value == 0)
+        assert bool(torch.isfinite(leaf.grad).all())
+
+
+# T9 and T11: settings
+
+NUMBERS = [math.nan, math.inf, -1, 0, 1e-300, 1, 3, 1e300]
+KINDS = [
+    DensityConfig, OptimizerConfig, LossConfig, ImportanceConfig, SamplerConfig, ProtectConfig, PhaseConfig, MethodConfig,
+    InitConfig, FitConfig,
+]  # fmt: skip
+SHORT = FitConfig(
+    steps=4, init=InitConfig(source="points", max_sh_degree=1), sh_every=2, phases=PhaseConfig(coarse=1, every=1),
+    density=DensityConfig(start=1, every=2, stop_share=1.0, gradient=1e-6, max_gaussians=200),
+    method=MethodConfig(events=True, hier=True, pm=False, sampler=SamplerConfig(min_alpha=0.01)),
+)  # fmt: skip
+
+
+def composed(part, name: str, value) -> FitConfig:
+    """The short fit with one field of one of its parts changed; a part's own checks run."""
+    if type(part) is FitConfig:
+        return dataclasses.replace(part, **{name: value})
+    for f in dataclasses.fields(SHORT):
+        own = getattr(SHORT, f.name)
+        if type(own) is part:
+            return dataclasses.replace(SHORT, **{f.name: dataclasses.replace(own, **{name: value})})
+    for f in dataclasses.fields(SHORT.method):
+        own = getattr(SHORT.method, f.name)
+        if type(own) is part:
+            method = dataclasses.replace(SHORT.method, **{f.name: dataclasses.replace(own, **{name: value})})
+            return dataclasses.replace(SHORT, method=method)
+    return dataclasses.replace(SHORT, **{name: value})
+
+
+def test_the_list_of_settings_is_complete():
+    """Whatever settings dataclass a fit is composed of is in the list above, but for the priors', which hold names."""
+    parts = [getattr(c, f.name) for c in (SHORT, SHORT.method) for f in dataclasses.fields(c)]
+    held = {type(p).__name__ for p in parts if dataclasses.is_dataclass(p)} | {"FitConfig"}
+    assert held - {k.__name__ for k in KINDS} == {"PriorConfig"}
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda k: k.__name__)
+def test_a_setting_is_refused_or_works(kind):
+    """Any number in any field, zero intervals too: a UsageError at once, or steps, events and resets that stay finite."""
+    views, points = photographs(1, 12, 10), seeds(12)
+    known, refused = priors(views), 0
+    torch.set_num_threads(1)  # everything is tiny
+    for field in dataclasses.fields(kind):
+        # bytes of memory and numbers of points are amounts of work, not numbers that could be wrong
+        if type(field.default) not in (int, float) or field.name in ("memory_limit", "random_count", "steps"):
+            continue
+        for value in NUMBERS:
+            if type(field.default) is int and value not in range(-9, 10):
+                continue  # the command line reads whole numbers
+            try:
+                config = composed(kind, field.name, type(field.default)(value))
+            except UsageError:
+                refused += 1
+                continue
+            fit = Fit(views, points, config, torch.device("cpu"), priors=known)
+            for _ in range(2):
+                assert math.isfinite(fit.advance().loss), (field.name, value)
+            fit.optimizer.cap_opacity(config.density.reset_opacity)
+            fit.reset_done = True
+            assert math.isfinite(fit.advance().loss), (field.name, value)
+            for name, t in fit.optimizer.state().items():
+                assert bool(torch.isfinite(t).all()), (field.name, value, name)
+    assert refused > 0
+
+
+# T14: nothing counts
+
+
+def test_views_of_which_nothing_counts(device):
+    """All pixels masked in one view, or in all: no division by zero, and nothing moves for a view that says nothing."""
+    views = photographs(2)
+    hidden = [dataclasses.replace(v, mask=np.zeros(v.image.shape[:2], bool)) for v in views]
+    fit = taken(hidden, seeds(), device, steps=2)
+    first = initial_gaussians(seeds(), POINTS, fit.extent, device)
+    assert all(torch.equal(a, b) for a, b in zip(fit.gaussians.tensors().values(), first.tensors().values()))
+    taken([hidden[0], views[1]], seeds(), device, steps=4)
+    with pytest.raises(DataError, match="every pixel of the training views is masked out"):
+        Fit(hidden, None, FitConfig(init=InitConfig(source="random")), device)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("masked", ["all", "all but one"])
+def test_masks_that_leave_nothing_or_one_pixel(device, share, masked):
+    """The mean is over what counts, and over nothing it is 0; gradients stay at what counts, or near it for similarity."""
+    mask = torch.zeros(12, 13, device=device)
+    if masked == "all but one":
+        mask[5, 6] = 1
+    generator = torch.Generator().manual_seed(0)
+    image, target = torch.rand(2, 12, 13, 3, generator=generator).to(device)
+    leaf = image.requires_grad_()
+    loss, l1 = photometric_loss(leaf, target, mask, LossConfig(ssim_weight=share))
+    loss.backward()
+    assert math.isfinite(float(loss.detach())) and bool(torch.isfinite(leaf.grad).all())
+    moved = torch.nonzero(leaf.grad.abs().sum(-1)).tolist()
+    assert moved == ([] if masked == "all" else [[5, 6]])
+    assert (float(l1) == 0) == (masked == "all")
