@@ -1,0 +1,176 @@
+"""Lists and blending at their limits: the last byte, the last slot, an alpha or transmittance equal to a cut-off."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from tests.kernels.test_limits_project import facing, run
+from tests.splats import camera, cloud
+from warpgs.constants import RULES
+from warpgs.errors import ResourceError
+from warpgs.kernels import blend, tiles
+
+EXACT = RULES["exact"]
+
+
+def test_budget_is_met_to_the_byte():
+    """As many instances as fit are allowed, one more is not; so are 2^31 - 1 and no more."""
+    cpu = torch.device("cpu")
+    tiles._check_total(1000, 1, cpu, 1, 148_000)
+    with pytest.raises(ResourceError, match=r"makes 1,001 .* 1001 of 7 tiles .* the limit is 0\.00 GiB"):
+        tiles._check_total(1001, 1, cpu, 7, 148_000)
+    tiles._check_total(2**31 - 1, 1, cpu, 1, 2**60)
+    with pytest.raises(ResourceError, match="the limit is 2,147,483,647 instances"):
+        tiles._check_total(2**31, 1, cpu, 1, 2**60)
+    with pytest.raises(ResourceError, match="the limit is 2,147,483,647 instances"):
+        tiles._check_total(2**31, 1, cpu, 1, None)
+    with pytest.raises(ResourceError, match=r"the limit is 1\.00 GiB"):
+        tiles._check_total(2**31 - 1, 1, cpu, 1, 2**30)
+
+
+def test_free_memory_is_asked_for_only_where_it_may_matter(monkeypatch):
+    """Below a twentieth of the machine nobody asks; from there on four fifths of what is free is the limit."""
+    cpu = torch.device("cpu")
+    asked = []
+    monkeypatch.setattr(tiles, "installed_bytes", lambda _: 20 * 148_000)
+    monkeypatch.setattr(tiles, "available_bytes", lambda _: asked.append(1) or 5 * 37_000)
+    tiles._check_total(999, 1, cpu, 1, None)
+    assert not asked
+    tiles._check_total(1000, 1, cpu, 1, None)
+    assert asked
+    with pytest.raises(ResourceError):
+        tiles._check_total(1001, 1, cpu, 1, None)
+    asked.clear()
+    monkeypatch.setattr(tiles, "installed_bytes", lambda _: 2**60)
+    tiles._check_total(2**31 - 1, 1, cpu, 1, None)
+    assert not asked
+
+
+def test_memory_of_the_machine_is_in_bytes():
+    """Something between a small computer and a large one; free is less than installed."""
+    cpu = torch.device("cpu")
+    assert 2**28 < tiles.installed_bytes(cpu) < 2**46
+    assert 2**20 < tiles.available_bytes(cpu) <= tiles.installed_bytes(cpu)
+
+
+def test_tiles_of_a_smaller_or_larger_picture_are_refused():
+    """`blend` counts columns, rows and cameras."""
+    gaussians, cam = cloud(5), camera(40, 30, cameras=2, dtype=torch.float32)
+    splats, counts = run(gaussians, cam)
+    made = tiles.bin_tiles(splats, counts, width=40, height=30, rule=EXACT)
+    for count, width, height in ((2, 16, 30), (2, 40, 16), (1, 40, 30)):
+        with pytest.raises(ValueError, match="made for another image"):
+            blend.contributions(splats[:count], made, width=width, height=height, rule=EXACT)
+
+
+def one_a_tile(device, columns=3, rows=3):
+    """A Gaussian of 1 px in the middle of each tile of 16 px."""
+    gaussians, cam = facing(columns * rows, device=device, size=16 * columns)
+    K = cam.K[0]
+    for i in range(columns * rows):
+        pixel = torch.tensor([16.0 * (i % columns) + 8.5, 16.0 * (i // columns) + 8.5], device=device)
+        gaussians.means[i, :2] = (pixel - K[:2, 2]) / torch.stack([K[0, 0], K[1, 1]])
+        gaussians.means[i, 2] = 1.0
+    return gaussians, cam
+
+
+def test_tiles_of_one_instance_each(device):
+    """Every instance begins and ends a tile; the default tile is 16 px."""
+    gaussians, cam = one_a_tile(device)
+    splats, counts = run(gaussians, cam)
+    made = tiles.bin_tiles(splats, counts, width=48, height=48, rule=EXACT)
+    assert made.size == 16 and made.ranges.tolist() == [[i, i + 1] for i in range(9)]
+    assert made.splat_ids.tolist() == list(range(9)) and made.total.tolist() == [9]
+    assert torch.equal(counts, run(gaussians, cam, tile_size=16)[1])
+    single = tiles.bin_tiles(splats[:, 4:5], counts[:, 4:5], width=48, height=48, rule=EXACT)
+    assert single.total.tolist() == [1] and single.ranges[4].tolist() == [0, 1] and single.splat_ids.tolist() == [0]
+
+
+def test_nothing_has_no_length(device):
+    """No Gaussians, and none that is seen: every list is empty and the total is 0."""
+    for gaussians in (cloud(0, device=device), cloud(3, device=device)):
+        cam = camera(40, 30, cameras=1, dtype=torch.float32, device=device)
+        gaussians.means[:, 2] = -4.0
+        splats, counts = run(gaussians, cam)
+        made = tiles.bin_tiles(splats, counts, width=40, height=30, rule=EXACT)
+        assert [len(t) for t in (made.splat_ids, made.slots, made.tile_ids)] == [0, 0, 0]
+        assert len(made.starts) == len(made.counts) == len(gaussians.means) and made.total.tolist() == [0]
+
+
+def test_counts_that_differ_from_what_is_found(device):
+    """One counted too many belongs to no tile, one too few is left out; nobody else's slots are touched."""
+    gaussians, cam = one_a_tile(device)
+    splats, counts = run(gaussians, cam)
+    more, fewer = counts.clone(), counts.clone()
+    more[0, 3] += 1
+    fewer[0, 3] -= 1
+    size = {"width": 48, "height": 48, "rule": EXACT}
+    made = tiles.bin_tiles(splats, more, **size)
+    assert made.ranges.tolist() == [[i, i + 1] for i in range(9)] and made.tile_ids.tolist() == list(range(10))
+    assert sorted(made.slots.tolist()) == list(range(10)) and made.splat_ids.tolist()[:9] == list(range(9))
+    made = tiles.bin_tiles(splats, fewer, **size)
+    assert made.splat_ids.tolist() == [0, 1, 2, 4, 5, 6, 7, 8] and made.ranges[3].tolist() in ([0, 0], [3, 3])
+
+
+def test_capacity_to_the_instance(device):
+    """Exactly enough is no overflow; one less is, and what is kept fits."""
+    gaussians, cam = one_a_tile(device)
+    splats, counts = run(gaussians, cam)
+    for capacity in (9, 8, 3):
+        mine, overflow = counts.clone(), torch.zeros(1, dtype=torch.int32, device=device)
+        made = tiles.bin_tiles(splats, mine, width=48, height=48, rule=EXACT, capacity=capacity, overflow=overflow)
+        assert int(overflow) == (capacity < 9)
+        assert int(made.counts.sum()) == capacity and len(made.splat_ids) == capacity
+
+
+def plain(opacities, device, rule, side=16, pixel=None):
+    """Flat layers, one behind another, whose alpha is the opacity to the bit, over one tile; needs their gradient."""
+    count = len(opacities)
+    splats = torch.zeros(1, count, 12, dtype=torch.float64)
+    splats[0, :, 5] = torch.tensor(opacities, dtype=torch.float64)
+    splats[0, :, 6:9] = 1.0
+    splats[0, :, 9] = torch.arange(1, count + 1)
+    splats[0, :, 10:] = 100.0
+    splats = splats.to(device).requires_grad_()
+    numbers = torch.arange(count, dtype=torch.int32, device=device)
+    ranges = torch.tensor([[0, count]], dtype=torch.int32, device=device)
+    made = tiles.Tiles(
+        16, ranges, numbers, numbers, numbers, torch.ones_like(numbers), numbers * 0, torch.tensor([count], device=device)
+    )
+    black = torch.zeros(1, 3, dtype=torch.float64, device=device)
+    pictures = blend.blend(splats, made, black, width=side, height=side, rule=rule)
+    shares = blend.contributions(splats, made, width=side, height=side, rule=rule)
+    return splats, pictures, shares
+
+
+@pytest.mark.parametrize(("inclusive", "weights"), [(True, [0.5, 0.25, 0.125, 0, 0]), (False, [0.5, 0.25, 0, 0, 0])])
+def test_a_transmittance_equal_to_the_stop(device, inclusive, weights):
+    """Halves to the bit: at the stop itself a pixel is still open, and the next layer is the last or not drawn."""
+    rule = dataclasses.replace(EXACT, transmittance_stop=0.25, inclusive_stop=inclusive)
+    splats, (rgb, alpha, depth), (sums, maxima) = plain([0.5] * 5, device, rule)
+    assert bool((alpha == sum(weights)).all()) and bool((rgb == sum(weights)).all())
+    mean = sum(w * z for w, z in zip(weights, range(1, 6))) / sum(weights)
+    assert float((depth.detach() - mean).abs().max()) < 1e-14
+    assert maxima.tolist() == [weights] and sums.tolist() == [[256 * w for w in weights]]
+    (gradient,) = torch.autograd.grad(rgb[..., 0].sum(), splats)
+    assert gradient[0, :, 6].tolist() == [256 * w for w in weights]
+
+
+def test_an_alpha_equal_to_the_cut_or_to_the_most(device):
+    """The cut itself is drawn; at the largest alpha the opacity still has its gradient, above it has none."""
+    rule = dataclasses.replace(EXACT, alpha_cut=2.0**-8, alpha_max=0.5)
+    splats, (_, alpha, _), (_, maxima) = plain([2.0**-8, 2.0**-9, 0.5, 0.75], device, rule)
+    first, second = 2.0**-8, (1 - 2.0**-8) * 0.5
+    assert maxima.tolist() == [[first, 0.0, second, second / 2]]
+    (gradient,) = torch.autograd.grad(alpha.sum(), splats)
+    opened = gradient[0, :, 5] != 0
+    assert opened.tolist() == [True, False, True, False]
+
+
+def test_layers_behind_one_open_pixel(device):
+    """More layers than are taken at a time, over a single pixel."""
+    splats, (_, alpha, _), _ = plain([0.01] * 100, device, EXACT, side=1)
+    assert abs(float(alpha.detach()) - (1 - 0.99**100)) < 1e-12
+    (gradient,) = torch.autograd.grad(alpha.sum(), splats)
+    assert bool((gradient[0, :, 5] > 0).all())

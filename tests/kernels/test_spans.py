@@ -1,0 +1,191 @@
+"""Which rows and columns a Gaussian's box and ellipse touch: the shared functions themselves, against a fine search."""
+
+import functools
+import math
+
+import pytest
+import torch
+import warp as wp
+
+from warpgs.kernels import bridge, falloff, functions
+
+COUNT = 4000
+
+
+@functools.cache
+def make_probe():
+    """A kernel that calls the functions in float64, one case an item."""
+    s, f = functions.make_spans(wp.float64), falloff.make_functions(wp.float64, 16)
+    vec3 = wp.types.vector(3, wp.float64)
+
+    @wp.kernel(enable_backward=False)
+    def probe(
+        begin: int, cases: wp.array2d(dtype=wp.float64), whole_tiles: int, origin: int, size: int, tile_size: int,
+        # outputs
+        spans: wp.array2d(dtype=int),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        factor = vec3(cases[i, 2], cases[i, 3], cases[i, 4])
+        rows = s.tile_rows(cases[i, 1], cases[i, 7], origin, size, tile_size)
+        columns = s.tile_columns(
+            cases[i, 0], cases[i, 1], factor, cases[i, 5], cases[i, 6], cases[i, 7], int(cases[i, 8]), origin, size, tile_size
+        )
+        within = f.rows_of(cases[i, 1], cases[i, 7], whole_tiles, origin)
+        for k in range(2):
+            spans[i, k] = rows[k]
+            spans[i, 2 + k] = columns[k]
+            spans[i, 4 + k] = within[k]
+
+    return probe
+
+
+def probe(cases: torch.Tensor, device, whole_tiles=0, origin=16, size=53, tile_size=16) -> torch.Tensor:
+    spans = torch.zeros(len(cases), 6, dtype=torch.int32, device=device)
+    inputs = [bridge.view(cases.to(device), wp.float64), whole_tiles, origin, size, tile_size, bridge.view(spans, wp.int32)]
+    bridge.launch(make_probe(), len(cases), inputs, device)
+    return spans.cpu()
+
+
+def ellipses(origin=16, size=53, tile_size=16, far=1.0) -> torch.Tensor:
+    """Random ellipses about a window: mean, factor, reach, half sides, row of tiles. ``far`` stretches all of it."""
+    generator = torch.Generator().manual_seed(int(far))
+
+    def rand(*shape):
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    angle, axes = rand(COUNT) * math.pi, torch.exp(rand(COUNT, 2) * 4.5 - 1.5) * far
+    turn = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], -1).view(-1, 2, 2)
+    cov = turn @ torch.diag_embed(axes**2) @ turn.transpose(1, 2)
+    inverse = torch.linalg.inv(cov)
+    u11 = inverse[:, 0, 0].sqrt()
+    u12 = inverse[:, 0, 1] / u11
+    u22 = (inverse[:, 1, 1] - u12**2).sqrt()
+    reach = 0.5 + 2.8 * rand(COUNT)
+    half = reach[:, None] * torch.stack([cov[:, 0, 0], cov[:, 1, 1]], -1).sqrt()
+    means = origin + size * (rand(COUNT, 2) * 1.6 - 0.3) + (half - 1) * (torch.sign(rand(COUNT, 2) - 0.5)) * (far > 1)
+    row = torch.floor((origin + size * rand(COUNT)) / tile_size)
+    return torch.stack([*means.unbind(-1), u11, u12, u22, reach, *half.unbind(-1), row], -1)
+
+
+def margin_of(center, half):
+    """What the functions promise to allow for rounding [px]."""
+    return 0.01 + 2e-6 * (center.abs() + half)
+
+
+def tiles_of(low, high, origin, size, tile_size):
+    """First tile and one past the last that has a pixel centre in [low, high]; 0, 0 for none."""
+    first = torch.ceil(low - 0.5).clamp(origin, origin + size)
+    last = torch.floor(high - 0.5).clamp(origin - 1, origin + size - 1)
+    spans = torch.stack([first // tile_size, last // tile_size + 1], -1)
+    return torch.where((last < first)[:, None], torch.zeros(()), spans).int()
+
+
+@pytest.mark.parametrize("far", [1.0, 1e5])
+@pytest.mark.parametrize("tile_size", [1, 16])
+def test_rows_of_tiles_are_those_of_the_box(device, tile_size, far):
+    """All that the box and its margin touch within the window, and no other."""
+    cases = ellipses(far=far)
+    found = probe(cases, device, tile_size=tile_size)[:, :2]
+    low, high = cases[:, 1] - cases[:, 7], cases[:, 1] + cases[:, 7]
+    margin = margin_of(cases[:, 1], cases[:, 7])
+    assert torch.equal(found, tiles_of(low - margin, high + margin, 16, 53, tile_size))
+    assert 0 < int((found[:, 1] > found[:, 0]).sum()) < COUNT
+
+
+def test_rows_within_a_tile(device):
+    """Rows counted from the tile's top; all of them where tiles are drawn whole."""
+    cases = ellipses()
+    found = probe(cases, device)[:, 4:]
+    margin = margin_of(cases[:, 1], cases[:, 7])
+    first = torch.ceil(cases[:, 1] - cases[:, 7] - margin - 16.5).clamp(0, 16)
+    last = torch.floor(cases[:, 1] + cases[:, 7] + margin - 16.5).clamp(-1, 15)
+    assert torch.equal(found, torch.stack([first, last + 1], -1).int())
+    assert bool((probe(cases, device, whole_tiles=1)[:, 4:] == torch.tensor([0, 16])).all())
+
+
+@pytest.mark.parametrize("far", [1.0, 300.0])
+@pytest.mark.parametrize("tile_size", [1, 16])
+def test_columns_of_tiles_are_those_of_the_ellipse(device, tile_size, far):
+    """In a row of tiles, widened by its margin: all that the ellipse touches, and no other."""
+    cases = ellipses(far=far, tile_size=tile_size)
+    found = probe(cases, device, tile_size=tile_size)[:, 2:4]
+    mx, my, u11, u12, u22, reach, half_width, half_height, row = (t[:, None] for t in cases.unbind(-1))
+    slack, margin = margin_of(my, half_height), margin_of(mx, half_width)
+    top = (row * tile_size + 0.5 - my - slack).maximum(-half_height)
+    bottom = (row * tile_size + tile_size - 0.5 - my + slack).minimum(half_height)
+    dy = top + (bottom - top) * torch.linspace(0, 1, 3001, dtype=torch.float64)
+    width = (reach**2 - (u22 * dy) ** 2).clamp_min(0).sqrt()
+    left = (mx + ((-width - u12 * dy) / u11).amin(1, keepdim=True) - margin)[:, 0]
+    right = (mx + ((width - u12 * dy) / u11).amax(1, keepdim=True) + margin)[:, 0]
+    within = (top < bottom)[:, 0]  # other rows are never asked for
+    # the search itself is coarse: what it finds to within its step must agree
+    step = 1e-3 * far
+    least, most = (tiles_of(left + e, right - e, 16, 53, tile_size)[within] for e in (step, -step))
+    touches = least[:, 1] > least[:, 0]
+    found = found[within]
+    sure = (least == most).all(1)
+    assert torch.equal(found[sure], least[sure])
+    assert int((sure & touches).sum()) > (0.2 if far == 1.0 else 0.05) * len(sure)
+    assert float(sure.float().mean()) > 0.9 if far == 1.0 else 0.3
+
+
+def test_columns_of_the_box_where_there_is_no_reach(device):
+    """Reach 0 asks for the box; so does a factor that has lost its range."""
+    cases = ellipses()
+    margin = margin_of(cases[:, 0], cases[:, 6])
+    wanted = tiles_of(cases[:, 0] - cases[:, 6] - margin, cases[:, 0] + cases[:, 6] + margin, 16, 53, 16)
+    for column, value in ((5, 0.0), (2, 1e-7), (4, 1e-7), (2, 1e-6), (4, 1e-6)):
+        changed = cases.clone()
+        changed[:, column] = value
+        assert torch.equal(probe(changed, device)[:, 2:4], wanted), column
+
+
+@functools.cache
+def make_reach():
+    """A kernel for `reach_of` and for the falloff of both scalar types."""
+    s = functions.make_spans(wp.float64)
+    single = falloff.make_falloff(wp.float32)
+
+    @wp.kernel(enable_backward=False)
+    def reaches(
+        begin: int, opacities: wp.array(dtype=wp.float64), cut: wp.float64, square_sigma: wp.float64,
+        xs: wp.array(dtype=wp.float32),
+        # outputs
+        found: wp.array(dtype=wp.float64), falls: wp.array(dtype=wp.float32),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        found[i] = s.reach_of(opacities[i], cut, square_sigma)
+        falls[i] = single(xs[i])
+
+    return reaches
+
+
+def reaches(opacities, cut, square_sigma, xs):
+    found, falls = torch.zeros_like(opacities), torch.zeros_like(xs)
+    inputs = [bridge.view(opacities, wp.float64), cut, square_sigma, bridge.view(xs, wp.float32)]
+    outputs = [bridge.view(found, wp.float64), bridge.view(falls, wp.float32)]
+    bridge.launch(make_reach(), len(opacities), [*inputs, *outputs], torch.device("cpu"))
+    return found, falls
+
+
+def test_reach_is_where_alpha_is_the_cut():
+    """At the reach alpha lies a little below the cut; the box is asked for by 0."""
+    opacities, cut = torch.linspace(0.004, 1.0, 500, dtype=torch.float64), 1 / 255
+    found, _ = reaches(opacities, cut, 0.0, torch.zeros(500))
+    alpha = opacities * torch.exp(-0.5 * found**2)
+    assert bool((alpha < cut).all()) and bool((alpha > cut * (1 - 3e-4)).all())
+    wanted = (2 * torch.log(opacities / cut) + 1e-5).sqrt()
+    assert bool(((found / wanted - 1).abs() < 2e-5).all()) and bool((found > wanted).all())
+    for no_cut, sigma in ((0.0, 0.0), (cut, 3.0), (0.0, 3.0)):
+        assert not bool(reaches(opacities, no_cut, sigma, torch.zeros(500))[0].any())
+    assert bool(reaches(opacities.clamp_min(0.6), 0.5, 0.0, torch.zeros(500))[0].all())
+
+
+def test_falloff_is_the_exponential():
+    """To the polynomial's 3e-7 where x is small, then to what the rounding of x leaves, down to the bound."""
+    x = torch.cat([torch.linspace(0, 152, 400_001), torch.tensor([153.0, 200.0, 1e4, 1e30])])
+    _, found = reaches(torch.ones(len(x), dtype=torch.float64), 0.5, 0.0, x)
+    error = (found.double() / torch.exp(-0.5 * x.double()).clamp_min(2.0**-110) - 1).abs()
+    # measured 1.9e-7, 5.2e-7 where alpha can still reach the cut, 3.8e-6
+    assert float(error[x < 3].max()) < 3e-7 and float(error[x < 12].max()) < 6e-7 and float(error.max()) < 1e-5
+    assert bool((found[x > 152.5].double() == 2.0**-110).all())

@@ -1,0 +1,102 @@
+"""`python -m tests.mutate`: break the kernels in many small ways, one at a time, and see whether the tests notice."""
+
+import argparse
+import itertools
+import json
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from tests.mutate import claims, report, rules
+from tests.mutate.candidates import KERNELS, ROOT, Candidate, all_candidates, draw
+from tests.mutate.process import Job, preload, run_jobs
+
+
+def arguments(args: list[str] | None = None) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="python -m tests.mutate", description=__doc__.split(": ", 1)[1])
+    parser.add_argument("--sample", type=int, default=200, help="mutants to draw (default 200)")
+    parser.add_argument("--seed", type=int, default=0, help="of the draw (default 0)")
+    parser.add_argument("--files", nargs="+", default=None, help="only of these, such as tiles.py cuda/blend_forward.cu")
+    parser.add_argument("--device", choices=["cpu", "cuda", "both"], default="cpu", help="whose code is mutated (default cpu)")
+    parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 2) - 2), help="mutants at a time")
+    parser.add_argument("--timeout", type=float, default=150.0, help="seconds of one mutant (default 150)")
+    parser.add_argument("--json", type=Path, default=Path("mutants.json"), help="results, which the same command goes on from")
+    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "warpgs-mutant-kernels")
+    parser.add_argument("--only", nargs="+", default=None, help="run just these mutants, by number")
+    parser.add_argument("--list", action="store_true", help="list the drawn mutants and run none")
+    return parser.parse_args(args)
+
+
+def chosen(options: argparse.Namespace) -> list[Candidate]:
+    """The drawn mutants."""
+    pool = all_candidates()
+    if options.only:
+        return [c for c in pool if c.id in options.only]
+    if options.device != "both":
+        pool = [c for c in pool if c.cuda == (options.device == "cuda")]
+    if options.files:
+        pool = [c for c in pool if c.file in options.files]
+    return draw(pool, options.sample, options.seed) if pool else []
+
+
+def job_of(candidate: Candidate, cuda: bool) -> Job:
+    """The tests of a mutant's op, on CUDA or on the CPU."""
+    source = candidate.edit.apply((ROOT / KERNELS / candidate.file).read_bytes())
+    tests = tuple(rules.tests_of(candidate.file))
+    return Job(candidate.id, tests, cuda, f"{KERNELS}/{candidate.file}", source, rules.SKIPPED)
+
+
+def check_unmutated(drawn: list[Candidate], options: argparse.Namespace) -> None:
+    """Run the tests on the code as it is, which also compiles its kernels; exit if any of them fails."""
+    wanted = {(test, c.cuda) for c in drawn for test in rules.tests_of(c.file)}
+    jobs = [
+        Job(f"{test} on {'CUDA' if cuda else 'the CPU'}", (test,), cuda, skipped=rules.SKIPPED) for test, cuda in sorted(wanted)
+    ]
+    for outcome in run_jobs(jobs, ROOT, options.cache, workers=options.workers, timeout=600):
+        if outcome.status != "survived":
+            sys.exit(f"the tests fail without a mutant: {outcome.name} ({outcome.status})\n{outcome.output}")
+        print(f"unmutated: {outcome.name} passes in {outcome.seconds:.0f} s", flush=True)
+
+
+def main() -> None:
+    """Draw, run, report."""
+    options = arguments()
+    drawn, claimed = chosen(options), claims.load()
+    reasons = {c.id: r for c in drawn if (r := claimed.reason(c))}
+    if options.list:
+        for c in drawn:
+            print(f"{report.describe(c)}  [{c.edit.function}]\n    {c.line}\n    {c.mutated_line()}")
+        return
+    preload()
+    done = json.loads(options.json.read_text()) if options.json.exists() else {}
+    left = [c for c in drawn if c.id not in reasons and (options.only or c.id not in done)]
+    begun = time.monotonic()
+    if left:
+        check_unmutated(left, options)
+    by_id = {c.id: c for c in left}
+    # CUDA mutants compile longest: first, so that none of them is alone at the end
+    first = [job_of(c, c.cuda) for c in sorted(left, key=lambda c: not c.cuda)]
+    # what no CPU test notices may still matter on CUDA, which runs the shared code too
+    second = (job_of(c, True) for c in left if options.device == "both" and not c.cuda and done[c.id]["status"] == "survived")
+    jobs = itertools.chain(first, second)
+    for i, o in enumerate(run_jobs(jobs, ROOT, options.cache, workers=options.workers, timeout=options.timeout), 1):
+        c = by_id[o.name]
+        done[o.name] = {
+            "file": c.file, "line": c.number, "function": c.edit.function, "source": c.line, "change": c.change,
+            "status": o.status, "seconds": o.seconds, "output": o.output,
+        }  # fmt: skip
+        fresh = options.json.with_name(f"{options.json.name}.{os.getpid()}")
+        fresh.write_text(json.dumps(done, indent=1))
+        fresh.replace(options.json)
+        print(f"{i}/{len(left)}  {o.status:<8} {o.seconds:5.1f} s  {report.describe(c)}", flush=True)
+    print()
+    print(report.summary(drawn, {n: r["status"] for n, r in done.items()}, reasons))
+    if left:
+        print(f"({time.monotonic() - begun:.0f} s, {options.workers} at a time)", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

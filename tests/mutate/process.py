@@ -1,0 +1,169 @@
+"""Runs tests against a mutated copy of the tree: a forked child a mutant, which inherits torch and Warp already imported."""
+
+import contextlib
+import os
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+COPIED = ("warpgs", "tests", "bench")
+PASSED, NOT_RUN = 0, (3, 4, 5, 70)
+"""What pytest returns for tests that pass, and where it cannot run any: an error of its own, no such file, no test; ours."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Tests to run on a tree in which one file is another."""
+
+    name: str
+    tests: tuple[str, ...]
+    cuda: bool
+    """Whether to run the tests marked cuda, else the others."""
+    file: str | None = None
+    """Path of the file that is replaced; None for the tree as it is."""
+    source: bytes = b""
+    skipped: tuple[str, ...] = ()
+    """Tests to leave out."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a job."""
+
+    name: str
+    status: str
+    """``killed``, ``survived``, ``timeout`` (counts as killed), or ``broken``: the tests could not be run at all."""
+    seconds: float
+    output: str
+    """The end of what pytest printed."""
+
+
+def copy_tree(root: Path, to: Path) -> None:
+    """Hard links to all that tests read; a file that is to differ must be unlinked first."""
+    ignored = shutil.ignore_patterns("__pycache__", "*.pyc")
+    for name in COPIED:
+        if (root / name).is_dir():
+            shutil.copytree(root / name, to / name, ignore=ignored, copy_function=_link)
+    for path in root.glob("*.toml"):
+        _link(path, to / path.name)
+
+
+def _link(source, target) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # another file system
+        shutil.copyfile(source, target)
+
+
+def preload() -> None:
+    """Import, once for all children, what is slow and holds no state of ours or of a device."""
+    for name in ("numpy", "torch", "torch.autograd.gradcheck", "warp", "pytest", "scipy.stats", "hypothesis"):
+        with contextlib.suppress(ImportError):
+            __import__(name)
+
+
+def _child(job: Job, tree: Path, root: Path, cache: Path, threads: int) -> int:
+    """Everything a forked child does; returns pytest's exit status."""
+    import pytest
+    import torch
+
+    copy_tree(root, tree)
+    if job.file is not None:
+        path = tree / job.file
+        path.unlink()
+        path.write_bytes(job.source)
+    for name in [n for n in sys.modules if n.split(".")[0] in ("tests", "warpgs", "bench")]:
+        del sys.modules[name]
+    os.chdir(tree)
+    sys.path[:] = [str(tree), *(p for p in sys.path if Path(p or ".").resolve() != root)]
+    sys.dont_write_bytecode = True
+    os.environ |= {"WARP_CACHE_PATH": str(cache), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTHONPATH": str(tree)}
+    torch.set_num_threads(threads)
+    mark = f"not slow and {'cuda' if job.cuda else 'not cuda'}"
+    # the project's own options ask for plugins and warnings that a mutant need not load
+    skipped = [f"--deselect={test}" for test in job.skipped]
+    return int(pytest.main([*job.tests, *skipped, "-x", "-q", "--tb=line", "-p", "no:cacheprovider", "-m", mark]))
+
+
+def _start(job: Job, folder: Path, root: Path, cache: Path, threads: int) -> int:
+    tree = folder / "tree"
+    tree.mkdir(parents=True)
+    if pid := os.fork():
+        return pid
+    status = 70
+    try:
+        os.setsid()  # so that a timeout ends what the tests started, too
+        out = os.open(folder / "output", os.O_WRONLY | os.O_CREAT)
+        os.dup2(out, 1)
+        os.dup2(out, 2)
+        status = _child(job, tree, root, cache, threads)
+    except BaseException:
+        import traceback
+
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+
+
+def _outcome(job: Job, status: int, timed_out: bool, seconds: float, output: str) -> Outcome:
+    """Classify an end: tests that failed, a process that crashed or one that never ended is a mutant that was noticed."""
+    code = os.waitstatus_to_exitcode(status)
+    if timed_out:
+        word = "timeout"
+    elif code == PASSED:
+        word = "survived"
+    elif code in NOT_RUN:
+        word = "broken"
+    else:
+        word = "killed"  # 1: a test failed; 2: a module does not import; below 0: a signal
+    return Outcome(job.name, word, round(seconds, 1), output)
+
+
+def run_jobs(
+    jobs: Iterable[Job], root: Path, cache: Path, *, workers: int, timeout: float, threads: int = 1
+) -> Iterator[Outcome]:
+    """Run jobs, ``workers`` at a time, and yield each outcome as it comes.
+
+    Args:
+        jobs: What to run.
+        root: The tree to copy.
+        cache: Warp's folder of compiled kernels, shared: it is keyed by the code, and entries are moved in whole.
+        workers: Processes at a time.
+        timeout: Seconds after which a job is ended.
+        threads: CPU threads of each process; some tests set their own number.
+    """
+    waiting, running = iter(jobs), {}
+    with tempfile.TemporaryDirectory(prefix="mutants-") as scratch:
+        try:
+            count = 0
+            while True:
+                while len(running) < workers and (job := next(waiting, None)) is not None:
+                    folder = Path(scratch) / str(count)
+                    count += 1
+                    running[_start(job, folder, root, cache, threads)] = (job, folder, time.monotonic(), set())
+                if not running:
+                    return
+                time.sleep(0.02)
+                for pid, (job, folder, since, killed) in list(running.items()):
+                    ended, status = os.waitpid(pid, os.WNOHANG)
+                    seconds = time.monotonic() - since
+                    if ended:
+                        del running[pid]
+                        lines = (folder / "output").read_text(errors="replace").strip().splitlines()
+                        yield _outcome(job, status, bool(killed), seconds, "\n".join(lines[-6:]))
+                        shutil.rmtree(folder, ignore_errors=True)
+                    elif seconds > timeout and not killed:
+                        killed.add(pid)
+                        os.killpg(pid, signal.SIGKILL)
+        finally:
+            for pid in running:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(pid, signal.SIGKILL)
+                os.waitpid(pid, 0)

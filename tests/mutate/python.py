@@ -1,0 +1,132 @@
+"""Mutants of a Python source: found in its syntax tree, made by replacing the bytes of one token."""
+
+import ast
+import io
+import itertools
+import tokenize
+from collections.abc import Iterator
+
+from tests.mutate import rules
+from tests.mutate.edit import NAMES, Edit, other_number, swaps
+from tests.mutate.native import native_edits
+
+COMPARISONS = {
+    ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=", ast.Is: "is", ast.IsNot: "is not",
+}  # fmt: skip
+OPERATORS = {
+    ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.FloorDiv: "//", ast.Mod: "%", ast.Pow: "**",
+    ast.LShift: "<<", ast.RShift: ">>", ast.BitOr: "|", ast.BitAnd: "&",
+}  # fmt: skip
+
+
+def python_edits(source: bytes, file: str) -> list[Edit]:
+    """All mutants of a file, in the order in which they stand in it."""
+    return sorted(_Walker(source, file).edits, key=lambda e: (e.start, e.end, e.change))
+
+
+class _Walker:
+    def __init__(self, source: bytes, file: str):
+        self.source, self.file = source, file
+        starts = [0]
+        for line in source.splitlines(keepends=True):
+            starts.append(starts[-1] + len(line))
+        self.starts = starts
+        self.bare = bytearray(source)  # without comments, so that an operator found between two operands is the operator
+        for token in tokenize.generate_tokens(io.StringIO(source.decode()).readline):
+            if token.type == tokenize.COMMENT:
+                begin = starts[token.start[0] - 1] + len(token.line[: token.start[1]].encode())
+                length = len(token.string.encode())
+                self.bare[begin : begin + length] = b" " * length
+        self.edits: list[Edit] = []
+        self.statement: ast.stmt | None = None
+        self.indices: set[int] = set()  # numbers that stand alone in brackets
+        self.walk(ast.parse(source), (), False)
+
+    def begin(self, node) -> int:
+        return self.starts[node.lineno - 1] + node.col_offset
+
+    def end(self, node) -> int:
+        return self.starts[node.end_lineno - 1] + node.end_col_offset
+
+    def walk(self, node, scope: tuple[str, ...], cuda: bool) -> None:
+        """Collect the edits of a node and of all below it that no rule leaves out."""
+        if rules.left_out(node):
+            return
+        if isinstance(node, ast.stmt):
+            self.statement = node
+        name = getattr(node, "name", None) if isinstance(node, ast.FunctionDef | ast.ClassDef) else None
+        if name:
+            scope = (*scope, name)
+            cuda = cuda or ".".join(scope) in rules.CUDA_FUNCTIONS.get(self.file, ())
+        for start, end, new, change in self.of(node):
+            self.edits.append(Edit(start, end, new, change, ".".join(scope), cuda or self.file in rules.CUDA_FILES))
+        if isinstance(node, ast.Constant) and rules.is_native(node):
+            self.native(node, scope)
+        body_cuda, else_cuda = rules.sides(node)
+        for field, child in ast.iter_fields(node):
+            if field in ("annotation", "returns", "decorator_list", "type_params"):
+                self.strings(child, scope)
+                continue
+            side = cuda or (field == "body" and body_cuda) or (field == "orelse" and else_cuda)
+            for item in child if isinstance(child, list) else [child]:
+                if isinstance(item, ast.AST):
+                    self.walk(item, scope, side)
+
+    def strings(self, children, scope) -> None:
+        """Native bodies among decorators, of which nothing else is mutated: compile options and annotations."""
+        for child in children if isinstance(children, list) else []:
+            for node in ast.walk(child):
+                if isinstance(node, ast.Constant) and rules.is_native(node):
+                    self.native(node, scope)
+
+    def native(self, node: ast.Constant, scope) -> None:
+        begin, end = self.begin(node), self.end(node)
+        quotes = 3 if self.source[begin : begin + 3] == b'"""' else 1
+        text = self.source[begin + quotes : end - quotes]
+        for e in native_edits(text):
+            shift = begin + quotes
+            self.edits.append(Edit(e.start + shift, e.end + shift, e.new, e.change, ".".join(scope), True))
+
+    def between(self, left, right, operator: str) -> tuple[int, int]:
+        """Where an operator stands between two operands."""
+        start = self.bare.index(operator.split()[0].encode(), self.end(left), self.begin(right))
+        return start, self.bare.index(operator.split()[-1].encode(), start, self.begin(right)) + len(operator.split()[-1])
+
+    def of(self, node) -> Iterator[tuple[int, int, str, str]]:
+        """Start, end, new text and description of the mutants of one node."""
+        match node:
+            case ast.BinOp(left=left, op=op, right=right) if type(op) in OPERATORS:
+                for new in swaps(old := OPERATORS[type(op)]):
+                    yield *self.between(left, right, old), new, f"{old} to {new}"
+            case ast.Compare(left=left, ops=ops, comparators=comparators):
+                for a, op, b in zip([left, *comparators], ops, comparators):
+                    old = COMPARISONS.get(type(op))
+                    for new in {"is": ["is not"], "is not": ["is"]}.get(old) or swaps(old or ""):
+                        yield *self.between(a, b, old), new, f"{old} to {new}"
+            case ast.BoolOp(op=op, values=values):
+                old = "and" if isinstance(op, ast.And) else "or"
+                for a, b in itertools.pairwise(values):
+                    yield *self.between(a, b, old), swaps(old)[0], f"{old} to {swaps(old)[0]}"
+            case ast.UnaryOp(op=ast.USub() | ast.Not() as op):
+                word = "-" if isinstance(op, ast.USub) else "not"
+                yield self.begin(node), self.begin(node) + len(word), "" if word == "-" else " " * 3, f"{word} dropped"
+            case ast.AugAssign(target=target, op=op, value=value) if type(op) in OPERATORS:
+                old = OPERATORS[type(op)] + "="
+                for new in swaps(old):
+                    yield *self.between(target, value, old), new, f"{old} to {new}"
+                yield self.begin(node), self.end(node), "pass", "statement dropped"
+            case ast.Constant(value=bool() as value):
+                yield self.begin(node), self.end(node), str(not value), f"{value} to {not value}"
+            case ast.Constant(value=int() | float()) if not rules.number_left_out(self.statement):
+                old = self.source[self.begin(node) : self.end(node)].decode()
+                new = other_number(old.replace("_", ""), index=id(node) in self.indices)
+                yield self.begin(node), self.end(node), new, f"{old} to {new}"
+            case ast.Subscript(slice=index):
+                self.indices.update(map(id, index.elts if isinstance(index, ast.Tuple) else [index]))
+            case ast.Call(func=func, args=args):
+                word = func.attr if isinstance(func, ast.Attribute) else getattr(func, "id", "")
+                if word in NAMES:
+                    yield self.end(func) - len(word), self.end(func), NAMES[word], f"{word} to {NAMES[word]}"
+                if word == "range" and args:
+                    last = args[1] if len(args) > 1 else args[0]
+                    yield self.end(last), self.end(last), " - 1", "range one shorter"

@@ -1,0 +1,54 @@
+"""The outcome of a run in words: by file, the survivors, the claims, and last the score."""
+
+import difflib
+from collections import Counter
+
+from tests.mutate.candidates import KERNELS, ROOT, Candidate
+
+KILLED = ("killed", "timeout")
+
+
+def difference(candidate: Candidate) -> str:
+    """The change as a diff without context."""
+    source = (ROOT / KERNELS / candidate.file).read_bytes()
+    new = candidate.edit.apply(source)
+    lines = difflib.unified_diff(source.decode().splitlines(), new.decode().splitlines(), n=0, lineterm="")
+    return "\n".join(line for line in list(lines)[3:])
+
+
+def describe(candidate: Candidate) -> str:
+    """Where and what, in one line."""
+    return f"{candidate.id}  {KERNELS}/{candidate.file}:{candidate.number}  {candidate.change}"
+
+
+def summary(drawn: list[Candidate], status: dict[str, str], reasons: dict[str, str]) -> str:
+    """The whole report.
+
+    Args:
+        drawn: The sample.
+        status: By number of the mutant: killed, timeout, survived, broken; mutants that were not run are missing.
+        reasons: By number, why a mutant is claimed to be equivalent.
+    """
+    parts = []
+    for c in drawn:
+        if status.get(c.id) in ("survived", "broken"):
+            parts.append(f"{status[c.id].upper()}  {describe(c)}\n{difference(c)}")
+    claimed = [c for c in drawn if c.id in reasons]
+    parts += [f"CLAIMED  {describe(c)}\n    {reasons[c.id]}" for c in claimed]
+    table = [f"{'file':<28}{'drawn':>7}{'killed':>8}{'timeout':>9}{'survived':>10}{'claimed':>9}"]
+    for file in sorted({c.file for c in drawn}):
+        own = [c for c in drawn if c.file == file]
+        n = Counter("claimed" if c.id in reasons else status.get(c.id, "not run") for c in own)
+        table.append(
+            f"{file:<28}{len(own):>7}{n['killed']:>8}{n['timeout']:>9}{n['survived'] + n['broken']:>10}{n['claimed']:>9}"
+        )
+    parts.append("\n".join(table))
+    run = [c for c in drawn if c.id in status and c.id not in reasons]
+    killed = sum(status[c.id] in KILLED for c in run)
+    missing = len(drawn) - len(run) - len(claimed)
+    note = f", {missing} not run" if missing else ""
+    share = f"{100 * killed / len(run):.1f} %" if run else "none run"
+    parts.append(
+        f"mutation score {share}: {killed} killed of {len(run)} ({len(drawn)} drawn, {len(claimed)} claimed equivalent{note})"
+    )
+    return "\n\n".join(parts)

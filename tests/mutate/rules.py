@@ -1,0 +1,103 @@
+"""What is mutated, where it runs, and which tests look at it."""
+
+import ast
+import re
+
+SPEED = {
+    "AHEAD", "SHORT", "CHUNKS_PER_THREAD", "FEW_THREADS", "SERIAL_WORK", "SEGMENT", "LANES", "BATCH", "BLOCK", "BOX", "SMALL",
+    "MANY", "WARPS",
+}  # fmt: skip
+"""Sizes of portions of work; every value that divides as its comment says gives the same numbers."""
+
+HINTS = {"cost", "enable_backward", "record_tape", "sync", "requires_grad", "thread_name_prefix", "cuda_max_registers"}
+"""Keywords that tell Warp, torch or a thread pool how to work, not what comes out."""
+
+SLACK = {"margin", "slack", "slack_x", "slack_y", "limit_of"}
+"""Widths by which bounds are safe: a hundredth more lists a tile in excess, which draws nothing. Their operators count."""
+
+CUDA_FILES = ("blend_cuda.py", "ssim_cuda.py", "native.py")
+CUDA_FUNCTIONS = {
+    "bridge.py": ("_Recorded", "_recorded", "warp_stream", "_warp_stream", "stream_of", "warp_device"),
+    "adam.py": ("make_scheduled_kernel", "scheduled_rates", "adam_scheduled"),
+    "ssim.py": ("make_kernels", "_Plan.padded", "_Plan.launch"),
+}
+"""What only a CUDA device runs, beside the branches that `sides` finds."""
+
+LIMITS, LIMITS_PROJECT, LIMITS_BLEND = (f"kernels/test_limits{what}.py" for what in ("", "_project", "_blend"))
+SPANS, CUTS = "kernels/test_spans.py", "kernels/test_bridge.py"
+OPS = {
+    "adam": ["kernels/test_adam.py", LIMITS],
+    "blend": ["kernels/test_blend.py", "test_rasterizer.py", LIMITS_BLEND],
+    "blend_cpu": ["kernels/test_blend.py", LIMITS_BLEND, "test_window.py"],
+    "blend_cuda": ["kernels/test_blend.py", "test_rasterizer.py", LIMITS_BLEND, "test_window.py"],
+    "bridge": [CUTS, "kernels/test_adam.py", "kernels/test_sh.py", "kernels/test_tiles.py"],
+    "compiler": ["kernels/test_blend.py"],
+    "dropout": ["kernels/test_dropout.py"],
+    "falloff": [SPANS, "kernels/test_blend.py", LIMITS_BLEND],
+    "functions": ["kernels/test_project.py", SPANS, LIMITS_PROJECT, "kernels/test_tiles.py", "test_window.py"],
+    "knn": ["kernels/test_knn.py", LIMITS],
+    "native": ["kernels/test_project.py", "kernels/test_tiles.py", "test_rasterizer.py", LIMITS_PROJECT, LIMITS_BLEND],
+    "project": ["kernels/test_project.py", LIMITS_PROJECT, "kernels/test_tiles.py", "test_rasterizer.py"],
+    "project_backward": ["kernels/test_project.py", LIMITS_PROJECT, "test_rasterizer.py"],
+    "sh": ["kernels/test_sh.py", "kernels/test_project.py"],
+    "ssim": ["kernels/test_ssim.py", LIMITS],
+    "tiles": ["kernels/test_tiles.py", LIMITS_BLEND, "test_rasterizer.py", "test_window.py"],
+}
+"""The tests of a file by the beginning of its name, the longest that fits; those that fail soonest come first."""
+
+
+SKIPPED = ("tests/kernels/test_blend.py::test_gradcheck",)
+"""Tests that take most of a minute, and check what another in the list checks to the same digits by other means."""
+
+
+def tests_of(file: str) -> list[str]:
+    """Test files for a kernel file, given by its path below warpgs/kernels."""
+    stem = file.removeprefix("cuda/").split(".")[0]
+    op = max((name for name in OPS if stem.startswith(name)), key=len)
+    if file.startswith("cuda/blend"):
+        op = "blend_cuda"
+    return [f"tests/{name}" for name in dict.fromkeys([*OPS[op], CUTS])]
+
+
+def left_out(node: ast.AST) -> bool:
+    """Whether a node is not mutated, with all below it.
+
+    Errors: their text, and what is computed for it, is no arithmetic. Formatted text: names of modules and messages.
+    Imports and `__all__` hold no operator. Hints and portions change the time, not the numbers. Slack: see `SLACK`.
+    """
+    match node:
+        case ast.Raise() | ast.JoinedStr() | ast.Import() | ast.ImportFrom():
+            return True
+        case ast.keyword(arg=name):
+            return name in HINTS
+        case ast.Assign(targets=[ast.Name(id=name)]):
+            return name in SPEED
+        case ast.AnnAssign(target=ast.Name(id=name)):
+            return name in SPEED
+    return False
+
+
+def number_left_out(statement: ast.stmt | None) -> bool:
+    """Whether the numbers of a statement are left out, its operators not."""
+    return isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) in SLACK
+
+
+def native_number_left_out(line: str) -> bool:
+    """The same for a line of a CUDA body, and the sizes of portions there."""
+    declared = re.match(r"\s*(?:const float|auto|constexpr int) (\w+) =", line)
+    return bool(declared) and declared[1] in SLACK | SPEED
+
+
+def is_native(node: ast.Constant) -> bool:
+    """Whether a string is a CUDA body: it has a statement, or more, of its own."""
+    return isinstance(node.value, str) and ";" in node.value and ("return " in node.value or ";\n" in node.value)
+
+
+def sides(node: ast.AST) -> tuple[bool, bool]:
+    """Whether only CUDA runs the body of an ``if`` (or conditional expression), and the same of its ``else``."""
+    if not isinstance(node, ast.If | ast.IfExp):
+        return False, False
+    test = ast.unparse(node.test)
+    if "== 'cuda'" in test or re.fullmatch(r"native|wp\.static\(native\)|_native\(\w+\)", test):
+        return True, False
+    return False, "== 'cpu'" in test or "blocked" in test
