@@ -10,6 +10,7 @@ from tests.splats import camera, cloud
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
 from warpgs.kernels import blend, tiles
+from warpgs.scene import Gaussians
 
 EXACT = RULES["exact"]
 
@@ -124,11 +125,11 @@ def test_capacity_to_the_instance(device):
         assert int(made.counts.sum()) == capacity and len(made.splat_ids) == capacity
 
 
-def plain(opacities, device, rule, side=16, pixel=None):
+def plain(opacities, device, dtype, rule, side=16):
     """Flat layers, one behind another, whose alpha is the opacity to the bit, over one tile; needs their gradient."""
     count = len(opacities)
-    splats = torch.zeros(1, count, 12, dtype=torch.float64)
-    splats[0, :, 5] = torch.tensor(opacities, dtype=torch.float64)
+    splats = torch.zeros(1, count, 12, dtype=dtype)
+    splats[0, :, 5] = torch.tensor(opacities, dtype=dtype)
     splats[0, :, 6:9] = 1.0
     splats[0, :, 9] = torch.arange(1, count + 1)
     splats[0, :, 10:] = 100.0
@@ -138,29 +139,29 @@ def plain(opacities, device, rule, side=16, pixel=None):
     made = tiles.Tiles(
         16, ranges, numbers, numbers, numbers, torch.ones_like(numbers), numbers * 0, torch.tensor([count], device=device)
     )
-    black = torch.zeros(1, 3, dtype=torch.float64, device=device)
+    black = torch.zeros(1, 3, dtype=dtype, device=device)
     pictures = blend.blend(splats, made, black, width=side, height=side, rule=rule)
     shares = blend.contributions(splats, made, width=side, height=side, rule=rule)
     return splats, pictures, shares
 
 
 @pytest.mark.parametrize(("inclusive", "weights"), [(True, [0.5, 0.25, 0.125, 0, 0]), (False, [0.5, 0.25, 0, 0, 0])])
-def test_a_transmittance_equal_to_the_stop(device, inclusive, weights):
+def test_a_transmittance_equal_to_the_stop(device, dtype, inclusive, weights):
     """Halves to the bit: at the stop itself a pixel is still open, and the next layer is the last or not drawn."""
     rule = dataclasses.replace(EXACT, transmittance_stop=0.25, inclusive_stop=inclusive)
-    splats, (rgb, alpha, depth), (sums, maxima) = plain([0.5] * 5, device, rule)
+    splats, (rgb, alpha, depth), (sums, maxima) = plain([0.5] * 5, device, dtype, rule)
     assert bool((alpha == sum(weights)).all()) and bool((rgb == sum(weights)).all())
     mean = sum(w * z for w, z in zip(weights, range(1, 6))) / sum(weights)
-    assert float((depth.detach() - mean).abs().max()) < 1e-14
+    assert float((depth.detach() - mean).abs().max()) < 1e-6
     assert maxima.tolist() == [weights] and sums.tolist() == [[256 * w for w in weights]]
     (gradient,) = torch.autograd.grad(rgb[..., 0].sum(), splats)
-    assert gradient[0, :, 6].tolist() == [256 * w for w in weights]
+    assert torch.allclose(gradient[0, :, 6].cpu().double(), 256 * torch.tensor(weights, dtype=torch.float64), rtol=1e-6, atol=0)
 
 
-def test_an_alpha_equal_to_the_cut_or_to_the_most(device):
+def test_an_alpha_equal_to_the_cut_or_to_the_most(device, dtype):
     """The cut itself is drawn; at the largest alpha the opacity still has its gradient, above it has none."""
     rule = dataclasses.replace(EXACT, alpha_cut=2.0**-8, alpha_max=0.5)
-    splats, (_, alpha, _), (_, maxima) = plain([2.0**-8, 2.0**-9, 0.5, 0.75], device, rule)
+    splats, (_, alpha, _), (_, maxima) = plain([2.0**-8, 2.0**-9, 0.5, 0.75], device, dtype, rule)
     first, second = 2.0**-8, (1 - 2.0**-8) * 0.5
     assert maxima.tolist() == [[first, 0.0, second, second / 2]]
     (gradient,) = torch.autograd.grad(alpha.sum(), splats)
@@ -168,9 +169,65 @@ def test_an_alpha_equal_to_the_cut_or_to_the_most(device):
     assert opened.tolist() == [True, False, True, False]
 
 
-def test_layers_behind_one_open_pixel(device):
+def test_layers_behind_one_open_pixel(device, dtype):
     """More layers than are taken at a time, over a single pixel."""
-    splats, (_, alpha, _), _ = plain([0.01] * 100, device, EXACT, side=1)
-    assert abs(float(alpha.detach()) - (1 - 0.99**100)) < 1e-12
+    splats, (_, alpha, _), _ = plain([0.01] * 100, device, dtype, EXACT, side=1)
+    assert abs(float(alpha.detach()) - (1 - 0.99**100)) < (1e-5 if dtype == torch.float32 else 1e-12)
     (gradient,) = torch.autograd.grad(alpha.sum(), splats)
     assert bool((gradient[0, :, 5] > 0).all())
+
+
+def needles(count, device):
+    """Long and round Gaussians of many sizes and opacities, from a fraction of a pixel to the whole picture."""
+    gaussians = cloud(count, torch.float32, device)
+    generator = torch.Generator().manual_seed(4)
+    gaussians.log_scales[:] = torch.rand(count, 3, generator=generator) * 5.5 - 6.5
+    gaussians.logit_opacities[:] = torch.rand(count, generator=generator) * 9 - 5
+    return gaussians
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("tile_size", [8, 16])
+@pytest.mark.parametrize("rule", ["exact", "gsplat", "inria"])
+def test_blocks_that_are_left_out_draw_nothing(rule, tile_size):
+    """CUDA asks for each block of 8 x 4 pixels what the CPU asks for rows: but for alphas at the cut the pictures agree."""
+    rule = dataclasses.replace(RULES[rule], transmittance_stop=0.0)
+    found = []
+    for device in ("cpu", "cuda:0"):
+        gaussians, cam = needles(1500, device), camera(150, 110, cameras=2, dtype=torch.float32, device=device)
+        splats, counts = run(gaussians, cam, rule, tile_size=tile_size)
+        size = {"width": 150, "height": 110, "rule": rule}
+        made = tiles.bin_tiles(splats, counts, tile_size=tile_size, **size)
+        record = splats.detach().requires_grad_()
+        rgb, alpha, depth = blend.blend(record, made, torch.zeros(2, 3, device=device), **size)
+        shares = blend.contributions(splats, made, **size)
+        (gradient,) = torch.autograd.grad((rgb.sum(-1) + alpha + depth).sum(), record, retain_graph=True)
+        (of_rgb,) = torch.autograd.grad(rgb.square().sum(), record)
+        found.append([t.detach().cpu().double() for t in (rgb, alpha, *shares, gradient[..., :10], of_rgb[..., :10])])
+    for name, a, b in zip(("rgb", "alpha", "sums", "maxima", "gradient", "gradient of rgb"), *found, strict=True):
+        off = (a - b).abs() > 2e-3 * (1 + b.abs())
+        assert float(off.double().mean()) < (2e-3 if name.startswith("gradient") else 3e-4), name
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("tile_size", [8, 16])
+def test_lists_are_those_of_the_cpu(tile_size):
+    """Gaussians of no tile, of a few, of 32 and of hundreds; windows, cameras and a capacity."""
+    found = []
+    for device in ("cpu", "cuda:0"):
+        gaussians, cam = needles(700, device), camera(300, 210, cameras=2, dtype=torch.float32, device=device)
+        gaussians = Gaussians(**{n: t.double() for n, t in gaussians.tensors().items()})
+        cam = dataclasses.replace(cam, viewmat=cam.viewmat.double(), K=cam.K.double())
+        for x, y, width, height in ((0, 0, 300, 210), (48, 32, 200, 160)):
+            splats, counts = run(gaussians, cam, window=(x, y, width, height), tile_size=tile_size)
+            how = {"width": width, "height": height, "rule": EXACT, "tile_size": tile_size, "origin": (x, y)}
+            made = tiles.bin_tiles(splats, counts, **how)
+            room = {"capacity": len(made.slots) + 50, "overflow": torch.zeros(1, dtype=torch.int32, device=device)}
+            spare = tiles.bin_tiles(splats, counts, **how, **room)
+            assert int(counts.max()) > 100 and {31, 32, 33} & set(counts.view(-1).tolist())
+            for m in (made, spare):
+                count = int(m.total)
+                found.append([m.ranges, m.splat_ids[:count], m.tile_ids[:count], m.counts, m.total])
+    half = len(found) // 2
+    for a, b in zip(found[:half], found[half:], strict=True):
+        assert all(torch.equal(s.cpu(), t.cpu()) for s, t in zip(a, b, strict=True))

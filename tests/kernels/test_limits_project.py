@@ -222,3 +222,30 @@ def test_one_gaussian_takes_its_factor(device):
         found = run(gaussians, cam, SMOOTH, opacity_factors=torch.tensor([factor], device=device))[0][0, 0, 5]
         assert float(found) == factor * float(full)
     assert run(gaussians, cam, SMOOTH, opacity_factors=torch.zeros(1, device=device))[1].tolist() == [[0]]
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_unseen_gaussians_have_zero_gradients(device, degree):
+    """In memory full of NaN: rows of every length, seen and unseen among each other, by one camera, both or none."""
+    gaussians, cam = cloud(300, torch.float32, device, degree=degree), camera(cameras=2, dtype=torch.float32, device=device)
+    gaussians.means[::3, 2] = -4.0
+    gaussians.means[130:260, 0] += 2.2
+    exact = Gaussians(**{n: t.cpu().double() for n, t in gaussians.tensors().items()})
+    results = []
+    torch.use_deterministic_algorithms(True)  # torch then fills what it allocates
+    try:
+        wide = dataclasses.replace(cam, viewmat=cam.viewmat.cpu().double(), K=cam.K.cpu().double())
+        for g, view in ((gaussians, cam), (exact, wide)):
+            moving = leaves(g)
+            splats, counts = run(moving, view, degree=degree)
+            weights = torch.linspace(0.5, 1.5, 9).to(splats)
+            (splats[..., :9].square() * weights).sum().backward()
+            results.append((counts.cpu(), [t.grad.cpu() for t in moving.tensors().values()]))
+    finally:
+        torch.use_deterministic_algorithms(False)
+    (counts, found), (_, wanted) = results
+    seen = (counts > 0).sum(0)
+    assert set(seen.tolist()) == {0, 1, 2}
+    for a, b in zip(found, wanted, strict=True):
+        assert not bool(a[seen == 0].any())
+        assert float((a.double() - b).norm()) <= 1e-4 * float(b.norm())

@@ -62,6 +62,11 @@ class _Walker:
             self.edits.append(Edit(start, end, new, change, ".".join(scope), cuda or self.file in rules.CUDA_FILES))
         if isinstance(node, ast.Constant) and rules.is_native(node):
             self.native(node, scope)
+        if isinstance(node, ast.Dict):
+            for key, value in zip(node.keys, node.values):
+                if not rules.is_hint(key):
+                    self.walk(value, scope, cuda)
+            return
         body_cuda, else_cuda = rules.sides(node)
         for field, child in ast.iter_fields(node):
             if field in ("annotation", "returns", "decorator_list", "type_params"):

@@ -9,8 +9,11 @@ SPEED = {
 }  # fmt: skip
 """Sizes of portions of work; every value that divides as its comment says gives the same numbers."""
 
-HINTS = {"cost", "enable_backward", "record_tape", "sync", "requires_grad", "thread_name_prefix", "cuda_max_registers"}
-"""Keywords that tell Warp, torch or a thread pool how to work, not what comes out."""
+HINTS = {
+    "cost", "enable_backward", "grid_stride", "record_tape", "sync", "requires_grad", "cuda_max_registers", "launch_bounds",
+    "max_unroll",
+}  # fmt: skip
+"""Keywords, and keys of options, that tell Warp or torch how to work, not what comes out."""
 
 SLACK = {"margin", "slack", "slack_x", "slack_y", "limit_of"}
 """Widths by which bounds are safe: a hundredth more lists a tile in excess, which draws nothing. Their operators count."""
@@ -75,6 +78,11 @@ def left_out(node: ast.AST) -> bool:
         case ast.AnnAssign(target=ast.Name(id=name)):
             return name in SPEED
     return False
+
+
+def is_hint(node: ast.AST) -> bool:
+    """Whether a key of a dictionary is the name of a hint; its value is left out then."""
+    return isinstance(node, ast.Constant) and node.value in HINTS
 
 
 def number_left_out(statement: ast.stmt | None) -> bool:
