@@ -153,13 +153,15 @@ def test_ends_of_a_test_run(tmp_path):
     sources = {
         "survived": "VALUE = 2 - 1\n", "killed": "VALUE = 2\n", "import": "VALUE = = 1\n",
         "crash": "import os\nos.abort()\n", "timeout": "while True:\n    pass\n",
+        "slow": "class Slow:\n    def __eq__(self, other):\n        while True:\n            pass\n\nVALUE = Slow()\n",
     }  # fmt: skip
     jobs = [Job(n, ("tests/test_value.py",), False, "warpgs/value.py", s.encode()) for n, s in sources.items()]
     jobs.append(Job("none", ("tests/test_value.py",), True))
     jobs.append(Job("unmutated", ("tests/test_value.py",), False))
-    outcomes = {o.name: o.status for o in run_jobs(jobs, tree, tmp_path / "cache", workers=2, timeout=8)}
+    outcomes = {o.name: o.status for o in run_jobs(jobs, tree, tmp_path / "cache", workers=2, timeout=8, test_timeout=3)}
     assert outcomes == {
         "survived": "survived", "killed": "killed", "import": "killed", "crash": "killed", "timeout": "timeout",
+        "slow": "timeout",
         "none": "broken", "unmutated": "survived",
     }  # fmt: skip
     assert (tree / "warpgs/value.py").read_text() == "VALUE = 1\n"

@@ -22,7 +22,8 @@ def arguments(args: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--files", nargs="+", default=None, help="only of these, such as tiles.py cuda/blend_forward.cu")
     parser.add_argument("--device", choices=["cpu", "cuda", "both"], default="cpu", help="whose code is mutated (default cpu)")
     parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 2) - 2), help="mutants at a time")
-    parser.add_argument("--timeout", type=float, default=150.0, help="seconds of one mutant (default 150)")
+    parser.add_argument("--timeout", type=float, default=120.0, help="seconds of one mutant (default 120)")
+    parser.add_argument("--test-timeout", type=float, default=45.0, help="seconds of one test of it (default 45)")
     parser.add_argument("--json", type=Path, default=Path("mutants.json"), help="results, which the same command goes on from")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "warpgs-mutant-kernels")
     parser.add_argument("--only", nargs="+", default=None, help="run just these mutants, by number")
@@ -77,12 +78,14 @@ def main() -> None:
     if left:
         check_unmutated(left, options)
     by_id = {c.id: c for c in left}
-    # CUDA mutants compile longest: first, so that none of them is alone at the end
-    first = [job_of(c, c.cuda) for c in sorted(left, key=lambda c: not c.cuda)]
+    # CUDA mutants compile longest: first, so that none of them is alone at the end; else in no order, so that the score of a
+    # run that was cut short is that of a random part
+    first = [job_of(c, c.cuda) for c in sorted(left, key=lambda c: (not c.cuda, c.id))]
     # what no CPU test notices may still matter on CUDA, which runs the shared code too
     second = (job_of(c, True) for c in left if options.device == "both" and not c.cuda and done[c.id]["status"] == "survived")
     jobs = itertools.chain(first, second)
-    for i, o in enumerate(run_jobs(jobs, ROOT, options.cache, workers=options.workers, timeout=options.timeout), 1):
+    limits = {"workers": options.workers, "timeout": options.timeout, "test_timeout": options.test_timeout}
+    for i, o in enumerate(run_jobs(jobs, ROOT, options.cache, **limits), 1):
         c = by_id[o.name]
         done[o.name] = {
             "file": c.file, "line": c.number, "function": c.edit.function, "source": c.line, "change": c.change,

@@ -67,7 +67,17 @@ def preload() -> None:
             __import__(name)
 
 
-def _child(job: Job, tree: Path, root: Path, cache: Path, threads: int) -> int:
+class _Clock:
+    """A pytest plugin that ends the process where a single test takes too long, in whatever loop it is."""
+
+    def __init__(self, seconds: float):
+        self.seconds = seconds
+
+    def pytest_runtest_logstart(self, nodeid, location):
+        signal.setitimer(signal.ITIMER_REAL, self.seconds)
+
+
+def _child(job: Job, tree: Path, root: Path, cache: Path, test_timeout: float, threads: int) -> int:
     """Everything a forked child does; returns pytest's exit status."""
     import pytest
     import torch
@@ -84,13 +94,16 @@ def _child(job: Job, tree: Path, root: Path, cache: Path, threads: int) -> int:
     sys.dont_write_bytecode = True
     os.environ |= {"WARP_CACHE_PATH": str(cache), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTHONPATH": str(tree)}
     torch.set_num_threads(threads)
+    clock = _Clock(test_timeout)
     mark = f"not slow and {'cuda' if job.cuda else 'not cuda'}"
     # the project's own options ask for plugins and warnings that a mutant need not load
     skipped = [f"--deselect={test}" for test in job.skipped]
-    return int(pytest.main([*job.tests, *skipped, "-x", "-q", "--tb=line", "-p", "no:cacheprovider", "-m", mark]))
+    return int(
+        pytest.main([*job.tests, *skipped, "-x", "-q", "--tb=line", "-p", "no:cacheprovider", "-m", mark], plugins=[clock])
+    )
 
 
-def _start(job: Job, folder: Path, root: Path, cache: Path, threads: int) -> int:
+def _start(job: Job, folder: Path, root: Path, cache: Path, test_timeout: float, threads: int) -> int:
     tree = folder / "tree"
     tree.mkdir(parents=True)
     if pid := os.fork():
@@ -101,7 +114,7 @@ def _start(job: Job, folder: Path, root: Path, cache: Path, threads: int) -> int
         out = os.open(folder / "output", os.O_WRONLY | os.O_CREAT)
         os.dup2(out, 1)
         os.dup2(out, 2)
-        status = _child(job, tree, root, cache, threads)
+        status = _child(job, tree, root, cache, test_timeout, threads)
     except BaseException:
         import traceback
 
@@ -115,7 +128,7 @@ def _start(job: Job, folder: Path, root: Path, cache: Path, threads: int) -> int
 def _outcome(job: Job, status: int, timed_out: bool, seconds: float, output: str) -> Outcome:
     """Classify an end: tests that failed, a process that crashed or one that never ended is a mutant that was noticed."""
     code = os.waitstatus_to_exitcode(status)
-    if timed_out:
+    if timed_out or code == -signal.SIGALRM:
         word = "timeout"
     elif code == PASSED:
         word = "survived"
@@ -127,7 +140,7 @@ def _outcome(job: Job, status: int, timed_out: bool, seconds: float, output: str
 
 
 def run_jobs(
-    jobs: Iterable[Job], root: Path, cache: Path, *, workers: int, timeout: float, threads: int = 1
+    jobs: Iterable[Job], root: Path, cache: Path, *, workers: int, timeout: float, test_timeout: float = 600, threads: int = 1
 ) -> Iterator[Outcome]:
     """Run jobs, ``workers`` at a time, and yield each outcome as it comes.
 
@@ -137,6 +150,7 @@ def run_jobs(
         cache: Warp's folder of compiled kernels, shared: it is keyed by the code, and entries are moved in whole.
         workers: Processes at a time.
         timeout: Seconds after which a job is ended.
+        test_timeout: Seconds after which it is ended if they all went into one test.
         threads: CPU threads of each process; some tests set their own number.
     """
     waiting, running = iter(jobs), {}
@@ -147,7 +161,7 @@ def run_jobs(
                 while len(running) < workers and (job := next(waiting, None)) is not None:
                     folder = Path(scratch) / str(count)
                     count += 1
-                    running[_start(job, folder, root, cache, threads)] = (job, folder, time.monotonic(), set())
+                    running[_start(job, folder, root, cache, test_timeout, threads)] = (job, folder, time.monotonic(), set())
                 if not running:
                     return
                 time.sleep(0.02)
