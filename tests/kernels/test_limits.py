@@ -6,6 +6,8 @@ import pytest
 import torch
 
 from tests.reference.adam import adam_reference
+from tests.reference.ssim import ssim_reference
+from tests.tolerances import close
 from warpgs.kernels import ssim as ssim_module
 from warpgs.kernels.adam import adam_step
 from warpgs.kernels.knn import mean_square_distances, morton_codes
@@ -109,3 +111,22 @@ def test_sums_take_one_pass_where_a_row_fills_a_step(monkeypatch, width, ways):
     sums = differences(a, b)
     assert len(taken) == ways
     assert torch.allclose(sums, torch.stack([(1 - ssim(a, b)).sum(), (a - b).abs().sum()]), rtol=1e-5)
+
+
+@pytest.mark.parametrize(("height", "width"), [(16, 16), (15, 32), (32, 17), (17, 33), (8, 11)])
+def test_pictures_that_fill_the_blocks(device, dtype, height, width):
+    """Whole blocks, and one row or column more or less than that, in a batch: map, sums and both gradients."""
+    generator = torch.Generator().manual_seed(height)
+    a, b = torch.rand(2, 2, height, width, 3, generator=generator, dtype=torch.float64).unbind()
+    weights = torch.rand(a.shape, generator=generator, dtype=torch.float64)
+    twin, leaf = a.clone().requires_grad_(), a.to(device, dtype).requires_grad_()
+    wanted = torch.stack([ssim_reference(x, y) for x, y in zip(twin, b)])
+    found = ssim(leaf, b.to(leaf))
+    close("ssim", found, wanted)
+    sums = differences(leaf, b.to(leaf))
+    both = torch.stack([(1 - wanted).sum(), (twin - b).abs().sum()])
+    close("ssim", sums, both)
+    maps = (found * weights.to(leaf)).sum(), (wanted * weights).sum()
+    for ours, theirs in (maps, (0.3 * sums[0] + 2 * sums[1], 0.3 * both[0] + 2 * both[1])):
+        (mine,), (other,) = torch.autograd.grad(ours, leaf), torch.autograd.grad(theirs, twin, retain_graph=True)
+        close("gradient", mine, other)

@@ -1,7 +1,7 @@
 """`python -m tests.mutate`: break the kernels in many small ways, one at a time, and see whether the tests notice."""
 
 import argparse
-import itertools
+import hashlib
 import json
 import os
 import sys
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tests.mutate import claims, report, rules
 from tests.mutate.candidates import KERNELS, ROOT, Candidate, all_candidates, draw
-from tests.mutate.process import Job, preload, run_jobs
+from tests.mutate.process import COPIED, Job, preload, run_jobs
 
 
 def arguments(args: list[str] | None = None) -> argparse.Namespace:
@@ -24,7 +24,9 @@ def arguments(args: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 2) - 2), help="mutants at a time")
     parser.add_argument("--timeout", type=float, default=120.0, help="seconds of one mutant (default 120)")
     parser.add_argument("--test-timeout", type=float, default=45.0, help="seconds of one test of it (default 45)")
-    parser.add_argument("--json", type=Path, default=Path("mutants.json"), help="results, which the same command goes on from")
+    parser.add_argument(
+        "--json", type=Path, default=Path("runs/mutants.json"), help="results, which the same command goes on from"
+    )
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "warpgs-mutant-kernels")
     parser.add_argument("--only", nargs="+", default=None, help="run just these mutants, by number")
     parser.add_argument("--list", action="store_true", help="list the drawn mutants and run none")
@@ -62,6 +64,31 @@ def check_unmutated(drawn: list[Candidate], options: argparse.Namespace) -> None
         print(f"unmutated: {outcome.name} passes in {outcome.seconds:.0f} s", flush=True)
 
 
+def tree_digest(drawn: list[Candidate]) -> str:
+    """Names the state of all sources and tests, and which files are mutated for which device."""
+    digest = hashlib.sha256(repr(sorted({(c.file, c.cuda) for c in drawn})).encode())
+    for path in sorted(p for room in COPIED for p in (ROOT / room).rglob("*") if p.suffix in (".py", ".cu", ".toml")):
+        digest.update(path.as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+def run(mutants: list[tuple[Candidate, bool]], kept: dict, options: argparse.Namespace) -> None:
+    """Run mutants, each on CUDA or not, and write each result down as it comes."""
+    by_id = {c.id: c for c, _ in mutants}
+    jobs = [job_of(c, cuda) for c, cuda in mutants]
+    limits = {"workers": options.workers, "timeout": options.timeout, "test_timeout": options.test_timeout}
+    for i, o in enumerate(run_jobs(jobs, ROOT, options.cache, **limits), 1):
+        c = by_id[o.name]
+        kept["mutants"][o.name] = {
+            "file": c.file, "line": c.number, "function": c.edit.function, "source": c.line, "change": c.change,
+            "status": o.status, "seconds": o.seconds, "output": o.output,
+        }  # fmt: skip
+        fresh = options.json.with_name(f"{options.json.name}.{os.getpid()}")
+        fresh.write_text(json.dumps(kept, indent=1))
+        fresh.replace(options.json)
+        print(f"{i}/{len(jobs)}  {o.status:<8} {o.seconds:5.1f} s  {report.describe(c)}", flush=True)
+
+
 def main() -> None:
     """Draw, run, report."""
     options = arguments()
@@ -72,29 +99,22 @@ def main() -> None:
             print(f"{report.describe(c)}  [{c.edit.function}]\n    {c.line}\n    {c.mutated_line()}")
         return
     preload()
-    done = json.loads(options.json.read_text()) if options.json.exists() else {}
-    left = [c for c in drawn if c.id not in reasons and (options.only or c.id not in done)]
+    options.json.parent.mkdir(parents=True, exist_ok=True)
+    kept = json.loads(options.json.read_text()) if options.json.exists() else {"unmutated": "", "mutants": {}}
+    done, state = kept["mutants"], tree_digest(drawn)
+    # a survivor is run again, since a test may have been added; what was killed stays so
+    left = [c for c in drawn if c.id not in reasons and done.get(c.id, {}).get("status") not in report.KILLED]
     begun = time.monotonic()
-    if left:
+    if left and kept["unmutated"] != state:
         check_unmutated(left, options)
-    by_id = {c.id: c for c in left}
+        kept["unmutated"] = state
     # CUDA mutants compile longest: first, so that none of them is alone at the end; else in no order, so that the score of a
     # run that was cut short is that of a random part
-    first = [job_of(c, c.cuda) for c in sorted(left, key=lambda c: (not c.cuda, c.id))]
-    # what no CPU test notices may still matter on CUDA, which runs the shared code too
-    second = (job_of(c, True) for c in left if options.device == "both" and not c.cuda and done[c.id]["status"] == "survived")
-    jobs = itertools.chain(first, second)
-    limits = {"workers": options.workers, "timeout": options.timeout, "test_timeout": options.test_timeout}
-    for i, o in enumerate(run_jobs(jobs, ROOT, options.cache, **limits), 1):
-        c = by_id[o.name]
-        done[o.name] = {
-            "file": c.file, "line": c.number, "function": c.edit.function, "source": c.line, "change": c.change,
-            "status": o.status, "seconds": o.seconds, "output": o.output,
-        }  # fmt: skip
-        fresh = options.json.with_name(f"{options.json.name}.{os.getpid()}")
-        fresh.write_text(json.dumps(done, indent=1))
-        fresh.replace(options.json)
-        print(f"{i}/{len(left)}  {o.status:<8} {o.seconds:5.1f} s  {report.describe(c)}", flush=True)
+    left.sort(key=lambda c: (not c.cuda, c.id))
+    run([(c, c.cuda) for c in left], kept, options)
+    if options.device == "both":
+        # what no CPU test notices may still matter on CUDA, which runs the shared code too
+        run([(c, True) for c in left if not c.cuda and done[c.id]["status"] == "survived"], kept, options)
     print()
     print(report.summary(drawn, {n: r["status"] for n, r in done.items()}, reasons))
     if left:
