@@ -103,35 +103,37 @@ def test_rows_within_a_tile(device):
     assert bool((probe(cases, device, whole_tiles=1)[:, 4:] == torch.tensor([0, 16])).all())
 
 
-@pytest.mark.parametrize("far", [1.0, 300.0])
+@pytest.mark.parametrize("far", [1.0, 1e4])
 @pytest.mark.parametrize("tile_size", [1, 16])
 def test_columns_of_tiles_are_those_of_the_ellipse(device, tile_size, far):
     """In a row of tiles, widened by its margin: all that the ellipse touches, and no other."""
     cases = ellipses(far=far, tile_size=tile_size)
-    found = probe(cases, device, tile_size=tile_size)[:, 2:4]
     mx, my, u11, u12, u22, reach, half_width, half_height, row = (t[:, None] for t in cases.unbind(-1))
-    slack, margin = margin_of(my, half_height), margin_of(mx, half_width)
+    slack = margin_of(my, half_height)
     top = (row * tile_size + 0.5 - my - slack).maximum(-half_height)
     bottom = (row * tile_size + tile_size - 0.5 - my + slack).minimum(half_height)
     dy = top + (bottom - top) * torch.linspace(0, 1, 3001, dtype=torch.float64)
     width = (reach**2 - (u22 * dy) ** 2).clamp_min(0).sqrt()
-    left = (mx + ((-width - u12 * dy) / u11).amin(1, keepdim=True) - margin)[:, 0]
-    right = (mx + ((width - u12 * dy) / u11).amax(1, keepdim=True) + margin)[:, 0]
+    left, right = ((-width - u12 * dy) / u11).amin(1, True), ((width - u12 * dy) / u11).amax(1, True)
+    if far > 1:  # one end or the other in the window
+        mx[::2], mx[1::2] = (mx - left)[::2].remainder(60) + 13 - left[::2], (mx - right)[1::2].remainder(60) + 13 - right[1::2]
+    found = probe(cases, device, tile_size=tile_size)[:, 2:4]
+    margin = margin_of(mx, half_width)
     within = (top < bottom)[:, 0]  # other rows are never asked for
     # the search itself is coarse: what it finds to within its step must agree
-    step = 1e-3 * far
-    least, most = (tiles_of(left + e, right - e, 16, 53, tile_size)[within] for e in (step, -step))
-    touches = least[:, 1] > least[:, 0]
-    found = found[within]
+    step = 1e-3 if far == 1.0 else 2e-2
+    low, high = (mx + left - margin)[:, 0], (mx + right + margin)[:, 0]
+    least, most = (tiles_of(low + e, high - e, 16, 53, tile_size)[within] for e in (step, -step))
     sure = (least == most).all(1)
-    assert torch.equal(found[sure], least[sure])
-    assert int((sure & touches).sum()) > (0.2 if far == 1.0 else 0.05) * len(sure)
-    assert float(sure.float().mean()) > 0.9 if far == 1.0 else 0.3
+    assert torch.equal(found[within][sure], least[sure])
+    ends = (least[:, 1] > least[:, 0]) & ((least[:, 0] * tile_size > 16) | (least[:, 1] * tile_size < 69))
+    assert int((sure & ends).sum()) > 0.2 * len(sure)
 
 
-def test_columns_of_the_box_where_there_is_no_reach(device):
+@pytest.mark.parametrize("far", [1.0, 1e5])
+def test_columns_of_the_box_where_there_is_no_reach(device, far):
     """Reach 0 asks for the box; so does a factor that has lost its range."""
-    cases = ellipses()
+    cases = ellipses(far=far)
     margin = margin_of(cases[:, 0], cases[:, 6])
     wanted = tiles_of(cases[:, 0] - cases[:, 6] - margin, cases[:, 0] + cases[:, 6] + margin, 16, 53, 16)
     for column, value in ((5, 0.0), (2, 1e-7), (4, 1e-7), (2, 1e-6), (4, 1e-6)):

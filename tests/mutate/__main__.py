@@ -29,13 +29,17 @@ def arguments(args: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "warpgs-mutant-kernels")
     parser.add_argument("--only", nargs="+", default=None, help="run just these mutants, by number")
+    parser.add_argument("--claims", action="store_true", help="run the claimed equivalents instead: none may be killed")
     parser.add_argument("--list", action="store_true", help="list the drawn mutants and run none")
     return parser.parse_args(args)
 
 
-def chosen(options: argparse.Namespace) -> list[Candidate]:
-    """The drawn mutants."""
+def chosen(options: argparse.Namespace, claimed: claims.Claims) -> list[Candidate]:
+    """The drawn mutants; of claimed ones, where those are asked for, all."""
     pool = all_candidates()
+    if options.claims:
+        pool = [c for c in pool if claimed.reason(c)]
+        options.sample = len(pool)
     if options.only:
         return [c for c in pool if c.id in options.only]
     if options.device != "both":
@@ -92,8 +96,9 @@ def run(mutants: list[tuple[Candidate, bool]], kept: dict, options: argparse.Nam
 def main() -> None:
     """Draw, run, report."""
     options = arguments()
-    drawn, claimed = chosen(options), claims.load()
-    reasons = {c.id: r for c in drawn if (r := claimed.reason(c))}
+    claimed = claims.load()
+    drawn = chosen(options, claimed)
+    reasons = {} if options.claims else {c.id: r for c in drawn if (r := claimed.reason(c))}
     if options.list:
         for c in drawn:
             print(f"{report.describe(c)}  [{c.edit.function}]\n    {c.line}\n    {c.mutated_line()}")
@@ -115,6 +120,10 @@ def main() -> None:
     if options.device == "both":
         # what no CPU test notices may still matter on CUDA, which runs the shared code too
         run([(c, True) for c in left if not c.cuda and done[c.id]["status"] == "survived"], kept, options)
+    if options.claims:
+        refuted = [c for c in drawn if done.get(c.id, {}).get("status") in report.KILLED]
+        print("\n".join(f"REFUTED  {report.describe(c)}" for c in refuted))
+        sys.exit(f"{len(refuted)} of {len(drawn)} claims are refuted by a test" if refuted else 0)
     print()
     print(report.summary(drawn, {n: r["status"] for n, r in done.items()}, reasons))
     if left:
