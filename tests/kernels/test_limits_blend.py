@@ -117,11 +117,14 @@ def test_counts_that_differ_from_what_is_found(device):
 def test_capacity_to_the_instance(device):
     """Exactly enough is no overflow; one less is, and what is kept fits."""
     gaussians, cam = one_a_tile(device)
+    gaussians.log_scales.add_(2.2)  # several tiles each
     splats, counts = run(gaussians, cam)
-    for capacity in (9, 8, 3):
+    total = int(counts.sum())
+    assert int(counts.min()) > 2
+    for capacity in (total, total - 1, total - 2, total // 2):
         mine, overflow = counts.clone(), torch.zeros(1, dtype=torch.int32, device=device)
         made = tiles.bin_tiles(splats, mine, width=48, height=48, rule=EXACT, capacity=capacity, overflow=overflow)
-        assert int(overflow) == (capacity < 9)
+        assert int(overflow) == (capacity < total)
         assert int(made.counts.sum()) == capacity and len(made.splat_ids) == capacity
 
 
