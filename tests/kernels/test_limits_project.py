@@ -9,7 +9,7 @@ import torch
 from tests.reference.project import project_reference
 from tests.splats import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.tolerances import close
-from warpgs.constants import RULES
+from warpgs.constants import FAR, FARTHEST_PIXEL, LARGEST_COEFFICIENT, RULES, SHORTEST_QUAT
 from warpgs.kernels.project import project
 from warpgs.kernels.sh import C0
 from warpgs.scene import Gaussians
@@ -44,8 +44,8 @@ def facing(count=1, dtype=torch.float32, device="cpu", size=16) -> tuple[Gaussia
 
 def test_quaternions_along_an_axis_turn_as_the_reference(device, dtype):
     """Zeros and any ratio of entries are fine: the length is taken of the largest."""
-    scales = torch.eye(4, dtype=torch.float64)
-    quats = torch.cat([scales, scales * 1e-25, scales + 1e-25, scales + 1e-25 * torch.ones(4, 4)]).to(dtype)
+    axes = torch.eye(4, dtype=torch.float64)
+    quats = torch.cat([axes, axes * 1e-14, axes * 1e14, axes + 1e-25]).to(dtype)
     gaussians, cam = cloud(len(quats), dtype, device), camera(cameras=1, dtype=dtype, device=device)
     gaussians.quats[:] = quats.to(device)
     splats, counts = run(gaussians, cam, SMOOTH)
@@ -79,20 +79,45 @@ def test_one_axis_that_overflows_culls(device, axis, log_scale):
 
 def test_without_a_filter_a_flat_gaussian_is_culled_and_no_other(device):
     """A covariance without an inverse has no factor; a small determinant is one."""
-    gaussians, cam = facing(4, device=device)
+    gaussians, cam = facing(5, device=device)
     bare = dataclasses.replace(EXACT, low_pass=0.0)
+    gaussians.log_scales[4, ::2] = -45.0  # a line whose factor is finite still
     gaussians.log_scales[1] = -200.0  # a point
     gaussians.log_scales[2, ::2] = -200.0  # a line
     gaussians.log_scales[3] -= 1.0  # 0.37 px
     splats, counts = run(gaussians, cam, bare)
-    assert counts.tolist() == [[1, 0, 0, 1]] and bool(torch.isfinite(splats).all())
+    assert counts.tolist() == [[1, 0, 0, 1, 0]] and bool(torch.isfinite(splats).all())
 
 
-def test_quaternions_below_the_shortest_are_culled(device, dtype):
-    """Longer than 1e-30 and no shorter."""
-    gaussians, cam = facing(4, dtype, device)
-    gaussians.quats[:, 0] = torch.tensor([1.005e-30, 0.99e-30, 1.0, 1e-30], dtype=dtype)
-    assert run(gaussians, cam)[1].tolist() == [[1, 0, 1, 0]]
+def test_quaternions_up_to_the_shortest_and_longest(device, dtype):
+    """At the shortest length itself a rotation can be read, not below; as long, the other way."""
+    gaussians, cam = facing(5, dtype, device)
+    shortest = torch.tensor(SHORTEST_QUAT, dtype=dtype)
+    gaussians.quats[:, 0] = torch.stack(
+        [shortest, torch.nextafter(shortest, 0 * shortest), 0.999 / shortest, 1.001 / shortest, shortest**0]
+    )
+    assert (run(gaussians, cam)[1] > 0).tolist() == [[True, False, True, False, True]]
+
+
+def test_the_farthest_depth_pixel_and_coefficient_are_drawn(device, dtype):
+    """Each range holds its end, and not the next number."""
+    K = torch.eye(3, dtype=dtype, device=device)[None]
+    cam = dataclasses.replace(camera(16, 16, cameras=1, dtype=dtype, device=device), K=K)
+
+    def drawn(**changes):
+        gaussians = cloud(1, dtype, device)
+        gaussians.means[:] = torch.tensor([1.0, 1.0, 1.0])
+        for name, (slot, value) in changes.items():
+            getattr(gaussians, name).view(-1)[slot] = value
+        return int(run(gaussians, cam, SMOOTH)[1][0, 0]) > 0
+
+    assert drawn()
+    ends = [("means", 2, FAR), ("sh", 0, LARGEST_COEFFICIENT), ("sh", 7, -LARGEST_COEFFICIENT), ("sh", 11, LARGEST_COEFFICIENT)]
+    ends += [("means", axis, sign * FARTHEST_PIXEL) for axis in (0, 1) for sign in (1, -1)]
+    for name, slot, end in ends:
+        end = torch.tensor(end, dtype=dtype)
+        assert drawn(**{name: (slot, end)}), (name, slot)
+        assert not drawn(**{name: (slot, torch.nextafter(end, 2 * end))}), (name, slot)
 
 
 def test_an_opacity_equal_to_the_cut_is_drawn_and_none_is_not(device, dtype):

@@ -28,20 +28,21 @@ CUDA_FUNCTIONS = {
 
 LIMITS, LIMITS_PROJECT, LIMITS_BLEND = (f"kernels/test_limits{what}.py" for what in ("", "_project", "_blend"))
 SPANS, CUTS = "kernels/test_spans.py", "kernels/test_bridge.py"
+EXTREMES, LAYERS = "numerics/test_extreme_projection.py", "numerics/test_extreme_compositing.py"
 OPS = {
     "adam": ["kernels/test_adam.py", LIMITS],
     "blend": ["kernels/test_blend.py", "test_rasterizer.py", LIMITS_BLEND],
-    "blend_cpu": ["kernels/test_blend.py", LIMITS_BLEND, "test_window.py"],
-    "blend_cuda": ["kernels/test_blend.py", "test_rasterizer.py", LIMITS_BLEND, "test_window.py"],
+    "blend_cpu": ["kernels/test_blend.py", LIMITS_BLEND, LAYERS, "test_window.py"],
+    "blend_cuda": ["kernels/test_blend.py", "test_rasterizer.py", LIMITS_BLEND, LAYERS, "test_window.py"],
     "bridge": [CUTS, "kernels/test_adam.py", "kernels/test_sh.py", "kernels/test_tiles.py"],
     "compiler": ["kernels/test_blend.py"],
     "dropout": ["kernels/test_dropout.py"],
     "falloff": [SPANS, "kernels/test_blend.py", LIMITS_BLEND],
-    "functions": ["kernels/test_project.py", SPANS, LIMITS_PROJECT, "kernels/test_tiles.py", "test_window.py"],
+    "functions": ["kernels/test_project.py", SPANS, LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "test_window.py"],
     "knn": ["kernels/test_knn.py", LIMITS],
     "native": ["kernels/test_project.py", "kernels/test_tiles.py", "test_rasterizer.py", LIMITS_PROJECT, LIMITS_BLEND],
-    "project": ["kernels/test_project.py", LIMITS_PROJECT, "kernels/test_tiles.py", "test_rasterizer.py"],
-    "project_backward": ["kernels/test_project.py", LIMITS_PROJECT, "test_rasterizer.py"],
+    "project": ["kernels/test_project.py", LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "test_rasterizer.py"],
+    "project_backward": ["kernels/test_project.py", LIMITS_PROJECT, EXTREMES, "test_rasterizer.py"],
     "sh": ["kernels/test_sh.py", "kernels/test_project.py"],
     "ssim": ["kernels/test_ssim.py", LIMITS],
     "tiles": ["kernels/test_tiles.py", LIMITS_BLEND, "test_rasterizer.py", "test_window.py"],
