@@ -189,6 +189,25 @@ def needles(count, device):
     return gaussians
 
 
+@pytest.mark.parametrize("rule", ["exact", "gsplat", "inria"])
+def test_all_three_passes_draw_the_same_pixels(device, dtype, rule):
+    """A colour's gradient is its Gaussian's contribution, and colours times contributions add up to the picture."""
+    gaussians, cam = needles(400, device), camera(70, 50, cameras=1, dtype=dtype, device=device)
+    gaussians.log_scales[:100] = -2.9  # about 3 sigma times 10 px to the edge of a square, which alpha passes by a row
+    gaussians = Gaussians(**{n: t.to(dtype) for n, t in gaussians.tensors().items()})
+    splats, counts = run(gaussians, cam, RULES[rule])
+    size = {"width": 70, "height": 50, "rule": RULES[rule]}
+    made = tiles.bin_tiles(splats, counts, **size)
+    record = splats.detach().requires_grad_()
+    rgb, _, _ = blend.blend(record, made, torch.zeros(1, 3, dtype=dtype, device=device), **size)
+    (gradient,) = torch.autograd.grad(rgb[..., 0].sum(), record)
+    sums, _ = blend.contributions(splats, made, **size)
+    near = 1e-4 if dtype == torch.float32 else 1e-12
+    assert float((gradient[..., 6] - sums).abs().max()) <= near * float(sums.max())
+    shown = (sums.double() * splats[..., 6].double()).sum()
+    assert abs(float(rgb[..., 0].detach().double().sum() - shown)) <= near * float(shown)
+
+
 @pytest.mark.cuda
 @pytest.mark.parametrize("tile_size", [8, 16])
 @pytest.mark.parametrize("rule", ["exact", "gsplat", "inria"])
