@@ -16,18 +16,22 @@ EXACT = RULES["exact"]
 
 
 def test_budget_is_met_to_the_byte():
-    """As many instances as fit are allowed, one more is not; so are 2^31 - 1 and no more."""
+    """As many instances as fit are allowed, one more is not; so are 2^30 - 1 of 2^27 - 1 Gaussians, and no more."""
     cpu = torch.device("cpu")
     tiles._check_total(1000, 1, cpu, 1, 148_000)
     with pytest.raises(ResourceError, match=r"makes 1,001 .* 1001 of 7 tiles .* the limit is 0\.00 GiB"):
         tiles._check_total(1001, 1, cpu, 7, 148_000)
-    tiles._check_total(2**31 - 1, 1, cpu, 1, 2**60)
-    with pytest.raises(ResourceError, match="the limit is 2,147,483,647 instances"):
-        tiles._check_total(2**31, 1, cpu, 1, 2**60)
-    with pytest.raises(ResourceError, match="the limit is 2,147,483,647 instances"):
-        tiles._check_total(2**31, 1, cpu, 1, None)
+    tiles._check_total(2**30 - 1, 2**27 - 1, cpu, 1, 2**60)
+    with pytest.raises(ResourceError, match="the limit is 1,073,741,823 instances of 134,217,727 Gaussians"):
+        tiles._check_total(2**30, 1, cpu, 1, 2**60)
+    with pytest.raises(ResourceError, match="the limit is 1,073,741,823 instances of 134,217,727 Gaussians"):
+        tiles._check_total(2**30, 1, cpu, 1, None)
     with pytest.raises(ResourceError, match=r"the limit is 1\.00 GiB"):
-        tiles._check_total(2**31 - 1, 1, cpu, 1, 2**30)
+        tiles._check_total(2**30 - 1, 1, cpu, 1, 2**30)
+    with pytest.raises(ResourceError, match="the limit is 1,073,741,823 instances of 134,217,727 Gaussians"):
+        tiles._check_total(1, 2**27, cpu, 1, 2**60)
+    # one running sum in 63 bits holds both
+    assert tiles.VISIBLE > tiles.MAX_INSTANCES and (tiles.MAX_VISIBLE + 1) * tiles.VISIBLE <= 2**63
 
 
 def test_free_memory_is_asked_for_only_where_it_may_matter(monkeypatch):
@@ -44,7 +48,7 @@ def test_free_memory_is_asked_for_only_where_it_may_matter(monkeypatch):
         tiles._check_total(1001, 1, cpu, 1, None)
     asked.clear()
     monkeypatch.setattr(tiles, "installed_bytes", lambda _: 2**60)
-    tiles._check_total(2**31 - 1, 1, cpu, 1, None)
+    tiles._check_total(2**30 - 1, 1, cpu, 1, None)
     assert not asked
 
 
