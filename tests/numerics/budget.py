@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from tests.numerics.scenes import Scene
+from tests.numerics.scenes import SCENES, Scene
 from tests.numerics.split import GRADIENTS, PICTURES, Split, gradient_errors, picture_errors
 from tests.numerics.thresholds import EPS, ulp
 from tests.tolerances import GRADIENT_ULPS, ORDINARY, PICTURE_ULPS, RATIO, STRESS, Limits
@@ -12,6 +12,15 @@ from warpgs.constants import Rule
 
 SLOPE = {"rgb": 0.5**0.5 * math.exp(-0.5), "alpha": 0.5**0.5 * math.exp(-0.5), "depth": 0.5 * 0.5**0.5 * 3.33}
 """What half an ulp in both coordinates of a mean does to a picture, per ulp and per 1/sigma; c in docs/accuracy.md."""
+
+
+CASES = [("exact", name) for name in SCENES] + [("gsplat", "wall"), ("inria", "wall"), ("inria", "blobs")]
+"""Rules and scenes that the budget is held on: the default rule on all, the others where they differ from it."""
+
+
+def tile_size_of(rule: str) -> int:
+    """Under `inria` the picture depends on the tiles, and smaller ones cut more off."""
+    return 8 if rule == "inria" else 16
 
 
 def limits_of(scene: Scene) -> Limits:

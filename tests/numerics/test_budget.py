@@ -3,20 +3,17 @@
 import pytest
 import torch
 
-from tests.numerics.budget import broken, measure
+from tests.numerics.budget import CASES, broken, measure, tile_size_of
 from tests.numerics.scenes import SCENES
 from tests.numerics.split import gradient_errors, split
 from warpgs.constants import RULES
-
-CASES = [("exact", name) for name in SCENES] + [("gsplat", "wall"), ("inria", "wall"), ("inria", "blobs")]
 
 
 @pytest.mark.parametrize(("rule", "name"), CASES, ids=[f"{r}-{n}" for r, n in CASES])
 def test_budget(device, rule, name):
     """E of pictures and gradients beside P32 and below the caps; bands counted, what happens in them bounded."""
     scene = SCENES[name]()
-    # under `inria` the picture depends on the tiles, and smaller ones cut more off
-    found = measure(scene, RULES[rule], split(scene, RULES[rule], device, tile_size=8 if rule == "inria" else 16))
+    found = measure(scene, RULES[rule], split(scene, RULES[rule], device, tile_size_of(rule)))
     assert not (lines := broken(scene, found)), "\n" + "\n".join(lines)
 
 
