@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from bench import many, step
+from bench import accuracy, many, needles, step
 from tests.scenes import photographs, seeds
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.fit import Fit
@@ -40,3 +40,16 @@ def test_the_smooth_picture_is_a_picture():
     picture = many.smooth_picture(40, 30, torch.device("cpu"))
     assert picture.shape == (30, 40, 3) and 0 <= picture.min() and picture.max() <= 1
     assert float((picture[:, 1:] - picture[:, :-1]).abs().max()) < 0.15
+
+
+def test_the_accuracy_page_is_that_of_the_committed_results():
+    """docs/accuracy.md is what `python -m bench.accuracy` writes."""
+    page = accuracy.PAGE.read_text("utf-8")
+    assert accuracy.filled(page) == page, "docs/accuracy.md is stale: run python -m bench.accuracy"
+    assert "| cloud |" in page and "| 300 |" in page
+
+
+def test_needles_err_less_in_the_factor_form(device):
+    """At 300 px the largest error of the weight is a hundredth of the conic's, also of the one with the same factor."""
+    e = needles.weight_errors(300, device)
+    assert all(e[n]["max"] >= 100 * e["factor"]["max"] for n in ("conic", "plain")), e

@@ -141,7 +141,8 @@ class _Blend(torch.autograd.Function):
             v_rgb = torch.zeros_like(saved[0])
         v_backgrounds = None
         if ctx.needs_input_grad[1]:
-            v_backgrounds = torch.einsum("chw,chwk->ck", saved[2], v_rgb)
+            # a product of matrices would sum the pixels one by one, and err several times as much
+            v_backgrounds = torch.stack([(saved[2] * v_rgb[..., k]).sum((1, 2)) for k in range(3)], 1)
         work = blend_cuda.backward if _native(splats) else _backward
         v_splats = work(splats, tiles, backgrounds, *ctx.how, saved, v_rgb, v_alpha, v_depth)
         return v_splats, v_backgrounds, None, None, None, None, None, None

@@ -23,17 +23,17 @@ def make_rotations(real):
 
     @wp.func
     def rotation(q: vec4) -> mat33:
-        # q is a unit quaternion wxyz
+        # q is a unit quaternion wxyz. Every entry is of second degree, so what rounding takes from its length only scales the
+        # matrix; with ones on the diagonal it would turn it, and a needle's end would move across its width.
         w = q[0]
         x = q[1]
         y = q[2]
         z = q[3]
-        one = real(1.0)
         two = real(2.0)
         return mat33(
-            one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y),
-            two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x),
-            two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y),
+            (w * w - z * z) + (x * x - y * y), two * (x * y - w * z), two * (x * z + w * y),
+            two * (x * y + w * z), (w * w - z * z) - (x * x - y * y), two * (y * z - w * x),
+            two * (x * z - w * y), two * (y * z + w * x), (w * w + z * z) - (x * x + y * y),
         )  # fmt: skip
 
     @wp.func

@@ -1,0 +1,98 @@
+"""Put the measured error budget and the needles into docs/accuracy.md: usage: python -m bench.accuracy.
+
+The figures are those of bench/results/budget_*.json (`python -m tests.numerics.report`) and bench/results/needles_*.json
+(`python -m bench.needles`), a table for each machine.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = ROOT / "docs/accuracy.md"
+
+
+def _results(kind: str) -> dict[str, dict]:
+    paths = sorted((ROOT / "bench/results").glob(f"{kind}_*.json"))
+    return {p.stem.removeprefix(f"{kind}_"): json.loads(p.read_text("utf-8")) for p in paths}
+
+
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def _e(value: float) -> str:
+    return f"{value:.1e}" if value else "0"
+
+
+def _machine(stem: str, result: dict) -> str:
+    m = result["machine"]
+    return f"**{m['name']}** ({stem}, commit {m['commit']}, {m['date']})."
+
+
+def budget_text(results: dict[str, dict]) -> str:
+    """Two tables a machine: pictures and gradients."""
+    parts = []
+    for stem, result in results.items():
+        pictures, gradients = [], []
+        for row in result["rows"]:
+            name = row["scene"] + ("" if row["rule"] == "exact" else f", `{row['rule']}`")
+            rgb, alpha, depth = (row["pictures"][n] for n in ("rgb", "alpha", "depth"))
+            both = {k: max(rgb[k], alpha[k]) for k in ("E mean", "E max", "P32 max", "A mean", "A max")}
+            pictures.append([
+                name, _e(both["E mean"]), _e(both["E max"]), _e(max(rgb["allowed"], alpha["allowed"])), _e(both["P32 max"]),
+                _e(depth["E max"]), _e(both["A mean"]), _e(both["A max"]),
+                f"{row['in band']} of {row['pixels']}", str(row["flips"]),
+            ])  # fmt: skip
+            v = row["gradients"]
+            worst = max(v, key=lambda n: v[n]["rel L2"])
+            gradients.append([
+                name, f"{_e(v[worst]['rel L2'])} ({worst})", _e(max(e["1 - cosine"] for e in v.values())),
+                _e(max(e["bias"] for e in v.values())), _e(max(e["E max"] for e in v.values())),
+                _e(max(e["P32 max"] for e in v.values())), _e(max(e["A max"] for e in v.values())),
+                str(sum(e["wrong zeros"] for e in v.values())),
+            ])  # fmt: skip
+        kept = "Every line is kept." if not result["broken"] else "Broken: " + "; ".join(result["broken"]) + "."
+        head = ["pictures", "mean E", "max E", "allowed", "max P32", "max E depth", "mean A", "max A", "band", "flips"]
+        parts += [f"{_machine(stem, result)} {kept}\n", _table(head, pictures)]
+        head = ["gradients", "relative L2", "1 - cosine", "bias", "max E", "max P32", "max A", "wrong zeros"]
+        parts.append(_table(head, gradients))
+    return "\n".join(parts)
+
+
+def needles_text(results: dict[str, dict]) -> str:
+    """A table a machine: max and mean errors by length, and how many times the factor form is better."""
+    parts = []
+    for stem, result in results.items():
+        rows = []
+        for row in result["rows"]:
+            line = [f"{row['sigma']:,}"]
+            for what, peers in (("weight", ("conic", "plain")), ("picture", ("conic", "plain")), ("gradient", ("plain",))):
+                e = row[what]
+                line += [" / ".join(_e(e[n][k]) for k in ("max", "mean")) for n in ("factor", *peers)]
+                line.append(f"{min(e[n]['max'] / e['factor']['max'] for n in peers):,.0f}")
+            rows.append(line)
+        head = ["length [px]", "weight: factor", "conic", "plain", "times", "picture: factor", "conic", "plain", "times"]
+        of = f"Max / mean over {result['needles']} needles (weight) and {result['pictures']} (picture, gradient)."
+        parts += [f"{_machine(stem, result)} {of}\n", _table([*head, "gradient: factor", "plain", "times"], rows)]
+    return "\n".join(parts)
+
+
+def filled(page: str) -> str:
+    """The page with the text between each pair of marks made anew."""
+    for name, text in (("budget", budget_text(_results("budget"))), ("needles", needles_text(_results("needles")))):
+        begin, end = f"<!-- {name}: written by bench.accuracy -->\n", f"<!-- end of {name} -->"
+        before, rest = page.split(begin)
+        page = before + begin + "\n" + text + "\n" + end + rest.split(end)[1]
+    return page
+
+
+def main() -> None:
+    """Rewrite the page."""
+    PAGE.write_text(filled(PAGE.read_text("utf-8")), "utf-8", newline="\n")
+
+
+if __name__ == "__main__":
+    main()
