@@ -64,7 +64,9 @@ def _flags(base: FitConfig) -> type:
         lpips_weights: Path | None = None
         """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
         rule: str = base.rule
-        """Cut-offs of the rasterizer: exact, gsplat or inria."""
+        """Cut-offs of the rasterizer: exact, balanced, fast, gsplat or inria."""
+        half_resolution: float = base.half_resolution
+        """Share of the steps, from the first, in which views are fitted at half their size."""
         sh_every: int = base.sh_every
         """Steps after which the spherical-harmonics degree rises by one."""
         dropout: float = base.dropout

@@ -27,6 +27,7 @@ from warpgs.pipeline.event_sheet import event_figures, keep_pictures, sampling_s
 from warpgs.pipeline.fit import Fit, StepReport, run, train_views
 from warpgs.pipeline.lpips import load_lpips
 from warpgs.pipeline.results import evaluate_run, protocol_of, score_line, write_report
+from warpgs.pipeline.trade import trade_on
 from warpgs.report.events import EventLog
 from warpgs.report.progress import Progress
 from warpgs.scene import Camera, Gaussians, Normalization, Scene
@@ -205,12 +206,18 @@ def fit_scene(request: FitRequest) -> dict:
     peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(device)} if device.type == "cuda" else {}
     write_ply(out / "point_cloud.ply", fit.gaussians, scene.normalization)
     metrics = evaluate_run(out, fit.gaussians, train, test, request.config.rule, scene.background, lpips, fit.most)
+    c = request.config
+    trade = trade_on(
+        fit.gaussians, train, c.rule, scene.background, seed=c.seed, half_resolution=c.half_resolution, max_instances=fit.most
+    )
+    notes.append(trade["sentence"])
+    print(f"  {notes[-1]}")
     metrics |= {
         "protocol": protocol_of(scene, request.scene.split, request.scene.downscale, train, test),
         "steps": fit.step, "gaussians": len(fit.gaussians), "preset": request.config.preset, "seed": request.config.seed,
         "config_hash": request.config.fingerprint(), "fingerprint": scene.fingerprint, "device": where.removeprefix("on "),
         "seconds": {"setup": setup, "training": trained, "total": time.perf_counter() - began}, **peak,
-        "memory": fit.memory.to_json(), **event_figures(fit),
+        "memory": fit.memory.to_json(), "trade": trade, **event_figures(fit),
     }  # fmt: skip
     write_json(out / "metrics.json", metrics)
     record["notes"] = notes
