@@ -9,7 +9,7 @@ import platform
 import signal
 import threading
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.load import load_scene
 from warpgs.io.splits import Split, default_split, split_views, twins
+from warpgs.pipeline.budget import within_budget
 from warpgs.pipeline.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.event_sheet import event_figures, keep_pictures, sampling_story
@@ -60,6 +61,10 @@ class FitRequest:
     resume: bool = False
     lpips_weights: Path | None = None
     """File of `warpgs convert-lpips`; without one LPIPS is not measured."""
+    time_budget: float | None = None
+    """Seconds that the fit may take, by which its steps are chosen; None to take those of ``config``. Not with ``resume``."""
+    notes: tuple[str, ...] = ()
+    """What was chosen for the user before."""
 
 
 def choose_device(name: str) -> tuple[torch.device, str]:
@@ -176,6 +181,10 @@ def fit_scene(request: FitRequest) -> dict:
         lpips = None if request.lpips_weights is None else load_lpips(request.lpips_weights, device)
         scene, split, notes = read_scene(request.scene)
         train, test = train_views(scene, split.train), train_views(scene, split.test)
+        if request.time_budget is not None:
+            config, note = within_budget(request.config, request.time_budget, train, device)
+            request, notes = replace(request, config=config), [*notes, note]
+        notes = [*request.notes, *notes]
         record = _record(request, scene, split, notes, device)
         if request.resume:
             _check_same(record, json.loads((out / CONFIG).read_text("utf-8")), out)
