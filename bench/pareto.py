@@ -9,7 +9,10 @@ from dataclasses import dataclass
 from bench.plot import PALETTE, _text, spread
 
 PLOT_WIDTH, PLOT_HEIGHT = 330, 250
-LEFT, RIGHT, TOP, BOTTOM = 66, 96, 60, 52
+LEFT, RIGHT, TOP, BOTTOM = 66, 110, 76, 66
+FAR = 5.0
+"""Costs this many times the least are named below the plot instead of shown, if they are few: they would squeeze the rest."""
+FEW = 2
 HEAD, LEGEND = 40, 22
 """Room for the title and for the line that explains the colours [px]."""
 
@@ -35,6 +38,8 @@ class Panel:
     """One pair of axes: cost and, on request, value are logarithmic."""
 
     title: str
+    what: str
+    """What is shown, in a line."""
     x_label: str
     y_label: str
     points: tuple[Point, ...]
@@ -64,8 +69,11 @@ def _ticks(low: float, high: float, log: bool) -> list[float]:
 
 
 def _panel(panel: Panel, left: float, top: float, colors: dict[str, str]) -> list[str]:
-    points, out = panel.points, []
-    best = front(points, panel.upwards)
+    best, out = front(panel.points, panel.upwards), []
+    least = min(p.cost for p in panel.points)
+    far = [p for p in panel.points if p.cost > FAR * least]
+    far = far if len(far) <= FEW else []
+    points = [p for p in panel.points if p not in far]
     costs = [p.cost for p in points]
     values = [v for p in points for v in (p.value - p.bar, p.value + p.bar)]
     x_low, x_high = min(costs) / 1.08, max(costs) * 1.08
@@ -83,18 +91,24 @@ def _panel(panel: Panel, left: float, top: float, colors: dict[str, str]) -> lis
         return top + PLOT_HEIGHT * (1 - share)
 
     bottom = top + PLOT_HEIGHT
-    out.append(_text(left, top - 26, panel.title, size=13, bold=True))
+    out.append(_text(left, top - 41, panel.title, size=13, bold=True))
+    out.append(_text(left, top - 25, panel.what, size=11, color="#666666"))
     out.append(_text(left, top - 9, panel.y_label, size=11, color="#666666"))
     for y in _ticks(y_low, y_high, panel.log_y):
         out.append(f'<path d="M{left:.1f} {py(y):.1f}h{PLOT_WIDTH}" stroke="#e6e6e6"/>')
         out.append(_text(left - 8, py(y) + 4, f"{y:.3g}", size=11, anchor="end", color="#666666"))
-    for x in _ticks(x_low, x_high, True):
+    for x in _ticks(x_low, x_high, x_high > 12 * x_low):
         out.append(f'<path d="M{px(x):.1f} {top}v{PLOT_HEIGHT}" stroke="#f0f0f0"/>')
         out.append(_text(px(x), bottom + 18, f"{x:.3g}", size=11, anchor="middle", color="#666666"))
     out.append(f'<path d="M{left:.1f} {bottom}h{PLOT_WIDTH}" stroke="#999999"/>')
     out.append(_text(left + PLOT_WIDTH / 2, bottom + 38, panel.x_label, anchor="middle", size=11, color="#666666"))
 
+    if far:
+        words = "; ".join(f"{p.name}: {p.cost:.3g}, {p.value:.2g}" for p in far)
+        out.append(_text(left, bottom + 54, f"farther right: {words}", size=10, color="#666666"))
+
     path, at = "", None
+    best = [p for p in best if p not in far]
     for p in best:  # a step for each point: what no setting reaches lies below and to the left
         x, y = px(p.cost), py(p.value)
         path += f"M{x:.1f} {y:.1f}" if at is None else f"L{x:.1f} {at:.1f}L{x:.1f} {y:.1f}"
@@ -139,6 +153,6 @@ def chart(title: str, panels: Sequence[Panel], columns: int = 3) -> str:
         out.append(_text(x + 13, HEAD + 10, knob, size=11, color=colors[knob]))
         x += 30 + 6.2 * len(knob)
     for i, panel in enumerate(panels):
-        left, top = (i % columns) * wide + LEFT, HEAD + LEGEND + (i // columns) * high + TOP - 14
+        left, top = (i % columns) * wide + LEFT, HEAD + LEGEND + (i // columns) * high + TOP - 16
         out += _panel(panel, left, top, colors)
     return "\n".join([*out, "</svg>"]) + "\n"

@@ -21,7 +21,7 @@ CUTS = (0.0, 0.25, 2.0, 4.0, 8.0)
 """Values of the alpha cut beside 1 [1/255]."""
 STOPS = (1e-5, 1e-3, 1e-2, 1e-1)
 """Values of the transmittance stop beside 1e-4."""
-PAIRS = ((0.25, 1e-3), (0.25, 1e-2), (2.0, 1e-3), (2.0, 1e-2), (4.0, 1e-2), (8.0, 1e-1))
+PAIRS = ((0.25, 1e-3), (2.0, 1e-2), (4.0, 1e-2), (8.0, 1e-3))
 """Cut and stop together."""
 STALE = (1.6e-4, 1.6e-3)
 """Errors of the depth that Gaussians are sorted by [u]: a step at the highest rate of positions, and ten of them."""
@@ -92,5 +92,5 @@ def settings(degree: int, cuda: bool) -> list[Setting]:
     if cuda:
         made += [Setting("atomic", "atomic sums", deterministic=False)]
     made += [Setting(f"cut {c:g}, stop {s:g}", "cut and stop", cut_and_stop(c, s)) for c, s in PAIRS]
-    made += [Setting(n, "preset", RULES[n], preset=True) for n in ("balanced", "fast") if n in RULES]
+    made += [Setting(n, "preset", RULES[n], preset=True) for n in ("balanced", "fast")]
     return made

@@ -2,7 +2,7 @@
 
 usage: python -m bench.tradeoff kernel --device cpu|cuda --out FILE.json [--run FOLDER] [--width 252] [--count 8000]
        python -m bench.tradeoff outcome SCENE --split llff:3 --out FILE.json [--downscale 1] [--seeds 0,1,2] [--only NAMES]
-       python -m bench.tradeoff plot FILE.json
+       python -m bench.tradeoff plot FILE.json    (draws again, prints tables)
 
 An interrupted run goes on where it stopped: what FILE.json holds is not measured again. FILE.csv and FILE.svg follow.
 """
@@ -60,11 +60,38 @@ def kernel_chart(done: dict) -> str:
             pareto.Point(r["setting"], r["knob"], r["both_ms"], max(r["mean"], 1e-9), preset=r["preset"])
             for r in scene["rows"] if "both_ms" in r
         )  # fmt: skip
-        panels.append(
-            pareto.Panel(f"{name}: {scene['what']}", f"{what} [ms]", "mean error to float64 without cut-offs", points)
-        )
+        panels.append(pareto.Panel(name, scene["what"], f"{what} [ms]", "mean error to float64 without cut-offs", points))
     m = done["machine"]
     return pareto.chart(f"{m['name']}: time against error, {done['size'][0]} x {done['size'][1]} px", panels)
+
+
+def kernel_table(done: dict) -> str:
+    """Markdown: time and mean error of every setting as multiples of `exact`'s, scene by scene."""
+    names = list(done["scenes"])
+    rows = {n: {r["setting"]: r for r in done["scenes"][n]["rows"]} for n in names}
+    lines = ["| setting | " + " | ".join(f"{n}: time, error" for n in names) + " |", "|---" * (len(names) + 1) + "|"]
+    for setting in rows[names[0]]:
+        cells = []
+        for n in names:
+            r, e = rows[n].get(setting), rows[n]["exact"]
+            if r is None:
+                cells.append("")
+                continue
+            time = f"{r['both_ms'] / e['both_ms']:.2f}" if "both_ms" in r else "-"
+            cells.append(f"{time}, {r['mean'] / e['mean']:.2g}")
+        lines.append(f"| {setting} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def outcome_table(lines: list[dict]) -> str:
+    """Markdown: time and scores of every trial, and its difference to `quick` with the 95 % interval over paired seeds."""
+    text = ["| fit | time [s] | PSNR [dB] | to quick | SSIM | to quick | Gaussians |", "|---|---|---|---|---|---|---|"]
+    for r in lines:
+        text.append(
+            f"| {r['trial']} | {r['seconds']:.1f} | {r['psnr']:.2f} | {r['psnr_gain']:+.2f} ± {r['psnr_bar']:.2f} | "
+            f"{r['ssim']:.4f} | {r['ssim_gain']:+.4f} ± {r['ssim_bar']:.4f} | {r['gaussians']:,.0f} |"
+        )
+    return "\n".join(text)
 
 
 def write_kernel(path: Path, done: dict) -> None:
@@ -115,7 +142,7 @@ def outcome_chart(done: dict, lines: list[dict]) -> str:
     for key, words in (("psnr", "held-out PSNR [dB]"), ("ssim", "held-out SSIM")):
         points = tuple(pareto.Point(r["trial"], r["knob"], r["seconds"], r[key], r[f"{key}_sd"], r["preset"]) for r in lines)
         panels.append(
-            pareto.Panel(words, label, f"{words}, bars: standard deviation over seeds", points, upwards=True, log_y=False)
+            pareto.Panel(words, "bars: standard deviation over seeds", label, words, points, upwards=True, log_y=False)
         )
     views = f"{done['scene']}, {done['size'][0]}, {done['resolution']}"
     return pareto.chart(f"{done['machine']['name']}: time of a fit against its scores, {views}", panels)
@@ -183,6 +210,7 @@ def main(arguments: list[str] | None = None) -> None:
     if a.kind == "plot":
         done = json.loads(a.out.read_text("utf-8"))
         (write_kernel if done["kind"] == "kernel" else write_outcome)(a.out, done)
+        print(kernel_table(done) if done["kind"] == "kernel" else outcome_table(done["summary"]))
         return
     (kernel if a.kind == "kernel" else outcome)(a)
 

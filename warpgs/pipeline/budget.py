@@ -19,9 +19,10 @@ PIXELS_PER_GAUSSIAN = 4
 REPEATS = 5
 
 
-STEP, SETUP = 1.0, 8.0
-"""Mean time of a step of a fit, and time before the first step for each training view, in probes (`probe_seconds`): measured on
-fern with preset `quick` (bench/results/tradeoff_outcome_fern_cpu2.json). On CUDA steps are recorded and take less."""
+STEP, SETUP = 1.6, 11.0
+"""Mean time of a step of a fit, and time before the first step for each training view, in probes (`probe_seconds`). Measured on
+a CPU on fern with preset `quick`: 1.54 and 11.2 at 126 x 94 px, 1.56 and 10.8 at 168 x 126 px (docs/trade.md). On CUDA, where
+steps are recorded and probes are not, a step takes less: what is foretold there is an upper limit."""
 FEWEST, MOST = 100, 3000
 """Steps that a budget may lead to: with fewer nothing is seen, with more held-out views gain nothing (docs/results.md)."""
 
