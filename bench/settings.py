@@ -51,7 +51,8 @@ class Setting:
     def draw(self, gaussians: Gaussians, camera: Camera, max_instances: int | None = None) -> torch.Tensor:
         """Colours, shape [H, W, 3]."""
         if self.half:
-            gaussians = dataclasses.replace(gaussians, sh=gaussians.sh.half().to(gaussians.sh.dtype))
+            sh = gaussians.sh  # its gradient is passed straight through the rounding
+            gaussians = dataclasses.replace(gaussians, sh=sh + (sh.half().to(sh.dtype) - sh).detach())
         if self.stale > 0:
             return self._draw_stale(gaussians, camera)
         options = RasterizeOptions(
