@@ -122,7 +122,7 @@ PRESETS: dict[str, FitConfig] = {
         _PAPER, preset="quick", steps=600, init=dataclasses.replace(_SPARSE.init, sweep_up_to=12)
     ),
     "balanced": dataclasses.replace(
-        _PAPER, preset="balanced", steps=1200, init=dataclasses.replace(_SPARSE.init, sweep_up_to=12)
+        _PAPER, preset="balanced", steps=1200, half_resolution=0.3, init=dataclasses.replace(_SPARSE.init, sweep_up_to=12)
     ),
     "strong-3dgs": _SPARSE,
     "3dgs": FitConfig(),
@@ -136,11 +136,11 @@ PRESETS: dict[str, FitConfig] = {
         method=MethodConfig(events=True, hier=True),
     ),
 }  # fmt: skip
-"""paper: the method, with the constants of docs/decisions/008-method.md. quick and balanced: the same in one and two fifths of
-the steps (docs/trade.md). strong-3dgs: the start, degree, rates, dropout and schedule of ``paper``, and none of its parts.
-3dgs: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few. nexusgs: Zheng et al. 2025, a start from
-flow with every pixel, and its resets. dropgaussian: Park et al. 2025. paper-literal: the paper on ``nexusgs``, with what it
-leaves open as first proposed."""
+"""paper: the method, with the constants of docs/decisions/008-method.md. quick: the same in a fifth of the steps; balanced: in
+two fifths, the first at half size (docs/trade.md). strong-3dgs: the start, degree, rates, dropout and schedule of ``paper``, and
+none of its parts. 3dgs: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few. nexusgs: Zheng et al.
+2025, a start from flow with every pixel, and its resets. dropgaussian: Park et al. 2025. paper-literal: the paper on
+``nexusgs``, with what it leaves open as first proposed."""
 
 DEFAULT_PRESET = {"cuda": "paper", "cpu": "quick"}
 """Preset where the user names none, by kind of device."""
