@@ -137,7 +137,7 @@ PRESETS: dict[str, FitConfig] = {
     ),
 }  # fmt: skip
 """paper: the method, with the constants of docs/decisions/008-method.md. quick: the same in a fifth of the steps; balanced: in
-two fifths, the first at half size (docs/trade.md). strong-3dgs: the start, degree, rates, dropout and schedule of ``paper``, and
+two fifths, the first at half size (docs/trade.md). strong-3dgs: the start, degree, rates, dropout and schedule of ``paper``,
 none of its parts. 3dgs: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few. nexusgs: Zheng et al.
 2025, a start from flow with every pixel, and its resets. dropgaussian: Park et al. 2025. paper-literal: the paper on
 ``nexusgs``, with what it leaves open as first proposed."""
