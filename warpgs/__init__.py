@@ -11,10 +11,11 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 __version__ = "0.1.0"
 
-__all__ = ["Camera", "Gaussians", "RasterizeOptions", "Render", "Scene", "load_scene", "rasterize"]
+__all__ = ["Camera", "Gaussians", "RasterizeOptions", "Render", "Scene", "choose_knobs", "load_scene", "rasterize"]
 
 if TYPE_CHECKING:
     from warpgs.io.load import load_scene
+    from warpgs.prices import choose_knobs
     from warpgs.rasterizer import RasterizeOptions, rasterize
     from warpgs.scene import Camera, Gaussians, Render, Scene
 
@@ -25,6 +26,7 @@ _HOMES = {
     "Scene": "warpgs.scene",
     "RasterizeOptions": "warpgs.rasterizer",
     "rasterize": "warpgs.rasterizer",
+    "choose_knobs": "warpgs.prices",
     "load_scene": "warpgs.io.load",
 }
 

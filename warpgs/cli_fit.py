@@ -6,6 +6,7 @@ from pathlib import Path
 
 from warpgs.errors import UsageError
 from warpgs.kernels.bridge import set_threads
+from warpgs.pipeline.budget import check_budget
 from warpgs.pipeline.config import DEFAULT_PRESET, PRESETS, FitConfig
 from warpgs.pipeline.density import DensityConfig
 from warpgs.pipeline.init import InitConfig
@@ -14,6 +15,7 @@ from warpgs.pipeline.method import MethodConfig
 from warpgs.pipeline.optimizer import OptimizerConfig
 from warpgs.pipeline.run import FitRequest, SceneRequest, choose_device
 from warpgs.pipeline.schedule import PhaseConfig
+from warpgs.prices import choose_knobs
 from warpgs.priors.view_prior import PriorConfig
 from warpgs.sizes import parse_bytes
 
@@ -64,7 +66,13 @@ def _flags(base: FitConfig) -> type:
         lpips_weights: Path | None = None
         """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
         rule: str = base.rule
-        """Cut-offs of the rasterizer: exact, gsplat or inria."""
+        """Cut-offs of the rasterizer: exact, balanced, fast, gsplat or inria."""
+        max_error: float | None = None
+        """Have the fastest rule chosen whose pictures are off exact by at most this on average, in [0, 1]; not with --rule."""
+        time_budget: float | None = None
+        """Have the number of steps chosen so that the fit is done in this time [s]; not with --steps or --max-error."""
+        half_resolution: float = base.half_resolution
+        """Share of the steps, from the first, in which views are fitted at half their size."""
         sh_every: int = base.sh_every
         """Steps after which the spherical-harmonics degree rises by one."""
         dropout: float = base.dropout
@@ -90,6 +98,25 @@ def _flags(base: FitConfig) -> type:
     return Fit
 
 
+def _choose(a, arguments: list[str], rooms: dict) -> tuple[str, ...]:
+    """Let the measured prices choose where the user asked for it; notes that say what was chosen. Settings change in place."""
+    if a.max_error is not None and a.time_budget is not None:
+        raise UsageError("--max-error and --time-budget choose knobs by different prices: give one of them")
+    if a.time_budget is not None:
+        if a.resume or _word(arguments, "--steps"):
+            raise UsageError(
+                "--time-budget chooses the number of steps: leave out --steps, and to continue such a run give --resume with "
+                "the --steps that it chose instead of --time-budget"
+            )
+        check_budget(a.time_budget)
+    if a.max_error is None:
+        return ()
+    if _word(arguments, "--rule"):
+        raise UsageError("--max-error chooses the rule: leave out --rule")
+    rooms["rule"], note = choose_knobs(max_error=a.max_error)
+    return (note,)
+
+
 def fit(arguments: list[str], description: str) -> FitRequest:
     """The request that the words of a command line make.
 
@@ -111,9 +138,11 @@ def fit(arguments: list[str], description: str) -> FitRequest:
     if a.threads:
         set_threads(a.threads)
     rooms = {f.name: getattr(a, f.name) for f in dataclasses.fields(base)}
+    notes = _choose(a, arguments, rooms)
     rooms["memory_limit"] = None if a.memory_limit is None else parse_bytes(a.memory_limit)
     if named is None:
-        print(f"preset {name}, as usual on {kind}, {a.steps} steps; the time left stands in the line of progress")
+        steps = "as many steps as the time allows" if a.time_budget else f"{a.steps} steps"
+        print(f"preset {name}, as usual on {kind}, {steps}; the time left stands in the line of progress")
     masks = None if a.score_masks is None else str(a.score_masks.resolve())
     scene = SceneRequest(str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.invert_masks, masks)
-    return FitRequest(scene, a.out, FitConfig(**rooms), a.device, a.resume, a.lpips_weights)
+    return FitRequest(scene, a.out, FitConfig(**rooms), a.device, a.resume, a.lpips_weights, a.time_budget, notes)

@@ -22,7 +22,7 @@ class RasterizeOptions:
     """How to draw; the defaults are exact."""
 
     rule: str | Rule = "exact"
-    """Cut-offs: exact, gsplat, inria, or a Rule of your own."""
+    """Cut-offs: exact, balanced, fast (docs/trade.md), gsplat, inria, or a Rule of your own."""
     sh_degree: int | None = None
     """Spherical-harmonics degree used; None for all that is stored."""
     background: torch.Tensor | None = None

@@ -102,3 +102,12 @@ def test_loss_that_is_no_number_stops_before_it_harms():
     with pytest.raises(NotFiniteError, match="became nan"):
         fit.burst(100)
     assert fit.step < 4 and all(bool(torch.isfinite(t).all()) for t in fit.gaussians.tensors().values())
+
+
+def test_recorded_steps_at_half_size_equal_single_steps():
+    """Two sizes one after the other, through the change between them."""
+    config = dataclasses.replace(BUSY, half_resolution=0.5)
+    single, _ = fitted(photographs(4), recorded=False, config=config)
+    recorded, _ = fitted(photographs(4), recorded=True, config=config)
+    a, b = single.state()[0], recorded.state()[0]
+    assert all(torch.equal(a[k], b[k]) for k in a)

@@ -8,6 +8,7 @@ import json
 import typing
 from dataclasses import dataclass, field
 
+from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.pipeline.density import DensityConfig
 from warpgs.pipeline.init import InitConfig
@@ -30,7 +31,9 @@ class FitConfig:
     seed: int = 0
     """Decides every random choice; the same seed, data and device kind give the same bytes."""
     rule: str = "exact"
-    """Cut-offs of the rasterizer: exact, gsplat or inria."""
+    """Cut-offs of the rasterizer: exact, balanced, fast, gsplat or inria."""
+    half_resolution: float = 0.0
+    """Share of the steps, from the first, in which views are fitted at half their size (docs/trade.md)."""
     sh_every: int = 1000
     """Steps after which the spherical-harmonics degree in use rises by one."""
     dropout: float = 0.0
@@ -65,10 +68,12 @@ class FitConfig:
             raise UsageError(f"memory-limit must be at least one byte, not {self.memory_limit}")
         if not self.checkpoint_seconds >= 0:
             raise UsageError(f"checkpoint-seconds must be at least 0, not {self.checkpoint_seconds}")
+        if not 0 <= self.half_resolution <= 1:
+            raise UsageError(f"half-resolution must lie in [0, 1], not {self.half_resolution}")
         if not 0 <= self.dropout < 1:
             raise UsageError(f"dropout must lie in [0, 1), not {self.dropout}")
-        if self.rule not in ("exact", "gsplat", "inria"):
-            raise UsageError(f"rule {self.rule!r} is not one of exact, gsplat, inria")
+        if self.rule not in RULES:
+            raise UsageError(f"rule {self.rule!r} is not one of {', '.join(RULES)}")
 
     def to_json(self) -> dict:
         """Nested plain values, as stored in a run folder."""
@@ -116,6 +121,9 @@ PRESETS: dict[str, FitConfig] = {
     "quick": dataclasses.replace(
         _PAPER, preset="quick", steps=600, init=dataclasses.replace(_SPARSE.init, sweep_up_to=12)
     ),
+    "balanced": dataclasses.replace(
+        _PAPER, preset="balanced", steps=1200, half_resolution=0.3, init=dataclasses.replace(_SPARSE.init, sweep_up_to=12)
+    ),
     "strong-3dgs": _SPARSE,
     "3dgs": FitConfig(),
     "nexusgs": _NEXUS,
@@ -128,10 +136,11 @@ PRESETS: dict[str, FitConfig] = {
         method=MethodConfig(events=True, hier=True),
     ),
 }  # fmt: skip
-"""paper: the method, with the constants of docs/decisions/008-method.md. quick: the same in a fifth of the steps. strong-3dgs:
-the start, degree, rates, dropout and schedule of ``paper``, and none of the paper's parts. 3dgs: Kerbl et al. 2023 without
-opacity resets, which cost decibels when views are few. nexusgs: Zheng et al. 2025, a start from flow with every pixel, and its
-resets. dropgaussian: Park et al. 2025. paper-literal: the paper on ``nexusgs``, with what it leaves open as first proposed."""
+"""paper: the method, with the constants of docs/decisions/008-method.md. quick: the same in a fifth of the steps; balanced: in
+two fifths, the first at half size (docs/trade.md). strong-3dgs: the start, degree, rates, dropout and schedule of ``paper``,
+none of its parts. 3dgs: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few. nexusgs: Zheng et al.
+2025, a start from flow with every pixel, and its resets. dropgaussian: Park et al. 2025. paper-literal: the paper on
+``nexusgs``, with what it leaves open as first proposed."""
 
 DEFAULT_PRESET = {"cuda": "paper", "cpu": "quick"}
 """Preset where the user names none, by kind of device."""

@@ -25,7 +25,8 @@ from warpgs.pipeline.memory import layout_of, most_instances, plan
 from warpgs.pipeline.method import Event, TrainingView, sampling_event
 from warpgs.pipeline.optimizer import Optimizer
 from warpgs.pipeline.region import counted_region
-from warpgs.pipeline.schedule import plan_phases, sh_degree
+from warpgs.pipeline.resolution import halved
+from warpgs.pipeline.schedule import Phase, plan_phases, sh_degree
 from warpgs.priors.cache import cache_folder
 from warpgs.priors.view_prior import view_priors
 from warpgs.rasterizer import RasterizeOptions, rasterize
@@ -46,18 +47,6 @@ class StepReport:
     """Number of Gaussians."""
     seconds: float
     """Wall time of the step [s]."""
-
-
-@dataclass(frozen=True)
-class Phase:
-    """What a step does beyond rendering, comparing and updating; steps of one phase can share a recording."""
-
-    degree: int
-    """Spherical-harmonics degree in use."""
-    densifying: bool
-    """Gradients are gathered, and the set is refined now and then."""
-    layered: bool
-    """The coarse layer is kept stable."""
 
 
 class Fit:
@@ -139,7 +128,7 @@ class Fit:
         begin = time.perf_counter()
         self.step += 1
         c, phase = self.config, self._phase(self.step)
-        view = self.views[self.next_view()]
+        view = self.shown[self.next_view() + phase.halved * len(self.views)]
         factors = None
         if self.dropout > 0:
             settings = torch.tensor(self._settings(self.step), dtype=torch.float32, device=self.device)
@@ -187,8 +176,9 @@ class Fit:
         ):
             count += 1
         chosen = [self.next_view() for _ in range(count)]
+        places = [self.places[i + phase.halved * len(self.views)] for i in chosen]
         try:
-            graphs = [self._graph(self.places[i][0], phase) for i in chosen]
+            graphs = [self._graph(kind, phase) for kind, _ in places]
         except OverLimitError as e:
             self.order += reversed(chosen)
             self.graphs.clear()
@@ -198,7 +188,7 @@ class Fit:
             return [self.advance()]
         steps = range(first, first + count)
         rates = [self.optimizer.schedule(self._progress(s), s) for s in steps]
-        self.work.load([self.places[i][1] for i in chosen], rates, [self._settings(s) for s in steps])
+        self.work.load([row for _, row in places], rates, [self._settings(s) for s in steps])
         for graph in graphs:
             graph.replay()
         done, stop, history = self.work.result()
@@ -231,7 +221,8 @@ class Fit:
     def _phase(self, step: int) -> Phase:
         c = self.config
         layered = c.method.hier and c.method.events and step > self.phases.refine
-        return Phase(sh_degree(step, c.sh_every, c.init.max_sh_degree), step <= self._densify_until, layered)
+        half = step <= c.half_resolution * c.steps
+        return Phase(sh_degree(step, c.sh_every, c.init.max_sh_degree), step <= self._densify_until, layered, half)
 
     @property
     def _densify_until(self) -> int:
@@ -269,7 +260,8 @@ class Fit:
     def _plan(self) -> None:
         """Foretell the memory that steps need, and decide how they are taken."""
         c = self.config
-        cameras, masked = [v.camera for v in self.views], [v.mask is not None for v in self.views]
+        self.shown = self.views + [halved(v) for v in self.views if c.half_resolution > 0]
+        cameras, masked = [v.camera for v in self.shown], [v.mask is not None for v in self.shown]
         layout = layout_of(self.gaussians, cameras, masked, scored=c.method.events, recorded=c.cuda_graph)
         self.memory, self.layout = plan(
             layout, count=len(self.optimizer.gaussians), instances=most_instances(self.gaussians, cameras, c.rule),
@@ -277,7 +269,7 @@ class Fit:
         )  # fmt: skip
         self._count_changed()
         if self.layout.recordings:
-            self.work, (self.stacks, self.places) = Burst(self.device), stack_views(self.views)
+            self.work, (self.stacks, self.places) = Burst(self.device), stack_views(self.shown)
 
     def _count_changed(self) -> None:
         """Set how many instances a step may have at a time: None where there is no limit."""

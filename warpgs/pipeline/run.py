@@ -9,7 +9,7 @@ import platform
 import signal
 import threading
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +21,14 @@ from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.load import load_scene
 from warpgs.io.splits import Split, default_split, split_views, twins
+from warpgs.pipeline.budget import within_budget
 from warpgs.pipeline.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.event_sheet import event_figures, keep_pictures, sampling_story
 from warpgs.pipeline.fit import Fit, StepReport, run, train_views
 from warpgs.pipeline.lpips import load_lpips
 from warpgs.pipeline.results import evaluate_run, protocol_of, score_line, write_report
+from warpgs.pipeline.trade import trade_on
 from warpgs.report.events import EventLog
 from warpgs.report.progress import Progress
 from warpgs.scene import Camera, Gaussians, Normalization, Scene
@@ -59,6 +61,10 @@ class FitRequest:
     resume: bool = False
     lpips_weights: Path | None = None
     """File of `warpgs convert-lpips`; without one LPIPS is not measured."""
+    time_budget: float | None = None
+    """Seconds that the fit may take, by which its steps are chosen; None to take those of ``config``. Not with ``resume``."""
+    notes: tuple[str, ...] = ()
+    """What was chosen for the user before."""
 
 
 def choose_device(name: str) -> tuple[torch.device, str]:
@@ -175,6 +181,10 @@ def fit_scene(request: FitRequest) -> dict:
         lpips = None if request.lpips_weights is None else load_lpips(request.lpips_weights, device)
         scene, split, notes = read_scene(request.scene)
         train, test = train_views(scene, split.train), train_views(scene, split.test)
+        if request.time_budget is not None:
+            config, note = within_budget(request.config, request.time_budget, train, device)
+            request, notes = replace(request, config=config), [*notes, note]
+        notes = [*request.notes, *notes]
         record = _record(request, scene, split, notes, device)
         if request.resume:
             _check_same(record, json.loads((out / CONFIG).read_text("utf-8")), out)
@@ -205,12 +215,18 @@ def fit_scene(request: FitRequest) -> dict:
     peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(device)} if device.type == "cuda" else {}
     write_ply(out / "point_cloud.ply", fit.gaussians, scene.normalization)
     metrics = evaluate_run(out, fit.gaussians, train, test, request.config.rule, scene.background, lpips, fit.most)
+    c = request.config
+    trade = trade_on(
+        fit.gaussians, train, c.rule, scene.background, seed=c.seed, half_resolution=c.half_resolution, max_instances=fit.most
+    )
+    notes.append(trade["sentence"])
+    print(f"  {notes[-1]}")
     metrics |= {
         "protocol": protocol_of(scene, request.scene.split, request.scene.downscale, train, test),
         "steps": fit.step, "gaussians": len(fit.gaussians), "preset": request.config.preset, "seed": request.config.seed,
         "config_hash": request.config.fingerprint(), "fingerprint": scene.fingerprint, "device": where.removeprefix("on "),
         "seconds": {"setup": setup, "training": trained, "total": time.perf_counter() - began}, **peak,
-        "memory": fit.memory.to_json(), **event_figures(fit),
+        "memory": fit.memory.to_json(), "trade": trade, **event_figures(fit),
     }  # fmt: skip
     write_json(out / "metrics.json", metrics)
     record["notes"] = notes

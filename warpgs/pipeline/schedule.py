@@ -52,6 +52,20 @@ class Phases:
     """Steps done when fine Gaussians are sampled, ascending; the first is ``refine``, or 1 where that is 0."""
 
 
+@dataclass(frozen=True)
+class Phase:
+    """What a step does beyond rendering, comparing and updating; steps of one phase can share a recording."""
+
+    degree: int
+    """Spherical-harmonics degree in use."""
+    densifying: bool
+    """Gradients are gathered, and the set is refined now and then."""
+    layered: bool
+    """The coarse layer is kept stable."""
+    halved: bool
+    """Views are half their size."""
+
+
 def plan_phases(config: PhaseConfig, steps: int) -> Phases:
     """The phases of a fit of that many steps.
 
