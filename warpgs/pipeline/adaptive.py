@@ -146,6 +146,11 @@ class AdaptiveFit(Fit):
     def _judge(self) -> None:
         """Look at the held-out blocks; end growth where the last level bought less than its noise, or where its time is up."""
         c, limits = self.config.judge, self.optimizer.limits
+        last = max((m for m in self.marks if m < self.step), default=self.step)
+        if last < self.step < self.marks[-1] and not any(
+            super(AdaptiveFit, self)._changes_after(s) for s in range(last, self.step)
+        ):
+            return  # nothing could have grown
         errors = self._errors(self.gaussians)
         if self.before is not None:
             old = limits.level < limits.growing
@@ -159,6 +164,8 @@ class AdaptiveFit(Fit):
                     f"level {len(self.levels)} bought {least.mean:+.3f} dB on the held-out blocks, less than "
                     f"{c.noise:g} x its noise of {least.noise:.3f} dB"
                 )
+                if bool(old.all()):
+                    self.why = f"no Gaussian came with level {len(self.levels)}: there is no room, or nothing to add"
                 if not own.bought(c.noise) and bool(old.any()):
                     self._change(torch.nonzero(old).squeeze(1))
                 self._close()

@@ -65,6 +65,7 @@ def coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOpti
         # from the distance of the unit vectors: the arc cosine of their product knows no small angles in float32
         angle = 2 * torch.asin((0.5 * (_directions(means, c) - middle).norm(dim=1)).clamp(max=1))
         widest = torch.where(sees, torch.maximum(widest, angle), widest)
+    widest = torch.where(views > 1, widest, 0)  # of a single direction only its rounding is left
     return Coverage(maxima, views, 2 * widest, torch.where(torch.isfinite(footprint), footprint, 0))
 
 

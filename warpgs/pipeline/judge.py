@@ -18,7 +18,8 @@ from warpgs.scene import Gaussians
 FLOOR = (2 / 255) ** 2
 """Mean squared error that is added to every block's: below two levels of an 8-bit photograph there is nothing to explain."""
 SIDES = 16, 32
-"""Least and largest side of a block [px]; between them a sixteenth of the picture's shorter side."""
+"""Least and largest side of a block [px]; between them a sixteenth of the picture's shorter side. In pictures of which an
+eighth is less than the least, it is that eighth."""
 FEWEST = 12
 """With fewer blocks over all views there is no telling a gain from noise."""
 
@@ -79,7 +80,7 @@ def draw_blocks(views: list[TrainingView], share: float, seed: int) -> list[Bloc
         generator = torch.Generator().manual_seed((seed << 16) + number)
         height, width = view.photo.shape[:2]
         short = min(height, width)
-        side = max(1, min(max(SIDES[0], min(SIDES[1], round(short / 16))), short // 4))
+        side = max(1, min(max(SIDES[0], min(SIDES[1], round(short / 16))), short // 8))
         first = torch.stack([torch.randint(n % side + 1, (), generator=generator) for n in (height, width)])
         cells = torch.cartesian_prod(torch.arange(height // side), torch.arange(width // side)) * side + first
         if view.mask is not None:
