@@ -22,7 +22,7 @@ from warpgs.scene import View
 CPU = torch.device("cpu")
 GROWING = FitConfig(
     steps=60, sh_every=15, adaptive=True, init=InitConfig(source="points", max_sh_degree=1),
-    judge=JudgeConfig(levels=2, share=0.3), density=DensityConfig(start=10, every=5, gradient=1e-5),
+    judge=JudgeConfig(levels=2, share=0.3, trim_db=0), density=DensityConfig(start=10, every=5, gradient=1e-5),
 )  # fmt: skip
 
 
@@ -61,7 +61,7 @@ def test_growth_is_judged_and_then_all_pixels_count():
         assert fit.advance().count == count
     c = complexity(fit)
     assert c["count"] == count == c["shrunk"]["count_after"]
-    assert c["shrunk"]["count_before"] - c["shrunk"]["merged"] - c["shrunk"]["pruned"] == count
+    assert c["shrunk"]["count_before"] - c["shrunk"]["merged"] - c["shrunk"]["pruned"] + c["shrunk"]["added"] == count
     assert c["bytes"] == c["shrunk"]["bytes_after"] <= c["shrunk"]["bytes_before"]
     assert c["marginal_db"] == c["levels"][-1]["gain"] == min(c["levels"][-1][k] for k in ("fall", "own"))
     assert c["why"] and c["why"] in told[-1] and c["why"] in complexity_sentence({"complexity": c})
@@ -80,6 +80,24 @@ def test_everything_by_row_stays_aligned():
     assert bool(flat.any()) and not bool(fit.gaussians.sh[flat, 1:].any())
     assert bool((fit.gaussians.log_scales >= fit.optimizer.limits.floor[:, None] - 1e-6).all())
     assert all(bool(t.isfinite().all()) for n, t in tensors.items() if n.startswith(("param", "mean", "square")))
+
+
+def test_finished_model_is_trimmed_within_its_loss():
+    """The last step leaves a smaller model, no further from its views than allowed, and rows for each Gaussian."""
+    before = advanced(GROWING, 60)
+    config = dataclasses.replace(GROWING, judge=dataclasses.replace(GROWING.judge, trim_db=0.5))
+    fit = advanced(config, 60)
+    c = complexity(fit)
+    assert c["count"] == len(fit.gaussians) < 0.9 * len(before.gaussians)
+    assert c["shrunk"]["trimmed"] == len(before.gaussians) - c["count"] and c["bytes"] == c["shrunk"]["bytes_after"]
+    assert before._view_psnr(before.gaussians) - fit._view_psnr(fit.gaussians) == pytest.approx(
+        c["shrunk"]["trim_db"], abs=1e-6
+    )
+    assert c["shrunk"]["trim_db"] <= 0.5 and "was trimmed to" in fit.news[-1]
+    tensors, _ = fit.state()
+    by_row = [n for n in tensors if n.split(".")[0] in ("param", "mean", "square", "density", "layers", "limits")]
+    assert all(len(tensors[n]) == c["count"] for n in by_row) and tensors["param.sh"].shape[1] == 4
+    assert bool((fit.optimizer.limits.degree.diff() >= 0).all())
 
 
 @pytest.mark.parametrize("at", [17, 24, 45])

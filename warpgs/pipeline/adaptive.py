@@ -5,6 +5,7 @@ docs/complexity.md. The fit itself is that of `fit.Fit`; this room decides when 
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import asdict, dataclass
 
 import torch
@@ -13,11 +14,13 @@ from warpgs.pipeline import shrink
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.density import Refinement
 from warpgs.pipeline.fit import Fit, Phase
-from warpgs.pipeline.judge import FEWEST, Gain, block_errors, decibels, draw_blocks, gain, hide
-from warpgs.pipeline.layers import COARSE, LONG_AGO
+from warpgs.pipeline.judge import FEWEST, FLOOR, Gain, block_errors, decibels, draw_blocks, gain, hide, only
+from warpgs.pipeline.layers import COARSE, FINE, LONG_AGO
 from warpgs.pipeline.limits import Limits, model_bytes
+from warpgs.pipeline.loss import masked_mse
+from warpgs.pipeline.method import MAX_VIEWS, sampling_event
 from warpgs.pipeline.schedule import sh_degree
-from warpgs.rasterizer import RasterizeOptions
+from warpgs.rasterizer import RasterizeOptions, rasterize
 from warpgs.scene import Gaussians
 
 
@@ -113,6 +116,8 @@ class AdaptiveFit(Fit):
         if self._judges_after(self.step):
             self._judge()
         super()._change_set(phase)
+        if self.judging and self.step == self.config.steps and self.config.judge.trim_db > 0:
+            self._trim()
 
     def _refine(self, phase: Phase) -> None:
         """Refine as the fit does, but never what one view alone sees, nor what is as fine as a pixel."""
@@ -188,7 +193,13 @@ class AdaptiveFit(Fit):
         self._observe()
         base, looks = self._errors(self.gaussians), self._looks
         degrees = shrink.stored_degrees(self.gaussians.sh)
-        self.shrunk = {"count_before": len(self.gaussians), "bytes_before": model_bytes(degrees), "merged": 0, "pruned": 0}
+        self.shrunk = {
+            "count_before": len(self.gaussians),
+            "bytes_before": model_bytes(degrees),
+            "merged": 0,
+            "pruned": 0,
+            "added": 0,
+        }
         parts = max(1, c.merge + c.prune + c.degrees)
         spent = 0
 
@@ -208,6 +219,7 @@ class AdaptiveFit(Fit):
             keep = shrink.dispensable(self.gaussians, looks, accepted)
             self.shrunk["pruned"] = len(self.gaussians) - len(keep)
             self._change(keep)
+        self._catch_up()
         self._observe()
         if c.degrees:
             spent += 1
@@ -221,11 +233,61 @@ class AdaptiveFit(Fit):
         self.graphs.clear()
         self.views = self.whole
         self._plan()
+        n, told = self.shrunk, float(limits.degree.double().mean())
         self.news.append(
-            f"adaptive: growth ended at step {self.step}, because {self.why}; {self.shrunk['count_before']:,} Gaussians became "
-            f"{len(order):,} ({self.shrunk['merged']:,} merged, {self.shrunk['pruned']:,} pruned) of mean degree "
-            f"{float(limits.degree.double().mean()):.2f}; all pixels are trained on from here"
+            f"adaptive: growth ended at step {self.step}, because {self.why}; {n['count_before']:,} Gaussians became "
+            f"{len(order):,} ({n['merged']:,} merged, {n['pruned']:,} pruned, {n['added']:,} added in the blocks) of mean "
+            f"degree {told:.2f}; all pixels are trained on from here"
         )
+
+    @torch.no_grad()
+    def _view_psnr(self, gaussians: Gaussians) -> float:
+        """Mean over the training views of the PSNR over the pixels that count, the judge's floor included [dB]."""
+        options = self._options()
+        errors = [masked_mse(rasterize(gaussians, v.camera, options).rgb, v.photo, v.mask).double() for v in self.whole]
+        return float((-10 * torch.log10(torch.stack(errors) + FLOOR)).mean())
+
+    def _trim(self) -> None:
+        """Make the finished model smaller within the loss that is allowed on its training views."""
+        limits, whole, before = self.optimizer.limits, self._view_psnr(self.gaussians), len(self.gaussians)
+        allowed = self.config.judge.trim_db
+        made = shrink.prune_model(
+            self.gaussians, self.layers.level, self._looks, lambda g, share: self._view_psnr(g) >= whole - share * allowed
+        )
+        rows = made.gaussians.tensors()
+        lost = self.gaussians.sh.shape[1] - rows["sh"].shape[1]
+        rows["sh"] = torch.nn.functional.pad(rows["sh"], (0, 0, 0, lost))
+        none = torch.zeros(0, dtype=torch.int64, device=self.device)
+        parents = none.new_full((len(made.degrees),), -1)
+        self._apply(Refinement(none, rows, parents), COARSE, LONG_AGO)
+        self.layers.level, limits.degree = made.kinds.to(self.layers.level.dtype), made.degrees
+        self.shrunk |= {
+            "trimmed": before - len(made.degrees), "trim_db": whole - self._view_psnr(self.gaussians),
+            "count_after": len(made.degrees), "bytes_after": model_bytes(made.degrees),
+        }  # fmt: skip
+        self.news.append(
+            f"adaptive: the finished model of {before:,} Gaussians was trimmed to {len(made.degrees):,} for "
+            f"{self.shrunk['trim_db']:.3f} dB on its training views"
+        )
+
+    def _catch_up(self) -> None:
+        """Give the blocks, where nothing was sampled so far, as many fine Gaussians a pixel as there are elsewhere."""
+        c, pixels = self.config, sum(v.photo[..., 0].numel() for v in self.whole)
+        held = sum(len(b) * b.side**2 for b in self.blocks)
+        share = int(self.layers.fine.sum()) / (pixels - held) * held / pixels
+        if not c.method.events or not share * pixels >= 1:
+            return
+        sampler = dataclasses.replace(c.method.sampler, share=min(1.0, share), max_share=1e6)
+        blocks = [only(v, b) for v, b in zip(self.whole, self.blocks)]
+        for first in range(0, len(blocks), MAX_VIEWS):
+            event = sampling_event(
+                self.gaussians, self.layers, blocks[first : first + MAX_VIEWS], dataclasses.replace(c.method, sampler=sampler),
+                step=self.step, room=self._room_for - len(self.optimizer.gaussians), rule=c.rule, background=self.background,
+                generator=self.generator, max_instances=self.most,
+            )  # fmt: skip
+            self._apply(event.change, FINE, self.step)
+            self.shrunk["added"] += len(event.change.parents)
+            self.shrunk["pruned"] += event.freed
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict]:
         """As the fit's, with what the judge knows."""

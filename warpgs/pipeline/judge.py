@@ -28,7 +28,7 @@ FEWEST = 12
 class JudgeConfig:
     """How an adaptive fit finds its size."""
 
-    share: float = 0.08
+    share: float = 0.05
     """Part of the pixels that is held out until growth ends."""
     levels: int = 4
     """Parts of equal length that growth is judged after."""
@@ -37,10 +37,12 @@ class JudgeConfig:
     keep_db: float = 0.1
     """PSNR that merging, pruning and lower degrees together may cost on the held-out blocks, before the rest of the fit mends
     it [dB]; what is within the noise of that difference may go in any case."""
+    trim_db: float = 0.1
+    """PSNR that the mean over the training views may fall by when the finished model is made smaller [dB]; 0 for not at all."""
     merge: bool = True
-    """Neighbours of like colour become one Gaussian."""
+    """When growth ends, neighbours of like colour become one Gaussian."""
     prune: bool = True
-    """Gaussians that neither contribute nor matter to any training view are removed."""
+    """When growth ends, Gaussians that neither contribute nor matter to any training view are removed."""
     degrees: bool = True
     """Each Gaussian keeps only the spherical harmonics that its views can tell apart and that the held-out blocks ask for."""
 
@@ -49,8 +51,8 @@ class JudgeConfig:
             raise UsageError(f"judge share {self.share} must lie above 0 and be at most 0.5")
         if self.levels < 1:
             raise UsageError(f"judge levels {self.levels} must be at least 1")
-        if not 0 <= self.noise < math.inf or not 0 <= self.keep_db < math.inf:
-            raise UsageError("judge: noise and keep db must be 0 or more")
+        if not 0 <= self.noise < math.inf or not 0 <= self.keep_db < math.inf or not 0 <= self.trim_db < math.inf:
+            raise UsageError("judge: noise, keep db and trim db must be 0 or more")
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,13 @@ def hide(view: TrainingView, blocks: Blocks) -> TrainingView:
     mask = torch.ones_like(view.photo[..., 0]) if view.mask is None else view.mask.clone()
     mask[blocks.pixels(mask.device)] = 0
     return replace(view, mask=mask)
+
+
+def only(view: TrainingView, blocks: Blocks) -> TrainingView:
+    """The view whose mask leaves out all but the blocks."""
+    mask = torch.zeros_like(view.photo[..., 0])
+    mask[blocks.pixels(mask.device)] = 1
+    return replace(view, mask=mask if view.mask is None else mask * view.mask)
 
 
 @torch.no_grad()

@@ -6,8 +6,6 @@ import math
 import os
 import secrets
 import shutil
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,19 +27,6 @@ from warpgs.rasterizer import RasterizeOptions
 from warpgs.scene import Gaussians, View
 from warpgs.sizes import format_bytes
 
-DEGREES_SHARE = 0.5
-"""Part of the allowed loss that lower degrees may take; removing Gaussians takes what is left of the whole."""
-
-
-@dataclass(frozen=True)
-class Pruned:
-    """A smaller model."""
-
-    gaussians: Gaussians
-    """Sorted by degree, ascending."""
-    degrees: torch.Tensor
-    """Degree of each, int32, shape [N], ascending."""
-
 
 def mean_psnr(gaussians: Gaussians, views: list[View], options: RasterizeOptions) -> float:
     """Mean over views of the PSNR [dB] as `warpgs eval` has it: rounded to 8 bits, over scored pixels; NaN without views."""
@@ -54,28 +39,6 @@ def mean_psnr(gaussians: Gaussians, views: list[View], options: RasterizeOptions
     return float(np.mean(scores))
 
 
-def prune_model(gaussians: Gaussians, looks: shrink.Looks, accepted: Callable[[Gaussians, float], bool]) -> Pruned:
-    """Lower degrees, then remove Gaussians, as far as is accepted.
-
-    Args:
-        gaussians: N Gaussians.
-        looks: The training views.
-        accepted: Whether a model is good enough when that share [0, 1] of the allowed loss may be spent.
-
-    Returns:
-        The smaller model, which was accepted with a share of 1; the model itself where nothing may go.
-    """
-    stored = shrink.stored_degrees(gaussians.sh)
-    degrees = stored
-    if bool((stored > 0).any()):
-        degrees = shrink.needed_degrees(gaussians, stored, looks, lambda g: accepted(g, DEGREES_SHARE))
-    model = shrink.with_degrees(gaussians, degrees)
-    keep = shrink.dispensable(model, looks, lambda g: accepted(g, 1.0))
-    model, degrees = shrink.rows_of(model, keep), degrees[keep]
-    order = torch.argsort(degrees, stable=True)
-    return Pruned(shrink.trimmed(shrink.rows_of(model, order)), degrees[order])
-
-
 def _new_folder(folder: Path, out: Path | None) -> Path:
     out = folder.with_name(f"{folder.resolve().name}-pruned") if out is None else out
     if out.exists():
@@ -85,7 +48,7 @@ def _new_folder(folder: Path, out: Path | None) -> Path:
     return out
 
 
-def _write(out: Path, record: dict, made: Pruned, step: int, normalization) -> None:
+def _write(out: Path, record: dict, made: shrink.Pruned, step: int, normalization) -> None:
     """The new run folder, whole or not at all."""
     temporary = out.with_name(f".{out.name}.{secrets.token_hex(4)}.tmp")
     tensors = {f"param.{n}": t for n, t in made.gaussians.tensors().items() if n != "sh"}
@@ -139,8 +102,9 @@ def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str) ->
         raise DataError(
             f"{folder}: its PSNR on the training views is {whole} dB, so no loss of it can be kept small; fit again"
         )
+    kinds = torch.zeros(len(before), dtype=torch.int64, device=device)
     looks = shrink.Looks([TrainingView.of(v, device).camera for v in train], options, stored.record["config"]["seed"])
-    made = prune_model(before, looks, lambda g, share: mean_psnr(g, train, options) >= whole - share * keep_psnr)
+    made = shrink.prune_model(before, kinds, looks, lambda g, share: mean_psnr(g, train, options) >= whole - share * keep_psnr)
 
     degrees = shrink.stored_degrees(before.sh)
     sizes = [model_bytes(d) for d in (degrees, made.degrees)]

@@ -18,6 +18,9 @@ ROUNDS = 5
 """Halvings of the interval in which the largest share is looked for."""
 PASSES = 12
 """Most rounds of merging: 2^12 neighbours become one."""
+DEGREES_SHARE, MERGE_SHARE = 1 / 3, 2 / 3
+"""Parts of the allowed loss of a finished model that may be spent after lower degrees, and after merging; removing takes it
+whole."""
 WORTHWHILE = 0.02
 """A round of merging that takes a smaller part of the Gaussians than this is the last."""
 
@@ -164,3 +167,46 @@ def needed_degrees(
         return result
 
     return lowered(largest_share(lambda s: accepted(with_degrees(gaussians, lowered(s)))))
+
+
+@dataclass(frozen=True)
+class Pruned:
+    """A smaller model."""
+
+    gaussians: Gaussians
+    """Sorted by degree, ascending."""
+    degrees: torch.Tensor
+    """Degree of each, int32, shape [N], ascending."""
+    kinds: torch.Tensor
+    """Number of each that only its likes were merged with, shape [N]."""
+
+
+def prune_model(
+    gaussians: Gaussians, kinds: torch.Tensor, looks: Looks, accepted: Callable[[Gaussians, float], bool]
+) -> Pruned:
+    """Lower degrees, merge neighbours, then remove Gaussians, as far as is accepted.
+
+    Args:
+        gaussians: N Gaussians.
+        kinds: Only Gaussians of the same number are merged, int, shape [N].
+        looks: The training views.
+        accepted: Whether a model is good enough when that share [0, 1] of the allowed loss may be spent.
+
+    Returns:
+        The smaller model, which was accepted with a share of 1; the model itself where nothing may go.
+    """
+    degrees, model = stored_degrees(gaussians.sh), gaussians
+    if bool((degrees > 0).any()):
+        model = with_degrees(model, needed_degrees(model, degrees, looks, lambda g: accepted(g, DEGREES_SHARE)))
+
+    def merged(change: Refinement) -> tuple[Gaussians, torch.Tensor]:
+        nonlocal model, kinds
+        model, kinds = changed(model, change), torch.cat([kinds[change.keep], kinds[change.parents]])
+        return model, kinds
+
+    merge_neighbours(model, kinds, looks, lambda g: accepted(g, MERGE_SHARE), merged)
+    keep = dispensable(model, looks, lambda g: accepted(g, 1.0))
+    model, kinds = rows_of(model, keep), kinds[keep]
+    degrees = stored_degrees(model.sh)
+    order = torch.argsort(degrees, stable=True)
+    return Pruned(trimmed(rows_of(model, order)), degrees[order], kinds[order])
