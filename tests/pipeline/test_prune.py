@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 
+from tests.scenes import ring
 from tests.splats import camera, cloud
 from warpgs.cli import main
 from warpgs.demo import split_spec, write_demo
@@ -14,8 +15,9 @@ from warpgs.export.ply import read_ply
 from warpgs.pipeline.checkpoint import load_checkpoint
 from warpgs.pipeline.prune import prune
 from warpgs.pipeline.run import open_run
-from warpgs.pipeline.shrink import keep_last, largest_share, prune_order, rows_of, stored_degrees
+from warpgs.pipeline.shrink import Looks, keep_last, largest_share, needed_degrees, prune_order, rows_of, stored_degrees
 from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.scene import Camera
 
 CPU = torch.device("cpu")
 
@@ -129,3 +131,28 @@ def test_a_pruned_run_cannot_be_continued(run, tmp_path, capsys):
     flags += ["--init.random-count", "600"]
     assert main(["fit", scene, "--out", str(tmp_path / "small"), "--resume", *flags]) == 2
     assert str(run) in capsys.readouterr().err
+
+
+def test_only_the_mirror_keeps_its_harmonics():
+    """Left matt, right as bright as the direction it is seen from: after lowering degrees, only the right has any."""
+    generator = torch.Generator().manual_seed(0)
+    count = 60
+    g = cloud(count, degree=1)
+    g.means[:] = torch.cat([2 * torch.rand(count, 2, generator=generator) - 1, torch.zeros(count, 1)], 1)
+    g.means.mul_(torch.tensor([0.8, 0.5, 1]))
+    g.log_scales[:] = math.log(0.08)
+    g.logit_opacities[:] = 2.0
+    right = g.means[:, 0] > 0.1
+    g.sh[:, 1:] = 1e-4 * torch.randn(count, 3, 3, generator=generator)  # what noise leaves in a coefficient
+    g.sh[right, 3] = 1.5
+    cameras = [
+        Camera(torch.from_numpy(c.viewmat).float(), torch.from_numpy(c.K).float(), c.width, c.height) for c in ring(6, 80, 60)
+    ]
+    photos = [rasterize(g, c).rgb for c in cameras]
+    looks = Looks(cameras, RasterizeOptions(), 0)
+
+    def accepted(model) -> bool:
+        return all(float((rasterize(model, c).rgb - p).square().mean()) < 1e-6 for c, p in zip(cameras, photos))
+
+    degrees = needed_degrees(g, looks.coverage(g).supported_degree(), looks, accepted)
+    assert bool((degrees[~right] == 0).all()) and float(degrees[right].float().mean()) > 0.8
