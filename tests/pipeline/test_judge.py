@@ -41,6 +41,8 @@ def test_no_evidence_is_no_gain():
     assert not gain(one, 0.1 * one).bought(1) and not gain(none, none).bought(0)
     assert not gain(torch.tensor([0.5, 0.5]), torch.tensor([0.1, math.nan])).bought(0)
     assert not gain(torch.tensor([0.1, 0.1]), torch.tensor([0.2, math.nan])).cost_at_most(99, 1)
+    wild = gain(torch.tensor([0.01, 0.01, 0.01]), torch.tensor([0.01, 0.01, 0.03]))
+    assert wild.noise > -wild.mean > 1 and not wild.cost_at_most(0.1, 1) and wild.cost_at_most(-wild.mean / 3 + 1e-9, 1)
     assert gain(0.1 * one, 0.101 * one).cost_at_most(0.1, 1) and not gain(0.1 * one, one).cost_at_most(0.1, 1)
 
 

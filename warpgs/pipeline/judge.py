@@ -20,6 +20,8 @@ FLOOR = (2 / 255) ** 2
 SIDES = 16, 32
 """Least and largest side of a block [px]; between them a sixteenth of the picture's shorter side. In pictures of which an
 eighth is less than the least, it is that eighth."""
+AT_MOST = 3
+"""What is lost within the noise may be this many times what is allowed."""
 FEWEST = 12
 """With fewer blocks over all views there is no telling a gain from noise."""
 
@@ -151,8 +153,11 @@ class Gain:
         return self.mean > max(0.0, noises * self.noise)
 
     def cost_at_most(self, allowed: float, noises: float) -> bool:
-        """Whether no more was lost than ``allowed`` [dB] or the noise of the difference, whichever is larger."""
-        return -self.mean <= max(allowed, noises * self.noise if math.isfinite(self.noise) else 0.0)
+        """Whether no more was lost than ``allowed`` [dB], or than the noise of the difference up to `AT_MOST` times that.
+
+        Without the bound few blocks would excuse anything: a large loss differs much from block to block.
+        """
+        return -self.mean <= max(allowed, min(noises * self.noise, AT_MOST * allowed))
 
 
 def gain(before: torch.Tensor, after: torch.Tensor) -> Gain:
