@@ -7,7 +7,7 @@ import torch
 
 from tests.splats import cloud
 from warpgs.pipeline.density import Refinement
-from warpgs.pipeline.limits import FINEST, Limits, model_bytes, pack, truncated, unpack
+from warpgs.pipeline.limits import FINEST, NONE, Limits, model_bytes, pack, truncated, unpack
 from warpgs.pipeline.optimizer import Optimizer, OptimizerConfig
 from warpgs.pipeline.shrink import stored_degrees, trimmed
 from warpgs.scene import Gaussians
@@ -74,7 +74,7 @@ def test_limits_follow_the_rows():
     added = {n: t.detach()[[2, 5, 5]] for n, t in o.params.items()}
     o.apply(Refinement(torch.tensor([1, 2, 5, 8]), added, torch.tensor([2, 5, -1])))
     assert o.limits.degree.tolist() == [1, 0, 1, 0, 0, 1, 1]
-    assert o.limits.floor.tolist() == [-1, -2, -5, -8, -2, -5, -math.inf]
+    assert o.limits.floor.tolist() == [-1, -2, -5, -8, -2, -5, NONE]
     assert o.limits.level.tolist() == [0, 0, 0, 0, 3, 3, 3]
     order = torch.tensor([6, 3, 0, 1, 2, 4, 5])
     o.reorder(order)

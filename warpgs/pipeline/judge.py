@@ -41,8 +41,8 @@ class JudgeConfig:
     it [dB]; what is within the noise of that difference may go in any case."""
     trim_db: float = 0.1
     """PSNR that the mean over the training views may fall by when the finished model is made smaller [dB]; 0 for not at all."""
-    merge: bool = True
-    """When growth ends, neighbours of like colour become one Gaussian."""
+    merge: bool = False
+    """When growth ends, neighbours of like colour become one Gaussian. A fit that is far from done then may lose too much."""
     prune: bool = True
     """When growth ends, Gaussians that neither contribute nor matter to any training view are removed."""
     degrees: bool = True

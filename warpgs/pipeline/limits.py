@@ -8,6 +8,8 @@ from warpgs.pipeline.density import Refinement
 
 FINEST = 12**-0.5
 """Least standard deviation of an axis, in pixels of the nearest view that sees the Gaussian: that of one pixel's box filter."""
+NONE = torch.finfo(torch.float32).min
+"""Least log scale of a Gaussian that has no limit."""
 FLOAT = 4
 """Bytes of a stored number."""
 
@@ -55,7 +57,7 @@ class Limits:
         """Degree of new Gaussians."""
         self.degree = torch.full((count,), degree, dtype=torch.int32, device=device)
         """Highest degree that each may have, shape [N]."""
-        self.floor = torch.full((count,), -torch.inf, device=device)
+        self.floor = torch.full((count,), NONE, device=device)
         """Least log scale of each, shape [N]."""
         self.level = torch.zeros(count, dtype=torch.int32, device=device)
         """Level of growth that each came with, 0 for those before, shape [N]."""
@@ -75,11 +77,11 @@ class Limits:
 
     def set_footprint(self, footprint: torch.Tensor) -> None:
         """Take the least scales from the width of a pixel [N] [u]; where that is 0, there is none."""
-        self.floor = torch.log(FINEST * footprint)
+        self.floor = torch.log(FINEST * footprint).clamp_min(NONE)
 
     def apply(self, change: Refinement) -> None:
         """Follow a change of the set: what grew from another has its limits, but the level of now."""
-        for name, fresh in (("degree", self.highest), ("floor", -torch.inf), ("level", self.growing)):
+        for name, fresh in (("degree", self.highest), ("floor", NONE), ("level", self.growing)):
             old = getattr(self, name)
             new = old.new_full((len(change.parents),), fresh)
             if name != "level" and len(new):
