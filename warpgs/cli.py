@@ -15,6 +15,7 @@ COMMANDS = {
     "eval": "score a run again on its held-out views",
     "render": "render a run: its views, an orbit or a spiral, as PNG and mp4",
     "export": "write a run's Gaussians to a PLY file",
+    "prune": "shrink a finished model as far as its training views allow, into a new run folder",
     "priors": "look at what is known before a fit (priors show), or write networks as ONNX (priors export)",
     "compare": "fit presets to scenes with several seeds; tables, plot and figure of the differences",
     "ablate": "fit a preset with its parts off one at a time; the same tables, plot and figure",
@@ -124,6 +125,28 @@ def _export(arguments: list[str]) -> int:
     from warpgs.pipeline.reuse import export
 
     print(export(a.run, a.to))
+    return 0
+
+
+def _prune(arguments: list[str]) -> int:
+    import tyro
+
+    @dataclass(frozen=True)
+    class Prune:
+        run: tyro.conf.Positional[Path]
+        """Run folder of `warpgs fit`; it stays as it is."""
+        keep_psnr: float = 0.1
+        """PSNR that the mean over the training views may fall by [dB]."""
+        out: Path | None = None
+        """Run folder to write; RUN-pruned where not given; must not exist yet."""
+        device: str = "auto"
+        """auto, cpu or cuda."""
+
+    a = _parse(Prune, "prune", arguments)
+    from warpgs.pipeline.prune import prune
+
+    for line in prune(a.run, a.keep_psnr, a.out, a.device):
+        print(line)
     return 0
 
 
@@ -243,7 +266,8 @@ def _study(name: str):
 
 
 RUN = {
-    "fit": _fit, "eval": _eval, "render": _render, "export": _export, "priors": _priors, "demo": _demo, "doctor": _doctor,
+    "fit": _fit, "eval": _eval, "render": _render, "export": _export, "prune": _prune, "priors": _priors,
+    "demo": _demo, "doctor": _doctor,
     **{name: _study(name) for name in ("compare", "ablate", "convert-lpips")},
 }  # fmt: skip
 

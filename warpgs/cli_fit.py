@@ -10,6 +10,7 @@ from warpgs.pipeline.budget import check_budget
 from warpgs.pipeline.config import DEFAULT_PRESET, PRESETS, FitConfig
 from warpgs.pipeline.density import DensityConfig
 from warpgs.pipeline.init import InitConfig
+from warpgs.pipeline.judge import JudgeConfig
 from warpgs.pipeline.loss import LossConfig
 from warpgs.pipeline.method import MethodConfig
 from warpgs.pipeline.optimizer import OptimizerConfig
@@ -87,6 +88,11 @@ def _flags(base: FitConfig) -> type:
         """Most memory that the fit's tensors may take on its device while it takes steps, such as 2GiB or 800MB."""
         cuda_graph: bool = base.cuda_graph
         """On CUDA, record a step once and replay it: the same bytes in less time."""
+        adaptive: bool = base.adaptive
+        """Held-out blocks of the training views decide how many Gaussians there are and of which degree."""
+        max_gaussians: int = base.density.max_gaussians
+        """No Gaussian is added beyond this number; the same as --density.max-gaussians."""
+        judge: JudgeConfig = field(default_factory=lambda: base.judge)
         init: InitConfig = field(default_factory=lambda: base.init)
         loss: LossConfig = field(default_factory=lambda: base.loss)
         optimizer: OptimizerConfig = field(default_factory=lambda: base.optimizer)
@@ -139,6 +145,8 @@ def fit(arguments: list[str], description: str) -> FitRequest:
         set_threads(a.threads)
     rooms = {f.name: getattr(a, f.name) for f in dataclasses.fields(base)}
     notes = _choose(a, arguments, rooms)
+    if a.max_gaussians != base.density.max_gaussians:
+        rooms["density"] = dataclasses.replace(a.density, max_gaussians=a.max_gaussians)
     rooms["memory_limit"] = None if a.memory_limit is None else parse_bytes(a.memory_limit)
     if named is None:
         steps = "as many steps as the time allows" if a.time_budget else f"{a.steps} steps"

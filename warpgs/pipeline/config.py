@@ -12,6 +12,7 @@ from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.pipeline.density import DensityConfig
 from warpgs.pipeline.init import InitConfig
+from warpgs.pipeline.judge import JudgeConfig
 from warpgs.pipeline.loss import LossConfig
 from warpgs.pipeline.method import MethodConfig
 from warpgs.pipeline.optimizer import OptimizerConfig
@@ -50,6 +51,9 @@ class FitConfig:
     stops where a step would not fit, and pictures are drawn in bands where a whole one would not."""
     cuda_graph: bool = True
     """On CUDA, record a step once and replay it; the same kernels and the same bytes as without, in less time."""
+    adaptive: bool = False
+    """Held-out blocks of the training views decide how many Gaussians there are and of which degree (docs/complexity.md)."""
+    judge: JudgeConfig = field(default_factory=JudgeConfig)
     init: InitConfig = field(default_factory=InitConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)

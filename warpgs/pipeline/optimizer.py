@@ -11,6 +11,7 @@ from warpgs.errors import UsageError
 from warpgs.kernels.adam import adam_scheduled, adam_step, scheduled_rates
 from warpgs.kernels.knn import morton_codes
 from warpgs.pipeline.density import Refinement
+from warpgs.pipeline.limits import Limits
 from warpgs.pipeline.schedule import log_linear
 from warpgs.scene import Gaussians
 
@@ -52,6 +53,8 @@ class Optimizer:
         self.means = {n: torch.zeros_like(t) for n, t in self.params.items()}
         self.squares = {n: torch.zeros_like(t) for n, t in self.params.items()}
         self.step_count = 0
+        self.limits: Limits | None = None
+        """What parameters are held to after every step; None for nothing."""
 
     @property
     def gaussians(self) -> Gaussians:
@@ -87,10 +90,12 @@ class Optimizer:
         self._hold_back(before, share)
 
     def _hold_back(self, before: torch.Tensor | None, share: torch.Tensor | None) -> None:
-        """Take back a part of the last step of the means, whose size Adam makes independent of the gradient's."""
+        """Take back a part of the last step of the means, whose size Adam makes independent of the gradient's; keep limits."""
         if share is not None:
             means = self.params["means"].detach()
             means.copy_(torch.where(share[:, None] == 1, means, before + share[:, None] * (means - before)))
+        if self.limits is not None:
+            self.limits.enforce(self.params)
 
     def schedule(self, progress: float, step: int) -> list[float]:
         """Numbers that `step_scheduled` reads from memory: three for each tensor, in order."""
@@ -116,6 +121,8 @@ class Optimizer:
             self.params[name] = torch.cat([self.params[name].detach()[change.keep], added]).requires_grad_()
             for moments in (self.means, self.squares):
                 moments[name] = torch.cat([moments[name][change.keep], torch.zeros_like(added)])
+        if self.limits is not None:
+            self.limits.apply(change)
 
     @torch.no_grad()
     def sort_along_curve(self) -> torch.Tensor:
@@ -125,12 +132,19 @@ class Optimizer:
             The number that each row had before, int64, shape [N].
         """
         order = torch.argsort(morton_codes(self.params["means"].detach()), stable=True)
+        self.reorder(order)
+        return order
+
+    @torch.no_grad()
+    def reorder(self, order: torch.Tensor) -> None:
+        """Row i becomes what row ``order[i]`` was, with its moments and limits."""
         for group in (self.params, self.means, self.squares):
             for name in group:
                 group[name] = group[name].detach()[order]
         for param in self.params.values():
             param.requires_grad_()
-        return order
+        if self.limits is not None:
+            self.limits.reorder(order)
 
     def cap_opacity(self, opacity: float) -> None:
         """Lower every opacity to at most this and forget the moments of all opacities (the classic reset)."""
@@ -142,7 +156,8 @@ class Optimizer:
     def state(self) -> dict[str, torch.Tensor]:
         """Everything that a continued fit needs, by flat names."""
         groups = (("param", self.params), ("mean", self.means), ("square", self.squares))
-        return {f"{kind}.{n}": t.detach() for kind, group in groups for n, t in group.items()}
+        tensors = {f"{kind}.{n}": t.detach() for kind, group in groups for n, t in group.items()}
+        return tensors if self.limits is None else tensors | self.limits.state()
 
     def load(self, state: dict[str, torch.Tensor], step_count: int) -> None:
         """Take over what `state` gave."""
@@ -153,3 +168,5 @@ class Optimizer:
         for name, t in self.params.items():
             self.params[name] = t.requires_grad_()
         self.step_count = step_count
+        if self.limits is not None:
+            self.limits.load(state)

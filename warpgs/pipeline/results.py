@@ -17,6 +17,7 @@ from warpgs.report.overview import render_overview
 from warpgs.report.page import SamplingStory, ViewPictures, write_page
 from warpgs.report.pictures import depth_map, error_map, png, side_by_side
 from warpgs.scene import Gaussians, Scene, View
+from warpgs.sizes import format_bytes
 
 LABELS = {
     "psnr": "PSNR [dB]", "ssim": "SSIM", "ssim_skimage": "SSIM (scikit-image)",
@@ -146,6 +147,8 @@ def write_report(
     seconds = metrics["seconds"]
     figures += [
         ("training PSNR", f"{metrics['train']['psnr']:.2f} dB"), ("Gaussians", f"{metrics['gaussians']:,}"),
+        ("mean SH degree", f"{metrics['complexity']['mean_degree']:.2f}"),
+        ("model", format_bytes(metrics["complexity"]["bytes"])),
         ("steps", f"{metrics['steps']:,}"), ("time", f"{seconds['total']:.0f} s"),
     ]  # fmt: skip
     keys = score_keys(metrics)

@@ -15,6 +15,7 @@ from warpgs.pipeline.lpips import load_lpips
 from warpgs.pipeline.paths import PATHS, camera_path
 from warpgs.pipeline.results import evaluate_run, file_stem, options_for, protocol_of, score_line
 from warpgs.pipeline.run import SceneRequest, choose_device, open_run, read_scene
+from warpgs.pipeline.shrink import trimmed
 from warpgs.rasterizer import rasterize
 from warpgs.report.film import write_mp4
 from warpgs.report.pictures import png
@@ -114,5 +115,5 @@ def export(folder: Path, target: Path) -> str:
     if target.suffix.lower() != ".ply":
         raise UsageError(f"{target}: format {target.suffix or '(none)'} is not supported; use .ply")
     stored = open_run(folder, torch.device("cpu"))
-    write_ply(target, stored.gaussians, stored.normalization)
+    write_ply(target, trimmed(stored.gaussians), stored.normalization)
     return f"{len(stored.gaussians):,} Gaussians in {target}"

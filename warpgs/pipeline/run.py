@@ -21,13 +21,16 @@ from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.load import load_scene
 from warpgs.io.splits import Split, default_split, split_views, twins
+from warpgs.pipeline.adaptive import complexity_figures, complexity_sentence, fit_class
 from warpgs.pipeline.budget import within_budget
 from warpgs.pipeline.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.event_sheet import event_figures, keep_pictures, sampling_story
 from warpgs.pipeline.fit import Fit, StepReport, run, train_views
+from warpgs.pipeline.limits import unpack
 from warpgs.pipeline.lpips import load_lpips
 from warpgs.pipeline.results import evaluate_run, protocol_of, score_line, write_report
+from warpgs.pipeline.shrink import trimmed
 from warpgs.pipeline.trade import trade_on
 from warpgs.report.events import EventLog
 from warpgs.report.progress import Progress
@@ -150,6 +153,11 @@ def _record(request: FitRequest, scene: Scene, split: Split, notes: list[str], d
 
 def _check_same(record: dict, stored: dict, out: Path) -> None:
     """A continued run must be the same run: same data, views, settings and kind of device."""
+    if "pruned" in stored:
+        raise UsageError(
+            f"--resume: {out} is a pruned model without the state of its fit; continue the run it came from, "
+            f"{stored['pruned']['source']}"
+        )
     for key in ("fingerprint", "train", "test", "config", "device"):
         now, then = json.loads(json.dumps(record[key])), stored.get(key)
         if now != then:
@@ -192,7 +200,7 @@ def fit_scene(request: FitRequest) -> dict:
                 tensors, plain = load_checkpoint(out)
         if device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(device)  # earlier fits of this process are not this one's need
-        fit = Fit(train, scene.points, request.config, device, scene.background)
+        fit = fit_class(request.config)(train, scene.points, request.config, device, scene.background)
     except WarpgsError:
         if not request.resume:
             out.rmdir()  # nothing is in it yet
@@ -213,7 +221,7 @@ def fit_scene(request: FitRequest) -> dict:
     _train(fit, out, notes)
     trained = time.perf_counter() - began - setup
     peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(device)} if device.type == "cuda" else {}
-    write_ply(out / "point_cloud.ply", fit.gaussians, scene.normalization)
+    write_ply(out / "point_cloud.ply", trimmed(fit.gaussians), scene.normalization)
     metrics = evaluate_run(out, fit.gaussians, train, test, request.config.rule, scene.background, lpips, fit.most)
     c = request.config
     trade = trade_on(
@@ -226,7 +234,7 @@ def fit_scene(request: FitRequest) -> dict:
         "steps": fit.step, "gaussians": len(fit.gaussians), "preset": request.config.preset, "seed": request.config.seed,
         "config_hash": request.config.fingerprint(), "fingerprint": scene.fingerprint, "device": where.removeprefix("on "),
         "seconds": {"setup": setup, "training": trained, "total": time.perf_counter() - began}, **peak,
-        "memory": fit.memory.to_json(), "trade": trade, **event_figures(fit),
+        "memory": fit.memory.to_json(), "trade": trade, **event_figures(fit), **complexity_figures(fit),
     }  # fmt: skip
     write_json(out / "metrics.json", metrics)
     record["notes"] = notes
@@ -288,6 +296,7 @@ def _print_result(out: Path, metrics: dict) -> None:
         print(f"held-out {score_line(scores)} over {len(metrics['views'])} views")
         for name, value in metrics["guesses"].items():
             print(f"  without a fit, the {name.replace('_', ' ')} scores {value:.2f} dB")
+    print(complexity_sentence(metrics))
     print(f"{metrics['gaussians']:,} Gaussians; report: {out / 'report.html'}  pictures: {out / 'renders'}")
 
 
@@ -324,5 +333,7 @@ def open_run(folder: Path, device: torch.device) -> StoredRun:
     except (OSError, ValueError, KeyError, TypeError) as e:
         raise DataError(f"{path}: cannot be read ({e}); give a folder that `warpgs fit --out` filled") from e
     tensors, state = load_checkpoint(folder)
+    if "param.sh_packed" in tensors:
+        tensors["param.sh"] = unpack(tensors["param.sh_packed"], tensors["degrees"])
     gaussians = Gaussians(**{n: tensors[f"param.{n}"].to(device) for n in Gaussians.__dataclass_fields__})
     return StoredRun(folder, record, gaussians, cameras, state["step"])

@@ -1,0 +1,168 @@
+"""The fit that finds its own size, on scenes of which the size is known; and that it is repeatable, resumable and honest."""
+
+import dataclasses
+import json
+
+import pytest
+import torch
+
+from tests import cards
+from tests.scenes import photographs, priors, seeds
+from warpgs.cli import main
+from warpgs.demo import split_spec, write_demo
+from warpgs.pipeline.adaptive import AdaptiveFit, complexity_figures, complexity_sentence, fit_class
+from warpgs.pipeline.checkpoint import load_checkpoint, save_checkpoint
+from warpgs.pipeline.config import PRESETS, FitConfig
+from warpgs.pipeline.density import DensityConfig
+from warpgs.pipeline.fit import Fit
+from warpgs.pipeline.init import InitConfig
+from warpgs.pipeline.judge import JudgeConfig
+from warpgs.scene import View
+
+CPU = torch.device("cpu")
+GROWING = FitConfig(
+    steps=60, sh_every=15, adaptive=True, init=InitConfig(source="points", max_sh_degree=1),
+    judge=JudgeConfig(levels=2, share=0.3, trim_db=0), density=DensityConfig(start=10, every=5, gradient=1e-5),
+)  # fmt: skip
+
+
+def advanced(config: FitConfig, steps: int) -> AdaptiveFit:
+    fit = AdaptiveFit(photographs(4), seeds(), config, CPU)
+    while fit.step < steps:
+        fit.advance()
+    return fit
+
+
+def finished(views: list[View], steps: int = 200, preset: str = "quick", **changes) -> AdaptiveFit:
+    config = dataclasses.replace(PRESETS[preset], steps=steps, adaptive=True, **changes)
+    fit = AdaptiveFit(views, None, config, CPU, priors=priors(views))
+    while fit.step < steps:
+        last = fit.advance()
+    fit.last = last
+    return fit
+
+
+def complexity(fit: Fit) -> dict:
+    return complexity_figures(fit)["complexity"]
+
+
+def test_growth_is_judged_and_then_all_pixels_count():
+    """Blocks are hidden up to the end of growth and from then on not; rows neither come nor go any more; the figures add up."""
+    fit = advanced(GROWING, 14)
+    hidden = sum(int((v.mask == 0).sum()) for v in fit.views)
+    assert hidden == sum(len(b) * b.side**2 for b in fit.blocks) > 0 and fit.closed is None
+    while fit.closed is None and fit.step < 60:
+        fit.advance()
+    assert 15 < fit.closed <= 30 == fit.marks[-1]
+    assert all(v.mask is None for v in fit.views)
+    count = len(fit.gaussians)
+    told = list(fit.news)
+    while fit.step < 60:
+        assert fit.advance().count == count
+    c = complexity(fit)
+    assert c["count"] == count == c["shrunk"]["count_after"]
+    assert c["shrunk"]["count_before"] - c["shrunk"]["merged"] - c["shrunk"]["pruned"] + c["shrunk"]["added"] == count
+    assert c["bytes"] == c["shrunk"]["bytes_after"] <= c["shrunk"]["bytes_before"]
+    assert c["marginal_db"] == c["levels"][-1]["gain"] == min(c["levels"][-1][k] for k in ("fall", "own"))
+    assert c["why"] and c["why"] in told[-1] and c["why"] in complexity_sentence({"complexity": c})
+    json.dumps(c)
+
+
+def test_everything_by_row_stays_aligned():
+    """After growth, shrinking and sorting: one row of every tensor for every Gaussian, moments finite, degrees ascending."""
+    fit = advanced(GROWING, 60)
+    tensors, _ = fit.state()
+    count = len(fit.gaussians)
+    by_row = [n for n in tensors if n.split(".")[0] in ("param", "mean", "square", "density", "layers", "limits")]
+    assert len(by_row) == 15 + 2 + 2 + 3 and all(len(tensors[n]) == count for n in by_row)
+    assert bool((fit.optimizer.limits.degree.diff() >= 0).all())
+    flat = fit.optimizer.limits.degree == 0
+    assert bool(flat.any()) and not bool(fit.gaussians.sh[flat, 1:].any())
+    assert bool((fit.gaussians.log_scales >= fit.optimizer.limits.floor[:, None] - 1e-6).all())
+    assert all(bool(t.isfinite().all()) for n, t in tensors.items() if n.startswith(("param", "mean", "square")))
+
+
+def test_finished_model_is_trimmed_within_its_loss():
+    """The last step leaves a smaller model, no further from its views than allowed, and rows for each Gaussian."""
+    before = advanced(GROWING, 60)
+    config = dataclasses.replace(GROWING, judge=dataclasses.replace(GROWING.judge, trim_db=0.5))
+    fit = advanced(config, 60)
+    c = complexity(fit)
+    assert c["count"] == len(fit.gaussians) < 0.9 * len(before.gaussians)
+    assert c["shrunk"]["trimmed"] == len(before.gaussians) - c["count"] and c["bytes"] == c["shrunk"]["bytes_after"]
+    assert before._view_psnr(before.gaussians) - fit._view_psnr(fit.gaussians) == pytest.approx(
+        c["shrunk"]["trim_db"], abs=1e-6
+    )
+    assert c["shrunk"]["trim_db"] <= 0.5 and "was trimmed to" in fit.news[-1]
+    tensors, _ = fit.state()
+    by_row = [n for n in tensors if n.split(".")[0] in ("param", "mean", "square", "density", "layers", "limits")]
+    assert all(len(tensors[n]) == c["count"] for n in by_row) and tensors["param.sh"].shape[1] == 4
+    assert bool((fit.optimizer.limits.degree.diff() >= 0).all())
+
+
+@pytest.mark.parametrize("at", [17, 24, 45])
+def test_continued_fit_equals_uninterrupted_one(tmp_path, at):
+    """Saved before a judgement, between two, or after growth, and continued: the same bits and the same story at the end."""
+    straight = advanced(GROWING, 60)
+    save_checkpoint(tmp_path, *advanced(GROWING, at).state())
+    resumed = AdaptiveFit(photographs(4), seeds(), GROWING, CPU)
+    resumed.load(*load_checkpoint(tmp_path))
+    while resumed.step < 60:
+        resumed.advance()
+    (a, plain), (b, again) = straight.state(), resumed.state()
+    assert a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+    assert plain["judge"] == again["judge"] and plain["judge"]["closed"] and plain["notes"] == again["notes"]
+
+
+def test_without_a_judge_it_is_the_plain_fit():
+    """Too few blocks to tell anything: said so, and the same bits as with --no-adaptive."""
+    config = dataclasses.replace(GROWING, steps=20, judge=JudgeConfig(share=0.001))
+    fit, plain = AdaptiveFit(photographs(1), seeds(), config, CPU), Fit(photographs(1), seeds(), config, CPU)
+    for _ in range(20):
+        fit.advance()
+        plain.advance()
+    assert any("no judge" in n for n in fit.notes) and not complexity(fit)["adaptive"]
+    assert all(torch.equal(t, plain.gaussians.tensors()[n]) for n, t in fit.gaussians.tensors().items())
+    assert fit_class(config) is AdaptiveFit and fit_class(dataclasses.replace(config, adaptive=False)) is Fit
+
+
+def test_what_one_view_alone_sees_stays_coarse():
+    """With one view that sees anything, nothing is cloned or split, and no Gaussian has a degree above 0."""
+    views = photographs(3)
+    away = [
+        dataclasses.replace(v, camera=dataclasses.replace(v.camera, viewmat=v.camera.viewmat @ _turned())) for v in views[1:]
+    ]
+    fit = AdaptiveFit([views[0], *away], seeds(), GROWING, CPU)
+    for _ in range(31):
+        fit.advance()
+    assert fit.closed and len(fit.gaussians) <= len(seeds())
+    assert not bool(fit.gaussians.sh[:, 1:].any()) and not bool(fit.optimizer.limits.degree.any())
+
+
+def _turned():
+    import numpy as np
+
+    turn = np.diag([-1.0, 1, -1, 1])  # half a turn about the vertical through the origin, and far away
+    turn[2, 3] = -90.0
+    return turn
+
+
+def test_a_wall_of_one_colour_needs_next_to_nothing():
+    """Under 50 Gaussians of degree 0 for a card of one colour that fills the views, and it is seen as it is."""
+    fit = finished(cards.photographs(cards.plain, half=(9, 9), width=64, height=48))
+    c = complexity(fit)
+    assert c["count"] < 50 and c["mean_degree"] == 0 and fit.last.psnr > 40
+
+
+def test_command_line_says_what_the_model_takes(tmp_path, capsys):
+    """A whole run with --adaptive and --max-gaussians: terminal, metrics.json, report, and the file without unused bands."""
+    write_demo(tmp_path / "scene", views=8, width=64, height=48)
+    flags = ["--split", split_spec(8), "--steps", "60", "--device", "cpu", "--preset", "quick", "--adaptive"]
+    assert main(["fit", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), *flags, "--max-gaussians", "900"]) == 0
+    words = capsys.readouterr().out
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    c = metrics["complexity"]
+    assert c["adaptive"] and c["cap"] == 900 and c["count"] == metrics["gaussians"] <= 900
+    assert "of mean SH degree" in words and "growth stopped because" in words and "bought" in words
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "mean SH degree" in page and "growth ended at step" in page

@@ -1,0 +1,70 @@
+"""Merging with moments, against the mixture's own."""
+
+import math
+
+import torch
+
+from tests.splats import cloud
+from warpgs.pipeline.merge import OPAQUE, covariances, merges, quaternions, rotation_matrices
+from warpgs.scene import Gaussians
+
+
+def test_rotations_there_and_back():
+    """Every quaternion, also a half turn about an axis, gives its rotation, and the rotation gives it back up to its sign."""
+    q = torch.nn.functional.normalize(
+        torch.randn(200, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0)), dim=1
+    )
+    q = torch.cat([q, torch.eye(4, dtype=torch.float64), torch.tensor([[0, 1.0, 1, 0]], dtype=torch.float64) / math.sqrt(2)])
+    r = rotation_matrices(q)
+    assert torch.allclose(r @ r.transpose(1, 2), torch.eye(3, dtype=torch.float64).expand_as(r), atol=1e-12)
+    assert torch.allclose(torch.linalg.det(r), torch.ones(len(r), dtype=torch.float64))
+    assert torch.allclose((quaternions(r) * q).sum(1).abs(), torch.ones(len(r), dtype=torch.float64), atol=1e-12)
+    turn = rotation_matrices(torch.tensor([[math.cos(0.3), 0, 0, math.sin(0.3)]]))[0]
+    assert torch.allclose(turn[:2, 0], torch.tensor([math.cos(0.6), math.sin(0.6)]))
+
+
+def test_moments_of_a_pair():
+    """Mean, covariance and colours of the mixture; opacity times area stays, up to what can be drawn."""
+    g = cloud(2, seed=3)
+    pairs = merges(g, torch.ones(2), torch.zeros(2), odd=False)
+    assert sorted([*pairs.first.tolist(), *pairs.second.tolist()]) == [0, 1]
+    areas = g.log_scales.double().exp().sort(1).values[:, 1:].prod(1)
+    mass = g.logit_opacities.double().sigmoid() * areas
+    share = (mass / mass.sum())[:, None]
+    mean = (share * g.means.double()).sum(0)
+    apart = g.means.double() - mean
+    cov = covariances(g.quats.double(), g.log_scales.double()) + apart[:, :, None] * apart[:, None, :]
+    merged = {n: t.double() for n, t in pairs.merged.items()}
+    assert torch.allclose(merged["means"][0], mean, atol=1e-6)
+    assert torch.allclose(covariances(merged["quats"], merged["log_scales"])[0], (share[:, None] * cov).sum(0), atol=1e-6)
+    assert torch.allclose(merged["sh"][0], (share[:, None] * g.sh.double()).sum(0), atol=1e-6)
+    new = merged["log_scales"].exp().sort(1).values[:, 1:].prod(1)
+    assert torch.allclose(merged["logit_opacities"].sigmoid() * new, mass.sum()[None].clamp(max=float(OPAQUE * new)), rtol=1e-4)
+
+
+def test_a_gaussian_in_two_halves_becomes_one_again():
+    """Two of half the opacity in the same place are one of the whole."""
+    g = cloud(1)
+    rows = {n: t[[0, 0]] for n, t in g.tensors().items()}
+    rows["logit_opacities"] = torch.logit(torch.full((2,), 0.3))
+    pairs = merges(Gaussians(**rows), torch.ones(2), torch.zeros(2), odd=False)
+    assert torch.allclose(pairs.merged["logit_opacities"].sigmoid(), torch.tensor([0.6]), atol=1e-5)
+    assert torch.allclose(pairs.merged["means"], g.means, atol=1e-6) and torch.allclose(pairs.merged["sh"], g.sh)
+
+
+def test_pairs_are_disjoint_cheapest_first_and_of_one_kind():
+    """No row twice; other kinds stay apart; like neighbours come before unlike ones; a change has a parent for every row."""
+    g = cloud(101)
+    kinds = torch.arange(101) % 2
+    for odd in (False, True):
+        pairs = merges(g, torch.ones(101), kinds, odd)
+        rows = torch.cat([pairs.first, pairs.second])
+        assert len(rows) == len(rows.unique()) > 20 and bool((kinds[pairs.first] == kinds[pairs.second]).all())
+    means = torch.tensor([[0.0, 0, 1], [0.01, 0, 1], [5, 5, 1], [5.01, 5, 1]])
+    four = {n: t[[0, 0, 0, 0]].clone() for n, t in cloud(1).tensors().items()} | {"means": means}
+    four["sh"][2] += 1
+    pairs = merges(Gaussians(**four), torch.ones(4), torch.zeros(4), odd=False)
+    assert {int(pairs.first[0]), int(pairs.second[0])} == {0, 1} and len(pairs.first) == 2
+    change = pairs.change(4, 1)
+    assert change.keep.tolist() == [2, 3] and change.parents.tolist() == pairs.first[:1].tolist()
+    assert all(len(t) == 1 for t in change.added.values())

@@ -1,0 +1,345 @@
+"""A fit that finds its own size: growth is judged on held-out blocks, what evidence does not ask for goes, then all is trained.
+
+docs/complexity.md. The fit itself is that of `fit.Fit`; this room decides when growth ends and what is left of it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import asdict, dataclass
+
+import torch
+
+from warpgs.pipeline import shrink
+from warpgs.pipeline.config import FitConfig
+from warpgs.pipeline.density import Refinement
+from warpgs.pipeline.fit import Fit, Phase
+from warpgs.pipeline.judge import FEWEST, FLOOR, Gain, block_errors, decibels, draw_blocks, gain, hide, only
+from warpgs.pipeline.layers import COARSE, FINE, LONG_AGO
+from warpgs.pipeline.limits import Limits, model_bytes
+from warpgs.pipeline.loss import masked_mse
+from warpgs.pipeline.method import MAX_VIEWS, sampling_event
+from warpgs.pipeline.schedule import sh_degree
+from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.scene import Gaussians
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level of growth, judged; plain values as metrics.json has them."""
+
+    step: int
+    """Steps done when it was judged."""
+    count: int
+    """Gaussians then."""
+    held_out_psnr: float
+    """PSNR of the held-out blocks, the judge's floor included [dB]."""
+    fall: float
+    """What held-out error fell by since the level before, by growth and training together [dB]."""
+    own: float
+    """What is lost when the Gaussians that came with the level are hidden [dB]."""
+    gain: float
+    """The smaller of the two, which both are upper bounds of what growth bought [dB]."""
+    noise: float
+    """Standard error of ``gain`` over the blocks [dB]."""
+
+
+class AdaptiveFit(Fit):
+    """A fit with a judge. Until growth ends, blocks of every view are held out of its loss and of its sampling.
+
+    The start sees whole photographs: its colours and depths come from them, and evidence is about growth, merging and pruning.
+    """
+
+    def __init__(self, *args, **kwargs):
+        """Set up as `Fit` does, then hold blocks out."""
+        self.closed: int | None = None
+        self.why = ""
+        """Why growth stopped, for the user."""
+        self.levels: list[Level] = []
+        self.shrunk: dict[str, int] = {}
+        """Gaussians and bytes before and after shrinking, and what each means took."""
+        super().__init__(*args, **kwargs)
+        c = self.config
+        begins = self.phases.refine if c.method.events else c.density.times(c.steps)[0]
+        ends = self._growth_ends
+        self.marks = sorted({max(1, begins + round(k * (ends - begins) / c.judge.levels)) for k in range(c.judge.levels + 1)})
+        """Steps done when the judge looks: before growth, and after each level."""
+        self.optimizer.limits = Limits(len(self.gaussians), c.init.max_sh_degree, self.device)
+        self.whole = self.views
+        self.blocks = draw_blocks(self.views, c.judge.share, c.seed)
+        self.before: torch.Tensor | None = None
+        """Errors of the blocks when the judge looked last, shape [B]."""
+        held = sum(map(len, self.blocks))
+        self.judging = held >= FEWEST and ends < c.steps
+        if self.judging:
+            self._hide_blocks()
+            pixels = sum(len(b) * b.side**2 for b in self.blocks) / sum(v.camera.width * v.camera.height for v in self.views)
+            self.notes.append(
+                f"adaptive: {held} blocks, {pixels:.1%} of the pixels, are held out until growth ends, by step {ends}"
+            )
+        else:
+            few = f"the pictures hold only {held} blocks" if held < FEWEST else "growth lasts to the end of the fit"
+            self.notes.append(f"adaptive: no judge, since {few}; the fit is as with --no-adaptive")
+
+    def _hide_blocks(self) -> None:
+        self.views = [hide(v, b) for v, b in zip(self.whole, self.blocks)]
+        self._plan()
+
+    @property
+    def _growth_ends(self) -> int:
+        """Steps done when growth ends by schedule."""
+        return super()._densify_until
+
+    @property
+    def _densify_until(self) -> int:
+        ends = self._growth_ends
+        return ends if self.closed is None else min(ends, self.closed - 1)
+
+    def _phase(self, step: int) -> Phase:
+        """As the fit has it, but the highest degree comes into use when growth begins: else nothing would speak for it."""
+        phase, highest = super()._phase(step), self.config.init.max_sh_degree
+        if not self.judging or highest == 0:
+            return phase
+        every = max(1, min(self.config.sh_every, self.marks[0] // highest))
+        return Phase(sh_degree(step, every, highest), phase.densifying, phase.layered)
+
+    def _samples_after(self, step: int) -> bool:
+        return super()._samples_after(step) and (self.closed is None or step < self.closed)
+
+    def _judges_after(self, step: int) -> bool:
+        return self.judging and self.closed is None and step in self.marks
+
+    def _changes_after(self, step: int) -> bool:
+        return super()._changes_after(step) or self._judges_after(step)
+
+    def _change_set(self, phase: Phase) -> None:
+        if self._judges_after(self.step):
+            self._judge()
+        super()._change_set(phase)
+        if self.judging and self.step == self.config.steps and self.config.judge.trim_db > 0:
+            self._trim()
+
+    def _refine(self, phase: Phase) -> None:
+        """Refine as the fit does, but never what one view alone sees, nor what is as fine as a pixel."""
+        if self.judging:
+            self._observe()
+        super()._refine(phase)
+
+    @property
+    def _looks(self) -> shrink.Looks:
+        return shrink.Looks([v.camera for v in self.whole], self._options(), self.config.seed)
+
+    def _options(self) -> RasterizeOptions:
+        degree = self._phase(self.step).degree
+        return RasterizeOptions(rule=self.config.rule, sh_degree=degree, background=self.background, max_instances=self.most)
+
+    def _errors(self, gaussians: Gaussians) -> torch.Tensor:
+        return block_errors(gaussians, self.whole, self.blocks, self._options())
+
+    def _observe(self) -> None:
+        """Limit every Gaussian to what the views can tell of it, and take growth from what one view alone sees."""
+        limits, seen = self.optimizer.limits, self._looks.coverage(self.gaussians)
+        limits.set_footprint(seen.footprint)
+        limits.degree = torch.minimum(limits.degree, seen.supported_degree().to(torch.int32))
+        limits.enforce(self.optimizer.params)
+        if len(self.views) > 1:
+            self.stats.gradient = torch.where(seen.views > 1, self.stats.gradient, 0)
+        finest = self.gaussians.log_scales.amax(1) <= limits.floor
+        self.stats.gradient = torch.where(finest, 0, self.stats.gradient)
+        self.graphs.clear()
+
+    def _judge(self) -> None:
+        """Look at the held-out blocks; end growth where the last level bought less than its noise, or where its time is up."""
+        c, limits = self.config.judge, self.optimizer.limits
+        last = max((m for m in self.marks if m < self.step), default=self.step)
+        if last < self.step < self.marks[-1] and not any(
+            super(AdaptiveFit, self)._changes_after(s) for s in range(last, self.step)
+        ):
+            return  # nothing could have grown
+        errors = self._errors(self.gaussians)
+        if self.before is not None:
+            old = limits.level < limits.growing
+            hidden = self._errors(shrink.rows_of(self.gaussians, old)) if bool(old.any()) and not bool(old.all()) else errors
+            fall, own = gain(self.before, errors), gain(hidden, errors)
+            least: Gain = min(fall, own, key=lambda g: g.mean)
+            count = len(self.gaussians)
+            self.levels.append(Level(self.step, count, decibels(errors), fall.mean, own.mean, least.mean, least.noise))
+            if not least.bought(c.noise):
+                self.why = (
+                    f"level {len(self.levels)} bought {least.mean:+.3f} dB on the held-out blocks, less than "
+                    f"{c.noise:g} x its noise of {least.noise:.3f} dB"
+                )
+                if bool(old.all()):
+                    self.why = f"no Gaussian came with level {len(self.levels)}: there is no room, or nothing to add"
+                if not own.bought(c.noise) and bool(old.any()):
+                    self._change(torch.nonzero(old).squeeze(1))
+                self._close()
+                return
+            if self.step == self.marks[-1]:
+                self.why = f"its time was up: level {len(self.levels)} still bought {least.mean:+.3f} dB"
+                self._close()
+                return
+        self.before = errors
+        limits.growing += 1
+
+    def _change(self, keep: torch.Tensor) -> None:
+        nothing = {n: t[:0] for n, t in self.gaussians.tensors().items()}
+        self._apply(Refinement(keep, nothing, keep[:0]), COARSE, LONG_AGO)
+
+    def _close(self) -> None:
+        """End growth: shrink the model as far as held-out evidence allows, and train on all pixels from here on."""
+        c, limits = self.config.judge, self.optimizer.limits
+        self.closed = self.step
+        self._observe()
+        base, looks = self._errors(self.gaussians), self._looks
+        degrees = shrink.stored_degrees(self.gaussians.sh)
+        self.shrunk = {
+            "count_before": len(self.gaussians),
+            "bytes_before": model_bytes(degrees),
+            "merged": 0,
+            "pruned": 0,
+            "added": 0,
+        }
+        parts = max(1, c.merge + c.prune + c.degrees)
+        spent = 0
+
+        def accepted(model: Gaussians) -> bool:
+            return gain(base, self._errors(model)).cost_at_most(c.keep_db * spent / parts, c.noise * spent / parts)
+
+        if c.merge:
+            spent += 1
+
+            def merged(change: Refinement) -> tuple[Gaussians, torch.Tensor]:
+                self._apply(change, COARSE, LONG_AGO)
+                return self.gaussians, self.layers.level
+
+            self.shrunk["merged"] = shrink.merge_neighbours(self.gaussians, self.layers.level, looks, accepted, merged)
+        if c.prune:
+            spent += 1
+            keep = shrink.dispensable(self.gaussians, looks, accepted)
+            self.shrunk["pruned"] = len(self.gaussians) - len(keep)
+            self._change(keep)
+        self._catch_up()
+        self._observe()
+        if c.degrees:
+            spent += 1
+            limits.degree = shrink.needed_degrees(self.gaussians, limits.degree, looks, accepted)
+        order = torch.argsort(limits.degree, stable=True)  # along the Morton curve within each degree
+        self.optimizer.reorder(order)
+        self.layers.reorder(order)
+        limits.enforce(self.optimizer.params)
+        self.shrunk |= {"count_after": len(order), "bytes_after": model_bytes(limits.degree)}
+        self.stats = type(self.stats)(len(order), self.device)
+        self.graphs.clear()
+        self.views = self.whole
+        self._plan()
+        n, told = self.shrunk, float(limits.degree.double().mean())
+        self.news.append(
+            f"adaptive: growth ended at step {self.step}, because {self.why}; {n['count_before']:,} Gaussians became "
+            f"{len(order):,} ({n['merged']:,} merged, {n['pruned']:,} pruned, {n['added']:,} added in the blocks) of mean "
+            f"degree {told:.2f}; all pixels are trained on from here"
+        )
+
+    @torch.no_grad()
+    def _view_psnr(self, gaussians: Gaussians) -> float:
+        """Mean over the training views of the PSNR over the pixels that count, the judge's floor included [dB]."""
+        options = self._options()
+        errors = [masked_mse(rasterize(gaussians, v.camera, options).rgb, v.photo, v.mask).double() for v in self.whole]
+        return float((-10 * torch.log10(torch.stack(errors) + FLOOR)).mean())
+
+    def _trim(self) -> None:
+        """Make the finished model smaller within the loss that is allowed on its training views."""
+        limits, whole, before = self.optimizer.limits, self._view_psnr(self.gaussians), len(self.gaussians)
+        allowed = self.config.judge.trim_db
+        made = shrink.prune_model(
+            self.gaussians, self.layers.level, self._looks, lambda g, share: self._view_psnr(g) >= whole - share * allowed
+        )
+        rows = made.gaussians.tensors()
+        lost = self.gaussians.sh.shape[1] - rows["sh"].shape[1]
+        rows["sh"] = torch.nn.functional.pad(rows["sh"], (0, 0, 0, lost))
+        none = torch.zeros(0, dtype=torch.int64, device=self.device)
+        parents = none.new_full((len(made.degrees),), -1)
+        self._apply(Refinement(none, rows, parents), COARSE, LONG_AGO)
+        self.layers.level, limits.degree = made.kinds.to(self.layers.level.dtype), made.degrees
+        self.shrunk |= {
+            "trimmed": before - len(made.degrees), "trim_db": whole - self._view_psnr(self.gaussians),
+            "count_after": len(made.degrees), "bytes_after": model_bytes(made.degrees),
+        }  # fmt: skip
+        self.news.append(
+            f"adaptive: the finished model of {before:,} Gaussians was trimmed to {len(made.degrees):,} for "
+            f"{self.shrunk['trim_db']:.3f} dB on its training views"
+        )
+
+    def _catch_up(self) -> None:
+        """Give the blocks, where nothing was sampled so far, as many fine Gaussians a pixel as there are elsewhere."""
+        c, pixels = self.config, sum(v.photo[..., 0].numel() for v in self.whole)
+        held = sum(len(b) * b.side**2 for b in self.blocks)
+        share = int(self.layers.fine.sum()) / (pixels - held) * held / pixels
+        if not c.method.events or not share * pixels >= 1:
+            return
+        sampler = dataclasses.replace(c.method.sampler, share=min(1.0, share), max_share=1e6)
+        blocks = [only(v, b) for v, b in zip(self.whole, self.blocks)]
+        for first in range(0, len(blocks), MAX_VIEWS):
+            event = sampling_event(
+                self.gaussians, self.layers, blocks[first : first + MAX_VIEWS], dataclasses.replace(c.method, sampler=sampler),
+                step=self.step, room=self._room_for - len(self.optimizer.gaussians), rule=c.rule, background=self.background,
+                generator=self.generator, max_instances=self.most,
+            )  # fmt: skip
+            self._apply(event.change, FINE, self.step)
+            self.shrunk["added"] += len(event.change.parents)
+            self.shrunk["pruned"] += event.freed
+
+    def state(self) -> tuple[dict[str, torch.Tensor], dict]:
+        """As the fit's, with what the judge knows."""
+        tensors, plain = super().state()
+        if self.before is not None:
+            tensors["judge.before"] = self.before
+        judge = {
+            "closed": self.closed, "why": self.why, "levels": [asdict(x) for x in self.levels], "shrunk": self.shrunk,
+            "growing": self.optimizer.limits.growing,
+        }  # fmt: skip
+        return tensors, plain | {"judge": judge}
+
+    def load(self, tensors: dict[str, torch.Tensor], plain: dict) -> None:
+        """Take over what `state` gave."""
+        judge = plain["judge"]
+        self.closed, self.why, self.shrunk = judge["closed"], judge["why"], judge["shrunk"]
+        self.levels = [Level(**x) for x in judge["levels"]]
+        self.before = tensors.get("judge.before")
+        self.optimizer.limits.growing = judge["growing"]
+        if self.closed is not None:
+            self.views = self.whole
+        super().load(tensors, plain)
+
+
+def fit_class(config: FitConfig) -> type[Fit]:
+    """The kind of fit that a configuration asks for."""
+    return AdaptiveFit if config.adaptive else Fit
+
+
+def complexity_figures(fit: Fit) -> dict:
+    """What metrics.json says of the size of a model: ``complexity`` with Gaussians, mean degree, bytes, levels of growth."""
+    limits = fit.optimizer.limits
+    degrees = shrink.stored_degrees(fit.gaussians.sh) if limits is None else limits.degree
+    figures = {
+        "count": len(degrees), "mean_degree": float(degrees.double().mean()), "bytes": model_bytes(degrees),
+        "cap": fit.config.density.max_gaussians, "adaptive": isinstance(fit, AdaptiveFit) and fit.judging,
+    }  # fmt: skip
+    if not figures["adaptive"]:
+        return {"complexity": figures | {"why": "growth ended by schedule", "marginal_db": None}}
+    last = fit.levels[-1] if fit.levels else None
+    return {"complexity": figures | {
+        "why": fit.why, "marginal_db": last and last.gain, "closed": fit.closed, "levels": [asdict(x) for x in fit.levels],
+        "shrunk": fit.shrunk,
+    }}  # fmt: skip
+
+
+def complexity_sentence(figures: dict) -> str:
+    """One line for people from the figures of `complexity_figures`."""
+    from warpgs.sizes import format_bytes
+
+    f = figures["complexity"]
+    text = f"{f['count']:,} Gaussians of mean SH degree {f['mean_degree']:.2f}, {format_bytes(f['bytes'])} uncompressed"
+    if f["marginal_db"] is not None:
+        text += f"; the last level bought {f['marginal_db']:+.3f} dB on held-out blocks"
+    return f"{text}; growth stopped because {f['why']}" if f["adaptive"] else f"{text}; {f['why']}"
