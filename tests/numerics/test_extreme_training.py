@@ -24,6 +24,7 @@ from warpgs.pipeline.density import DensityConfig, DensityStats, Refinement, ref
 from warpgs.pipeline.fit import Fit, run
 from warpgs.pipeline.importance import ImportanceConfig, normalized
 from warpgs.pipeline.init import InitConfig, initial_gaussians, initial_points
+from warpgs.pipeline.judge import JudgeConfig
 from warpgs.pipeline.layers import ProtectConfig
 from warpgs.pipeline.loss import LossConfig, photometric_loss
 from warpgs.pipeline.method import MethodConfig
@@ -345,7 +346,7 @@ def test_constant_images_of_any_size(device, dtype, value, height, width):
 NUMBERS = [math.nan, math.inf, -1, 0, 1e-300, 1, 3, 1e300]
 KINDS = [
     DensityConfig, OptimizerConfig, LossConfig, ImportanceConfig, SamplerConfig, ProtectConfig, PhaseConfig, MethodConfig,
-    InitConfig, FitConfig,
+    InitConfig, JudgeConfig, FitConfig,
 ]  # fmt: skip
 SHORT = FitConfig(
     steps=4, init=InitConfig(source="points", max_sh_degree=1), sh_every=2, phases=PhaseConfig(coarse=1, every=1),

@@ -101,7 +101,7 @@ class AdaptiveFit(Fit):
         if not self.judging or highest == 0:
             return phase
         every = max(1, min(self.config.sh_every, self.marks[0] // highest))
-        return Phase(sh_degree(step, every, highest), phase.densifying, phase.layered)
+        return dataclasses.replace(phase, degree=sh_degree(step, every, highest))
 
     def _samples_after(self, step: int) -> bool:
         return super()._samples_after(step) and (self.closed is None or step < self.closed)
