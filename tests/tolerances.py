@@ -58,8 +58,14 @@ RATIO = 2.0
 PICTURE_ULPS = 2.0
 """Floor of a picture's error in ulps of its largest value, or of its mean for the mean; without it exact scenes would fail."""
 GRADIENT_ULPS = 8.0  # measured 4.2 (blobs: the background, three numbers that are sums of 3072 of either sign)
-"""Floor of a gradient's error, the same way. The most layers that a pixel blends add their square root: the backward pass
-recovers transmittance by one division a layer, whose roundings add up like a random walk (measured: fog, 893 layers, 14)."""
+"""Floor of a gradient's error, the same way, beside what layers add."""
+LAYER_ULPS = {
+    "cpu": 1.0,  # measured: fog, 893 layers, 14 ulps in all
+    "cuda": 3.0,  # measured on an H200: fog, 76 ulps
+}
+"""What the layers of a pixel add to that floor, times the square root of their number: roundings add up like a random walk.
+On a CPU the backward pass recovers transmittance by a division a layer. On CUDA ``ex2.approx`` errs by up to 2 ulps a layer (PTX
+manual), and what lies behind a layer is the pixel's colour less what lies before, one more."""
 
 
 def close(quantity: str, found: torch.Tensor, wanted: torch.Tensor) -> None:

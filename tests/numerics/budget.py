@@ -7,7 +7,7 @@ import math
 from tests.numerics.scenes import SCENES, Scene
 from tests.numerics.split import GRADIENTS, PICTURES, Split, gradient_errors, picture_errors
 from tests.numerics.thresholds import EPS, ulp
-from tests.tolerances import GRADIENT_ULPS, ORDINARY, PICTURE_ULPS, RATIO, STRESS, Limits
+from tests.tolerances import GRADIENT_ULPS, LAYER_ULPS, ORDINARY, PICTURE_ULPS, RATIO, STRESS, Limits
 from warpgs.constants import Rule
 
 SLOPE = {"rgb": 0.5**0.5 * math.exp(-0.5), "alpha": 0.5**0.5 * math.exp(-0.5), "depth": 0.5 * 0.5**0.5 * 3.33}
@@ -47,7 +47,7 @@ def measure(scene: Scene, rule: Rule, s: Split) -> dict:
     flipped = error[inside] > pictures["rgb"]["allowed"]
     excess = error[inside] - s.band.jump[inside] - pictures["rgb"]["allowed"]
     return {
-        "scene": scene.name, "rule": rule.name, "stress": scene.stress, "gaussians": len(scene.gaussians),
+        "scene": scene.name, "rule": rule.name, "device": s.device, "stress": scene.stress, "gaussians": len(scene.gaussians),
         "pixels": inside.numel(), "layers": s.band.layers,
         "band": {name: int(where.sum()) for name, where in s.band.reasons.items()}, "in band": int(inside.sum()),
         "flips": int(flipped.sum()), "beyond jump": int((excess > 0).sum()),
@@ -69,7 +69,7 @@ def broken(scene: Scene, found: dict) -> list[str]:
         for kind in ("mean", "max"):
             floor = PICTURE_ULPS * EPS * e[f"scale {kind}"]
             line(f"{kind} E of {name} beside P32", e[f"E {kind}"], RATIO * e[f"P32 {kind}"] + floor)
-    ulps = GRADIENT_ULPS + found["layers"] ** 0.5
+    ulps = GRADIENT_ULPS + LAYER_ULPS[found["device"]] * found["layers"] ** 0.5
     for name, e in found["gradients"].items():
         for kind in ("mean", "max"):
             floor = ulps * EPS * e[f"scale {kind}"]

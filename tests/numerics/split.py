@@ -41,6 +41,8 @@ class Split:
     model: Drawn | None
     """R64, where asked for."""
     band: Band
+    device: str
+    """Where the kernels ran: cpu or cuda."""
 
 
 def _kernel(inputs: Inputs, scene: Scene, rule: Rule, tile_size: int) -> Pictures:
@@ -82,6 +84,7 @@ def split(
         _drawn(single, p32(single, frame, rule, tile_size), *how),
         _drawn(exact, r64(exact, frame, rule), *how) if with_model else None,
         near,
+        torch.device(device).type,
     )
 
 

@@ -96,13 +96,13 @@ print("checked")
 
 
 @pytest.mark.slow
-def test_no_access_out_of_bounds(device, tmp_path):
-    """All ops once with Warp's bounds checks, which end the process; the check of written numbers (verify_fp) does not apply:
-
+def test_no_access_out_of_bounds(tmp_path):
+    """All ops once with Warp's bounds checks, which end the process; on a CPU: unoptimised kernels of 1024 threads want more
+    registers than a multiprocessor has, and compute-sanitizer looks after them. The check of written numbers does not apply:
     it also stops at what entries held before they were written, and at quotients that a branch-free kernel does not select.
     """
     done = subprocess.run(
-        [sys.executable, "-c", DEBUG, str(device)], capture_output=True, text=True, check=False,
+        [sys.executable, "-c", DEBUG, "cpu"], capture_output=True, text=True, check=False,
         env={**os.environ, "WARP_CACHE_PATH": str(tmp_path)},
     )  # fmt: skip
     assert done.returncode == 0 and done.stdout.split()[-1] == "checked", (done.stdout + done.stderr)[-2000:]
