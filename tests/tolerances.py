@@ -64,8 +64,8 @@ LAYER_ULPS = {
     "cuda": 3.0,  # measured on an H200: fog, 76 ulps
 }
 """What the layers of a pixel add to that floor, times the square root of their number: roundings add up like a random walk.
-On a CPU the backward pass recovers transmittance by a division a layer. On CUDA ``ex2.approx`` errs by up to 2 ulps a layer (PTX
-manual), and what lies behind a layer is the pixel's colour less what lies before, one more."""
+On a CPU the backward pass recovers transmittance by a division a layer. On CUDA ``ex2.approx`` errs by up to 2 ulps a layer
+(PTX manual), and what lies behind a layer is the pixel's colour less what lies before, one more."""
 
 
 def close(quantity: str, found: torch.Tensor, wanted: torch.Tensor) -> None:
