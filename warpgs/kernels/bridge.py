@@ -117,6 +117,10 @@ def warp_stream(device: torch.device) -> wp.Stream:
     return _warp_stream(device, torch._C._cuda_getCurrentRawStream(index))
 
 
+_SORTING = threading.RLock()
+"""Warp has one stream for all threads of a device: a thread keeps it while it sorts."""
+
+
 @contextlib.contextmanager
 def stream_of(device: torch.device):
     """Run Warp's own work (sorts, scans) on torch's current stream of that device; nothing to do on a CPU.
@@ -127,12 +131,13 @@ def stream_of(device: torch.device):
         yield
         return
     wanted, where = warp_stream(device), warp_device(device)
-    before = where.stream
-    where.set_stream(wanted, sync=False)
-    try:
-        yield
-    finally:
-        where.set_stream(before, sync=False)
+    with _SORTING:
+        before = where.stream
+        where.set_stream(wanted, sync=False)
+        try:
+            yield
+        finally:
+            where.set_stream(before, sync=False)
 
 
 class _Recorded:
