@@ -1,6 +1,7 @@
 """Binning and sorting at the limits of their numbers, and pictures of extreme sizes (docs/extremes.md)."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -92,6 +93,19 @@ def test_sizes_beyond_32_bits_are_refused(device):
     splats, counts = torch.zeros(1, 0, 12, device=device), torch.zeros(1, 0, dtype=torch.int32, device=device)
     with pytest.raises(ResourceError, match=r"2,147,483,648 tiles of 8 px.* fewer cameras"):
         bin_tiles(splats, counts, width=8 * 2**16, height=8 * 2**15, tile_size=8, rule=EXACT)
+
+
+def test_a_refused_size_leaves_a_recorded_launch_as_it_was():
+    """A recorded launch that was refused an argument takes the next one whole, at the same address and of the same size too."""
+    recorded, packed = bridge._Recorded.__new__(bridge._Recorded), SimpleNamespace(ndim=1, data=0, shape=[0])
+    recorded.command = SimpleNamespace(bounds=SimpleNamespace(size=1), params=[None, None, packed], set_dim=lambda _: None)
+    recorded.known = [None]
+    small, other = torch.zeros(5), torch.zeros(6)
+    recorded._patch(1, [bridge.view(small, None)])
+    with pytest.raises(ResourceError, match="2,147,483,648 entries"):
+        recorded._patch(1, [bridge.view(other[:1].expand(2**31), None)])
+    recorded._patch(1, [bridge.view(small, None)])
+    assert packed.data == small.data_ptr() and packed.shape == [5]
 
 
 # B2: numbers of tiles around powers of two

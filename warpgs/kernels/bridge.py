@@ -177,9 +177,11 @@ class _Recorded:
                 if known[i] == now:
                     continue
                 packed = command.params[i + 2]  # after the bounds and ``begin``
+                for size in now[1][: packed.ndim]:
+                    _check_size(size)  # it would wrap around
+                known[i] = None  # whoever is interrupted here leaves nothing that is taken for known
                 packed.data = now[0]
                 for axis in range(packed.ndim):
-                    _check_size(now[1][axis])  # it would wrap around
                     packed.shape[axis] = now[1][axis]
                 if packed.ndim == 2:
                     packed.strides[0] = tensor.stride(0) * tensor.element_size()
