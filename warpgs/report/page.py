@@ -19,10 +19,10 @@ main{max-width:1080px;margin:0 auto;padding:48px 24px 80px}
 h1{font-size:34px;letter-spacing:-.02em;margin:0 0 4px;overflow-wrap:anywhere}
 h2{font-size:20px;margin:52px 0 14px;letter-spacing:-.01em}
 .sub,figcaption,.dim{color:var(--soft)}.sub{margin:0}
-.figures{display:flex;flex-wrap:wrap;gap:1px;background:var(--line);
+.figures{display:grid;grid-template-columns:repeat(auto-fill,minmax(168px,1fr));gap:1px;background:var(--card);
 border:1px solid var(--line);border-radius:10px;overflow:hidden;margin:28px 0 0}
-.figures div{background:var(--card);padding:16px 18px;flex:1 1 125px}
-.figures b{display:block;font-size:25px;font-weight:600;letter-spacing:-.02em;
+.figures div{box-shadow:0 0 0 1px var(--line);padding:16px 18px}
+.figures b{display:block;white-space:nowrap;font-size:25px;font-weight:600;letter-spacing:-.02em;
 font-variant-numeric:tabular-nums}.figures span{color:var(--soft);font-size:13px}
 ul{padding-left:20px;margin:0}li{margin:3px 0}
 table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums}
