@@ -7,9 +7,11 @@ import tokenize
 import pytest
 
 from tests.mutate import claims, report, rules
-from tests.mutate.candidates import KERNELS, ROOT, all_candidates, candidates_of, draw
+from tests.mutate.__main__ import all_tests, arguments, check_unmutated, job_of
+from tests.mutate.candidates import KERNELS, ROOT, Candidate, all_candidates, candidates_of, draw
+from tests.mutate.edit import Edit
 from tests.mutate.native import native_edits
-from tests.mutate.process import Job, run_jobs
+from tests.mutate.process import Job, Outcome, run_jobs
 from tests.mutate.python import python_edits
 
 PYTHON = '''
@@ -84,6 +86,11 @@ def test_what_only_cuda_runs():
     }  # fmt: skip
     assert all(e.cuda for e in python_edits(source, "blend_cuda.py"))
     assert all(c.cuda for c in all_candidates() if c.file.endswith(".cu"))
+    source = b"def blend(a=1, *, block_dim=2, deterministic=True, keep=False):\n    launch(a, 3, block_dim=4, keep=5)\n"
+    assert {e.change: e.cuda for e in python_edits(source, "some.py")} == {
+        "1 to 2": False, "2 to 3": True, "True to False": True, "False to True": False,
+        "3 to 4": False, "4 to 5": True, "5 to 6": False,
+    }  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +103,8 @@ def test_every_kernel_file_has_mutants_and_tests(candidates):
     assert len(candidates) > 4000 and len({c.key for c in candidates}) == len({c.id for c in candidates}) == len(candidates)
     files = {p.relative_to(ROOT / KERNELS).as_posix() for p in (ROOT / KERNELS).rglob("*") if p.suffix in (".py", ".cu")}
     assert files - {c.file for c in candidates} == {"__init__.py"}
-    assert all((ROOT / test).is_file() for file in files - {"__init__.py"} for test in rules.tests_of(file))
+    for file in files - {"__init__.py"}:
+        assert all((ROOT / test).is_file() for cuda in (False, True) for test in rules.tests_of(file, cuda))
     assert all((ROOT / test.split("::")[0]).is_file() for test in rules.SKIPPED)
 
 
@@ -142,7 +150,7 @@ def test_claims_are_refused(tmp_path):
 
 
 def test_ends_of_a_test_run(tmp_path):
-    """A planted module under planted tests: passes, fails, does not import, crashes, never ends, has no test."""
+    """A planted module under planted tests: passes, fails, does not import, crashes, never ends, has no test for a device."""
     tree = tmp_path / "tree"
     (tree / "tests").mkdir(parents=True)
     (tree / "warpgs").mkdir()
@@ -156,13 +164,25 @@ def test_ends_of_a_test_run(tmp_path):
         "slow": "class Slow:\n    def __eq__(self, other):\n        while True:\n            pass\n\nVALUE = Slow()\n",
     }  # fmt: skip
     jobs = [Job(n, ("tests/test_value.py",), False, "warpgs/value.py", s.encode()) for n, s in sources.items()]
-    jobs.append(Job("none", ("tests/test_value.py",), True))
-    jobs.append(Job("unmutated", ("tests/test_value.py",), False))
+    head = "import pytest\nfrom warpgs.value import VALUE\n\n@pytest.mark.{}\ndef test_value():\n    assert VALUE == 1\n"
+    (tree / "tests/test_cuda.py").write_text(head.format("cuda"))
+    (tree / "tests/test_skipped.py").write_text(head.format("skip").replace("\ndef", "\n@pytest.mark.cuda\ndef"))
+    mixed, two = ("tests/test_value.py", "tests/test_cuda.py"), b"VALUE = 2\n"
+    jobs += [
+        Job("unmutated", ("tests/test_value.py",), False), Job("no file", ("tests/test_none.py",), False),
+        # mutants that every other test would notice: of those not meant for the device none may run
+        Job("deselected", ("tests/test_value.py",), True, "warpgs/value.py", two),
+        Job("skipped", ("tests/test_value.py", "tests/test_skipped.py"), True, "warpgs/value.py", two),
+        Job("no test left", (), True, "warpgs/value.py", two),
+        Job("mixed", mixed, True), Job("mixed, killed", mixed, True, "warpgs/value.py", two),
+        Job("patient", ("tests/test_value.py",), False, patience=0.001),
+    ]  # fmt: skip
     outcomes = {o.name: o.status for o in run_jobs(jobs, tree, tmp_path / "cache", workers=2, timeout=8, test_timeout=3)}
     assert outcomes == {
         "survived": "survived", "killed": "killed", "import": "killed", "crash": "killed", "timeout": "timeout",
         "slow": "timeout",
-        "none": "broken", "unmutated": "survived",
+        "unmutated": "survived", "no file": "broken", "deselected": "untested", "skipped": "untested",
+        "no test left": "untested", "mixed": "survived", "mixed, killed": "killed", "patient": "timeout",
     }  # fmt: skip
     assert (tree / "warpgs/value.py").read_text() == "VALUE = 1\n"
 
@@ -174,3 +194,33 @@ def test_score_counts_no_claims(candidates):
     text = report.summary(drawn, {c.id: w for c, w in zip(drawn, words)}, {drawn[4].id: "no one reads it"})
     assert text.splitlines()[-1] == "mutation score 75.0 %: 3 killed of 4 (6 drawn, 1 claimed equivalent, 1 not run)"
     assert "SURVIVED" in text and "no one reads it" in text and report.difference(drawn[3]) in text
+    text = report.summary(drawn[:2], {drawn[0].id: "killed", drawn[1].id: "untested"}, {})
+    assert "UNTESTED" in text and text.endswith("mutation score 50.0 %: 1 killed of 2 (2 drawn, 0 claimed equivalent)")
+
+
+def plan(*files_on_cuda):
+    """A mutant of each file, of what CUDA runs or not."""
+    return [Candidate(file, Edit(0, 0, "", "", cuda=cuda), 1, "", "") for file, cuda in files_on_cuda]
+
+
+def test_which_tests_run_where(monkeypatch):
+    """Of each device that a mutant is tested on; a file without a test for the device is no failure, and is left out later."""
+    drawn = plan(("knn.py", False), ("bridge.py", True))
+    found = all_tests(drawn, "cpu")
+    assert ("tests/kernels/test_knn.py", False) in found and ("tests/kernels/test_knn.py", True) not in found
+    assert ("tests/kernels/test_bridge.py", True) in found
+    assert ("tests/kernels/test_knn.py", True) in all_tests(drawn, "both")
+    ends = {"tests/kernels/test_bridge.py on CUDA": "untested"}
+
+    def instead(jobs, *_, **__):
+        return [Outcome(j.name, ends.get(j.name, "survived"), 0, "") for j in jobs]
+
+    monkeypatch.setattr("tests.mutate.__main__.run_jobs", instead)
+    untested = check_unmutated(found, arguments([]))
+    assert untested == ["tests/kernels/test_bridge.py on CUDA"]
+    assert "tests/kernels/test_bridge.py" in rules.tests_of("bridge.py", True)
+    assert "tests/kernels/test_bridge.py" not in job_of(drawn[1], True, untested).tests
+    assert "tests/kernels/test_bridge.py" in job_of(drawn[1], False, untested).tests
+    ends["tests/kernels/test_knn.py on the CPU"] = "broken"
+    with pytest.raises(SystemExit, match=r"fail without a mutant: .*test_knn"):
+        check_unmutated(found, arguments([]))

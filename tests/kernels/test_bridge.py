@@ -8,6 +8,7 @@ import warp as wp
 
 from tests.splats import camera, cloud, leaves
 from warpgs.constants import RULES
+from warpgs.errors import ResourceError
 from warpgs.kernels import bridge
 from warpgs.kernels.adam import adam_step
 from warpgs.kernels.blend import blend, contributions
@@ -68,7 +69,7 @@ def test_ranges_cover_every_item_once(monkeypatch, threads, count, cost, ranges)
 
 def everything():
     """The result of every kernel there is for a CPU in float32, gradients included."""
-    g, cam = leaves(cloud(60)), camera(37, 30, cameras=2, dtype=torch.float32)
+    g, cam = leaves(cloud(61)), camera(37, 30, cameras=2, dtype=torch.float32)
     size, rule = {"width": 37, "height": 30}, RULES["exact"]
     views, Ks = cam.viewmat.clone().requires_grad_(), cam.K.clone().requires_grad_()
     splats, counts = project(*g.tensors().values(), views, Ks, **size, degree=1, rule=rule)
@@ -83,34 +84,55 @@ def everything():
     moved = torch.rand(3 * 4096, 3, generator=torch.Generator().manual_seed(1))
     state = [moved, moved.flip(0).contiguous(), moved * 0, moved * 0]
     adam_step(*state, lr=0.1, step=1)
-    drawn = opacity_dropout(50, torch.tensor([0.3, 1.0]), 5)
+    drawn = opacity_dropout(53, torch.tensor([0.3, 1.0]), 5)
     lists = [t for tiled in (tiles, capped) for t in (tiled.ranges, tiled.counts, tiled.splat_ids[: len(tiles.slots)])]
     weights = contributions(splats, tiles, **size, rule=rule)
-    near = mean_square_distances(moved[:90])
+    near = mean_square_distances(moved[:91])
     return [t.detach() for t in (splats, counts, *lists, *pictures, *gradients, *weights, *state, near, drawn, maps, sums)]
 
 
-def test_every_op_gives_the_same_bits_in_ranges(monkeypatch):
-    """However a launch is cut: items know their own number, and share nothing."""
+@pytest.fixture
+def poisoned_memory():
+    """Fill what torch allocates with NaN and with the largest numbers."""
+    torch.use_deterministic_algorithms(True)
+    assert bool(torch.empty(3).isnan().all())
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """The results of one thread, each launch in one piece."""
+    count = torch.get_num_threads()
     torch.set_num_threads(1)
-    whole = everything()
+    yield everything()
+    torch.set_num_threads(count)
+
+
+def test_every_op_gives_the_same_bits_in_ranges(monkeypatch, whole, poisoned_memory):
+    """However a launch is cut: items know their own number, share nothing, and none is left out.
+
+    Ranges of unequal length, none of which may cover for another: Warp counts a negative index from the end, and so a
+    kernel that goes backwards from the beginning of its range visits every item of equal ranges.
+    """
     monkeypatch.setattr(bridge, "SERIAL_WORK", 0)
-    torch.set_num_threads(3)
+    monkeypatch.setattr(bridge, "CHUNKS_PER_THREAD", 2)
+    torch.set_num_threads(4)
     for i, (a, b) in enumerate(zip(whole, everything(), strict=True)):
         assert torch.equal(a, b), i
 
 
-def test_memory_that_nobody_wrote_is_not_read():
+def test_memory_that_nobody_wrote_is_not_read(whole, poisoned_memory):
     """Scratch and outputs full of NaN and of the largest numbers beforehand: the same bits."""
-    clean = everything()
-    torch.use_deterministic_algorithms(True)  # torch then fills what it allocates
-    try:
-        assert bool(torch.empty(3).isnan().all())
-        poisoned = everything()
-    finally:
-        torch.use_deterministic_algorithms(False)
-    for i, (a, b) in enumerate(zip(clean, poisoned, strict=True)):
+    for i, (a, b) in enumerate(zip(whole, everything(), strict=True)):
         assert torch.equal(a, b), i
+
+
+def test_items_are_numbered_in_31_bits():
+    """2^31 - 1 of them can be, one more cannot."""
+    bridge._check_size(2**31 - 1)
+    with pytest.raises(ResourceError, match=r"2,147,483,648 entries is beyond the 2,147,483,647"):
+        bridge._check_size(2**31)
 
 
 def test_check_names_what_disagrees():

@@ -6,7 +6,9 @@ import pytest
 import torch
 
 from tests.kernels.test_limits_project import facing, run
+from tests.reference.blend import blend_reference
 from tests.splats import camera, cloud
+from tests.tolerances import close
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
 from warpgs.kernels import blend, tiles
@@ -50,6 +52,27 @@ def test_free_memory_is_asked_for_only_where_it_may_matter(monkeypatch):
     monkeypatch.setattr(tiles, "installed_bytes", lambda _: 2**60)
     tiles._check_total(2**30 - 1, 1, cpu, 1, None)
     assert not asked
+
+
+@pytest.mark.parametrize(
+    ("spare_sum", "spare_count", "apart"), [(1, 0, False), (0, 0, True), (1, -1, True)], ids=["fits", "sum", "count"]
+)
+def test_counted_apart_where_one_sum_might_not_hold_both(monkeypatch, spare_sum, spare_count, apart):
+    """From as many (Gaussian, tile) pairs on as a sum has room for, and beyond as many Gaussians."""
+    splats, counts = torch.zeros(2, 5, 12), torch.ones(2, 5, dtype=torch.int32)  # 10 Gaussians, 6 tiles
+
+    def stop(word):
+        def work(*_, **__):
+            raise InterruptedError(word)
+
+        return work
+
+    monkeypatch.setattr(tiles, "VISIBLE", 60 + spare_sum)
+    monkeypatch.setattr(tiles, "MAX_VISIBLE", 10 + spare_count)
+    monkeypatch.setattr(tiles, "_check_total", stop("apart"))
+    monkeypatch.setattr(tiles.bridge, "launch", stop("together"))
+    with pytest.raises(InterruptedError, match="apart" if apart else "together"):
+        tiles.bin_tiles(splats, counts, width=48, height=30, rule=EXACT)
 
 
 def test_memory_of_the_machine_is_in_bytes():
@@ -163,6 +186,24 @@ def test_a_transmittance_equal_to_the_stop(device, dtype, inclusive, weights):
     assert maxima.tolist() == [weights] and sums.tolist() == [[256 * w for w in weights]]
     (gradient,) = torch.autograd.grad(rgb[..., 0].sum(), splats)
     assert torch.allclose(gradient[0, :, 6].cpu().double(), 256 * torch.tensor(weights, dtype=torch.float64), rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("rule", ["gsplat", "inria"])
+def test_nothing_is_drawn_behind_a_stop(device, dtype, rule):
+    """A layer that would take transmittance below the stop ends the pixel, also for fainter ones behind it."""
+    opacities = [0.98, 0.98, 0.9, 0.01, 0.5, 0.005]
+    splats, (rgb, alpha, _), (_, maxima) = plain(opacities, device, dtype, RULES[rule])
+    # the reference has no flat layers: 10^12 px wide ones are as good
+    count = len(opacities)
+    columns = torch.tensor(opacities, dtype=torch.float64), torch.ones(count, 3), torch.arange(1.0, count + 1)
+    wide = torch.full((count, 2), 8.0, dtype=torch.float64), torch.eye(2, dtype=torch.float64).expand(count, 2, 2) * 1e24
+    wanted = blend_reference(*wide, *(t.double() for t in columns), torch.zeros(3).double(), 16, 16, RULES[rule])
+    assert (wanted[3].sum((1, 2)) > 0).tolist() == [True, True, False, False, False, False]
+    close("image", rgb[0], wanted[0])
+    close("image", alpha[0], wanted[1])
+    close("gradient", maxima[0], wanted[3].amax((1, 2)))
+    (gradient,) = torch.autograd.grad(rgb[..., 0].sum(), splats)
+    close("gradient", gradient[0, :, 6], wanted[3].sum((1, 2)))
 
 
 def test_an_alpha_equal_to_the_cut_or_to_the_most(device, dtype):

@@ -4,6 +4,7 @@ import argparse
 import hashlib
 import json
 import os
+import subprocess
 import sys
 import tempfile
 import time
@@ -49,28 +50,55 @@ def chosen(options: argparse.Namespace, claimed: claims.Claims) -> list[Candidat
     return draw(pool, options.sample, options.seed) if pool else []
 
 
-def job_of(candidate: Candidate, cuda: bool) -> Job:
-    """The tests of a mutant's op, on CUDA or on the CPU."""
+CUDA_PATIENCE = 3.0
+"""A mutant of a CUDA body compiles for up to a minute where many do, which must not count as a test that never ends."""
+
+
+def has_cuda() -> bool:
+    """Whether there is a device; asked in a process of its own, since a parent that has asked CUDA cannot fork."""
+    code = "import sys, torch; sys.exit(not torch.cuda.is_available())"
+    return subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def job_of(candidate: Candidate, cuda: bool, untested: list[str]) -> Job:
+    """The tests of a mutant's op, on CUDA or on the CPU, but for files that have none for it."""
     source = candidate.edit.apply((ROOT / KERNELS / candidate.file).read_bytes())
-    tests = tuple(rules.tests_of(candidate.file))
-    return Job(candidate.id, tests, cuda, f"{KERNELS}/{candidate.file}", source, rules.SKIPPED)
+    tests = tuple(test for test in rules.tests_of(candidate.file, cuda) if named(test, cuda) not in untested)
+    patience = CUDA_PATIENCE if cuda else 1.0
+    return Job(candidate.id, tests, cuda, f"{KERNELS}/{candidate.file}", source, rules.SKIPPED, patience)
 
 
-def check_unmutated(drawn: list[Candidate], options: argparse.Namespace) -> None:
-    """Run the tests on the code as it is, which also compiles its kernels; exit if any of them fails."""
-    wanted = {(test, c.cuda) for c in drawn for test in rules.tests_of(c.file)}
-    jobs = [
-        Job(f"{test} on {'CUDA' if cuda else 'the CPU'}", (test,), cuda, skipped=rules.SKIPPED) for test, cuda in sorted(wanted)
-    ]
+def named(test: str, cuda: bool) -> str:
+    """A test file and where it runs, in words."""
+    return f"{test} on {'CUDA' if cuda else 'the CPU'}"
+
+
+def all_tests(drawn: list[Candidate], device: str) -> list[tuple[str, bool]]:
+    """The test files of a sample, and whether each runs on CUDA."""
+    where = [(c.file, cuda) for c in drawn for cuda in {c.cuda, device == "both" or c.cuda}]
+    return sorted({(test, cuda) for file, cuda in where for test in rules.tests_of(file, cuda)})
+
+
+def check_unmutated(tests: list[tuple[str, bool]], options: argparse.Namespace) -> list[str]:
+    """Run the tests on the code as it is, which also compiles its kernels; exit if any of them fails.
+
+    Returns the files, in words, that have no test for the device.
+    """
+    untested = []
+    jobs = [Job(named(test, cuda), (test,), cuda, skipped=rules.SKIPPED) for test, cuda in tests]
     for outcome in run_jobs(jobs, ROOT, options.cache, workers=options.workers, timeout=600):
-        if outcome.status != "survived":
+        if outcome.status not in ("survived", "untested"):
             sys.exit(f"the tests fail without a mutant: {outcome.name} ({outcome.status})\n{outcome.output}")
-        print(f"unmutated: {outcome.name} passes in {outcome.seconds:.0f} s", flush=True)
+        if outcome.status == "untested":
+            untested.append(outcome.name)
+        found = f"passes in {outcome.seconds:.0f} s" if outcome.status == "survived" else "has no test"
+        print(f"unmutated: {outcome.name} {found}", flush=True)
+    return untested
 
 
-def tree_digest(drawn: list[Candidate]) -> str:
-    """Names the state of all sources and tests, and which files are mutated for which device."""
-    digest = hashlib.sha256(repr(sorted({(c.file, c.cuda) for c in drawn})).encode())
+def tree_digest(tests: list[tuple[str, bool]]) -> str:
+    """Names the state of all sources and tests, and which tests run where."""
+    digest = hashlib.sha256(repr(tests).encode())
     for path in sorted(p for room in COPIED for p in (ROOT / room).rglob("*") if p.suffix in (".py", ".cu", ".toml")):
         digest.update(path.as_posix().encode() + path.read_bytes())
     return digest.hexdigest()
@@ -79,7 +107,7 @@ def tree_digest(drawn: list[Candidate]) -> str:
 def run(mutants: list[tuple[Candidate, bool]], kept: dict, options: argparse.Namespace) -> None:
     """Run mutants, each on CUDA or not, and write each result down as it comes."""
     by_id = {c.id: c for c, _ in mutants}
-    jobs = [job_of(c, cuda) for c, cuda in mutants]
+    jobs = [job_of(c, cuda, kept["untested"]) for c, cuda in mutants]
     limits = {"workers": options.workers, "timeout": options.timeout, "test_timeout": options.test_timeout}
     for i, o in enumerate(run_jobs(jobs, ROOT, options.cache, **limits), 1):
         c = by_id[o.name]
@@ -103,15 +131,19 @@ def main() -> None:
         for c in drawn:
             print(f"{report.describe(c)}  [{c.edit.function}]\n    {c.line}\n    {c.mutated_line()}")
         return
+    if (options.device == "both" or any(c.cuda for c in drawn)) and not has_cuda():
+        sys.exit("mutants of what CUDA runs need a CUDA device, and torch finds none here; use --device cpu")
     preload()
     options.json.parent.mkdir(parents=True, exist_ok=True)
     kept = json.loads(options.json.read_text()) if options.json.exists() else {"unmutated": "", "mutants": {}}
-    done, state = kept["mutants"], tree_digest(drawn)
+    kept.setdefault("untested", [])
+    done, tests = kept["mutants"], all_tests(drawn, options.device)
+    state = tree_digest(tests)
     # a survivor is run again, since a test may have been added; what was killed stays so
     left = [c for c in drawn if c.id not in reasons and done.get(c.id, {}).get("status") not in report.KILLED]
     begun = time.monotonic()
     if left and kept["unmutated"] != state:
-        check_unmutated(left, options)
+        kept["untested"] = check_unmutated(tests, options)
         kept["unmutated"] = state
     # CUDA mutants compile longest: first, so that none of them is alone at the end; else in no order, so that the score of a
     # run that was cut short is that of a random part
@@ -119,7 +151,7 @@ def main() -> None:
     run([(c, c.cuda) for c in left], kept, options)
     if options.device == "both":
         # what no CPU test notices may still matter on CUDA, which runs the shared code too
-        run([(c, True) for c in left if not c.cuda and done[c.id]["status"] == "survived"], kept, options)
+        run([(c, True) for c in left if not c.cuda and done[c.id]["status"] in report.NOTICED_BY_NONE], kept, options)
     if options.claims:
         refuted = [c for c in drawn if done.get(c.id, {}).get("status") in report.KILLED]
         print("\n".join(f"REFUTED  {report.describe(c)}" for c in refuted))

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 COPIED = ("warpgs", "tests", "bench")
-PASSED, NOT_RUN = 0, (3, 4, 5, 70)
-"""What pytest returns for tests that pass, and where it cannot run any: an error of its own, no such file, no test; ours."""
+PASSED, NO_TESTS, NOT_RUN = 0, 5, (3, 4, 70)
+"""What pytest returns for tests that pass, where there are none, and where it cannot run: its own error, no such file; ours."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,8 @@ class Job:
     source: bytes = b""
     skipped: tuple[str, ...] = ()
     """Tests to leave out."""
+    patience: float = 1.0
+    """Factor of the time limits."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,8 @@ class Outcome:
 
     name: str
     status: str
-    """``killed``, ``survived``, ``timeout`` (counts as killed), or ``broken``: the tests could not be run at all."""
+    """``killed``, ``survived``, ``timeout`` (counts as killed), ``untested``: no test is meant for that device, or ``broken``:
+    the tests could not be run at all."""
     seconds: float
     output: str
     """The end of what pytest printed."""
@@ -68,10 +71,13 @@ def preload() -> None:
 
 
 class _Clock:
-    """A pytest plugin that ends the process where a single test takes too long, in whatever loop it is."""
+    """A pytest plugin that ends the process where a single test takes too long, in whatever loop it is, and counts tests."""
 
     def __init__(self, seconds: float):
-        self.seconds = seconds
+        self.seconds, self.run = seconds, 0
+
+    def pytest_runtest_logreport(self, report):
+        self.run += report.when == "call" and not report.skipped
 
     def pytest_runtest_logstart(self, nodeid, location):
         signal.setitimer(signal.ITIMER_REAL, self.seconds)
@@ -98,9 +104,9 @@ def _child(job: Job, tree: Path, root: Path, cache: Path, test_timeout: float, t
     mark = f"not slow and {'cuda' if job.cuda else 'not cuda'}"
     # the project's own options ask for plugins and warnings that a mutant need not load
     skipped = [f"--deselect={test}" for test in job.skipped]
-    return int(
-        pytest.main([*job.tests, *skipped, "-x", "-q", "--tb=line", "-p", "no:cacheprovider", "-m", mark], plugins=[clock])
-    )
+    options = [*skipped, "-x", "-q", "--tb=line", "-p", "no:cacheprovider", "-m", mark]
+    status = int(pytest.main([*job.tests, *options], plugins=[clock])) if job.tests else NO_TESTS
+    return NO_TESTS if status == PASSED and not clock.run else status  # all of them were skipped
 
 
 def _start(job: Job, folder: Path, root: Path, cache: Path, test_timeout: float, threads: int) -> int:
@@ -132,6 +138,8 @@ def _outcome(job: Job, status: int, timed_out: bool, seconds: float, output: str
         word = "timeout"
     elif code == PASSED:
         word = "survived"
+    elif code == NO_TESTS:
+        word = "untested"
     elif code in NOT_RUN:
         word = "broken"
     else:
@@ -161,7 +169,8 @@ def run_jobs(
                 while len(running) < workers and (job := next(waiting, None)) is not None:
                     folder = Path(scratch) / str(count)
                     count += 1
-                    running[_start(job, folder, root, cache, test_timeout, threads)] = (job, folder, time.monotonic(), set())
+                    pid = _start(job, folder, root, cache, test_timeout * job.patience, threads)
+                    running[pid] = (job, folder, time.monotonic(), set())
                 if not running:
                     return
                 time.sleep(0.02)
@@ -173,7 +182,7 @@ def run_jobs(
                         lines = (folder / "output").read_text(errors="replace").strip().splitlines()
                         yield _outcome(job, status, bool(killed), seconds, "\n".join(lines[-6:]))
                         shutil.rmtree(folder, ignore_errors=True)
-                    elif seconds > timeout and not killed:
+                    elif seconds > timeout * job.patience and not killed:
                         killed.add(pid)
                         os.killpg(pid, signal.SIGKILL)
         finally:

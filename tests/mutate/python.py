@@ -67,6 +67,13 @@ class _Walker:
                 if not rules.is_hint(key):
                     self.walk(value, scope, cuda)
             return
+        if isinstance(node, ast.arguments):
+            named = [*zip([*node.posonlyargs, *node.args][::-1], node.defaults[::-1]), *zip(node.kwonlyargs, node.kw_defaults)]
+            for argument, default in named:
+                if default is not None:
+                    self.walk(default, scope, cuda or argument.arg in rules.CUDA_ARGUMENTS)
+            return
+        cuda = cuda or (isinstance(node, ast.keyword) and node.arg in rules.CUDA_ARGUMENTS)
         body_cuda, else_cuda = rules.sides(node)
         for field, child in ast.iter_fields(node):
             if field in ("annotation", "returns", "decorator_list", "type_params"):

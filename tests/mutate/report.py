@@ -6,6 +6,7 @@ from collections import Counter
 from tests.mutate.candidates import KERNELS, ROOT, Candidate
 
 KILLED = ("killed", "timeout")
+NOTICED_BY_NONE = ("survived", "untested", "broken")
 
 
 def difference(candidate: Candidate) -> str:
@@ -26,12 +27,12 @@ def summary(drawn: list[Candidate], status: dict[str, str], reasons: dict[str, s
 
     Args:
         drawn: The sample.
-        status: By number of the mutant: killed, timeout, survived, broken; mutants that were not run are missing.
+        status: By number of the mutant: killed, timeout, survived, untested, broken; mutants that were not run are missing.
         reasons: By number, why a mutant is claimed to be equivalent.
     """
     parts = []
     for c in drawn:
-        if status.get(c.id) in ("survived", "broken"):
+        if status.get(c.id) in NOTICED_BY_NONE:
             parts.append(f"{status[c.id].upper()}  {describe(c)}\n{difference(c)}")
     claimed = [c for c in drawn if c.id in reasons]
     parts += [f"CLAIMED  {describe(c)}\n    {reasons[c.id]}" for c in claimed]
@@ -40,7 +41,7 @@ def summary(drawn: list[Candidate], status: dict[str, str], reasons: dict[str, s
         own = [c for c in drawn if c.file == file]
         n = Counter("claimed" if c.id in reasons else status.get(c.id, "not run") for c in own)
         table.append(
-            f"{file:<28}{len(own):>7}{n['killed']:>8}{n['timeout']:>9}{n['survived'] + n['broken']:>10}{n['claimed']:>9}"
+            f"{file:<28}{len(own):>7}{n['killed']:>8}{n['timeout']:>9}{sum(n[w] for w in NOTICED_BY_NONE):>10}{n['claimed']:>9}"
         )
     parts.append("\n".join(table))
     run = [c for c in drawn if c.id in status and c.id not in reasons]

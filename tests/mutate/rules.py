@@ -26,6 +26,9 @@ CUDA_FUNCTIONS = {
 }
 """What only a CUDA device runs, beside the branches that `sides` finds."""
 
+CUDA_ARGUMENTS = {"deterministic", "block_dim"}
+"""Arguments that mean something on CUDA alone: their defaults, and what is passed for them, are judged there."""
+
 LIMITS, LIMITS_PROJECT, LIMITS_BLEND = (f"kernels/test_limits{what}.py" for what in ("", "_project", "_blend"))
 SPANS, CUTS = "kernels/test_spans.py", "kernels/test_bridge.py"
 EXTREMES, LAYERS = "numerics/test_extreme_projection.py", "numerics/test_extreme_compositing.py"
@@ -49,18 +52,24 @@ OPS = {
 }
 """The tests of a file by the beginning of its name, the longest that fits; those that fail soonest come first."""
 
+CUDA_OPS = {
+    "adam": ["pipeline/test_graph.py"], "bridge": ["kernels/test_project.py", "pipeline/test_graph.py"],
+    "tiles": ["pipeline/test_graph.py"],
+}  # fmt: skip
+"""More of them for CUDA: steps that are recorded and replayed."""
 
 SKIPPED = ("tests/kernels/test_blend.py::test_gradcheck",)
 """Tests that take most of a minute, and check what another in the list checks to the same digits by other means."""
 
 
-def tests_of(file: str) -> list[str]:
-    """Test files for a kernel file, given by its path below warpgs/kernels."""
+def tests_of(file: str, cuda: bool) -> list[str]:
+    """Test files for a kernel file, given by its path below warpgs/kernels, on CUDA or on the CPU."""
     stem = file.removeprefix("cuda/").split(".")[0]
     op = max((name for name in OPS if stem.startswith(name)), key=len)
     if file.startswith("cuda/blend"):
         op = "blend_cuda"
-    return [f"tests/{name}" for name in dict.fromkeys([*OPS[op], CUTS])]
+    more = CUDA_OPS.get(op, []) if cuda else [CUTS]
+    return [f"tests/{name}" for name in dict.fromkeys([*OPS[op], *more])]
 
 
 def left_out(node: ast.AST) -> bool:
