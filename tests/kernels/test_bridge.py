@@ -122,6 +122,19 @@ def test_every_op_gives_the_same_bits_in_ranges(monkeypatch, whole, poisoned_mem
         assert torch.equal(a, b), i
 
 
+def test_items_run_in_any_order(monkeypatch, whole, poisoned_memory):
+    """One by one from the last to the first: the same bits, since none may rely on another having run."""
+
+    def backwards(kernel, count, inputs, device, **_):
+        arrays = [a.array() if isinstance(a, bridge.View) else a for a in inputs]
+        for i in reversed(range(count)):
+            wp.launch(kernel, 1, inputs=[i, *arrays], device="cpu")
+
+    monkeypatch.setattr(bridge, "launch", backwards)
+    for i, (a, b) in enumerate(zip(whole, everything(), strict=True)):
+        assert torch.equal(a, b), i
+
+
 def test_memory_that_nobody_wrote_is_not_read(whole, poisoned_memory):
     """Scratch and outputs full of NaN and of the largest numbers beforehand: the same bits."""
     for i, (a, b) in enumerate(zip(whole, everything(), strict=True)):

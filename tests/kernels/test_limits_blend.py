@@ -115,6 +115,17 @@ def test_tiles_of_one_instance_each(device):
     assert single.total.tolist() == [1] and single.ranges[4].tolist() == [0, 1] and single.splat_ids.tolist() == [0]
 
 
+def test_a_gaussian_of_every_tile(device, dtype):
+    """A hundred tiles, each of which lists it once."""
+    gaussians, cam = facing(2, dtype, device, size=160)
+    gaussians.log_scales[1] += 6.0
+    splats, counts = run(gaussians, cam)
+    made = tiles.bin_tiles(splats, counts, width=160, height=160, rule=EXACT)
+    assert counts.tolist() == [[1, 100]] and made.total.tolist() == [101]
+    assert sorted(made.tile_ids.tolist()) == sorted([0, *range(100)])
+    assert (made.ranges[:, 1] - made.ranges[:, 0]).tolist() == [2] + [1] * 99
+
+
 def test_nothing_has_no_length(device):
     """No Gaussians, and none that is seen: every list is empty and the total is 0."""
     for gaussians in (cloud(0, device=device), cloud(3, device=device)):

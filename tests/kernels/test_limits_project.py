@@ -129,9 +129,9 @@ def test_an_opacity_equal_to_the_cut_is_drawn_and_none_is_not(device, dtype):
     assert (run(gaussians, cam, SMOOTH)[1] > 0).tolist() == [[True, True, False]]
 
 
-@pytest.mark.parametrize("logit", [-700.0, -40.0, -3.0, 0.0, 0.7, 3.0, 40.0, 700.0])
+@pytest.mark.parametrize("logit", [-700.0, -40.0, -3.0, 0.0, 0.7, 3.0, 40.0, 700.0, 1000.0])
 def test_opacities_equal_the_sigmoid(device, logit):
-    """On both sides and far out, in float64."""
+    """On both sides and far out, in float64, whose exponential overflows beyond 709."""
     gaussians, cam = facing(1, torch.float64, device)
     gaussians.logit_opacities[:] = logit
     found = run(gaussians, cam, dataclasses.replace(SMOOTH, near=0.01))[0][0, 0, 5].cpu()
