@@ -221,6 +221,9 @@ def test_which_tests_run_where(monkeypatch):
     assert "tests/kernels/test_bridge.py" in rules.tests_of("bridge.py", True)
     assert "tests/kernels/test_bridge.py" not in job_of(drawn[1], True, untested).tests
     assert "tests/kernels/test_bridge.py" in job_of(drawn[1], False, untested).tests
+    ends |= {f"{test} on CUDA": "untested" for test, _ in found}
+    with pytest.raises(SystemExit, match="do they see the device"):
+        check_unmutated(found, arguments([]))
     ends["tests/kernels/test_knn.py on the CPU"] = "broken"
     with pytest.raises(SystemExit, match=r"fail without a mutant: .*test_knn"):
         check_unmutated(found, arguments([]))

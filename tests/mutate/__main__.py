@@ -93,6 +93,9 @@ def check_unmutated(tests: list[tuple[str, bool]], options: argparse.Namespace) 
             untested.append(outcome.name)
         found = f"passes in {outcome.seconds:.0f} s" if outcome.status == "survived" else "has no test"
         print(f"unmutated: {outcome.name} {found}", flush=True)
+    on_cuda = {named(test, cuda) for test, cuda in tests if cuda}
+    if on_cuda and on_cuda <= set(untested):
+        sys.exit(f"none of {len(on_cuda)} test files has a test that runs on CUDA; do they see the device?")
     return untested
 
 
