@@ -139,6 +139,27 @@ def test_opacities_equal_the_sigmoid(device, logit):
     assert abs(float(found - wanted)) <= 1e-13 * float(wanted)
 
 
+@pytest.mark.parametrize("log_scale", [3.0, 9.0, 14.0, 20.0])
+def test_factors_of_the_largest_shrink_as_the_scale_grows(device, log_scale):
+    """Beside its size the low-pass is nothing: each entry of the factor is homogeneous of degree -1 in the scales (Euler)."""
+    gaussians, cam = facing(1, torch.float64, device)
+    gaussians.quats[:] = torch.tensor([0.8, 0.3, -0.4, 0.2])
+    gaussians.log_scales[:] = torch.tensor([0.0, -0.3, 0.4]) + log_scale
+    moving = leaves(gaussians)
+    splats, _ = run(moving, cam, dataclasses.replace(SMOOTH, low_pass=1e-9, near=0.01))
+    for k in (2, 3, 4):
+        (gradient,) = torch.autograd.grad(splats[0, 0, k], moving.log_scales, retain_graph=True)
+        value = float(splats[0, 0, k].detach())
+        assert value != 0 and abs(float(gradient.sum()) + value) <= 1e-9 * abs(value), k
+
+
+def test_tiles_have_16_px_unless_it_is_said(device):
+    """A picture of 17 px has two columns and two rows of them."""
+    gaussians, cam = facing(1, device=device, size=17)
+    gaussians.log_scales.add_(6.0)
+    assert run(gaussians, cam)[1].tolist() == [[4]]
+
+
 def test_a_colour_of_exactly_zero_has_no_gradient():
     """The clamp begins at zero: its slope there is that of the flat side; just above it is one.
 
