@@ -93,7 +93,8 @@ def test_hidden_blocks_and_their_errors():
 
 
 @pytest.mark.parametrize(
-    "bad", [{"share": 0}, {"share": math.nan}, {"levels": 0}, {"noise": -1}, {"keep_db": math.nan}, {"share": 0.6}, {"trims": 0}]
+    "bad",
+    [{"share": 0}, {"share": math.nan}, {"levels": 0}, {"noise": -1}, {"keep_db": math.nan}, {"share": 0.6}, {"trims": 0}],
 )
 def test_bad_settings_are_refused(bad):
     with pytest.raises(UsageError, match="judge"):

@@ -63,7 +63,8 @@ def test_a_pair_covers_what_it_covered(apart, opacity):
         for mean, scale, logit in zip(rows["means"].double(), rows["log_scales"].double().exp(), rows["logit_opacities"]):
             flat = scale.sort().values  # the long axis is x in both
             left = left * (
-                1 - logit.double().sigmoid() * torch.exp(-0.5 * (((x - mean[0]) / flat[2]) ** 2 + ((y - mean[1]) / flat[1]) ** 2))
+                1
+                - logit.double().sigmoid() * torch.exp(-0.5 * (((x - mean[0]) / flat[2]) ** 2 + ((y - mean[1]) / flat[1]) ** 2))
             )
         return float((1 - left).sum()) * 1e-4
 

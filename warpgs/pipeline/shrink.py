@@ -141,7 +141,7 @@ def merge_neighbours(
     for number in range(PASSES):
         part = min(1.0, (number + 1) / RAMP)
         pairs = merges(gaussians, looks.coverage(gaussians).maxima, kinds, odd=bool(number % 2), shift=number / PASSES)
-        taken = cheapest(gaussians, pairs, lambda g: accepted(g, part))
+        taken = cheapest(gaussians, pairs, lambda g, part=part: accepted(g, part))
         if taken:
             change = pairs.change(len(gaussians), taken)
             place = torch.empty_like(kinds, dtype=torch.int64)
