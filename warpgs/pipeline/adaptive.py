@@ -183,8 +183,8 @@ class AdaptiveFit(Fit):
             self.levels.append(Level(self.step, count, decibels(errors), fall.mean, own.mean, least.mean, least.noise))
             if least.surely_below(c.least_db, c.noise):
                 self.why = (
-                    f"level {len(self.levels)} bought {least.mean:+.3f} dB on the held-out blocks, which with {c.noise:g} x its "
-                    f"noise of {least.noise:.3f} dB is less than {c.least_db:g} dB"
+                    f"level {len(self.levels)} bought {least.mean:+.3f} dB on the held-out blocks, which with {c.noise:g} x "
+                    f"its noise of {least.noise:.3f} dB is less than {c.least_db:g} dB"
                 )
                 if bool(old.all()):
                     self.why = f"no Gaussian came with level {len(self.levels)}: there is no room, or nothing to add"
@@ -215,8 +215,8 @@ class AdaptiveFit(Fit):
         self.views = self.whole
         self._plan()
         self.news.append(
-            f"adaptive: growth ended at step {self.step} with {len(self.gaussians):,} Gaussians, because {self.why}; all pixels "
-            f"are trained on from here"
+            f"adaptive: growth ended at step {self.step} with {len(self.gaussians):,} Gaussians, because {self.why}; all "
+            f"pixels are trained on from here"
         )
 
     @torch.no_grad()
