@@ -17,7 +17,7 @@ from warpgs.pipeline.density import DensityConfig
 from warpgs.pipeline.fit import Fit
 from warpgs.pipeline.init import InitConfig
 from warpgs.pipeline.judge import JudgeConfig
-from warpgs.scene import View
+from warpgs.scene import PointCloud, View
 
 CPU = torch.device("cpu")
 GROWING = FitConfig(
@@ -33,12 +33,14 @@ def advanced(config: FitConfig, steps: int) -> AdaptiveFit:
     return fit
 
 
-def finished(views: list[View], steps: int = 200, preset: str = "quick", **changes) -> AdaptiveFit:
-    config = dataclasses.replace(PRESETS[preset], steps=steps, adaptive=True, **changes)
-    fit = AdaptiveFit(views, None, config, CPU, priors=priors(views))
+def finished(views: list[View], trims: int, points: PointCloud | None = None, steps: int = 200) -> AdaptiveFit:
+    quick = dataclasses.replace(PRESETS["quick"], judge=JudgeConfig(trims=trims))
+    start = quick.init if points is None else dataclasses.replace(quick.init, source="points")
+    fit = AdaptiveFit(
+        views, points, dataclasses.replace(quick, steps=steps, adaptive=True, init=start), CPU, priors=priors(views)
+    )
     while fit.step < steps:
-        last = fit.advance()
-    fit.last = last
+        fit.advance()
     return fit
 
 
@@ -60,52 +62,55 @@ def test_growth_is_judged_and_then_all_pixels_count():
     while fit.step < 60:
         assert fit.advance().count == count
     c = complexity(fit)
-    assert c["count"] == count == c["shrunk"]["count_after"]
-    assert c["shrunk"]["count_before"] - c["shrunk"]["merged"] - c["shrunk"]["pruned"] + c["shrunk"]["added"] == count
-    assert c["bytes"] == c["shrunk"]["bytes_after"] <= c["shrunk"]["bytes_before"]
+    assert c["count"] == count and c["trims"] == []
     assert c["marginal_db"] == c["levels"][-1]["gain"] == min(c["levels"][-1][k] for k in ("fall", "own"))
     assert c["why"] and c["why"] in told[-1] and c["why"] in complexity_sentence({"complexity": c})
     json.dumps(c)
 
 
-def test_everything_by_row_stays_aligned():
-    """After growth, shrinking and sorting: one row of every tensor for every Gaussian, moments finite, degrees ascending."""
-    fit = advanced(GROWING, 60)
+BY_ROW = ("param", "mean", "square", "density", "layers", "limits")
+
+
+def test_trimmed_within_the_loss_and_everything_by_row_stays_aligned():
+    """Smaller after each trim, training in between, at the end no worse than allowed, and one row of everything for each."""
+    config = dataclasses.replace(GROWING, judge=dataclasses.replace(GROWING.judge, trim_db=0.2, mended_db=0.6, trims=2))
+    fit = advanced(config, 60)
+    c, closed = complexity(fit), fit.closed
+    first, last = c["trims"]
+    assert [first["step"], last["step"]] == [closed + round((60 - closed) / 2), 60]
+    assert first["before"] > first["after"] == last["before"] >= last["after"] == c["count"] == len(fit.gaussians)
+    assert first["after"] < 0.9 * first["before"] and first["psnr"][0] - first["psnr"][1] <= 0.6
+    assert last["psnr"][1] == pytest.approx(fit._view_psnr(fit.gaussians), abs=1e-9)
+    assert last["psnr"][1] >= min(first["psnr"][0] - 0.2, last["psnr"][0]) - 1e-6 and last["psnr"][0] > first["psnr"][1]
+    assert "trimmed at step 60" in fit.news[-1]
+
     tensors, _ = fit.state()
-    count = len(fit.gaussians)
-    by_row = [n for n in tensors if n.split(".")[0] in ("param", "mean", "square", "density", "layers", "limits")]
-    assert len(by_row) == 15 + 2 + 2 + 3 and all(len(tensors[n]) == count for n in by_row)
-    assert bool((fit.optimizer.limits.degree.diff() >= 0).all())
+    by_row = [n for n in tensors if n.split(".")[0] in BY_ROW]
+    assert len(by_row) == 15 + 2 + 2 + 3 and all(len(tensors[n]) == c["count"] for n in by_row)
+    assert tensors["param.sh"].shape[1] == 4 and bool((fit.optimizer.limits.degree.diff() >= 0).all())
     flat = fit.optimizer.limits.degree == 0
     assert bool(flat.any()) and not bool(fit.gaussians.sh[flat, 1:].any())
     assert bool((fit.gaussians.log_scales >= fit.optimizer.limits.floor[:, None] - 1e-6).all())
     assert all(bool(t.isfinite().all()) for n, t in tensors.items() if n.startswith(("param", "mean", "square")))
 
 
-def test_finished_model_is_trimmed_within_its_loss():
-    """The last step leaves a smaller model, no further from its views than allowed, and rows for each Gaussian."""
-    before = advanced(GROWING, 60)
-    config = dataclasses.replace(GROWING, judge=dataclasses.replace(GROWING.judge, trim_db=0.5))
-    fit = advanced(config, 60)
-    c = complexity(fit)
-    assert c["count"] == len(fit.gaussians) < 0.9 * len(before.gaussians)
-    assert c["shrunk"]["trimmed"] == len(before.gaussians) - c["count"] and c["bytes"] == c["shrunk"]["bytes_after"]
-    assert before._view_psnr(before.gaussians) - fit._view_psnr(fit.gaussians) == pytest.approx(
-        c["shrunk"]["trim_db"], abs=1e-6
-    )
-    assert c["shrunk"]["trim_db"] <= 0.5 and "was trimmed to" in fit.news[-1]
-    tensors, _ = fit.state()
-    by_row = [n for n in tensors if n.split(".")[0] in ("param", "mean", "square", "density", "layers", "limits")]
-    assert all(len(tensors[n]) == c["count"] for n in by_row) and tensors["param.sh"].shape[1] == 4
-    assert bool((fit.optimizer.limits.degree.diff() >= 0).all())
+def test_of_a_trimmed_model_no_more_is_hidden_than_of_the_whole():
+    """The number shown is that of the whole model with dropout, and all where fewer are left."""
+    fit = AdaptiveFit(photographs(3), seeds(), dataclasses.replace(GROWING, dropout=0.5), CPU)
+    assert fit._settings(60) == (0.5, 60)
+    fit.trims = [{"before": 100, "after": 80}]
+    assert fit._settings(60)[0] == pytest.approx(1 - 0.5 / 0.8)
+    fit.trims.append({"before": 80, "after": 40})
+    assert fit._settings(60)[0] == 0
 
 
-@pytest.mark.parametrize("at", [17, 24, 45])
+@pytest.mark.parametrize("at", [17, 24, 50])
 def test_continued_fit_equals_uninterrupted_one(tmp_path, at):
-    """Saved before a judgement, between two, or after growth, and continued: the same bits and the same story at the end."""
-    straight = advanced(GROWING, 60)
-    save_checkpoint(tmp_path, *advanced(GROWING, at).state())
-    resumed = AdaptiveFit(photographs(4), seeds(), GROWING, CPU)
+    """Saved before a judgement, between two, or between trims, and continued: the same bits and the same story at the end."""
+    config = dataclasses.replace(GROWING, dropout=0.3, judge=dataclasses.replace(GROWING.judge, trim_db=0.2, trims=2))
+    straight = advanced(config, 60)
+    save_checkpoint(tmp_path, *advanced(config, at).state())
+    resumed = AdaptiveFit(photographs(4), seeds(), config, CPU)
     resumed.load(*load_checkpoint(tmp_path))
     while resumed.step < 60:
         resumed.advance()
@@ -149,9 +154,26 @@ def _turned():
 
 def test_a_wall_of_one_colour_needs_next_to_nothing():
     """Under 50 Gaussians of degree 0 for a card of one colour that fills the views, and it is seen as it is."""
-    fit = finished(cards.photographs(cards.plain, half=(9, 9), width=64, height=48))
+    fit = finished(cards.photographs(cards.plain, half=(9, 9), width=64, height=48), 1)
     c = complexity(fit)
-    assert c["count"] < 50 and c["mean_degree"] == 0 and fit.last.psnr > 40
+    assert c["count"] < 50 and c["mean_degree"] == 0 and fit._view_psnr(fit.gaussians) > 40
+
+
+def test_a_card_that_ends_before_black_needs_little():
+    """Its border is sharp, and Gaussians are not: more than for a wall, but a tenth of what there was."""
+    fit = finished(cards.photographs(cards.plain, width=64, height=48), 4, cards.points())
+    c = complexity(fit)
+    assert c["count"] < 150 and c["count"] < 0.1 * c["trims"][0]["before"] and c["mean_degree"] == 0
+    assert fit._view_psnr(fit.gaussians) >= c["trims"][0]["psnr"][0] - 0.1 - 1e-6
+
+
+def test_size_follows_content_more_than_pixels_and_views():
+    """Of a smooth wall four times the pixels make less than twice the Gaussians, a view a second time less than half more."""
+    start = cards.points(400, (2.0, 1.4))
+    walls = [cards.photographs(cards.smooth, half=(9, 9), width=w, height=3 * w // 4) for w in (64, 128)]
+    again = [*walls[0], dataclasses.replace(walls[0][1], name="again.png")]
+    once, fine, twice = (complexity(finished(v, 4, start))["count"] for v in (*walls, again))
+    assert fine < 2 * once and twice < 1.5 * once
 
 
 def test_command_line_says_what_the_model_takes(tmp_path, capsys):

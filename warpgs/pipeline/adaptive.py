@@ -6,6 +6,7 @@ docs/complexity.md. The fit itself is that of `fit.Fit`; this room decides when 
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import asdict, dataclass
 
 import torch
@@ -56,8 +57,8 @@ class AdaptiveFit(Fit):
         self.why = ""
         """Why growth stopped, for the user."""
         self.levels: list[Level] = []
-        self.shrunk: dict[str, int] = {}
-        """Gaussians and bytes before and after shrinking, and what each means took."""
+        self.trims: list[dict] = []
+        """Step of each trim, and the Gaussians and the training PSNR [dB] before and after it."""
         super().__init__(*args, **kwargs)
         c = self.config
         begins = self.phases.refine if c.method.events else c.density.times(c.steps)[0]
@@ -106,17 +107,33 @@ class AdaptiveFit(Fit):
     def _samples_after(self, step: int) -> bool:
         return super()._samples_after(step) and (self.closed is None or step < self.closed)
 
+    def _settings(self, step: int) -> tuple[float, int]:
+        """As the fit has it, but of a trimmed model no fewer Gaussians are shown than would have been of the whole one.
+
+        Hiding some teaches the others to stand in for them, and what could be spared that way has gone.
+        """
+        probability, number = super()._settings(step)
+        kept = math.prod(t["after"] / t["before"] for t in self.trims)
+        return max(0.0, 1 - (1 - probability) / kept), number
+
     def _judges_after(self, step: int) -> bool:
         return self.judging and self.closed is None and step in self.marks
 
+    def _trims_after(self, step: int) -> bool:
+        c = self.config.judge
+        if self.closed is None or not c.trim_db > 0:
+            return False
+        rest = self.config.steps - self.closed
+        return step in {self.closed + round(k * rest / c.trims) for k in range(1, c.trims + 1)}
+
     def _changes_after(self, step: int) -> bool:
-        return super()._changes_after(step) or self._judges_after(step)
+        return super()._changes_after(step) or self._judges_after(step) or self._trims_after(step)
 
     def _change_set(self, phase: Phase) -> None:
         if self._judges_after(self.step):
             self._judge()
         super()._change_set(phase)
-        if self.judging and self.step == self.config.steps and self.config.judge.trim_db > 0:
+        if self._trims_after(self.step):
             self._trim()
 
     def _refine(self, phase: Phase) -> None:
@@ -164,15 +181,13 @@ class AdaptiveFit(Fit):
             least: Gain = min(fall, own, key=lambda g: g.mean)
             count = len(self.gaussians)
             self.levels.append(Level(self.step, count, decibels(errors), fall.mean, own.mean, least.mean, least.noise))
-            if not least.bought(c.noise):
+            if least.surely_below(c.least_db, c.noise):
                 self.why = (
-                    f"level {len(self.levels)} bought {least.mean:+.3f} dB on the held-out blocks, less than "
-                    f"{c.noise:g} x its noise of {least.noise:.3f} dB"
+                    f"level {len(self.levels)} bought {least.mean:+.3f} dB on the held-out blocks, which with {c.noise:g} x "
+                    f"its noise of {least.noise:.3f} dB is less than {c.least_db:g} dB"
                 )
                 if bool(old.all()):
                     self.why = f"no Gaussian came with level {len(self.levels)}: there is no room, or nothing to add"
-                if not own.bought(c.noise) and bool(old.any()):
-                    self._change(torch.nonzero(old).squeeze(1))
                 self._close()
                 return
             if self.step == self.marks[-1]:
@@ -182,62 +197,26 @@ class AdaptiveFit(Fit):
         self.before = errors
         limits.growing += 1
 
-    def _change(self, keep: torch.Tensor) -> None:
-        nothing = {n: t[:0] for n, t in self.gaussians.tensors().items()}
-        self._apply(Refinement(keep, nothing, keep[:0]), COARSE, LONG_AGO)
-
     def _close(self) -> None:
-        """End growth: shrink the model as far as held-out evidence allows, and train on all pixels from here on."""
+        """End growth: no harmonics but those that held-out evidence asks for, and all pixels are trained on from here on."""
         c, limits = self.config.judge, self.optimizer.limits
         self.closed = self.step
-        self._observe()
-        base, looks = self._errors(self.gaussians), self._looks
-        degrees = shrink.stored_degrees(self.gaussians.sh)
-        self.shrunk = {
-            "count_before": len(self.gaussians),
-            "bytes_before": model_bytes(degrees),
-            "merged": 0,
-            "pruned": 0,
-            "added": 0,
-        }
-        parts = max(1, c.merge + c.prune + c.degrees)
-        spent = 0
-
-        def accepted(model: Gaussians) -> bool:
-            return gain(base, self._errors(model)).cost_at_most(c.keep_db * spent / parts, c.noise * spent / parts)
-
-        if c.merge:
-            spent += 1
-
-            def merged(change: Refinement) -> tuple[Gaussians, torch.Tensor]:
-                self._apply(change, COARSE, LONG_AGO)
-                return self.gaussians, self.layers.level
-
-            self.shrunk["merged"] = shrink.merge_neighbours(self.gaussians, self.layers.level, looks, accepted, merged)
-        if c.prune:
-            spent += 1
-            keep = shrink.dispensable(self.gaussians, looks, accepted)
-            self.shrunk["pruned"] = len(self.gaussians) - len(keep)
-            self._change(keep)
         self._catch_up()
         self._observe()
         if c.degrees:
-            spent += 1
-            limits.degree = shrink.needed_degrees(self.gaussians, limits.degree, looks, accepted)
-        order = torch.argsort(limits.degree, stable=True)  # along the Morton curve within each degree
-        self.optimizer.reorder(order)
-        self.layers.reorder(order)
+            base = self._errors(self.gaussians)
+            limits.degree = shrink.needed_degrees(
+                self.gaussians, limits.degree, self._looks,
+                lambda model: gain(base, self._errors(model)).cost_at_most(c.keep_db, c.noise),
+            )  # fmt: skip
         limits.enforce(self.optimizer.params)
-        self.shrunk |= {"count_after": len(order), "bytes_after": model_bytes(limits.degree)}
-        self.stats = type(self.stats)(len(order), self.device)
+        self.stats = type(self.stats)(len(self.gaussians), self.device)
         self.graphs.clear()
         self.views = self.whole
         self._plan()
-        n, told = self.shrunk, float(limits.degree.double().mean())
         self.news.append(
-            f"adaptive: growth ended at step {self.step}, because {self.why}; {n['count_before']:,} Gaussians became "
-            f"{len(order):,} ({n['merged']:,} merged, {n['pruned']:,} pruned, {n['added']:,} added in the blocks) of mean "
-            f"degree {told:.2f}; all pixels are trained on from here"
+            f"adaptive: growth ended at step {self.step} with {len(self.gaussians):,} Gaussians, because {self.why}; all "
+            f"pixels are trained on from here"
         )
 
     @torch.no_grad()
@@ -248,26 +227,30 @@ class AdaptiveFit(Fit):
         return float((-10 * torch.log10(torch.stack(errors) + FLOOR)).mean())
 
     def _trim(self) -> None:
-        """Make the finished model smaller within the loss that is allowed on its training views."""
+        """Make the model smaller within the loss that is allowed on its training views, counted from before the first trim."""
         limits, whole, before = self.optimizer.limits, self._view_psnr(self.gaussians), len(self.gaussians)
-        allowed = self.config.judge.trim_db
+        c = self.config
+        promised = self.trims[0]["psnr"][0] if self.trims else whole
+        spare = whole - promised + (c.judge.trim_db if self.step == c.steps else c.judge.mended_db)
         made = shrink.prune_model(
-            self.gaussians, self.layers.level, self._looks, lambda g, share: self._view_psnr(g) >= whole - share * allowed
+            self.gaussians, self.layers.level, self._looks, lambda g, share: self._view_psnr(g) >= whole - share * spare
         )
-        rows = made.gaussians.tensors()
-        lost = self.gaussians.sh.shape[1] - rows["sh"].shape[1]
-        rows["sh"] = torch.nn.functional.pad(rows["sh"], (0, 0, 0, lost))
-        none = torch.zeros(0, dtype=torch.int64, device=self.device)
-        parents = none.new_full((len(made.degrees),), -1)
-        self._apply(Refinement(none, rows, parents), COARSE, LONG_AGO)
-        self.layers.level, limits.degree = made.kinds.to(self.layers.level.dtype), made.degrees
-        self.shrunk |= {
-            "trimmed": before - len(made.degrees), "trim_db": whole - self._view_psnr(self.gaussians),
-            "count_after": len(made.degrees), "bytes_after": model_bytes(made.degrees),
-        }  # fmt: skip
+        old = torch.arange(before, device=self.device)
+        first = old.new_full((len(made.degrees),), before)
+        went = made.into >= 0
+        first = first.scatter_reduce(0, made.into[went], old[went], "amin")  # age and layer of what was merged: its first's
+        nothing = {n: t[:0] for n, t in self.gaussians.tensors().items()}
+        moments = self.optimizer.means | {}, self.optimizer.squares | {}
+        self._apply(Refinement(first, nothing, first[:0]), COARSE, LONG_AGO)
+        self.optimizer.means, self.optimizer.squares = moments
+        self.optimizer.regroup(made.gaussians, made.into)
+        limits.degree = made.degrees
+        self._observe()
+        after = self._view_psnr(self.gaussians)
+        self.trims.append({"step": self.step, "before": before, "after": len(made.degrees), "psnr": [whole, after]})
         self.news.append(
-            f"adaptive: the finished model of {before:,} Gaussians was trimmed to {len(made.degrees):,} for "
-            f"{self.shrunk['trim_db']:.3f} dB on its training views"
+            f"adaptive: trimmed at step {self.step} from {before:,} to {len(made.degrees):,} Gaussians for "
+            f"{whole - after:.3f} dB on the training views"
         )
 
     def _catch_up(self) -> None:
@@ -286,8 +269,6 @@ class AdaptiveFit(Fit):
                 generator=self.generator, max_instances=self.most,
             )  # fmt: skip
             self._apply(event.change, FINE, self.step)
-            self.shrunk["added"] += len(event.change.parents)
-            self.shrunk["pruned"] += event.freed
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict]:
         """As the fit's, with what the judge knows."""
@@ -295,7 +276,7 @@ class AdaptiveFit(Fit):
         if self.before is not None:
             tensors["judge.before"] = self.before
         judge = {
-            "closed": self.closed, "why": self.why, "levels": [asdict(x) for x in self.levels], "shrunk": self.shrunk,
+            "closed": self.closed, "why": self.why, "levels": [asdict(x) for x in self.levels], "trims": self.trims,
             "growing": self.optimizer.limits.growing,
         }  # fmt: skip
         return tensors, plain | {"judge": judge}
@@ -303,7 +284,7 @@ class AdaptiveFit(Fit):
     def load(self, tensors: dict[str, torch.Tensor], plain: dict) -> None:
         """Take over what `state` gave."""
         judge = plain["judge"]
-        self.closed, self.why, self.shrunk = judge["closed"], judge["why"], judge["shrunk"]
+        self.closed, self.why, self.trims = judge["closed"], judge["why"], judge["trims"]
         self.levels = [Level(**x) for x in judge["levels"]]
         self.before = tensors.get("judge.before")
         self.optimizer.limits.growing = judge["growing"]
@@ -330,7 +311,7 @@ def complexity_figures(fit: Fit) -> dict:
     last = fit.levels[-1] if fit.levels else None
     return {"complexity": figures | {
         "why": fit.why, "marginal_db": last and last.gain, "closed": fit.closed, "levels": [asdict(x) for x in fit.levels],
-        "shrunk": fit.shrunk,
+        "trims": fit.trims,
     }}  # fmt: skip
 
 

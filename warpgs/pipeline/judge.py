@@ -24,37 +24,43 @@ AT_MOST = 3
 """What is lost within the noise may be this many times what is allowed."""
 FEWEST = 12
 """With fewer blocks over all views there is no telling a gain from noise."""
+MOST_SHARE = 0.1
+"""Small pictures hold out more than was asked for, up to this share, where it takes that to have `FEWEST` blocks."""
 
 
 @dataclass(frozen=True)
 class JudgeConfig:
     """How an adaptive fit finds its size."""
 
-    share: float = 0.05
+    share: float = 0.03
     """Part of the pixels that is held out until growth ends."""
     levels: int = 4
     """Parts of equal length that growth is judged after."""
     noise: float = 1.0
-    """A level must buy more than this many standard errors of its mean gain over the blocks."""
-    keep_db: float = 0.1
-    """PSNR that merging, pruning and lower degrees together may cost on the held-out blocks, before the rest of the fit mends
-    it [dB]; what is within the noise of that difference may go in any case."""
-    trim_db: float = 0.1
-    """PSNR that the mean over the training views may fall by when the finished model is made smaller [dB]; 0 for not at all."""
-    merge: bool = False
-    """When growth ends, neighbours of like colour become one Gaussian. A fit that is far from done then may lose too much."""
-    prune: bool = True
-    """When growth ends, Gaussians that neither contribute nor matter to any training view are removed."""
+    """Standard errors of the mean gain over the blocks that count as its noise."""
+    least_db: float = 0.02
+    """Growth ends early where a level's gain with its noise is below this [dB]: only where it surely bought nothing."""
     degrees: bool = True
     """Each Gaussian keeps only the spherical harmonics that its views can tell apart and that the held-out blocks ask for."""
+    keep_db: float = 0.1
+    """PSNR that lower degrees may cost on the held-out blocks when growth ends, before the rest of the fit mends it [dB]; what
+    is within the noise of that difference may go in any case."""
+    trims: int = 1
+    """Times that the model is made smaller, at equal distances from the end of growth to the last step. With one it keeps the
+    PSNR of the finished model; with several that of the first time, and what training gains afterwards goes for size."""
+    trim_db: float = 0.1
+    """PSNR on the training views that the last trim may leave the model below that before the first [dB]; 0 for no trims."""
+    mended_db: float = 0.3
+    """The same for the trims before the last: training mends what they take [dB]."""
 
     def __post_init__(self):
         if not 0 < self.share <= 0.5:
             raise UsageError(f"judge share {self.share} must lie above 0 and be at most 0.5")
-        if self.levels < 1:
-            raise UsageError(f"judge levels {self.levels} must be at least 1")
-        if not 0 <= self.noise < math.inf or not 0 <= self.keep_db < math.inf or not 0 <= self.trim_db < math.inf:
-            raise UsageError("judge: noise, keep db and trim db must be 0 or more")
+        if self.levels < 1 or self.trims < 1:
+            raise UsageError(f"judge: levels {self.levels} and trims {self.trims} must be at least 1")
+        for name in ("noise", "least_db", "keep_db", "trim_db", "mended_db"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise UsageError(f"judge {name.replace('_', '-')} must be 0 or more and finite, not {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -78,7 +84,10 @@ class Blocks:
 
 
 def draw_blocks(views: list[TrainingView], share: float, seed: int) -> list[Blocks]:
-    """Squares of a random grid in every view, about ``share`` of its pixels; more than half of each counts by the mask."""
+    """Squares of a random grid in every view, about ``share`` of its pixels; more than half of each counts by the mask.
+
+    In small pictures it is more: see `MOST_SHARE`.
+    """
     found = []
     for number, view in enumerate(views):
         generator = torch.Generator().manual_seed((seed << 16) + number)
@@ -90,7 +99,8 @@ def draw_blocks(views: list[TrainingView], share: float, seed: int) -> list[Bloc
         if view.mask is not None:
             rows, columns = Blocks(side, cells).pixels(view.mask.device)
             cells = cells[(view.mask[rows, columns].mean((1, 2)) > 0.5).cpu()]
-        wanted = min(len(cells), max(1, round(share * len(cells))))
+        least = min(math.ceil(FEWEST / len(views)), int(MOST_SHARE * len(cells)))
+        wanted = min(len(cells), max(1, least, round(share * len(cells))))
         chosen = torch.randperm(len(cells), generator=generator)[:wanted].sort().values
         found.append(Blocks(side, cells[chosen]))
     return found
@@ -148,9 +158,12 @@ class Gain:
     """Standard error of that mean; infinite with fewer than two blocks [dB]. Blocks of a view are not independent, so it is
     rather too small than too large."""
 
-    def bought(self, noises: float) -> bool:
-        """Whether the mean is above so many standard errors, and above 0; a gain that is no number bought nothing."""
-        return self.mean > max(0.0, noises * self.noise)
+    def surely_below(self, least: float, noises: float) -> bool:
+        """Whether the mean and so many standard errors are together below ``least`` [dB]; a gain that is no number is.
+
+        Few blocks are a weak judge: it may end growth that bought nothing, never growth of which it cannot tell.
+        """
+        return not self.mean + noises * self.noise >= least
 
     def cost_at_most(self, allowed: float, noises: float) -> bool:
         """Whether no more was lost than ``allowed`` [dB], or than the noise of the difference up to `AT_MOST` times that.

@@ -125,6 +125,26 @@ class Optimizer:
             self.limits.apply(change)
 
     @torch.no_grad()
+    def regroup(self, rows: Gaussians, into: torch.Tensor) -> None:
+        """Replace the set by one whose Gaussians each stand for some of the old; what moves with them moves on as they did.
+
+        First moments add up as the gradients do, second ones as if the gradients had all had one sign: a step is then rather
+        too short than too long. Summed in float64 on the CPU, where the order is the same every time. Limits are the caller's.
+
+        Args:
+            rows: The new set, M rows.
+            into: Row of the new set that each old one went into, -1 for none, int64, shape [N].
+        """
+        into = into.cpu()
+        old = torch.nonzero(into >= 0).squeeze(1)
+        for name, new in rows.tensors().items():
+            for moments, power in ((self.means, 1.0), (self.squares, 0.5)):
+                each = moments[name].double().cpu()[old] ** power
+                total = each.new_zeros(new.shape).index_add_(0, into[old], each)
+                moments[name] = (total ** (1 / power)).to(moments[name])
+            self.params[name] = new.detach().to(self.params[name].dtype).contiguous().requires_grad_()
+
+    @torch.no_grad()
     def sort_along_curve(self) -> torch.Tensor:
         """Put the Gaussians in Morton order, each with its moments, so that neighbours in space are neighbours in memory.
 

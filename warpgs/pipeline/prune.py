@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 import secrets
@@ -105,6 +106,7 @@ def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str) ->
     kinds = torch.zeros(len(before), dtype=torch.int64, device=device)
     looks = shrink.Looks([TrainingView.of(v, device).camera for v in train], options, stored.record["config"]["seed"])
     made = shrink.prune_model(before, kinds, looks, lambda g, share: mean_psnr(g, train, options) >= whole - share * keep_psnr)
+    made = dataclasses.replace(made, gaussians=shrink.trimmed(made.gaussians))
 
     degrees = shrink.stored_degrees(before.sh)
     sizes = [model_bytes(d) for d in (degrees, made.degrees)]

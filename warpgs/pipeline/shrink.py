@@ -16,11 +16,13 @@ from warpgs.scene import Camera, Gaussians
 
 ROUNDS = 5
 """Halvings of the interval in which the largest share is looked for."""
-PASSES = 12
-"""Most rounds of merging: 2^12 neighbours become one."""
+PASSES = 8
+"""Most rounds of merging: 2^8 neighbours become one."""
 DEGREES_SHARE, MERGE_SHARE = 1 / 3, 2 / 3
 """Parts of the allowed loss of a finished model that may be spent after lower degrees, and after merging; removing takes it
 whole."""
+RAMP = 3
+"""Rounds of merging over which the loss that they may spend grows to the whole."""
 WORTHWHILE = 0.02
 """A round of merging that takes a smaller part of the Gaussians than this is the last."""
 
@@ -121,31 +123,37 @@ def cheapest(gaussians: Gaussians, pairs: Merges, accepted: Callable[[Gaussians]
 
 
 def merge_neighbours(
-    gaussians: Gaussians, kinds: torch.Tensor, looks: Looks, accepted: Callable[[Gaussians], bool],
-    apply: Callable[[Refinement], tuple[Gaussians, torch.Tensor]],
-) -> int:  # fmt: skip
-    """Merge pairs, cheapest first, as long as the model that results is accepted; again and again while it is worthwhile.
+    gaussians: Gaussians, kinds: torch.Tensor, looks: Looks, accepted: Callable[[Gaussians, float], bool]
+) -> tuple[Gaussians, torch.Tensor]:
+    """Merge pairs, cheapest first, in rounds: again and again while it is worthwhile.
 
     Args:
         gaussians: The set.
         kinds: Only Gaussians of the same number are paired, int, shape [N].
         looks: Training views.
-        accepted: What the judge says of a model.
-        apply: Carries out a change; returns the set and the kinds after it.
+        accepted: Whether a model is good enough when that part [0, 1] of the allowed loss may be spent. It grows over the first
+            `RAMP` rounds, for the cheapest pairs of the second are cheaper than the dearest of the first.
 
     Returns:
-        Number of Gaussians fewer than before.
+        The smaller set, and the row of it that each Gaussian went into, int64 [N].
     """
-    before, idle = len(gaussians), 0
+    idle, into = 0, torch.arange(len(gaussians), device=gaussians.means.device)
     for number in range(PASSES):
-        pairs = merges(gaussians, looks.coverage(gaussians).maxima, kinds, odd=bool(number % 2))
-        taken = cheapest(gaussians, pairs, accepted)
+        part = min(1.0, (number + 1) / RAMP)
+        pairs = merges(gaussians, looks.coverage(gaussians).maxima, kinds, odd=bool(number % 2), shift=number / PASSES)
+        taken = cheapest(gaussians, pairs, lambda g, part=part: accepted(g, part))
         if taken:
-            gaussians, kinds = apply(pairs.change(len(gaussians), taken))
+            change = pairs.change(len(gaussians), taken)
+            place = torch.empty_like(kinds, dtype=torch.int64)
+            place[change.keep] = torch.arange(len(change.keep), device=place.device)
+            for half in (pairs.first, pairs.second):
+                place[half[:taken]] = len(change.keep) + torch.arange(taken, device=place.device)
+            into = place[into]
+            gaussians, kinds = changed(gaussians, change), torch.cat([kinds[change.keep], kinds[change.parents]])
         idle = 0 if taken > WORTHWHILE * len(gaussians) else idle + 1
-        if idle == 2 or len(gaussians) < 2:  # neither even nor odd pairs are left
+        if (idle >= 2 and part == 1) or len(gaussians) < 2:
             break
-    return before - len(gaussians)
+    return gaussians, into
 
 
 def dispensable(gaussians: Gaussians, looks: Looks, accepted: Callable[[Gaussians], bool]) -> torch.Tensor:
@@ -177,8 +185,8 @@ class Pruned:
     """Sorted by degree, ascending."""
     degrees: torch.Tensor
     """Degree of each, int32, shape [N], ascending."""
-    kinds: torch.Tensor
-    """Number of each that only its likes were merged with, shape [N]."""
+    into: torch.Tensor
+    """Row that each Gaussian of the larger model went into, -1 where it was removed, int64."""
 
 
 def prune_model(
@@ -199,14 +207,12 @@ def prune_model(
     if bool((degrees > 0).any()):
         model = with_degrees(model, needed_degrees(model, degrees, looks, lambda g: accepted(g, DEGREES_SHARE)))
 
-    def merged(change: Refinement) -> tuple[Gaussians, torch.Tensor]:
-        nonlocal model, kinds
-        model, kinds = changed(model, change), torch.cat([kinds[change.keep], kinds[change.parents]])
-        return model, kinds
-
-    merge_neighbours(model, kinds, looks, lambda g: accepted(g, MERGE_SHARE), merged)
+    begin = DEGREES_SHARE
+    model, into = merge_neighbours(model, kinds, looks, lambda g, part: accepted(g, begin + part * (MERGE_SHARE - begin)))
     keep = dispensable(model, looks, lambda g: accepted(g, 1.0))
-    model, kinds = rows_of(model, keep), kinds[keep]
-    degrees = stored_degrees(model.sh)
+    degrees = stored_degrees(model.sh[keep])
     order = torch.argsort(degrees, stable=True)
-    return Pruned(trimmed(rows_of(model, order)), degrees[order], kinds[order])
+    keep, degrees = keep[order], degrees[order]
+    place = torch.full((len(model),), -1, dtype=torch.int64, device=keep.device)
+    place[keep] = torch.arange(len(keep), device=keep.device)
+    return Pruned(rows_of(model, keep), degrees, place[into])
