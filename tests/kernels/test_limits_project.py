@@ -295,3 +295,18 @@ def test_unseen_gaussians_have_zero_gradients(device, degree):
     for a, b in zip(found, wanted, strict=True):
         assert not bool(a[seen == 0].any())
         assert float((a.double() - b).norm()) <= 1e-4 * float(b.norm())
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_colour_gradients_of_every_degree(device, degree):
+    """Rows of coefficients that are a multiple of 16 bytes long and such that are not: as in float64, one camera or two."""
+    for cameras in (1, 2):
+        found = {}
+        for kind, where in ((torch.float32, device), (torch.float64, torch.device("cpu"))):
+            g, cam = leaves(cloud(60, kind, where, degree=degree)), camera(40, 30, cameras=cameras, dtype=kind, device=where)
+            splats, _ = project(*g.tensors().values(), cam.viewmat, cam.K, width=40, height=30, degree=degree, rule=EXACT)
+            upstream = torch.linspace(-1, 1, splats.numel(), dtype=kind, device=where).view(splats.shape)
+            upstream[..., 9:] = 0
+            found[kind] = torch.autograd.grad((splats * upstream).sum(), [g.sh, g.means])
+        for single, double in zip(found[torch.float32], found[torch.float64], strict=True):
+            close("gradient", single, double)

@@ -142,3 +142,11 @@ def test_statistics_follow_rows():
     stats.gradient[:], stats.seen[:] = torch.tensor([1.0, 2, 3]), torch.tensor([4.0, 5, 6])
     stats.apply(Refinement(torch.tensor([2, 0]), {}, torch.tensor([-1])))
     assert stats.gradient.tolist() == [3, 1, 0] and stats.seen.tolist() == [6, 4, 0]
+
+
+def test_rates_of_scales_may_fall():
+    """Log-linear to the share that is left at the last step; as they are where nothing is asked for."""
+    gaussians = cloud(3)
+    falling = Optimizer(gaussians, OptimizerConfig(scales_lr=0.1, scales_decay=0.01), 1.0)
+    assert [falling.rates(p)["log_scales"] for p in (0.0, 0.5, 1.0)] == pytest.approx([0.1, 0.01, 0.001])
+    assert Optimizer(gaussians, OptimizerConfig(scales_lr=0.1), 1.0).rates(1.0)["log_scales"] == pytest.approx(0.1)

@@ -31,6 +31,8 @@ class OptimizerConfig:
     """Of rotations."""
     scales_lr: float = 0.01
     """Of log scales; 0.005 in the reference (docs/decisions/004-scale-rate.md)."""
+    scales_decay: float = 1.0
+    """Share of that rate which is left at the last step; log-linear between. 1 keeps it as it is."""
     opacities_lr: float = 0.05
     """Of opacity logits."""
     sh_lr: float = 2.5e-3
@@ -67,7 +69,7 @@ class Optimizer:
         return {
             "means": self.extent * log_linear(c.means_lr, c.means_lr_final, progress),
             "quats": c.quats_lr,
-            "log_scales": c.scales_lr,
+            "log_scales": log_linear(c.scales_lr, c.scales_lr * c.scales_decay, progress),
             "logit_opacities": c.opacities_lr,
             "sh": c.sh_lr * c.sh_rest_factor,
         }
