@@ -105,7 +105,7 @@ def _compose(kind: type, values: dict):
 _SPARSE = FitConfig(
     preset="strong-3dgs", steps=3000, sh_every=500, dropout=0.6, phases=PhaseConfig(coarse=2000, stable=3000),
     init=InitConfig(sweep_up_to=30, max_sh_degree=1, merge_px=8, fill_px=32),
-    optimizer=OptimizerConfig(scales_lr=0.1), density=DensityConfig(gradient=5e-4),
+    optimizer=OptimizerConfig(scales_lr=0.1, scales_decay=0.1), density=DensityConfig(gradient=5e-4),
 )  # fmt: skip
 _PAPER = dataclasses.replace(
     _SPARSE, preset="paper",

@@ -78,9 +78,11 @@ class Fit:
         start = initial_points(train, points, config.init, np.random.default_rng(config.seed))
         cloud, self.notes = start.cloud, [line.strip() for line in f"start: {start.how}".splitlines()]
         self.extent = self._extent([v.camera for v in train], cloud)
-        self.optimizer = Optimizer(initial_gaussians(cloud, config.init, self.extent, device), config.optimizer, self.extent)
-        self.stats, self.layers = DensityStats(len(cloud), device), Layers(len(cloud), device)
         self.phases = plan_phases(config.phases, config.steps)
+        settle = self.phases.settle / config.steps if self.phases.settle < config.steps else 0.0
+        gaussians = initial_gaussians(cloud, config.init, self.extent, device)
+        self.optimizer = Optimizer(gaussians, config.optimizer, self.extent, settle)
+        self.stats, self.layers = DensityStats(len(cloud), device), Layers(len(cloud), device)
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
         self.events: list[dict] = []
         self.step, self.reset_done = 0, False

@@ -32,7 +32,8 @@ class OptimizerConfig:
     scales_lr: float = 0.01
     """Of log scales; 0.005 in the reference (docs/decisions/004-scale-rate.md)."""
     scales_decay: float = 1.0
-    """Share of that rate which is left at the last step; log-linear between. 1 keeps it as it is."""
+    """Share of that rate which is left at the last step; log-linear from the beginning of phase 3, or of a fit without phases.
+    1 keeps it as it is."""
     opacities_lr: float = 0.05
     """Of opacity logits."""
     sh_lr: float = 2.5e-3
@@ -49,8 +50,9 @@ class OptimizerConfig:
 class Optimizer:
     """Adam over the five tensors of a set of Gaussians."""
 
-    def __init__(self, gaussians: Gaussians, config: OptimizerConfig, extent: float):
-        self.config, self.extent = config, extent
+    def __init__(self, gaussians: Gaussians, config: OptimizerConfig, extent: float, settle: float = 0.0):
+        """Begin with zero moments; ``settle`` in [0, 1) is the share of the fit after which the rate of scales falls."""
+        self.config, self.extent, self.settle = config, extent, settle
         self.params = {n: t.detach().clone().contiguous().requires_grad_() for n, t in gaussians.tensors().items()}
         self.means = {n: torch.zeros_like(t) for n, t in self.params.items()}
         self.squares = {n: torch.zeros_like(t) for n, t in self.params.items()}
@@ -66,10 +68,11 @@ class Optimizer:
     def rates(self, progress: float) -> dict[str, float]:
         """Learning rate of each tensor at a share [0, 1] of the fit."""
         c = self.config
+        settled = (progress - self.settle) / (1 - self.settle)
         return {
             "means": self.extent * log_linear(c.means_lr, c.means_lr_final, progress),
             "quats": c.quats_lr,
-            "log_scales": log_linear(c.scales_lr, c.scales_lr * c.scales_decay, progress),
+            "log_scales": log_linear(c.scales_lr, c.scales_lr * c.scales_decay, settled),
             "logit_opacities": c.opacities_lr,
             "sh": c.sh_lr * c.sh_rest_factor,
         }
