@@ -45,8 +45,8 @@ def trial_config(trial: str) -> FitConfig:
         *groups, last = key.split(".")
         place = values
         for group in groups:
-            place = place.get(group, {}) if isinstance(place, dict) else {}
-        if not sep or last not in place:
+            place = place.get(group) if isinstance(place, dict) else None
+        if not sep or not isinstance(place, dict) or last not in place:
             raise UsageError(f"trial {trial!r}: {change!r} sets nothing; write GROUP.NAME=VALUE as in optimizer.scales_lr=0.1")
         try:
             place[last] = json.loads(value)
@@ -85,13 +85,12 @@ def table(rows: list[dict], trials: list[str], views: int) -> list[str]:
             by_seed = [[r for r in own if r["seed"] == s] for s in sorted({r["seed"] for r in own})]
             whole = [g for g in by_seed if len(g) == views]
             psnr = [statistics.mean(r["psnr"] for r in g) for g in whole]
-            ssim = [statistics.mean(r["ssim"] for r in g) for g in whole]
-            spread = statistics.stdev(psnr) if len(psnr) > 1 else math.nan
-            cells += (
-                [f"{statistics.mean(psnr):.2f} ± {spread:.2f} ({len(psnr)})", f"{statistics.mean(ssim):.4f}", f"{min(psnr):.2f}"]
-                if whole
-                else ["", "", ""]
-            )
+            if not psnr:
+                cells += ["", "", ""]
+                continue
+            spread = f" ± {statistics.stdev(psnr):.2f}" if len(psnr) > 1 else ""
+            ssim = statistics.mean(r["ssim"] for g in whole for r in g)
+            cells += [f"{statistics.mean(psnr):.2f}{spread} ({len(psnr)})", f"{ssim:.4f}", f"{min(psnr):.2f}"]
         lines.append(f"| `{trial}` | " + " | ".join(cells) + " |")
     return lines
 

@@ -145,7 +145,7 @@ def test_statistics_follow_rows():
 
 
 def test_rates_of_scales_may_fall():
-    """Log-linear to the share that is left at the last step, from where the set settles; as they are where nothing is asked for."""
+    """Log-linear to the share that is left at the last step, from where the set settles; level where nothing is asked for."""
     gaussians = cloud(3)
     falling = Optimizer(gaussians, OptimizerConfig(scales_lr=0.1, scales_decay=0.01), 1.0)
     assert [falling.rates(p)["log_scales"] for p in (0.0, 0.5, 1.0)] == pytest.approx([0.1, 0.01, 0.001])
