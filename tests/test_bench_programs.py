@@ -1,10 +1,12 @@
 """The benches that are programs of their own still run on tiny sizes; how long things take is nobody's test."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
-from bench import accuracy, many, needles, step
+from bench import accuracy, fused, many, needles, step
 from tests.scenes import photographs, seeds
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.fit import Fit
@@ -19,11 +21,10 @@ def test_stages_of_a_step(device):
     assert len(table) == 9 and all(row["median_ms"] > 0 for row in table.values())
 
 
-@pytest.mark.cuda
-def test_many_gaussians_train(tmp_path):
-    """The program that trains ten million trains a few hundred too: the loss falls."""
+def points(folder: Path) -> str:
+    """A file as `bench.garden` reads it, of 400 points."""
     generator = np.random.default_rng(0)
-    path = tmp_path / "points.npz"
+    path = folder / "points.npz"
     K = np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]], np.float32)
     viewmat = np.eye(4, dtype=np.float32)
     viewmat[2, 3] = 3
@@ -31,8 +32,23 @@ def test_many_gaussians_train(tmp_path):
         path, means3d=generator.uniform(-1, 1, (400, 3)).astype(np.float32), colors=generator.integers(0, 255, (400, 3)),
         viewmats=viewmat[None], Ks=K[None], width=64, height=48,
     )  # fmt: skip
-    result = many.train(str(path), 300, 64, 48, 120)
+    return str(path)
+
+
+@pytest.mark.cuda
+def test_many_gaussians_train(tmp_path):
+    """The program that trains ten million trains a few hundred too: the loss falls."""
+    result = many.train(points(tmp_path), 300, 64, 48, 120)
     assert result["loss_last"] < result["loss_first"] and result["gaussians"] == 300
+
+
+@pytest.mark.cuda
+def test_fused_and_separate_steps_are_compared(tmp_path):
+    """Both have times, and the same bits after 20 steps."""
+    row = fused.compare(points(tmp_path), 1, 64, 48, repeats=6)
+    assert row["same_bits"] and max(row["difference"].values()) == 0
+    assert all(row[k][who]["median"] > 0 for k in ("wall_ms", "gpu_ms") for who in ("fused", "apart"))
+    assert len(fused.lines("tiny", row)) == 4
 
 
 def test_the_smooth_picture_is_a_picture():

@@ -45,6 +45,7 @@ OPS = {
     "knn": ["kernels/test_knn.py", LIMITS],
     "native": ["kernels/test_project.py", "kernels/test_tiles.py", "test_rasterizer.py", LIMITS_PROJECT, LIMITS_BLEND],
     "project": ["kernels/test_project.py", LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "test_rasterizer.py"],
+    "project_adam": ["kernels/test_project_adam.py"],
     "project_backward": ["kernels/test_project.py", LIMITS_PROJECT, EXTREMES, "test_rasterizer.py"],
     "sh": ["kernels/test_sh.py", "kernels/test_project.py"],
     "ssim": ["kernels/test_ssim.py", LIMITS],
@@ -54,7 +55,7 @@ OPS = {
 
 CUDA_OPS = {
     "adam": ["pipeline/test_graph.py"], "bridge": ["kernels/test_project.py", "pipeline/test_graph.py"],
-    "tiles": ["pipeline/test_graph.py"],
+    "project_adam": ["pipeline/test_graph.py"], "tiles": ["pipeline/test_graph.py"],
 }  # fmt: skip
 """More of them for CUDA: steps that are recorded and replayed."""
 

@@ -1,6 +1,7 @@
 """Recorded steps on CUDA: the same bits as step by step, whatever happens on the way."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import torch
 
 from tests.pipeline.test_method import CONFIG as METHOD
 from tests.scenes import photographs, priors, seeds
+from warpgs.pipeline import fit as fit_module
 from warpgs.pipeline import graph
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.density import DensityConfig
@@ -61,6 +63,16 @@ def test_recorded_method_equals_single_steps():
     a, b = single.state()[0], recorded.state()[0]
     assert single.events == recorded.events and len(single.events) > 2
     assert all(torch.equal(a[k], b[k]) for k in a) and [r.count for r in said] == [r.count for r in reports]
+
+
+@pytest.mark.parametrize("config", [BUSY, METHOD], ids=["busy", "method"])
+def test_gradients_in_memory_or_not_make_no_difference(monkeypatch, config):
+    """Projection's backward pass and Adam apart, and in one kernel: the same bits after all steps."""
+    fused, _ = fitted(photographs(3), recorded=True, config=config)
+    monkeypatch.setattr(fit_module, "StepGraph", functools.partial(graph.StepGraph, fused=False))
+    apart, _ = fitted(photographs(3), recorded=True, config=config)
+    a, b = fused.state()[0], apart.state()[0]
+    assert all(torch.equal(a[k], b[k]) for k in a)
 
 
 def test_recordings_do_not_pile_up(monkeypatch):

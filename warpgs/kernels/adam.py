@@ -1,6 +1,7 @@
 """Adam (Kingma and Ba 2015) in place, one pass over parameter, gradient and both moments."""
 
 import functools
+from types import SimpleNamespace
 
 import torch
 import warp as wp
@@ -19,12 +20,35 @@ SEGMENT = 4096
 
 
 @functools.cache
+def make_functions(real):
+    """The update of one element in three parts, for one scalar type."""
+
+    @wp.func
+    def decayed(m: real, g: real, beta1: real, rest1: real) -> real:
+        """Running mean of the gradient."""
+        return beta1 * m + rest1 * g
+
+    @wp.func
+    def decayed_square(s: real, g: real, beta2: real, rest2: real) -> real:
+        """Running mean of its square."""
+        return beta2 * s + rest2 * g * g
+
+    @wp.func
+    def moved(p: real, m: real, s: real, rate: real, root_correction2: real, eps: real) -> real:
+        """The parameter after the step."""
+        return p - rate * m / (wp.sqrt(s) / root_correction2 + eps)
+
+    return SimpleNamespace(decayed=decayed, decayed_square=decayed_square, moved=moved)
+
+
+@functools.cache
 def make_kernel(real, split: bool, lanes: int):
     """The update kernel for one scalar type; a task updates a segment of the flat parameter, some lanes at a time.
 
     ``split`` says whether the head of each row has a rate of its own, which costs some arithmetic.
     """
     values = wp.types.vector(lanes, real)
+    f = make_functions(real)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def update(
@@ -47,14 +71,14 @@ def make_kernel(real, split: bool, lanes: int):
                 for lane in range(lanes):
                     i = base + lane
                     g = gradient[i]
-                    m[lane] = beta1 * mean[i] + rest1 * g
-                    s[lane] = beta2 * square[i] + rest2 * g * g
+                    m[lane] = f.decayed(mean[i], g, beta1, rest1)
+                    s[lane] = f.decayed_square(square[i], g, beta2, rest2)
                     step = rate
                     if wp.static(split):
                         # place in the row, from its middle, so that no rounding moves it to another
                         place = (phase + real(lane)) / real(row)
                         step = wp.where((place - wp.floor(place)) * real(row) < real(head), head_rate, rate)
-                    p[lane] = parameter[i] - step * m[lane] / (wp.sqrt(s[lane]) / root_correction2 + eps)
+                    p[lane] = f.moved(parameter[i], m[lane], s[lane], step, root_correction2, eps)
                 for lane in range(lanes):
                     parameter[base + lane] = p[lane]
                     mean[base + lane] = m[lane]
@@ -62,41 +86,51 @@ def make_kernel(real, split: bool, lanes: int):
             else:
                 for i in range(base, end):
                     g = gradient[i]
-                    mean[i] = beta1 * mean[i] + rest1 * g
-                    square[i] = beta2 * square[i] + rest2 * g * g
+                    mean[i] = f.decayed(mean[i], g, beta1, rest1)
+                    square[i] = f.decayed_square(square[i], g, beta2, rest2)
                     step = rate
                     if wp.static(split):
                         step = wp.where(i % row < head, head_rate, rate)
-                    parameter[i] = parameter[i] - step * mean[i] / (wp.sqrt(square[i]) / root_correction2 + eps)
+                    parameter[i] = f.moved(parameter[i], mean[i], square[i], step, root_correction2, eps)
 
     return update
 
 
-_UPDATE = """
+# The same for CUDA. Products and sums that the compiler might fuse are spelled with their rounding: it may choose otherwise
+# in another kernel, and all that update must give the same bits.
+ELEMENT = """
+    auto one = [&](float g, float rate, float& p, float& m, float& s) {
+        m = __fmaf_rn(beta1, m, __fmul_rn(rest1, g));
+        s = __fmaf_rn(beta2, s, __fmul_rn(__fmul_rn(rest2, g), g));
+        p -= rate * m / (sqrtf(s) / root_correction2 + eps);
+    };
+"""
+
+_UPDATE = (
+    """
     if (skip.data[0] != 0)
         return;
     const float head_rate = rates.data[0], rate = rates.data[1], root_correction2 = rates.data[2];
     const int size = parameter.shape[0];
-    auto one = [&](int i, float g, float& p, float& m, float& s) {
-        m = beta1 * m + rest1 * g;
-        s = beta2 * s + rest2 * g * g;
-        p -= (i % row < head ? head_rate : rate) * m / (sqrtf(s) / root_correction2 + eps);
-    };
+"""
+    + ELEMENT
+    + """    auto rate_of = [&](int i) { return i % row < head ? head_rate : rate; };
     if (4 * four + 4 <= size) {
         float4 p = reinterpret_cast<float4*>(parameter.data)[four], m = reinterpret_cast<float4*>(mean.data)[four];
         float4 s = reinterpret_cast<float4*>(square.data)[four];
         const float4 g = reinterpret_cast<const float4*>(gradient.data)[four];
-        one(4 * four, g.x, p.x, m.x, s.x);
-        one(4 * four + 1, g.y, p.y, m.y, s.y);
-        one(4 * four + 2, g.z, p.z, m.z, s.z);
-        one(4 * four + 3, g.w, p.w, m.w, s.w);
+        one(g.x, rate_of(4 * four), p.x, m.x, s.x);
+        one(g.y, rate_of(4 * four + 1), p.y, m.y, s.y);
+        one(g.z, rate_of(4 * four + 2), p.z, m.z, s.z);
+        one(g.w, rate_of(4 * four + 3), p.w, m.w, s.w);
         reinterpret_cast<float4*>(parameter.data)[four] = p;
         reinterpret_cast<float4*>(mean.data)[four] = m;
         reinterpret_cast<float4*>(square.data)[four] = s;
     } else
         for (int i = 4 * four; i < size; ++i)
-            one(i, gradient.data[i], parameter.data[i], mean.data[i], square.data[i]);
+            one(gradient.data[i], rate_of(i), parameter.data[i], mean.data[i], square.data[i]);
 """
+)
 
 
 @functools.cache

@@ -58,16 +58,7 @@ _CLEAR = """
 
 # Rows of K x 3 floats are a multiple of 16 bytes for K = 4 and 16. What lies past the count is loaded along, and not used:
 # it may be anything, a NaN too.
-_COLOR = """
-    const int size = sh.shape[1];
-    const float* row = reinterpret_cast<const float*>(sh.data) + 3ll * size * n;
-    float sum[3] = {0.0f, 0.0f, 0.0f}, largest = 0.0f;
-    auto take = [&](int i, float c) {
-        if (i < 3 * count) {
-            sum[i % 3] += weights[i / 3] * c;
-            largest = fmaxf(largest, fabsf(c));
-        }
-    };
+_EACH = """
     if (size % 4 == 0) {
         #pragma unroll
         for (int q = 0; q < 12; ++q)
@@ -84,8 +75,39 @@ _COLOR = """
             if (i < 3 * count)
                 take(i, row[i]);
     }
-    return wp::vec4(sum[0], sum[1], sum[2], largest);
 """
+
+_COLOR = (
+    """
+    const int size = sh.shape[1];
+    const float* row = reinterpret_cast<const float*>(sh.data) + 3ll * size * n;
+    float sum[3] = {0.0f, 0.0f, 0.0f}, largest = 0.0f;
+    auto take = [&](int i, float c) {
+        if (i < 3 * count) {
+            sum[i % 3] += weights[i / 3] * c;
+            largest = fmaxf(largest, fabsf(c));
+        }
+    };
+"""
+    + _EACH
+    + """    return wp::vec4(sum[0], sum[1], sum[2], largest);
+"""
+)
+
+_COLOR_WEIGHTS = (
+    """
+    const int size = sh.shape[1] / 3;
+    const float* row = sh.data + 3ll * size * n;
+    wp::vec_t<16, float> w;
+    auto take = [&](int i, float c) {
+        if (i < 3 * count)
+            w[i / 3] += c * upstream[i % 3];
+    };
+"""
+    + _EACH
+    + """    return w;
+"""
+)
 
 _COLOR_BACKWARD = """
     const int size = sh.shape[1];
@@ -197,7 +219,13 @@ def make_functions():
         """Gradients of `color`, upstream ``v``: the row's are stored (0 past ``count``) or added, the weights' returned."""
         ...
 
+    @wp.func_native(_COLOR_WEIGHTS)
+    def color_weights(sh: wp.array2d(dtype=float), n: int, count: int, upstream: wp.vec3) -> vec16:
+        """The weights' gradient alone, of rows that lie flat: sh [N, 3 K]."""
+        ...
+
     return SimpleNamespace(
         compact=compact, store_record=store_record, clear_rows=clear_rows, ballot=ballot, broadcast=broadcast,
         running_sum=running_sum, lowest=lowest, color=color, color_backward=color_backward,
+        color_weights=color_weights,
     )  # fmt: skip

@@ -1,6 +1,7 @@
 """The backward kernel of `project`; docs/project.md has the derivation, by whose sections the comments go."""
 
 import functools
+from types import SimpleNamespace
 
 import warp as wp
 
@@ -10,12 +11,149 @@ from warpgs.kernels.native import make_functions as make_native
 
 
 @functools.cache
+def make_functions(real):
+    """The gradients of one Gaussian from that of its record, for one scalar type."""
+    m = make_projection(real)
+    vec3 = m.vec3
+    vec4 = m.vec4
+    vec16 = sh.make_functions(real).vec16
+    mat33 = m.mat33
+    basis_backward = sh.make_functions(real).basis_backward
+
+    @wp.struct
+    class ShapeGradient:
+        """What the mean in the image, the factor and the depth of a record say."""
+
+        mean: vec3  # without what the colour adds
+        quat: vec4
+        log_scale: vec3
+        position: vec3  # of the position in the camera
+        turned: mat33  # of camera rotation times Gaussian rotation
+        unit: vec4  # no gradient: the quaternion at length 1
+        K: mat33
+
+    @wp.func
+    def shape(
+        mean: vec3, quat: vec4, log_scale: vec3, view: m.mat44, K: mat33,
+        width: real, height: real, near: real, low_pass: real, v_splats: wp.array2d(dtype=real), i: int,
+    ) -> ShapeGradient:  # fmt: skip
+        g = ShapeGradient()
+        e = m.ellipse(mean, quat, log_scale, view, K, width, height, near, low_pass)
+        x = e.position[0]
+        y = e.position[1]
+        z = e.position[2]
+        rotation = mat33(
+            view[0, 0], view[0, 1], view[0, 2],
+            view[1, 0], view[1, 1], view[1, 2],
+            view[2, 0], view[2, 1], view[2, 2],
+        )  # fmt: skip
+
+        # factor -> projected axes (section 4); v_u and u are both per shrunk pixel
+        inv_c = real(1.0) / wp.sqrt(e.c)
+        inv_det = real(1.0) / wp.sqrt(e.det)
+        t11 = v_splats[i, 2] * e.shrink * (e.c * inv_c * inv_det)
+        t12 = v_splats[i, 3] * e.shrink * (-e.b * inv_c * inv_det)
+        t22 = v_splats[i, 4] * e.shrink * inv_c
+        # twice v_det det and v_c c, times shrink; det and c divide vectors of their own size, or needles overflow
+        s_det = -(t11 + t12) * e.shrink
+        s_c = (t11 - t12 - t22) * e.shrink
+        v_b = -v_splats[i, 3] * e.shrink * inv_c * (e.shrink * inv_det)
+        blur = low_pass * e.shrink * e.shrink
+        normal = wp.cross(e.m1, e.m2)
+        per_det = real(1.0) / e.det
+        per_c = real(1.0) / e.c
+        v_m1 = s_det * (per_det * (wp.cross(e.m2, normal) + blur * e.m1)) + v_b * e.m2
+        v_m2 = s_det * (per_det * (wp.cross(normal, e.m1) + blur * e.m2)) + v_b * e.m1 + s_c * (per_c * e.m2)
+
+        # projected axes -> camera axes and Jacobian (section 3)
+        fx = K[0, 0]
+        fy = K[1, 1]
+        inv_z = real(1.0) / z
+        jx = fx * inv_z
+        jy = fy * inv_z
+        jxz = (K[0, 2] - e.clamped[0]) * inv_z
+        jyz = (K[1, 2] - e.clamped[1]) * inv_z
+        axes0 = vec3(e.axes[0, 0], e.axes[0, 1], e.axes[0, 2])
+        axes1 = vec3(e.axes[1, 0], e.axes[1, 1], e.axes[1, 2])
+        axes2 = vec3(e.axes[2, 0], e.axes[2, 1], e.axes[2, 2])
+        v_jx = wp.dot(v_m1, axes0)
+        v_jxz = wp.dot(v_m1, axes2)
+        v_jy = wp.dot(v_m2, axes1)
+        v_jyz = wp.dot(v_m2, axes2)
+        g0 = jx * v_m1
+        g1 = jy * v_m2
+        g2 = jxz * v_m1 + jyz * v_m2
+        v_axes = mat33(g0[0], g0[1], g0[2], g1[0], g1[1], g1[2], g2[0], g2[1], g2[2])
+        g.log_scale = wp.cw_mul(g0, axes0) + wp.cw_mul(g1, axes1) + wp.cw_mul(g2, axes2)
+        v_turned = v_axes * wp.diag(e.scales)  # gradient of camera rotation times Gaussian rotation
+        v_unit = m.rotation_backward(e.quat, wp.transpose(rotation) * v_turned)
+        g.quat = (v_unit - e.quat * wp.dot(e.quat, v_unit)) / e.quat_length
+
+        # mean in the image, Jacobian and depth -> position in the camera (section 3)
+        v_px = v_splats[i, 0]
+        v_py = v_splats[i, 1]
+        v_K = mat33()
+        v_x = v_px * jx
+        v_y = v_py * jy
+        v_z = -(v_px * jx * x + v_py * jy * y + v_jx * jx + v_jy * jy + v_jxz * jxz + v_jyz * jyz) * inv_z + v_splats[i, 9]
+        v_K[0, 0] = (v_px * x + v_jx) * inv_z
+        v_K[1, 1] = (v_py * y + v_jy) * inv_z
+        v_K[0, 2] = v_px
+        v_K[1, 2] = v_py
+        if e.clamped[0] == e.pixel[0]:  # the Jacobian moves with the mean: cx - px = -fx x / z
+            v_x -= v_jxz * jx * inv_z
+            v_z += v_jxz * jx * x * inv_z * inv_z
+            v_K[0, 0] = v_K[0, 0] - v_jxz * x * inv_z * inv_z
+        else:
+            v_K[0, 2] = v_K[0, 2] + v_jxz * inv_z
+        if e.clamped[1] == e.pixel[1]:
+            v_y -= v_jyz * jy * inv_z
+            v_z += v_jyz * jy * y * inv_z * inv_z
+            v_K[1, 1] = v_K[1, 1] - v_jyz * y * inv_z * inv_z
+        else:
+            v_K[1, 2] = v_K[1, 2] + v_jyz * inv_z
+        g.position = vec3(v_x, v_y, v_z)
+        g.mean = wp.transpose(rotation) * g.position
+        g.turned = v_turned
+        g.unit = e.quat
+        g.K = v_K
+        return g
+
+    @wp.func
+    def color(splats: wp.array2d(dtype=real), v_splats: wp.array2d(dtype=real), i: int) -> vec3:
+        """Gradient of the colour before its clamp at zero (section 5)."""
+        v_color = vec3(v_splats[i, 6], v_splats[i, 7], v_splats[i, 8])
+        for channel in range(3):
+            if not (splats[i, 6 + channel] > real(0.0)):  # clamped at zero
+                v_color[channel] = real(0.0)
+        return v_color
+
+    @wp.func
+    def centered(d: vec4, w: vec16) -> vec3:
+        """Gradient of the mean by way of the direction ``d`` that it is seen in; ``w`` is that of the basis (section 5)."""
+        v_centered = vec3()
+        if d[3] > real(0.0):
+            unit = vec3(d[0], d[1], d[2])
+            v_unit = basis_backward(unit, w)
+            v_centered = (v_unit - unit * wp.dot(unit, v_unit)) / d[3]
+        return v_centered
+
+    @wp.func
+    def logit(splats: wp.array2d(dtype=real), v_splats: wp.array2d(dtype=real), i: int, logit_opacity: real) -> real:
+        """Gradient of the opacity's logit (section 6)."""
+        return v_splats[i, 5] * splats[i, 5] * m.sigmoid(-logit_opacity)
+
+    return SimpleNamespace(shape=shape, color=color, centered=centered, logit=logit)
+
+
+@functools.cache
 def make_backward(real, native: bool):
     """The backward kernel for one scalar type: one thread per Gaussian, over all cameras, so no sum needs atomics.
 
     ``native`` is for CUDA and float32: the Gaussians that some camera sees are dealt to the first threads of each block.
     """
     m = make_projection(real)
+    f = make_functions(real)
     functions = sh.make_functions(real)
     vec3 = m.vec3
     vec4 = m.vec4
@@ -67,95 +205,17 @@ def make_backward(real, native: bool):
             i = camera * count + n
             if tile_counts[i] > 0:
                 view = viewmats[camera]
-                K = Ks[camera]
-                e = m.ellipse(means[n], quats[n], log_scales[n], view, K, real(width), real(height), near, low_pass)
-                x = e.position[0]
-                y = e.position[1]
-                z = e.position[2]
-                rotation = mat33(
-                    view[0, 0], view[0, 1], view[0, 2],
-                    view[1, 0], view[1, 1], view[1, 2],
-                    view[2, 0], view[2, 1], view[2, 2],
-                )  # fmt: skip
-
-                # factor -> projected axes (section 4); v_u and u are both per shrunk pixel
-                inv_c = real(1.0) / wp.sqrt(e.c)
-                inv_det = real(1.0) / wp.sqrt(e.det)
-                t11 = v_splats[i, 2] * e.shrink * (e.c * inv_c * inv_det)
-                t12 = v_splats[i, 3] * e.shrink * (-e.b * inv_c * inv_det)
-                t22 = v_splats[i, 4] * e.shrink * inv_c
-                # twice v_det det and v_c c, times shrink; det and c divide vectors of their own size, or needles overflow
-                s_det = -(t11 + t12) * e.shrink
-                s_c = (t11 - t12 - t22) * e.shrink
-                v_b = -v_splats[i, 3] * e.shrink * inv_c * (e.shrink * inv_det)
-                blur = low_pass * e.shrink * e.shrink
-                normal = wp.cross(e.m1, e.m2)
-                per_det = real(1.0) / e.det
-                per_c = real(1.0) / e.c
-                v_m1 = s_det * (per_det * (wp.cross(e.m2, normal) + blur * e.m1)) + v_b * e.m2
-                v_m2 = s_det * (per_det * (wp.cross(normal, e.m1) + blur * e.m2)) + v_b * e.m1 + s_c * (per_c * e.m2)
-
-                # projected axes -> camera axes and Jacobian (section 3)
-                fx = K[0, 0]
-                fy = K[1, 1]
-                inv_z = real(1.0) / z
-                jx = fx * inv_z
-                jy = fy * inv_z
-                jxz = (K[0, 2] - e.clamped[0]) * inv_z
-                jyz = (K[1, 2] - e.clamped[1]) * inv_z
-                axes0 = vec3(e.axes[0, 0], e.axes[0, 1], e.axes[0, 2])
-                axes1 = vec3(e.axes[1, 0], e.axes[1, 1], e.axes[1, 2])
-                axes2 = vec3(e.axes[2, 0], e.axes[2, 1], e.axes[2, 2])
-                v_jx = wp.dot(v_m1, axes0)
-                v_jxz = wp.dot(v_m1, axes2)
-                v_jy = wp.dot(v_m2, axes1)
-                v_jyz = wp.dot(v_m2, axes2)
-                g0 = jx * v_m1
-                g1 = jy * v_m2
-                g2 = jxz * v_m1 + jyz * v_m2
-                v_axes = mat33(g0[0], g0[1], g0[2], g1[0], g1[1], g1[2], g2[0], g2[1], g2[2])
-                v_log_scale += wp.cw_mul(g0, axes0) + wp.cw_mul(g1, axes1) + wp.cw_mul(g2, axes2)
-                v_turned = v_axes * wp.diag(e.scales)  # gradient of camera rotation times Gaussian rotation
-                v_unit = m.rotation_backward(e.quat, wp.transpose(rotation) * v_turned)
-                v_quat += (v_unit - e.quat * wp.dot(e.quat, v_unit)) / e.quat_length
-
-                # mean in the image, Jacobian and depth -> position in the camera (section 3)
-                v_px = v_splats[i, 0]
-                v_py = v_splats[i, 1]
-                v_K = mat33()
-                v_x = v_px * jx
-                v_y = v_py * jy
-                v_z = (
-                    -(v_px * jx * x + v_py * jy * y + v_jx * jx + v_jy * jy + v_jxz * jxz + v_jyz * jyz) * inv_z
-                    + v_splats[i, 9]
+                g = f.shape(
+                    means[n], quats[n], log_scales[n], view, Ks[camera], real(width), real(height), near, low_pass, v_splats, i
                 )
-                v_K[0, 0] = (v_px * x + v_jx) * inv_z
-                v_K[1, 1] = (v_py * y + v_jy) * inv_z
-                v_K[0, 2] = v_px
-                v_K[1, 2] = v_py
-                if e.clamped[0] == e.pixel[0]:  # the Jacobian moves with the mean: cx - px = -fx x / z
-                    v_x -= v_jxz * jx * inv_z
-                    v_z += v_jxz * jx * x * inv_z * inv_z
-                    v_K[0, 0] = v_K[0, 0] - v_jxz * x * inv_z * inv_z
-                else:
-                    v_K[0, 2] = v_K[0, 2] + v_jxz * inv_z
-                if e.clamped[1] == e.pixel[1]:
-                    v_y -= v_jyz * jy * inv_z
-                    v_z += v_jyz * jy * y * inv_z * inv_z
-                    v_K[1, 1] = v_K[1, 1] - v_jyz * y * inv_z * inv_z
-                else:
-                    v_K[1, 2] = v_K[1, 2] + v_jyz * inv_z
-                v_position = vec3(v_x, v_y, v_z)
-                v_mean += wp.transpose(rotation) * v_position
+                v_mean += g.mean
+                v_quat += g.quat
+                v_log_scale += g.log_scale
+                v_logit += f.logit(splats, v_splats, i, logit_opacities[n])
 
-                # colour -> coefficients and direction (section 5)
                 d = m.direction(means[n], view)
-                unit = vec3(d[0], d[1], d[2])
-                basis = functions.basis(unit)
-                v_color = vec3(v_splats[i, 6], v_splats[i, 7], v_splats[i, 8])
-                for channel in range(3):
-                    if not (splats[i, 6 + channel] > real(0.0)):  # clamped at zero
-                        v_color[channel] = real(0.0)
+                basis = functions.basis(vec3(d[0], d[1], d[2]))
+                v_color = f.color(splats, v_splats, i)
                 w = vec16()
                 if wp.static(native):
                     w = color_backward(coefficients, n, sh_count, basis, v_color, stored, v_coefficients)
@@ -165,30 +225,27 @@ def make_backward(real, native: bool):
                         if k < sh_count:
                             v_coefficients[n, k] = v_coefficients[n, k] + basis[k] * v_color
                             w[k] = wp.dot(coefficients[n, k], v_color)
-                v_centered = vec3()
-                if d[3] > real(0.0):
-                    v_unit_direction = functions.basis_backward(unit, w)
-                    v_centered = (v_unit_direction - unit * wp.dot(unit, v_unit_direction)) / d[3]
+                v_centered = f.centered(d, w)
                 v_mean += v_centered
 
-                # opacity
-                opacity = splats[i, 5]
-                v_logit += v_splats[i, 5] * opacity * m.sigmoid(-logit_opacities[n])
-
-                if camera_gradients != 0:
+                if camera_gradients != 0:  # section 6
+                    rotation = mat33(
+                        view[0, 0], view[0, 1], view[0, 2],
+                        view[1, 0], view[1, 1], view[1, 2],
+                        view[2, 0], view[2, 1], view[2, 2],
+                    )  # fmt: skip
                     t = vec3(view[0, 3], view[1, 3], view[2, 3])
                     v_rotation = (
-                        wp.outer(v_position, means[n]) + wp.outer(t, v_centered)
-                        + v_turned * wp.transpose(m.rotation(e.quat))
-                    )  # fmt: skip
-                    v_t = v_position + rotation * v_centered
+                        wp.outer(g.position, means[n]) + wp.outer(t, v_centered) + g.turned * wp.transpose(m.rotation(g.unit))
+                    )
+                    v_t = g.position + rotation * v_centered
                     v_view = m.mat44()
                     for row in range(3):
                         for column in range(3):
                             v_view[row, column] = v_rotation[row, column]
                         v_view[row, 3] = v_t[row]
                     v_viewmats[camera, n] = v_view
-                    v_Ks[camera, n] = v_K
+                    v_Ks[camera, n] = g.K
         v_means[n] = v_mean
         v_quats[n] = v_quat
         v_log_scales[n] = v_log_scale

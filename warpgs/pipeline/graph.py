@@ -76,6 +76,7 @@ class StepGraph:
         self, views: Views, optimizer: Optimizer, stats: DensityStats | None, burst: Burst, *,
         degree: int, rule: str, loss: LossConfig, background: torch.Tensor, dropout_seed: int | None = None,
         share: torch.Tensor | None = None, protected: tuple[Layers, ProtectConfig] | None = None, most: int | None = None,
+        fused: bool = True,
     ):  # fmt: skip
         """Record.
 
@@ -92,6 +93,7 @@ class StepGraph:
             share: Part of its step that each mean takes, shape [N]; None for all of it.
             protected: What holds up the opacity of the young; None where nothing does.
             most: Instances that the memory limit allows; None for no limit.
+            fused: Whether projection's backward pass and Adam are one kernel, so that gradients never are in memory.
 
         Raises:
             OverLimitError: There is room for more than ``most`` instances to be made.
@@ -99,7 +101,7 @@ class StepGraph:
         """
         self.views, self.optimizer, self.stats, self.burst = views, optimizer, stats, burst
         self.degree, self.rule, self.loss, self.background = degree, RULES[rule], loss, background[None]
-        self.dropout_seed, self.share, self.protected = dropout_seed, share, protected
+        self.dropout_seed, self.share, self.protected, self.fused = dropout_seed, share, protected, fused
         self.height, self.width = views.targets.shape[1:3]
         self.capacity = self._capacity()
         if most is not None and self.capacity > most:
@@ -157,15 +159,23 @@ class StepGraph:
         settings, factors = burst.setting_rows.index_select(0, burst.counter)[0], None
         if self.dropout_seed is not None:
             factors = opacity_dropout(len(self.optimizer.gaussians), settings, self.dropout_seed)
-        splats, counts = self._project(views.viewmats.index_select(0, view), views.Ks.index_select(0, view), factors)
+        viewmat, K = views.viewmats.index_select(0, view), views.Ks.index_select(0, view)
+        with torch.set_grad_enabled(not self.fused):
+            splats, counts = self._project(viewmat, K, factors)
+        splats.requires_grad_()
         tiles = bin_tiles(splats, counts, **size, rule=self.rule, capacity=self.capacity, overflow=burst.stop)
         rgb = blend(splats, tiles, self.background, **size, rule=self.rule)[0][0]
         loss, _ = photometric_loss(rgb, target, mask, self.loss)
         params = self.optimizer.params
-        *gradients, v_splats = torch.autograd.grad(loss, [*params.values(), splats])
+        *gradients, v_splats = torch.autograd.grad(loss, [*(() if self.fused else params.values()), splats])
         with torch.no_grad():
             burst.stop.masked_fill_(~torch.isfinite(loss), NOT_FINITE)
-            self.optimizer.step_scheduled(dict(zip(params, gradients)), rates, burst.stop, self.share)
+            if self.fused:
+                of = (viewmat, K, splats, counts, v_splats)
+                how = {"degree": self.degree, "rule": self.rule, **size}
+                self.optimizer.step_projected(*of, rates, burst.stop, self.share, **how)
+            else:
+                self.optimizer.step_scheduled(dict(zip(params, gradients)), rates, burst.stop, self.share)
             going = burst.stop == 0
             if self.protected is not None:
                 layers, protect = self.protected

@@ -113,8 +113,11 @@ class Layout:
         }
 
     def _projection(self, count: int) -> int:
-        """Records, their gradient and its copy for the density statistics, and the gradients of the parameters."""
-        return (FLOAT * (3 * RECORD + 1) + self.row) * count
+        """Records, their gradient and its copy for the density statistics, and the gradients of the parameters.
+
+        Recorded steps have no gradients of the parameters (graph.StepGraph).
+        """
+        return (FLOAT * (3 * RECORD + 1) + (0 if self.recordings else self.row)) * count
 
     def event(self, before: int, after: int) -> int:
         """Bytes on top of ``held(after)`` while Gaussians are added: new rows, and one tensor before, cut and grown."""

@@ -10,6 +10,7 @@ import torch
 from warpgs.errors import UsageError
 from warpgs.kernels.adam import adam_scheduled, adam_step, scheduled_rates
 from warpgs.kernels.knn import morton_codes
+from warpgs.kernels.project_adam import project_adam
 from warpgs.pipeline.density import Refinement
 from warpgs.pipeline.limits import Limits
 from warpgs.pipeline.schedule import log_linear
@@ -118,6 +119,23 @@ class Optimizer:
             state = (self.params[name].detach(), gradient, self.means[name], self.squares[name])
             adam_scheduled(*state, rates[3 * i : 3 * i + 3], skip, head=3 if name == "sh" else 0)
         self._hold_back(before, share)
+
+    def step_projected(
+        self, viewmats: torch.Tensor, Ks: torch.Tensor, splats: torch.Tensor, counts: torch.Tensor, v_splats: torch.Tensor,
+        rates: torch.Tensor, skip: torch.Tensor, share: torch.Tensor | None = None, **size,
+    ) -> None:  # fmt: skip
+        """`step_scheduled` from the gradient of the records: projection's backward pass and Adam in one kernel.
+
+        ``viewmats``, ``Ks`` and ``size`` (width, height, degree, rule) are what one camera's `project` took; ``splats`` and
+        ``counts`` what it gave; ``v_splats`` the gradient of the records [1, N, 12].
+        """
+        params = {n: t.detach() for n, t in self.params.items()}
+        project_adam(
+            params, self.means, self.squares, viewmats, Ks, splats, counts, v_splats,
+            rates=rates, skip=skip, share=share, **size,
+        )  # fmt: skip
+        if self.limits is not None:
+            self.limits.enforce(self.params)
 
     def apply(self, change: Refinement) -> None:
         """Keep the named rows with their moments and append new rows with zero moments."""
