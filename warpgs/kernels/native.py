@@ -179,6 +179,18 @@ def make_functions():
         """Sum over this lane of the warp and those before it."""
         ...
 
+    @wp.func_native(
+        """
+        long long sum = value;
+        for (int distance = 16; distance > 0; distance /= 2)
+            sum += __shfl_xor_sync(0xffffffffu, sum, distance);
+        return sum;
+        """
+    )
+    def whole_sum(value: wp.int64) -> wp.int64:
+        """Sum over all lanes of the warp, which all of them must ask for."""
+        ...
+
     @wp.func_native("return __ffs(mask) - 1;")
     def lowest(mask: int) -> int:
         """Position of the lowest bit set, -1 for none."""
@@ -199,5 +211,5 @@ def make_functions():
 
     return SimpleNamespace(
         compact=compact, store_record=store_record, clear_rows=clear_rows, ballot=ballot, broadcast=broadcast,
-        running_sum=running_sum, lowest=lowest, color=color, color_backward=color_backward,
+        running_sum=running_sum, whole_sum=whole_sum, lowest=lowest, color=color, color_backward=color_backward,
     )  # fmt: skip
