@@ -99,19 +99,30 @@ _COLOR_BACKWARD = """
         }
     };
     if (size % 4 == 0) {
+        // AHEAD loads before the stores that use them: the compiler cannot know that rows are apart, and would wait for each
+        constexpr int AHEAD = 6;
         #pragma unroll
-        for (int q = 0; q < 12; ++q) {
-            float4* to = reinterpret_cast<float4*>(v_row) + q;
-            if (4 * q < 3 * count) {
-                const float4 c = reinterpret_cast<const float4*>(row)[q];
-                float4 sum = add ? *to : make_float4(0.0f, 0.0f, 0.0f, 0.0f);
-                give(4 * q, c.x, sum.x);
-                give(4 * q + 1, c.y, sum.y);
-                give(4 * q + 2, c.z, sum.z);
-                give(4 * q + 3, c.w, sum.w);
-                *to = sum;
-            } else if (!add && 4 * q < 3 * size)
-                *to = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+        for (int first = 0; first < 12; first += AHEAD) {
+            float4 held[AHEAD];
+            #pragma unroll
+            for (int k = 0; k < AHEAD; ++k)
+                if (4 * (first + k) < 3 * count)
+                    held[k] = reinterpret_cast<const float4*>(row)[first + k];
+            #pragma unroll
+            for (int k = 0; k < AHEAD; ++k) {
+                const int q = first + k;
+                float4* to = reinterpret_cast<float4*>(v_row) + q;
+                if (4 * q < 3 * count) {
+                    const float4 c = held[k];
+                    float4 sum = add ? *to : make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+                    give(4 * q, c.x, sum.x);
+                    give(4 * q + 1, c.y, sum.y);
+                    give(4 * q + 2, c.z, sum.z);
+                    give(4 * q + 3, c.w, sum.w);
+                    *to = sum;
+                } else if (!add && 4 * q < 3 * size)
+                    *to = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+            }
         }
     } else {
         #pragma unroll

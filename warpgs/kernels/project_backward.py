@@ -148,6 +148,10 @@ def make_backward(real, native: bool):
                 v_position = vec3(v_x, v_y, v_z)
                 v_mean += wp.transpose(rotation) * v_position
 
+                # opacity, before the colour: its loads need not wait for what is stored there
+                opacity = splats[i, 5]
+                v_logit += v_splats[i, 5] * opacity * m.sigmoid(-logit_opacities[n])
+
                 # colour -> coefficients and direction (section 5)
                 d = m.direction(means[n], view)
                 unit = vec3(d[0], d[1], d[2])
@@ -170,10 +174,6 @@ def make_backward(real, native: bool):
                     v_unit_direction = functions.basis_backward(unit, w)
                     v_centered = (v_unit_direction - unit * wp.dot(unit, v_unit_direction)) / d[3]
                 v_mean += v_centered
-
-                # opacity
-                opacity = splats[i, 5]
-                v_logit += v_splats[i, 5] * opacity * m.sigmoid(-logit_opacities[n])
 
                 if camera_gradients != 0:
                     t = vec3(view[0, 3], view[1, 3], view[2, 3])
