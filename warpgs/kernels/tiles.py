@@ -108,9 +108,7 @@ def make_kernels(real, native: bool):
         keys: wp.array(dtype=real), ids: wp.array(dtype=int),
     ):  # fmt: skip
         i = begin + wp.tid()
-        seen = int(0)
-        if i < tile_counts.shape[0] and tile_counts[i] > 0:
-            seen = 1
+        seen = wp.where(i < tile_counts.shape[0] and tile_counts[i] > 0, 1, 0)
         after = int(0)  # the visible ones that the sum has behind this one
         if wp.static(native):
             rank = lanes.running_sum(seen)
@@ -138,13 +136,16 @@ def make_kernels(real, native: bool):
     ):  # fmt: skip
         i = begin + wp.tid()
         tile = keys[i]
+        slot = slots[i]  # asked for before its tile is known, as are the neighbours: the waits overlap
+        before = keys[wp.max(i - 1, 0)]
+        after = keys[wp.min(i + 1, count - 1)]
         if tile == no_tile:
             ids[i] = 0
             return
-        ids[i] = owners[slots[i]]
-        if i == 0 or keys[wp.max(i - 1, 0)] != tile:
+        ids[i] = owners[slot]
+        if i == 0 or before != tile:
             ranges[tile, 0] = i
-        if i == count - 1 or keys[wp.min(i + 1, count - 1)] != tile:
+        if i == count - 1 or after != tile:
             ranges[tile, 1] = i + 1
 
     return SimpleNamespace(
@@ -347,9 +348,8 @@ def bin_tiles(
     ranges = torch.zeros(no_tile, 2, dtype=torch.int32, device=device)
     ints = functools.partial(torch.empty, dtype=torch.int32, device=device)
     if count == 0:
-        return Tiles(
-            tile_size, ranges, *(ints(0) for _ in range(3)), counts, ints(0), torch.zeros(1, dtype=torch.int64, device=device)
-        )
+        none = torch.zeros(1, dtype=torch.int64, device=device)
+        return Tiles(tile_size, ranges, *(ints(0) for _ in range(3)), counts, ints(0), none)
 
     splats = splats.detach().contiguous().view(count, -1)
     splats_view, counts_view = bridge.view(splats, real), bridge.view(counts, wp.int32)
