@@ -62,7 +62,9 @@ def put_off(work: Callable, *inputs) -> tuple[object, list[Launch]]:
 
 
 class Case:
-    """One picture: forward launches by distance of states, the product's backward launch, and those by buckets.
+    """One picture: forward launches by distance of states, the product's backward launch, and its variants.
+
+    A variant is the product's kernel with another size of chunk, or one by buckets.
 
     Args:
         splats: Records of `project`, shape [C, N, 12].
@@ -91,11 +93,14 @@ class Case:
         assert self.backward.inputs[STATES].tensor is states[chunk]
         self.v_slots = self.backward.inputs[-1].tensor
         self.state_mib = {size: t.numel() * 4 / 2**20 for size, t in states.items()}
-        self.buckets = {"bucket 32, all pixels": self._bucket(32, False, states)}
-        self.buckets |= {f"bucket {size}": self._bucket(size, True, states) for size in SIZES}
+        with_depth = self.values == blend_cuda.VALUES
+        kernels = {f"chunks of {n}": (blend_cuda.make_backward(tiles.size, with_depth, n, False).backward, n) for n in SIZES}
+        kernels["bucket 32, all pixels"] = make_backward(tiles.size, with_depth, 32, False), 32
+        kernels |= {f"bucket {n}": (make_backward(tiles.size, with_depth, n, True), n) for n in SIZES}
+        self.name = f"chunks of {chunk}"
+        self.variants = {name: self._variant(*k, states) for name, k in kernels.items() if name != self.name}
 
-    def _bucket(self, size: int, skip: bool, states: dict) -> Launch:
-        kernel = make_backward(self.tiles.size, self.values == blend_cuda.VALUES, size, skip)
+    def _variant(self, kernel, size: int, states: dict) -> Launch:
         inputs = list(self.backward.inputs)
         inputs[STATES] = bridge.view(states[size], wp.float32)
         count = 32 * -(-self.instances // size)
@@ -110,10 +115,10 @@ class Case:
         return self.v_slots[:, : self.values].clone(), self.v_splats.clone()
 
     def disagreements(self) -> dict[str, dict]:
-        """Distance of each bucket kernel's gradients from the product's, relative, the largest among the values."""
+        """Distance of each variant's gradients from the product's, relative, the largest among the values."""
         wanted, result = self.gradients(self.backward), {}
-        for name, bucket in self.buckets.items():
-            found = self.gradients(bucket)
+        for name, variant in self.variants.items():
+            found = self.gradients(variant)
             result[name] = {
                 "instances": max(distance(found[0][:, k], wanted[0][:, k]) for k in range(self.values)),
                 "records": max(distance(found[1][..., k], wanted[1][..., k]) for k in range(self.values)),
@@ -123,7 +128,7 @@ class Case:
     def works(self) -> dict[str, Launch]:
         """What is timed."""
         forward = {f"forward, states at {size}": launch for size, launch in self.forward.items()}
-        return forward | {f"backward, chunks of {self.chunk}": self.backward} | self.buckets
+        return forward | {self.name: self.backward} | self.variants
 
 
 def distance(found: torch.Tensor, wanted: torch.Tensor) -> float:
@@ -178,7 +183,7 @@ def table(rows: list[dict]) -> str:
     lines = []
     for row in rows:
         lines.append(f"{row['configuration']}: {row['instances']:,} instances, states {row['state_mib']} MiB")
-        base = row["gpu_us"][f"backward, chunks of {row['chunk']}"]["median"]
+        base = row["gpu_us"][f"chunks of {row['chunk']}"]["median"]
         for name, t in row["gpu_us"].items():
             low, high = t["quartiles"]
             line = f"  {name:<24} {t['median']:9.1f} us [{low:.1f}, {high:.1f}]"

@@ -19,7 +19,7 @@ def test_buckets_give_the_gradients_of_chunks(rule, with_depth):
     cameras = camera(150, 90, 2, dtype=torch.float32, device="cuda:0")
     case = bucket.case_of(cloud(6000, device="cuda:0"), cameras, RULES[rule], with_depth)
     assert int((case.tiles.ranges[:, 1] - case.tiles.ranges[:, 0]).max()) > 2 * max(SIZES)
-    assert len(case.buckets) == len(SIZES) + 1
+    assert len(case.variants) == 2 * len(SIZES)
     for name, errors in case.disagreements().items():
         assert all(error <= bucket.TOLERANCE for error in errors.values()), (name, errors)
 
@@ -43,7 +43,7 @@ def test_a_gradient_that_nobody_wrote_is_a_disagreement():
     time = {"median": 2.0, "quartiles": [1.0, 3.0], "repeats": 2}
     row = {
         "configuration": "small", "instances": 5, "chunk": 64, "state_mib": {"32": 1.0},
-        "gpu_us": {"backward, chunks of 64": time, "bucket 32": time},
+        "gpu_us": {"chunks of 64": time, "bucket 32": time},
         "disagreement": {"bucket 32": {"instances": math.nan, "records": 0.0}},
     }  # fmt: skip
     assert not bucket.agrees(row) and "DISAGREE" in bucket.table([row])
