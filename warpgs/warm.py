@@ -31,7 +31,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     real = wp.float32
     common = [
         (project.make_forward(real, cuda), THREADS), (project.make_backward(real, cuda), BLOCK),
-        (tiles.make_kernels(real).pack_counts, THREADS), (tiles.make_kernels(real).find_ranges, THREADS),
+        (tiles.make_kernels(real, cuda).pack_counts, THREADS), (tiles.make_kernels(real, cuda).find_ranges, THREADS),
         (tiles.make_emit(real, cuda), THREADS), (knn.make_kernels(real).search, THREADS), (dropout.make_kernel(), THREADS),
     ]  # fmt: skip
     if not cuda:
