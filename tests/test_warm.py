@@ -16,6 +16,7 @@ from warpgs.pipeline.density import DensityConfig
 from warpgs.pipeline.evaluate import render_view, score
 from warpgs.pipeline.fit import Fit
 from warpgs.pipeline.init import InitConfig
+from warpgs.pipeline.loss import LossConfig
 from warpgs.pipeline.method import MethodConfig
 from warpgs.pipeline.sampler import SamplerConfig
 from warpgs.pipeline.schedule import PhaseConfig
@@ -38,6 +39,7 @@ def test_a_fit_launches_nothing_else(device, recorded, monkeypatch):
     method = MethodConfig(events=True, hier=True, pm=False, sampler=SamplerConfig(share=0.01, min_alpha=0.05, max_share=0.05))
     config = FitConfig(
         steps=20, dropout=0.2, cuda_graph=recorded, init=InitConfig(source="points"), method=method,
+        loss=LossConfig(depth_weight=0.1, depth_until=0.5),
         density=DensityConfig(start=2, every=2), phases=PhaseConfig(4, 6, every=2),
     )  # fmt: skip
     fit = Fit(views, seeds(), config, device, priors=priors(views))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import time
 from collections.abc import Iterator
@@ -48,8 +49,8 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     blending, warps = blend_cuda.make_kernels(TILE), 32 * blend_cuda.WARPS
     own = [(blending.forward, warps), (blending.order_tiles, 1024), (blending.contributions, TILE * TILE)]
     own.append((blend.make_segments(real).gather_weights, THREADS))
-    for chunk in blend_cuda.CHUNKS:
-        passes = blend_cuda.make_backward(TILE, False, chunk, False)
+    for depth, chunk in itertools.product((False, True), blend_cuda.CHUNKS):  # with a depth term, and without
+        passes = blend_cuda.make_backward(TILE, depth, chunk, False)
         own += [(passes.backward, warps), (passes.gather, THREADS)]
     own += [(ssim_cuda.make_kernels().forward, ssim_cuda.THREADS), (adam.make_scheduled_kernel(), THREADS)]
     own.append((make_project_adam(real, True), BLOCK))

@@ -15,6 +15,7 @@ from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.density import DensityConfig
 from warpgs.pipeline.fit import Fit, NotFiniteError
 from warpgs.pipeline.init import InitConfig
+from warpgs.pipeline.loss import LossConfig
 from warpgs.scene import View
 
 pytestmark = pytest.mark.cuda
@@ -114,6 +115,19 @@ def test_loss_that_is_no_number_stops_before_it_harms():
     with pytest.raises(NotFiniteError, match="became nan"):
         fit.burst(100)
     assert fit.step < 4 and all(bool(torch.isfinite(t).all()) for t in fit.gaussians.tensors().values())
+
+
+@pytest.mark.parametrize("views", [photographs(4), sizes()], ids=["one size", "two sizes and a mask"])
+def test_recorded_depth_term_equals_single_steps(views):
+    """Halved at first, then whole, then without the term: the same bits, and others than without it throughout."""
+    loss = LossConfig(depth_weight=0.3, depth_until=0.7)
+    config = dataclasses.replace(BUSY, loss=loss, half_resolution=0.3)
+    single, _ = fitted(views, recorded=False, config=config)
+    recorded, _ = fitted(views, recorded=True, config=config)
+    without, _ = fitted(views, recorded=True, config=dataclasses.replace(config, loss=LossConfig()))
+    a, b = single.state()[0], recorded.state()[0]
+    assert all(torch.equal(a[k], b[k]) for k in a)
+    assert not torch.equal(recorded.gaussians.means[:10], without.gaussians.means[:10])
 
 
 def test_recorded_steps_at_half_size_equal_single_steps():

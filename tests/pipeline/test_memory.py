@@ -16,6 +16,7 @@ from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.density import DensityConfig
 from warpgs.pipeline.fit import Fit
 from warpgs.pipeline.init import InitConfig
+from warpgs.pipeline.loss import LossConfig
 from warpgs.pipeline.memory import Layout, instance_bytes, most_instances, plan
 from warpgs.pipeline.method import MethodConfig
 from warpgs.pipeline.sampler import SamplerConfig
@@ -72,6 +73,17 @@ def test_plan_covers_a_step_and_not_much_more(views, count):
     found = measured(fit, 2)
     planned = fit.layout.step(count, instances(fit))
     assert fit.memory.planned >= 0.95 * planned and found <= planned <= 1.25 * found + 20_000
+
+
+@pytest.mark.parametrize("views", [photographs(2, 400, 300), masked(photographs(2, 400, 300))], ids=["all", "masked"])
+def test_plan_covers_the_depth_term(views):
+    """A disparity a pixel that stays, and what a correlation and its gradient take."""
+    config = dataclasses.replace(STEADY, loss=LossConfig(depth_weight=0.1))
+    fit = Fit(views, seeds(60), config, CPU, priors=priors(views))
+    fit.advance()
+    found = measured(fit, 2)
+    planned = fit.layout.step(60, instances(fit))
+    assert fit.layout.guided and found <= planned <= 1.25 * found + 20_000
 
 
 def test_plan_covers_density_events():

@@ -135,6 +135,11 @@ PRESETS: dict[str, FitConfig] = {
         preset="dropgaussian", steps=10_000, dropout=0.2, optimizer=OptimizerConfig(scales_lr=0.005),
         density=DensityConfig(gradient=5e-4, stop_share=1.0, prune_size=0),
     ),
+    "fsgs": FitConfig(
+        preset="fsgs", steps=10_000, sh_every=500, init=InitConfig(sweep_up_to=30), loss=LossConfig(depth_weight=0.05),
+        optimizer=OptimizerConfig(scales_lr=0.005),
+        density=DensityConfig(gradient=5e-4, stop_share=1.0, reset_every=3000, reset_opacity=0.05, prune_size=0),
+    ),
     "paper-literal": dataclasses.replace(
         _NEXUS, preset="paper-literal", steps=30_000, phases=PhaseConfig(coarse=2000, stable=3000),
         method=MethodConfig(events=True, hier=True),
@@ -143,8 +148,9 @@ PRESETS: dict[str, FitConfig] = {
 """paper: the method, with the constants of docs/decisions/008-method.md. quick: the same in a fifth of the steps; balanced: in
 two fifths, the first at half size (docs/trade.md). strong-3dgs: the start, degree, rates, dropout and schedule of ``paper``,
 none of its parts. 3dgs: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few. nexusgs: Zheng et al.
-2025, a start from flow with every pixel, and its resets. dropgaussian: Park et al. 2025. paper-literal: the paper on
-``nexusgs``, with what it leaves open as first proposed."""
+2025, a start from flow with every pixel, and its resets. dropgaussian: Park et al. 2025. fsgs: our trainer with
+the depth term, rates, threshold and resets of Zhu et al. 2024, without their unpooling and unseen views, from our own sweep.
+paper-literal: the paper on ``nexusgs``, with what it leaves open as first proposed."""
 
 DEFAULT_PRESET = {"cuda": "paper", "cpu": "quick"}
 """Preset where the user names none, by kind of device."""

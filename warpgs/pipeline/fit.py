@@ -20,9 +20,9 @@ from warpgs.pipeline.density import DensityStats, Refinement, refine
 from warpgs.pipeline.graph import BURST, NOT_FINITE, ROOM, Burst, OverLimitError, StepGraph, stack_views
 from warpgs.pipeline.init import initial_gaussians, initial_points
 from warpgs.pipeline.layers import COARSE, FINE, LONG_AGO, Layers
-from warpgs.pipeline.loss import masked_mse, photometric_loss
+from warpgs.pipeline.loss import masked_mse, training_loss
 from warpgs.pipeline.memory import layout_of, most_instances, plan
-from warpgs.pipeline.method import Event, TrainingView, sampling_event
+from warpgs.pipeline.method import Event, TrainingView, guided_views, sampling_event
 from warpgs.pipeline.optimizer import Optimizer
 from warpgs.pipeline.region import counted_region
 from warpgs.pipeline.resolution import halved
@@ -64,7 +64,7 @@ class Fit:
             config: Settings.
             device: Where to work.
             background: Colour behind the scene.
-            priors: What is believed of each view; None to find out where ``config.method.events`` asks for sampling.
+            priors: What is believed of each view; None to find out where sampling or the depth term asks for it.
 
         Raises:
             DataError: There is nothing to start from.
@@ -90,15 +90,19 @@ class Fit:
         self.on_event: Callable[[int, Event], None] | None = None
         self.graphs: dict[tuple, StepGraph] = {}
         self.views = [TrainingView.of(v, device) for v in train]
-        if config.method.events:
+        if config.method.events or config.loss.depth_weight > 0:
             if priors is None:
                 regions = [counted_region(v)[0] for v in train]
                 priors, notes = view_priors(train, config.priors, depths=start.depths, regions=regions, cache=cache_folder())
                 self.notes += notes
             self.disparities = [p.disparity for p in priors]
             """Relative inverse depth of each view in [0, 1], [H, W]: only pictures of events show it."""
-            depths = start.depths or [None] * len(train)
-            self.views = [v.scored(p, d, config.method) for v, p, d in zip(self.views, priors, depths, strict=True)]
+            if config.method.events:
+                depths = start.depths or [None] * len(train)
+                self.views = [v.scored(p, d, config.method) for v, p, d in zip(self.views, priors, depths, strict=True)]
+            if config.loss.depth_weight > 0:
+                self.views, note = guided_views(self.views, priors)
+                self.notes.append(note)
         self.news: list[str] = []
         """What the user must know of and was not told yet."""
         self._plan()
@@ -140,7 +144,8 @@ class Fit:
         )
         render = rasterize(self.optimizer.gaussians, view.camera, options)
         render.splats.retain_grad()
-        loss, _ = photometric_loss(render.rgb, view.photo, view.mask, c.loss)
+        disparity = view.disparity if phase.guided else None
+        loss = training_loss((render.rgb, render.alpha, render.depth), view.photo, view.mask, disparity, c.loss)
         loss.backward()
         value = loss.item()
         if not math.isfinite(value):
@@ -224,7 +229,8 @@ class Fit:
         c = self.config
         layered = c.method.hier and c.method.events and step > self.phases.refine
         half = step <= c.half_resolution * c.steps
-        return Phase(sh_degree(step, c.sh_every, c.init.max_sh_degree), step <= self._densify_until, layered, half)
+        guided = c.loss.depth_weight > 0 and step <= c.loss.depth_until * c.steps
+        return Phase(sh_degree(step, c.sh_every, c.init.max_sh_degree), step <= self._densify_until, layered, half, guided)
 
     @property
     def _densify_until(self) -> int:
@@ -249,10 +255,11 @@ class Fit:
     def _graph(self, kind: tuple[int, int, bool], phase: Phase) -> StepGraph:
         key = (kind, phase)
         if key not in self.graphs:
-            c = self.config
+            c, views = self.config, self.stacks[kind]
+            views = views if phase.guided else dataclasses.replace(views, disparities=None)
             self.graphs = {k: g for k, g in self.graphs.items() if k[1:] == key[1:]}
             self.graphs[key] = StepGraph(
-                self.stacks[kind], self.optimizer, self.stats if phase.densifying else None, self.work,
+                views, self.optimizer, self.stats if phase.densifying else None, self.work,
                 degree=phase.degree, rule=c.rule, loss=c.loss, background=self.background,
                 dropout_seed=c.seed if self.dropout > 0 else None, share=self._share(phase),
                 protected=(self.layers, c.method.protect) if self._protects else None, most=self.most,
@@ -264,7 +271,10 @@ class Fit:
         c = self.config
         self.shown = self.views + [halved(v) for v in self.views if c.half_resolution > 0]
         cameras, masked = [v.camera for v in self.shown], [v.mask is not None for v in self.shown]
-        layout = layout_of(self.gaussians, cameras, masked, scored=c.method.events, recorded=c.cuda_graph)
+        layout = layout_of(
+            self.gaussians, cameras, masked, scored=c.method.events, recorded=c.cuda_graph,
+            guided=c.loss.depth_weight > 0,
+        )  # fmt: skip
         self.memory, self.layout = plan(
             layout, count=len(self.optimizer.gaussians), instances=most_instances(self.gaussians, cameras, c.rule),
             most=c.density.max_gaussians, limit=c.memory_limit, available=available_bytes(self.device), room=ROOM,

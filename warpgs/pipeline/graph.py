@@ -21,7 +21,7 @@ from warpgs.kernels.project import project
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, available_bytes, bin_tiles
 from warpgs.pipeline.density import DensityStats
 from warpgs.pipeline.layers import Layers, ProtectConfig
-from warpgs.pipeline.loss import LossConfig, masked_mse, photometric_loss
+from warpgs.pipeline.loss import LossConfig, masked_mse, training_loss
 from warpgs.pipeline.method import TrainingView
 from warpgs.pipeline.optimizer import Optimizer
 
@@ -47,6 +47,8 @@ class Views:
     """Colours in [0, 1], shape [V, H, W, 3]."""
     masks: torch.Tensor | None
     """1 where a pixel counts, else 0, shape [V, H, W]; None where all count."""
+    disparities: torch.Tensor | None = None
+    """Relative inverse depth in [0, 1], shape [V, H, W]; None where the loss does not look at depth."""
 
 
 def stack_views(views: list[TrainingView]) -> tuple[dict[tuple, Views], list[tuple[tuple, int]]]:
@@ -58,6 +60,7 @@ def stack_views(views: list[TrainingView]) -> tuple[dict[tuple, Views], list[tup
         stacks[kind] = Views(
             torch.stack([v.camera.viewmat for v in same]), torch.stack([v.camera.K for v in same]),
             torch.stack([v.photo for v in same]), torch.stack([v.mask for v in same]) if kind[2] else None,
+            None if same[0].disparity is None else torch.stack([v.disparity for v in same]),
         )  # fmt: skip
     return stacks, [(k, kinds[:i].count(k)) for i, k in enumerate(kinds)]
 
@@ -156,6 +159,7 @@ class StepGraph:
         rates = burst.rate_rows.index_select(0, burst.counter)[0]
         target = views.targets.index_select(0, view)[0]
         mask = None if views.masks is None else views.masks.index_select(0, view)[0]
+        disparity = None if views.disparities is None else views.disparities.index_select(0, view)[0]
         settings, factors = burst.setting_rows.index_select(0, burst.counter)[0], None
         if self.dropout_seed is not None:
             factors = opacity_dropout(len(self.optimizer.gaussians), settings, self.dropout_seed)
@@ -164,8 +168,8 @@ class StepGraph:
             splats, counts = self._project(viewmat, K, factors)
         splats.requires_grad_()
         tiles = bin_tiles(splats, counts, **size, rule=self.rule, capacity=self.capacity, overflow=burst.stop)
-        rgb = blend(splats, tiles, self.background, **size, rule=self.rule)[0][0]
-        loss, _ = photometric_loss(rgb, target, mask, self.loss)
+        rgb, *rest = (p[0] for p in blend(splats, tiles, self.background, **size, rule=self.rule))
+        loss = training_loss((rgb, *rest), target, mask, disparity, self.loss)
         params = self.optimizer.params
         *gradients, v_splats = torch.autograd.grad(loss, [*(() if self.fused else params.values()), splats])
         with torch.no_grad():

@@ -1,4 +1,4 @@
-"""The photometric loss: 0.8 L1 + 0.2 (1 - SSIM), the paper's section on preliminaries and Kerbl et al. 2023, eq. 7."""
+"""The loss: 0.8 L1 + 0.2 (1 - SSIM), as in the paper's preliminaries and Kerbl et al. 2023, eq. 7; on request a depth term."""
 
 from __future__ import annotations
 
@@ -9,6 +9,12 @@ import torch
 from warpgs.errors import UsageError
 from warpgs.kernels.ssim import differences, ssim
 
+MIN_ALPHA = 0.5
+"""Depth counts where the picture is more opaque than this: elsewhere the background has the larger share."""
+FLAT = 1e-3
+"""Standard deviation at or below which a map is constant: of a disparity in [0, 1], and of mean depth over depth, whose values
+lie around 1. The gradient of a correlation grows with the inverse of it."""
+
 
 @dataclass(frozen=True)
 class LossConfig:
@@ -16,8 +22,16 @@ class LossConfig:
 
     ssim_weight: float = 0.2
     """Share lambda of the structural term, in [0, 1]."""
+    depth_weight: float = 0.0
+    """Weight of the depth term, 1 minus the correlation of rendered inverse depth with the view's prior, in [0, 1000]; 0 for
+    none, 0.05 in FSGS (Zhu et al. 2024)."""
+    depth_until: float = 0.95
+    """Share of the steps, from the first, that have the depth term."""
 
     def __post_init__(self):
+        for name, most in (("depth_weight", 1000), ("depth_until", 1)):
+            if not 0 <= getattr(self, name) <= most:
+                raise UsageError(f"loss {name.replace('_', ' ')} {getattr(self, name)} must lie between 0 and {most}")
         if not 0 <= self.ssim_weight <= 1:
             raise UsageError(f"loss ssim weight {self.ssim_weight} must lie between 0 and 1")
 
@@ -49,6 +63,55 @@ def photometric_loss(
         return l1, l1.detach()
     structural = ((1 - ssim(rgb, target)) * mask[..., None]).sum() / (3 * pixels)
     return (1 - share) * l1 + share * structural, l1.detach()
+
+
+def depth_disagreement(
+    depth: torch.Tensor, alpha: torch.Tensor, disparity: torch.Tensor, mask: torch.Tensor | None
+) -> torch.Tensor:
+    """1 minus Pearson's correlation of rendered inverse depth with a disparity, which may have any scale and offset.
+
+    Over the pixels that count: alpha above `MIN_ALPHA`, and kept by the mask. Differentiable in ``depth`` alone. Where either
+    map is constant over them (`FLAT`), and where none counts, no correlation is known: then it is 0 and has no gradient. The
+    unit of depth does not matter from 1e-30 to 1e30 u: maps are brought to values around 1 and centred before squaring.
+
+    Args:
+        depth: Expected z-depth [u], positive where alpha is, shape [H, W].
+        alpha: Accumulated opacity, shape [H, W].
+        disparity: Relative inverse depth in [0, 1], shape [H, W].
+        mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count.
+
+    Returns:
+        A number in [0, 2], shape []; NaN where a pixel that counts has one.
+    """
+    counts = ~(alpha <= MIN_ALPHA)  # of a NaN too: it must not vanish
+    counts = counts if mask is None else counts & (mask > 0)
+    share = counts.to(depth.dtype)
+    pixels = share.sum().clamp_min(1)
+    depth = torch.where(counts, depth, 1)
+    mean = (depth.detach() * share).sum() / pixels
+    a, b = ((m - (m * share).sum() / pixels) * share for m in (mean / depth, disparity))
+    of_a, of_b = (a * a).sum() / pixels, (b * b).sum() / pixels
+    flat = (of_a <= FLAT**2) | (of_b <= FLAT**2)
+    spread = torch.where(flat, 1, of_a).sqrt() * torch.where(flat, 1, of_b).sqrt()
+    return torch.where(flat, 0, 1 - (a * b).sum() / pixels / spread)
+
+
+def training_loss(
+    pictures: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+    target: torch.Tensor,
+    mask: torch.Tensor | None,
+    disparity: torch.Tensor | None,
+    config: LossConfig,
+) -> torch.Tensor:
+    """What a step minimises, shape []: `photometric_loss` and, where a disparity is given, the weighted depth term.
+
+    ``pictures`` are colour, alpha and depth; the rest is as in `photometric_loss` and `depth_disagreement`.
+    """
+    rgb, alpha, depth = pictures
+    loss, _ = photometric_loss(rgb, target, mask, config)
+    if disparity is None:
+        return loss
+    return loss + config.depth_weight * depth_disagreement(depth, alpha, disparity, mask)
 
 
 def masked_mse(rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:

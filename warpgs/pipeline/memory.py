@@ -57,6 +57,8 @@ class Layout:
     """Whether a view has a mask."""
     scored: bool = False
     """Whether views have scores, by which fine Gaussians are sampled."""
+    guided: bool = False
+    """Whether the loss has its depth term."""
     cuda: bool = False
     recordings: int = 0
     """CUDA graphs that exist at a time, one for each size of view; 0 where steps are taken one by one."""
@@ -69,7 +71,7 @@ class Layout:
     def held(self, count: int) -> int:
         """Bytes that last from step to step: parameters, two moments, density statistics, layers and births, views."""
         copies = 2 if self.recordings else 1  # recorded steps take views from one tensor
-        views = FLOAT * (copies * (3 + self.masked) + 3 * self.scored) * self.view_pixels
+        views = FLOAT * (copies * (3 + self.masked + self.guided) + 3 * self.scored) * self.view_pixels
         return (3 * self.row + 4 * FLOAT) * count + views
 
     def moments(self, count: int, instances: int, banded: bool) -> dict[str, int]:
@@ -87,9 +89,9 @@ class Layout:
         sorting = count * (FLOAT * 4 + 2 * 8)  # depths and order twice, two running sums
         pictures = 5 * FLOAT * pixels  # colour, alpha, depth
         kept = 3 * FLOAT * pixels  # transmittance, weight, end: what blending leaves for its gradient
-        upstream = FLOAT * pixels * (3 if self.cuda else 5)
-        # three partials for each colour and the gradient; masked copies
-        loss = FLOAT * pixels * (36 if self.masked else 12)
+        upstream = FLOAT * pixels * (3 if self.cuda and not self.guided else 5)
+        # three partials for each colour and the gradient; masked copies; the two maps that are correlated, with gradients
+        loss = FLOAT * pixels * ((36 if self.masked else 12) + 4 * self.guided)
         if not self.cuda:
             loss += 5 * FLOAT * (3 * self.width + 30) * -(-self.height // 8)
         # what an event sees of each view stays until its end: the picture, scores, the gate
@@ -211,13 +213,15 @@ class MemoryPlan:
         return text
 
 
-def layout_of(gaussians: Gaussians, cameras: list[Camera], masked: list[bool], *, scored: bool, recorded: bool) -> Layout:
+def layout_of(
+    gaussians: Gaussians, cameras: list[Camera], masked: list[bool], *, scored: bool, recorded: bool, guided: bool = False
+) -> Layout:
     """The layout of a fit to views with these cameras, recorded where the device can and ``recorded`` says so."""
     largest = max(cameras, key=lambda c: c.width * c.height)
     cuda, kinds = gaussians.means.is_cuda, {(c.width, c.height, m) for c, m in zip(cameras, masked)}
     return Layout(
         gaussians.sh.shape[1], largest.width, largest.height, sum(c.width * c.height for c in cameras), len(cameras),
-        any(masked), scored, cuda, len(kinds) if cuda and recorded else 0,
+        any(masked), scored, guided, cuda, len(kinds) if cuda and recorded else 0,
     )  # fmt: skip
 
 

@@ -76,6 +76,8 @@ class TrainingView:
     """S_geometry in [0, 1], shape [H, W]; None before `scored`."""
     confirmed: torch.Tensor | None = None
     """z-depth [u] that other views confirm, 0 where none does, shape [H, W]; None where nothing is confirmed."""
+    disparity: torch.Tensor | None = None
+    """Relative inverse depth in [0, 1] for the loss, shape [H, W]; None where the loss does not look at depth."""
 
     @staticmethod
     def of(view: View, device: torch.device) -> TrainingView:
@@ -99,7 +101,20 @@ class TrainingView:
         if depth is not None and depth.valid.any():
             confirmed = torch.as_tensor(np.where(depth.valid, depth.depth, 0), dtype=torch.float32, device=self.photo.device)
         known = semantic if bool(semantic.any()) else None
-        return TrainingView(self.camera, self.photo, self.mask, known, geometry, confirmed)
+        return dataclasses.replace(self, semantic=known, geometry=geometry, confirmed=confirmed)
+
+    def guided(self, prior: Prior) -> TrainingView:
+        """The same view with the disparity of its prior, for the depth term of the loss."""
+        disparity = torch.as_tensor(prior.disparity, dtype=torch.float32, device=self.photo.device)
+        return dataclasses.replace(self, disparity=disparity)
+
+
+def guided_views(views: list[TrainingView], priors: list[Prior]) -> tuple[list[TrainingView], str]:
+    """The views with what the depth term compares their depth with, and a sentence on where there is anything."""
+    known = sum(bool(p.disparity.any()) for p in priors)
+    more = "" if known else "; --depth-model, or a start by --init.source sweep or flow, makes priors"
+    note = f"depth term: in {known} of {len(views)} views, those whose prior knows a depth{more}"
+    return [v.guided(p) for v, p in zip(views, priors, strict=True)], note
 
 
 @dataclass(frozen=True)

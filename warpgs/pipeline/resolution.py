@@ -12,7 +12,7 @@ from warpgs.scene import Camera
 def halved(view: TrainingView) -> TrainingView:
     """The view with both sides halved, rounded down but to at least one pixel; without scores, which belong to whole views.
 
-    Colours are means over what a pixel covers, and a pixel counts where all of that does.
+    Colours and disparities are means over what a pixel covers, and a pixel counts where all of that does.
     """
     c = view.camera
     width, height = max(1, c.width // 2), max(1, c.height // 2)
@@ -23,4 +23,6 @@ def halved(view: TrainingView) -> TrainingView:
 
     photo = mean(view.photo.permute(2, 0, 1)).permute(1, 2, 0).contiguous()
     mask = None if view.mask is None else (mean(view.mask[None])[0] > 1 - 1e-4).to(view.mask.dtype)
-    return TrainingView(Camera(c.viewmat, scale[:, None] * c.K, width, height), photo, mask)
+    disparity = None if view.disparity is None else mean(view.disparity[None])[0]
+    camera = Camera(c.viewmat, scale[:, None] * c.K, width, height)
+    return TrainingView(camera, photo, mask, disparity=disparity)

@@ -64,6 +64,8 @@ class Phase:
     """The coarse layer is kept stable."""
     halved: bool
     """Views are half their size."""
+    guided: bool
+    """The loss has its depth term."""
 
 
 def plan_phases(config: PhaseConfig, steps: int) -> Phases:
