@@ -15,7 +15,6 @@ import warp as wp
 
 from warpgs.kernels import adam, blend, blend_cpu, blend_cuda, bridge, dropout, knn, project, ssim_cpu, ssim_cuda, tiles
 from warpgs.kernels.native import BLOCK
-from warpgs.kernels.project_adam import make_kernel as make_project_adam
 from warpgs.sizes import format_bytes
 
 TILE = 16
@@ -53,7 +52,6 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         passes = blend_cuda.make_backward(TILE, depth, chunk, False)
         own += [(passes.backward, warps), (passes.gather, THREADS)]
     own += [(ssim_cuda.make_kernels().forward, ssim_cuda.THREADS), (adam.make_scheduled_kernel(), THREADS)]
-    own.append((make_project_adam(real, True), BLOCK))
     return common + own
 
 
