@@ -56,7 +56,7 @@ def test_the_second_call_finds_all_in_the_cache(tmp_path):
     code = (
         "import sys; from warpgs import warm; from warpgs.cli import main; "
         "from warpgs.kernels import tiles; import warp as wp; "
-        "warm.fit_kernels = lambda cuda: [] if cuda else [(tiles.make_kernels(wp.float32).find_ranges, 1)]; "
+        "warm.fit_kernels = lambda cuda: [] if cuda else [(tiles.make_kernels(wp.float32, cuda).find_ranges, 1)]; "
         "sys.exit(main(['doctor', '--warm']))"
     )
     environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path), "CUDA_VISIBLE_DEVICES": ""}

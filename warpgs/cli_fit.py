@@ -88,6 +88,8 @@ def _flags(base: FitConfig) -> type:
         """Most memory that the fit's tensors may take on its device while it takes steps, such as 2GiB or 800MB."""
         cuda_graph: bool = base.cuda_graph
         """On CUDA, record a step once and replay it: the same bytes in less time."""
+        fused_adam: bool = base.fused_adam
+        """In recorded steps, update Gaussians in the kernel that finds their gradients: less memory, other last digits."""
         adaptive: bool = base.adaptive
         """Held-out blocks of the training views decide how many Gaussians there are and of which degree."""
         max_gaussians: int = base.density.max_gaussians

@@ -15,7 +15,6 @@ import warp as wp
 
 from warpgs.kernels import adam, blend, blend_cpu, blend_cuda, bridge, dropout, knn, project, ssim_cpu, ssim_cuda, tiles
 from warpgs.kernels.native import BLOCK
-from warpgs.kernels.project_adam import make_kernel as make_project_adam
 from warpgs.sizes import format_bytes
 
 TILE = 16
@@ -32,7 +31,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     real = wp.float32
     common = [
         (project.make_forward(real, cuda), THREADS), (project.make_backward(real, cuda), BLOCK),
-        (tiles.make_kernels(real).pack_counts, THREADS), (tiles.make_kernels(real).find_ranges, THREADS),
+        (tiles.make_kernels(real, cuda).pack_counts, THREADS), (tiles.make_kernels(real, cuda).find_ranges, THREADS),
         (tiles.make_emit(real, cuda), THREADS), (knn.make_kernels(real).search, THREADS), (dropout.make_kernel(), THREADS),
     ]  # fmt: skip
     if not cuda:
@@ -53,7 +52,6 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         passes = blend_cuda.make_backward(TILE, depth, chunk, False)
         own += [(passes.backward, warps), (passes.gather, THREADS)]
     own += [(ssim_cuda.make_kernels().forward, ssim_cuda.THREADS), (adam.make_scheduled_kernel(), THREADS)]
-    own.append((make_project_adam(real, True), BLOCK))
     return common + own
 
 

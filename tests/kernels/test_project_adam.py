@@ -73,11 +73,11 @@ class State:
 
 
 def agree(found: State, wanted: State, before: State):
-    """Bit for bit on CUDA in float32; elsewhere Adam's own kernel fuses products with sums and the other does not."""
+    """Up to rounding: compilers fuse products with sums in one kernel and not in another, on CUDA those of gradients too."""
     for name, a in found.all().items():
         b, old = wanted.all()[name], before.all()[name]
-        if a.is_cuda and a.dtype == torch.float32:
-            assert torch.equal(a, b), name
+        if a.is_cuda and a.dtype == torch.float32:  # measured over 20 steps: 1.7e-4 of the way, 6.6e-6 of moments
+            assert float((a - b).norm()) <= 1e-3 * float((b - old).norm()), name
         else:  # measured: 1.0 ulp
             size = torch.maximum(b.abs(), old.abs())
             if name.startswith("params"):

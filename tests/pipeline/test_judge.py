@@ -94,7 +94,8 @@ def test_hidden_blocks_and_their_errors():
 
 @pytest.mark.parametrize(
     "bad",
-    [{"share": 0}, {"share": math.nan}, {"levels": 0}, {"noise": -1}, {"keep_db": math.nan}, {"share": 0.6}, {"trims": 0}],
+    [{"share": x} for x in (0, 0.6, math.nan)]
+    + [{"levels": 0}, {"trims": 0}, {"noise": -1}, {"enough_db": -1}, {"keep_db": math.nan}],
 )
 def test_bad_settings_are_refused(bad):
     with pytest.raises(UsageError, match="judge"):

@@ -181,8 +181,9 @@ def test_recorded_steps_are_given_up_where_they_need_more():
     """On CUDA a recording has room to spare and views twice; a limit between the two ways is kept by the smaller one."""
     layout = Layout(16, 504, 378, 3 * 504 * 378, cuda=True, recordings=1)
     single = dataclasses.replace(layout, recordings=0)
-    ways = [way.moments(20_000, 200_000, False)["projection"] for way in (layout, single)]
-    assert ways[1] - ways[0] == 20_000 * layout.row  # recorded steps have no gradients of the parameters
+    ways = [dataclasses.replace(way, fused=True).moments(20_000, 200_000, False)["projection"] for way in (layout, single)]
+    assert ways[1] - ways[0] == 20_000 * layout.row  # fused steps have no gradients of the parameters
+    assert layout.moments(20_000, 200_000, False)["projection"] == ways[1]
     many = {"count": 20_000, "instances": 200_000, "most": 20_000, "available": 2**40}
     wide, _ = plan(layout, **many, limit=2**33, room=1.3)
     assert not wide.graph_refused and not wide.banded

@@ -46,11 +46,16 @@ _CLEAR = """
     __syncthreads();
     const int first = item - (int)threadIdx.x, rows = min(BLOCK, sh.shape[0] - first), size = 3 * sh.shape[1];
     float* from = reinterpret_cast<float*>(sh.data) + (long long)first * size;
-    if (size % 4 == 0) {
-        for (int i = threadIdx.x; i < rows * (size / 4); i += BLOCK)
-            if (!s_kept[i / (size / 4)])
+    auto clear = [&](int pieces) {
+        for (int i = threadIdx.x; i < rows * pieces; i += BLOCK)
+            if (!s_kept[i / pieces])
                 reinterpret_cast<float4*>(from)[i] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
-    } else
+    };
+    if (size == 48)
+        clear(12);  // degree 3, the usual: to divide by what the compiler knows is much faster
+    else if (size % 4 == 0)
+        clear(size / 4);
+    else
         for (int i = threadIdx.x; i < rows * size; i += BLOCK)
             if (!s_kept[i / size])
                 from[i] = 0.0f;
@@ -121,19 +126,30 @@ _COLOR_BACKWARD = """
         }
     };
     if (size % 4 == 0) {
+        // AHEAD loads before the stores that use them: the compiler cannot know that rows are apart, and would wait for each
+        constexpr int AHEAD = 6;
         #pragma unroll
-        for (int q = 0; q < 12; ++q) {
-            float4* to = reinterpret_cast<float4*>(v_row) + q;
-            if (4 * q < 3 * count) {
-                const float4 c = reinterpret_cast<const float4*>(row)[q];
-                float4 sum = add ? *to : make_float4(0.0f, 0.0f, 0.0f, 0.0f);
-                give(4 * q, c.x, sum.x);
-                give(4 * q + 1, c.y, sum.y);
-                give(4 * q + 2, c.z, sum.z);
-                give(4 * q + 3, c.w, sum.w);
-                *to = sum;
-            } else if (!add && 4 * q < 3 * size)
-                *to = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+        for (int first = 0; first < 12; first += AHEAD) {
+            float4 held[AHEAD];
+            #pragma unroll
+            for (int k = 0; k < AHEAD; ++k)
+                if (4 * (first + k) < 3 * count)
+                    held[k] = reinterpret_cast<const float4*>(row)[first + k];
+            #pragma unroll
+            for (int k = 0; k < AHEAD; ++k) {
+                const int q = first + k;
+                float4* to = reinterpret_cast<float4*>(v_row) + q;
+                if (4 * q < 3 * count) {
+                    const float4 c = held[k];
+                    float4 sum = add ? *to : make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+                    give(4 * q, c.x, sum.x);
+                    give(4 * q + 1, c.y, sum.y);
+                    give(4 * q + 2, c.z, sum.z);
+                    give(4 * q + 3, c.w, sum.w);
+                    *to = sum;
+                } else if (!add && 4 * q < 3 * size)
+                    *to = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+            }
         }
     } else {
         #pragma unroll
@@ -201,6 +217,18 @@ def make_functions():
         """Sum over this lane of the warp and those before it."""
         ...
 
+    @wp.func_native(
+        """
+        long long sum = value;
+        for (int distance = 16; distance > 0; distance /= 2)
+            sum += __shfl_xor_sync(0xffffffffu, sum, distance);
+        return sum;
+        """
+    )
+    def whole_sum(value: wp.int64) -> wp.int64:
+        """Sum over all lanes of the warp, which all of them must ask for."""
+        ...
+
     @wp.func_native("return __ffs(mask) - 1;")
     def lowest(mask: int) -> int:
         """Position of the lowest bit set, -1 for none."""
@@ -226,6 +254,6 @@ def make_functions():
 
     return SimpleNamespace(
         compact=compact, store_record=store_record, clear_rows=clear_rows, ballot=ballot, broadcast=broadcast,
-        running_sum=running_sum, lowest=lowest, color=color, color_backward=color_backward,
+        running_sum=running_sum, whole_sum=whole_sum, lowest=lowest, color=color, color_backward=color_backward,
         color_weights=color_weights,
     )  # fmt: skip

@@ -211,6 +211,7 @@ def make_backward(real, native: bool):
                 v_mean += g.mean
                 v_quat += g.quat
                 v_log_scale += g.log_scale
+                # before the colour: its loads need not wait for what is stored there
                 v_logit += f.logit(splats, v_splats, i, logit_opacities[n])
 
                 d = m.direction(means[n], view)

@@ -68,10 +68,12 @@ def grid(width: int, height: int, tile_size: int) -> tuple[int, int]:
 
 
 @functools.cache
-def make_kernels(real):
-    """Kernels for one scalar type."""
+def make_kernels(real, native: bool):
+    """Kernels for one scalar type; ``native`` is for CUDA, where a running sum has one entry for the 32 items of a warp."""
+    lanes, per = make_native() if native else None, wp.constant(32 if native else 1)
+    module = f"warpgs.kernels.tiles.{real.__name__}.{int(native)}"
 
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.tiles.{real.__name__}")
+    @wp.kernel(enable_backward=False, module=module)
     def depth_keys(
         begin: int, splats: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
         # outputs
@@ -84,28 +86,39 @@ def make_kernels(real):
         else:
             keys[i] = real(wp.inf)
 
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.tiles.{real.__name__}")
+    @wp.kernel(enable_backward=False, module=module)
     def pack_counts(
         begin: int, tile_counts: wp.array(dtype=int),
         # outputs
         packed: wp.array(dtype=wp.int64),
     ):  # fmt: skip
         i = begin + wp.tid()
-        packed[i] = wp.int64(tile_counts[i]) + wp.where(tile_counts[i] > 0, wp.int64(VISIBLE), wp.int64(0))
+        own = wp.int64(0)
+        if i < tile_counts.shape[0] and tile_counts[i] > 0:
+            own = wp.int64(VISIBLE) + wp.int64(tile_counts[i])
+        if wp.static(native):
+            own = lanes.whole_sum(own)
+        if i < tile_counts.shape[0] and i % per == 0:
+            packed[i // per] = own
 
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.tiles.{real.__name__}")
+    @wp.kernel(enable_backward=False, module=module)
     def visible_keys(
         begin: int, splats: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), packed: wp.array(dtype=wp.int64),
         # outputs
         keys: wp.array(dtype=real), ids: wp.array(dtype=int),
     ):  # fmt: skip
         i = begin + wp.tid()
-        if tile_counts[i] > 0:
-            j = int(packed[i] / wp.int64(VISIBLE)) - 1
+        seen = wp.where(i < tile_counts.shape[0] and tile_counts[i] > 0, 1, 0)
+        after = int(0)  # the visible ones that the sum has behind this one
+        if wp.static(native):
+            rank = lanes.running_sum(seen)
+            after = lanes.broadcast(rank, 31) - rank
+        if seen == 1:
+            j = int(packed[i // per] / wp.int64(VISIBLE)) - 1 - after
             keys[j] = splats[i, 9]
             ids[j] = i
 
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.tiles.{real.__name__}")
+    @wp.kernel(enable_backward=False, module=module)
     def ordered_counts(
         begin: int, order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
         # outputs
@@ -123,22 +136,22 @@ def make_kernels(real):
     ):  # fmt: skip
         i = begin + wp.tid()
         tile = keys[i]
+        slot = slots[i]  # asked for before its tile is known, as are the neighbours: the waits overlap
+        before = keys[wp.max(i - 1, 0)]
+        after = keys[wp.min(i + 1, count - 1)]
         if tile == no_tile:
             ids[i] = 0
             return
-        ids[i] = owners[slots[i]]
-        if i == 0 or keys[wp.max(i - 1, 0)] != tile:
+        ids[i] = owners[slot]
+        if i == 0 or before != tile:
             ranges[tile, 0] = i
-        if i == count - 1 or keys[wp.min(i + 1, count - 1)] != tile:
+        if i == count - 1 or after != tile:
             ranges[tile, 1] = i + 1
 
     return SimpleNamespace(
-        depth_keys=depth_keys,
-        pack_counts=pack_counts,
-        visible_keys=visible_keys,
-        ordered_counts=ordered_counts,
+        depth_keys=depth_keys, pack_counts=pack_counts, visible_keys=visible_keys, ordered_counts=ordered_counts,
         find_ranges=find_ranges,
-    )
+    )  # fmt: skip
 
 
 @functools.cache
@@ -321,8 +334,8 @@ def bin_tiles(
     sizes = bridge.check(splats=(splats, "C N 12"))
     if tuple(tile_counts.shape) != (sizes["C"], sizes["N"]) or tile_counts.dtype != torch.int32:
         raise ValueError(f"tile_counts must be int32 of shape {[sizes['C'], sizes['N']]}, not {list(tile_counts.shape)}")
-    device, real = splats.device, bridge.real_of(splats)
-    k = make_kernels(real)
+    device, real, native = splats.device, bridge.real_of(splats), splats.is_cuda
+    k = make_kernels(real, native)
     columns, rows = grid(width, height, tile_size)
     tiles, count = columns * rows, sizes["C"] * sizes["N"]
     no_tile = sizes["C"] * tiles
@@ -335,9 +348,8 @@ def bin_tiles(
     ranges = torch.zeros(no_tile, 2, dtype=torch.int32, device=device)
     ints = functools.partial(torch.empty, dtype=torch.int32, device=device)
     if count == 0:
-        return Tiles(
-            tile_size, ranges, *(ints(0) for _ in range(3)), counts, ints(0), torch.zeros(1, dtype=torch.int64, device=device)
-        )
+        none = torch.zeros(1, dtype=torch.int64, device=device)
+        return Tiles(tile_size, ranges, *(ints(0) for _ in range(3)), counts, ints(0), none)
 
     splats = splats.detach().contiguous().view(count, -1)
     splats_view, counts_view = bridge.view(splats, real), bridge.view(counts, wp.int32)
@@ -351,8 +363,8 @@ def bin_tiles(
                 many = torch.stack([(counts > 0).sum(), counts.sum(dtype=torch.int64)])
                 _check_total(*reversed(many.tolist()), device, tiles, budget_bytes)
             # One look at the device, before the sorts, tells how many are visible and how many tiles they touch.
-            packed = longs(count)
-            bridge.launch(k.pack_counts, count, [counts_view, bridge.view(packed, wp.int64)], device)
+            packed, threads = (longs(-(-count // 32)), -(-count // 256) * 256) if native else (longs(count), count)
+            bridge.launch(k.pack_counts, threads, [counts_view, bridge.view(packed, wp.int64)], device)
             torch.cumsum(packed, 0, out=packed)
             visible, total = divmod(int(packed[-1]), VISIBLE)
             _check_total(total, visible, device, tiles, budget_bytes)
@@ -362,16 +374,12 @@ def bin_tiles(
             bridge.launch(k.depth_keys, count, [splats_view, counts_view, depths_view, order_view], device)
         else:
             inputs = [splats_view, counts_view, bridge.view(packed, wp.int64), depths_view, order_view]
-            bridge.launch(k.visible_keys, count, inputs, device)
-        if visible > 0:
-            wp.utils.radix_sort_pairs(depths_view.array(), order_view.array(), visible)
+            bridge.launch(k.visible_keys, threads, inputs, device)
+        wp.utils.radix_sort_pairs(depths_view.array(), order_view.array(), visible)
         ends = longs(max(visible, 1))
         ends_view = bridge.view(ends, wp.int64)
         bridge.launch(k.ordered_counts, visible, [order_view, counts_view, ends_view], device)
-        if visible > 0:
-            torch.cumsum(ends, 0, out=ends)
-        else:
-            ends.zero_()
+        ends = torch.cumsum(ends, 0, out=ends) if visible > 0 else ends.zero_()
         starts, keys, slots, owners = ints(count), ints(2 * total), ints(2 * total), ints(total)
         if fixed:
             keys[:total].fill_(no_tile)
@@ -382,10 +390,9 @@ def bin_tiles(
             bridge.view(starts, wp.int32), keys_view, slots_view, owners_view,
             bridge.view(overflow if fixed else starts, wp.int32),
         ]  # fmt: skip
-        threads = -(-visible // 256) * 256 if device.type == "cuda" else visible
-        bridge.launch(make_emit(real, device.type == "cuda"), threads, inputs, device, cost=10)
-        if total > 0:
-            wp.utils.radix_sort_pairs(keys_view.array(), slots_view.array(), total, end_bit=no_tile.bit_length())
+        threads = -(-visible // 256) * 256 if native else visible
+        bridge.launch(make_emit(real, native), threads, inputs, device, cost=10)
+        wp.utils.radix_sort_pairs(keys_view.array(), slots_view.array(), total, end_bit=no_tile.bit_length())
         # the second half of the sorted buffers is free again
         ids = slots[total:]
         inputs = [keys_view, slots_view, owners_view, total, no_tile, bridge.view(ids, wp.int32), bridge.view(ranges, wp.int32)]

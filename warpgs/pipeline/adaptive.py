@@ -227,11 +227,12 @@ class AdaptiveFit(Fit):
         return float((-10 * torch.log10(torch.stack(errors) + FLOOR)).mean())
 
     def _trim(self) -> None:
-        """Make the model smaller within the loss that is allowed on its training views, counted from before the first trim."""
+        """Make the model smaller within the loss allowed on its training views, from before the first trim or from enough."""
         limits, whole, before = self.optimizer.limits, self._view_psnr(self.gaussians), len(self.gaussians)
         c = self.config
-        promised = self.trims[0]["psnr"][0] if self.trims else whole
-        spare = whole - promised + (c.judge.trim_db if self.step == c.steps else c.judge.mended_db)
+        promised = min(self.trims[0]["psnr"][0] if self.trims else whole, c.judge.enough_db)
+        rest = (c.steps - self.step) / (c.steps - self.closed)
+        spare = whole - promised + c.judge.trim_db + rest * c.judge.mended_db
         made = shrink.prune_model(
             self.gaussians, self.layers.level, self._looks, lambda g, share: self._view_psnr(g) >= whole - share * spare
         )

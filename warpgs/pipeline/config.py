@@ -51,6 +51,9 @@ class FitConfig:
     stops where a step would not fit, and pictures are drawn in bands where a whole one would not."""
     cuda_graph: bool = True
     """On CUDA, record a step once and replay it; the same kernels and the same bytes as without, in less time."""
+    fused_adam: bool = False
+    """In recorded steps, update Gaussians in the kernel that finds their gradients: a step takes less memory and, with millions
+    of them, a tenth more time; results differ in their last digits (docs/decisions/006-recorded-steps.md)."""
     adaptive: bool = False
     """Held-out blocks of the training views decide how many Gaussians there are and of which degree (docs/complexity.md)."""
     judge: JudgeConfig = field(default_factory=JudgeConfig)

@@ -263,6 +263,7 @@ class Fit:
                 degree=phase.degree, rule=c.rule, loss=c.loss, background=self.background,
                 dropout_seed=c.seed if self.dropout > 0 else None, share=self._share(phase),
                 protected=(self.layers, c.method.protect) if self._protects else None, most=self.most,
+                fused=c.fused_adam,
             )  # fmt: skip
         return self.graphs[key]
 
@@ -273,7 +274,7 @@ class Fit:
         cameras, masked = [v.camera for v in self.shown], [v.mask is not None for v in self.shown]
         layout = layout_of(
             self.gaussians, cameras, masked, scored=c.method.events, recorded=c.cuda_graph,
-            guided=c.loss.depth_weight > 0,
+            guided=c.loss.depth_weight > 0, fused=c.fused_adam,
         )  # fmt: skip
         self.memory, self.layout = plan(
             layout, count=len(self.optimizer.gaussians), instances=most_instances(self.gaussians, cameras, c.rule),

@@ -79,7 +79,7 @@ class StepGraph:
         self, views: Views, optimizer: Optimizer, stats: DensityStats | None, burst: Burst, *,
         degree: int, rule: str, loss: LossConfig, background: torch.Tensor, dropout_seed: int | None = None,
         share: torch.Tensor | None = None, protected: tuple[Layers, ProtectConfig] | None = None, most: int | None = None,
-        fused: bool = True,
+        fused: bool = False,
     ):  # fmt: skip
         """Record.
 
@@ -96,7 +96,8 @@ class StepGraph:
             share: Part of its step that each mean takes, shape [N]; None for all of it.
             protected: What holds up the opacity of the young; None where nothing does.
             most: Instances that the memory limit allows; None for no limit.
-            fused: Whether projection's backward pass and Adam are one kernel, so that gradients never are in memory.
+            fused: Whether projection's backward pass and Adam are one kernel, so that gradients never are in memory; the bits
+                are then not those of single steps (docs/decisions/006-recorded-steps.md).
 
         Raises:
             OverLimitError: There is room for more than ``most`` instances to be made.

@@ -51,14 +51,18 @@ class JudgeConfig:
     trim_db: float = 0.1
     """PSNR on the training views that the last trim may leave the model below that before the first [dB]; 0 for no trims."""
     mended_db: float = 0.3
-    """The same for the trims before the last: training mends what they take [dB]."""
+    """What earlier trims may take beyond that, times the share of the steps after growth that is left to mend it [dB]."""
+    enough_db: float = 39.1
+    """PSNR on the training views, `FLOOR` included, that no Gaussian is spent on improving: where a fit is better when it is
+    trimmed first, both losses count from here, so that size follows content and not how well a fit happened to go [dB]. At
+    most 42.1, where there is no error; the default is an error of `FLOOR`."""
 
     def __post_init__(self):
         if not 0 < self.share <= 0.5:
             raise UsageError(f"judge share {self.share} must lie above 0 and be at most 0.5")
         if self.levels < 1 or self.trims < 1:
             raise UsageError(f"judge: levels {self.levels} and trims {self.trims} must be at least 1")
-        for name in ("noise", "least_db", "keep_db", "trim_db", "mended_db"):
+        for name in ("noise", "least_db", "keep_db", "trim_db", "mended_db", "enough_db"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise UsageError(f"judge {name.replace('_', '-')} must be 0 or more and finite, not {getattr(self, name)}")
 

@@ -59,6 +59,8 @@ class Layout:
     """Whether views have scores, by which fine Gaussians are sampled."""
     guided: bool = False
     """Whether the loss has its depth term."""
+    fused: bool = False
+    """Whether recorded steps update Gaussians in the kernel that finds their gradients."""
     cuda: bool = False
     recordings: int = 0
     """CUDA graphs that exist at a time, one for each size of view; 0 where steps are taken one by one."""
@@ -117,9 +119,9 @@ class Layout:
     def _projection(self, count: int) -> int:
         """Records, their gradient and its copy for the density statistics, and the gradients of the parameters.
 
-        Recorded steps have no gradients of the parameters (graph.StepGraph).
+        Fused steps have no gradients of the parameters (graph.StepGraph).
         """
-        return (FLOAT * (3 * RECORD + 1) + (0 if self.recordings else self.row)) * count
+        return (FLOAT * (3 * RECORD + 1) + (0 if self.fused and self.recordings else self.row)) * count
 
     def event(self, before: int, after: int) -> int:
         """Bytes on top of ``held(after)`` while Gaussians are added: new rows, and one tensor before, cut and grown."""
@@ -214,14 +216,21 @@ class MemoryPlan:
 
 
 def layout_of(
-    gaussians: Gaussians, cameras: list[Camera], masked: list[bool], *, scored: bool, recorded: bool, guided: bool = False
+    gaussians: Gaussians,
+    cameras: list[Camera],
+    masked: list[bool],
+    *,
+    scored: bool,
+    recorded: bool,
+    guided: bool = False,
+    fused: bool = False,
 ) -> Layout:
     """The layout of a fit to views with these cameras, recorded where the device can and ``recorded`` says so."""
     largest = max(cameras, key=lambda c: c.width * c.height)
     cuda, kinds = gaussians.means.is_cuda, {(c.width, c.height, m) for c, m in zip(cameras, masked)}
     return Layout(
         gaussians.sh.shape[1], largest.width, largest.height, sum(c.width * c.height for c in cameras), len(cameras),
-        any(masked), scored, guided, cuda, len(kinds) if cuda and recorded else 0,
+        any(masked), scored, guided, fused, cuda, len(kinds) if cuda and recorded else 0,
     )  # fmt: skip
 
 

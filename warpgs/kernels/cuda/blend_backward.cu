@@ -33,6 +33,9 @@ while (top_instance > floor) {
     }
     const int stop_at = top_instance;
     top_instance = first;
+    // the Gaussian of this lane in a batch is known a batch before its record is loaded
+    int batch = (stop_at - 1) & ~31;
+    int next_id = batch + lane >= first && batch + lane < stop_at ? splat_ids.data[batch + lane] : 0;
     const int camera = tile / tiles, in_camera = tile - camera * tiles;
     const int left = (in_camera % columns) * SIDE, top = (in_camera / columns) * SIDE;
     const float px = origin_x + left + lane % 8 + 0.5f, py = origin_y + top + lane / 8 + 0.5f;  // of the pixel in the first block
@@ -88,17 +91,19 @@ while (top_instance > floor) {
             }
         }
     }
-    for (int batch = (stop_at - 1) & ~31; batch + 32 > first; batch -= 32) {
-        const int i = batch + lane;
+    for (; batch + 32 > first; batch -= 32) {
+        const int i = batch + lane, id = next_id;
         const bool mine = i >= first && i < stop_at;
+        if (i - 32 >= first)
+            next_id = splat_ids.data[i - 32];
         unsigned mask = 0;
         int target = 0;
         __syncwarp();
         if (mine) {
-            target = atomic ? splat_ids.data[i] : slots.data[i];
+            target = atomic ? id : slots.data[i];
             if (i < part_last) {
                 Splat s;
-                s.load(splats.data, splat_ids.data[i]);
+                s.load(splats.data, id);
                 s.rescale();
                 const float limit = limit_of(s.b.y, alpha_cut);
                 #pragma unroll

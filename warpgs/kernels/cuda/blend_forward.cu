@@ -19,6 +19,7 @@ int i = (begin & ~31) + lane;
 Splat s;
 if (i >= begin && i < end)
     s.load(splats.data, splat_ids.data[i]);
+int next_id = i + 32 < end ? splat_ids.data[i + 32] : 0;  // known a batch before its record is loaded
 for (int batch = begin & ~31; batch < end; batch += 32) {
     if (__all_sync(ALL, done))
         break;
@@ -50,7 +51,9 @@ for (int batch = begin & ~31; batch < end; batch += 32) {
     __syncwarp();
     i += 32;
     if (i < end)
-        s.load(splats.data, splat_ids.data[i]);  // under way while this batch is blended
+        s.load(splats.data, next_id);  // under way while this batch is blended
+    if (i + 32 < end)
+        next_id = splat_ids.data[i + 32];
     for (int j = 0; j < count; j += AHEAD) {
         float alpha[AHEAD];
         #pragma unroll

@@ -1,19 +1,42 @@
 // Tiles with long lists first, so that none of them starts when the others are done: a counting sort by the number of binary
 // digits of the length, in one thread block. The order among equals differs from run to run; no result depends on it.
-__shared__ int s_starts[33];
-for (int i = threadIdx.x; i < 33; i += blockDim.x)
+constexpr int HELD = 8;  // lengths that a thread asks for before it needs the first: one block alone cannot hide the waits
+__shared__ int s_starts[34];  // by rank: 0 for the longest lists, 32 for empty ones, 33 for what is no tile
+const int lane = threadIdx.x % 32, threads = blockDim.x;
+for (int i = threadIdx.x; i < 34; i += threads)
     s_starts[i] = 0;
 __syncthreads();
-auto rank = [&](int tile) { return __clz(ranges.data[2 * tile + 1] - ranges.data[2 * tile]); };  // 0 for the longest
-for (int tile = threadIdx.x; tile < count; tile += blockDim.x)
-    atomicAdd(&s_starts[rank(tile)], 1);
+auto deal = [&](bool place) {
+    for (int begin = threadIdx.x; begin - (int)threadIdx.x < count; begin += HELD * threads) {
+        int rank[HELD];
+        #pragma unroll
+        for (int k = 0; k < HELD; ++k) {
+            const int tile = begin + k * threads;
+            rank[k] = 33;
+            if (tile < count)
+                rank[k] = __clz(ranges.data[2 * tile + 1] - ranges.data[2 * tile]);
+        }
+        #pragma unroll
+        for (int k = 0; k < HELD; ++k) {
+            // one addition for all lanes of a rank: most tiles have one of a few, and additions to one number wait in line
+            const unsigned alike = __match_any_sync(0xffffffffu, rank[k]);
+            const int leader = __ffs(alike) - 1;
+            int at = 0;
+            if (lane == leader)
+                at = atomicAdd(&s_starts[rank[k]], __popc(alike));
+            at = __shfl_sync(0xffffffffu, at, leader) + __popc(alike & ((1u << lane) - 1u));
+            if (place && rank[k] < 33)
+                order.data[at] = begin + k * threads;
+        }
+    }
+};
+deal(false);
 __syncthreads();
 if (threadIdx.x == 0)
-    for (int i = 0, sum = 0; i < 33; ++i) {
+    for (int i = 0, sum = 0; i < 34; ++i) {
         const int here = s_starts[i];
         s_starts[i] = sum;
         sum += here;
     }
 __syncthreads();
-for (int tile = threadIdx.x; tile < count; tile += blockDim.x)
-    order.data[atomicAdd(&s_starts[rank(tile)], 1)] = tile;
+deal(true);

@@ -1,0 +1,234 @@
+"""Blending's backward pass by buckets, a lane per Gaussian, against the product's by chunks: same inputs, same outputs.
+
+usage: python -m bench.bucket GARDEN.npz [--out FILE.json] [--only NAME] [--depth] [--repeats 30]
+Needs a CUDA device; GARDEN.npz as for bench.garden. For each size all gradients are compared first. Then the kernels are timed,
+one launch each in turn, between events, and with them the forward kernel that leaves states for either. The last lines are
+a table; the exit code is 1 if gradients disagree.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from unittest import mock
+
+import torch
+import warp as wp
+
+from bench.against_gsplat import CONFIGURATIONS, first_camera, quartiles
+from bench.garden import garden_inputs
+from bench.kernels.bucket import SIZES, make_backward
+from warpgs.constants import RULES, Rule
+from warpgs.kernels import blend_cuda, bridge
+from warpgs.kernels.project import project
+from warpgs.kernels.tiles import Tiles, bin_tiles
+from warpgs.scene import Camera, Gaussians
+
+NAMES = ("112k at 504x378", "2.8M at 1920x1080", "2.8M at 3840x2160")
+REPEATS, WARM_UP = 30, 5
+TOLERANCE = 1e-5
+"""Relative distance (L2) between the gradients of two kernels up to which they agree, for every one of the values."""
+STATES = -5
+"""Where the backward kernels take the states, among their arguments."""
+
+
+@dataclass(frozen=True)
+class Launch:
+    """A launch of the product, put off."""
+
+    kernel: object
+    count: int
+    inputs: list
+    device: torch.device
+    how: dict
+
+    def __call__(self) -> None:
+        bridge.launch(self.kernel, self.count, self.inputs, self.device, **self.how)
+
+
+def put_off(work: Callable, *inputs) -> tuple[object, list[Launch]]:
+    """What a function of the product returns, with its memory not written yet, and the launches that would write it."""
+    launches = []
+
+    def note(kernel, count, arguments, device, **how):
+        launches.append(Launch(kernel, count, arguments, device, how))
+
+    with mock.patch.object(bridge, "launch", note):
+        result = work(*inputs)
+    return result, launches
+
+
+class Case:
+    """One picture: forward launches by distance of states, the product's backward launch, and its variants.
+
+    A variant is the product's kernel with another size of chunk, or one by buckets.
+
+    Args:
+        splats: Records of `project`, shape [C, N, 12].
+        tiles: Their instances.
+        width: Image width [px].
+        height: Image height [px].
+        rule: Cut-offs.
+        upstream: Gradients of colour [C, H, W, 3], and of alpha and depth [C, H, W] or None for neither.
+    """
+
+    def __init__(self, splats: torch.Tensor, tiles: Tiles, width: int, height: int, rule: Rule, upstream: tuple):
+        how = (splats, tiles, torch.full((len(splats), 3), 0.3, device=splats.device), (0, 0), width, height, rule)
+        chunk = blend_cuda.chunk_of(tiles, True)
+        self.chunk, self.instances, self.tiles = chunk, len(tiles.slots), tiles
+        self.values = 9 if upstream[1] is None else blend_cuda.VALUES
+        self.forward, states = {}, {}
+        for size in SIZES:
+            with mock.patch.object(blend_cuda, "chunk_of", return_value=size):
+                (rgb, _, depth, *kept), (order, self.forward[size]) = put_off(blend_cuda.forward, *how, True, True)
+            order()
+            self.forward[size]()
+            states[size] = kept[-1]
+            if size == chunk:
+                saved = (rgb, depth, *kept)
+        self.v_splats, (self.backward, self.gather) = put_off(blend_cuda.backward, *how, True, saved, *upstream)
+        assert self.backward.inputs[STATES].tensor is states[chunk]
+        self.v_slots = self.backward.inputs[-1].tensor
+        self.state_mib = {size: t.numel() * 4 / 2**20 for size, t in states.items()}
+        with_depth = self.values == blend_cuda.VALUES
+        kernels = {f"chunks of {n}": (blend_cuda.make_backward(tiles.size, with_depth, n, False).backward, n) for n in SIZES}
+        kernels["bucket 32, all pixels"] = make_backward(tiles.size, with_depth, 32, False), 32
+        kernels |= {f"bucket {n}": (make_backward(tiles.size, with_depth, n, True), n) for n in SIZES}
+        self.name = f"chunks of {chunk}"
+        self.variants = {name: self._variant(*k, states) for name, k in kernels.items() if name != self.name}
+
+    def _variant(self, kernel, size: int, states: dict) -> Launch:
+        inputs = list(self.backward.inputs)
+        inputs[STATES] = bridge.view(states[size], wp.float32)
+        count = 32 * -(-self.instances // size)
+        return Launch(kernel, count, inputs, self.backward.device, {"block_dim": 32 * blend_cuda.WARPS})
+
+    def gradients(self, backward: Launch) -> tuple[torch.Tensor, torch.Tensor]:
+        """Sums of each instance, shape [M, 9 or 10], and gradients of the records, [C, N, 12]; NaN where none was written."""
+        self.v_slots.fill_(torch.nan)
+        self.v_splats.fill_(torch.nan)
+        backward()
+        self.gather()
+        return self.v_slots[:, : self.values].clone(), self.v_splats.clone()
+
+    def disagreements(self) -> dict[str, dict]:
+        """Distance of each variant's gradients from the product's, relative, the largest among the values."""
+        wanted, result = self.gradients(self.backward), {}
+        for name, variant in self.variants.items():
+            found = self.gradients(variant)
+            result[name] = {
+                "instances": max(distance(found[0][:, k], wanted[0][:, k]) for k in range(self.values)),
+                "records": max(distance(found[1][..., k], wanted[1][..., k]) for k in range(self.values)),
+            }
+        return result
+
+    def works(self) -> dict[str, Launch]:
+        """What is timed."""
+        forward = {f"forward, states at {size}": launch for size, launch in self.forward.items()}
+        return forward | {self.name: self.backward} | self.variants
+
+
+def distance(found: torch.Tensor, wanted: torch.Tensor) -> float:
+    """Of two tensors, relative to the second, L2; NaN if any entry is."""
+    return float(torch.linalg.vector_norm(found.double() - wanted.double()) / torch.linalg.vector_norm(wanted.double()))
+
+
+def agrees(row: dict) -> bool:
+    """Whether all distances are within the tolerance; NaN is not."""
+    return all(d <= TOLERANCE for errors in row["disagreement"].values() for d in errors.values())
+
+
+def times_in_turn(works: dict[str, Callable], repeats: int) -> dict[str, dict]:
+    """GPU time of each work [us], one repeat each in turn. The host runs ahead, so that no launch is waited for."""
+    marks = {name: [] for name in works}
+    for i in range(WARM_UP + repeats):
+        for name, work in works.items():
+            begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+            begin.record()
+            work()
+            end.record()
+            if i >= WARM_UP:
+                marks[name].append((begin, end))
+    torch.cuda.synchronize()
+    return {name: quartiles([1000 * begin.elapsed_time(end) for begin, end in own]) for name, own in marks.items()}
+
+
+def case_of(gaussians: Gaussians, camera: Camera, rule: Rule, with_depth: bool) -> Case:
+    """The picture of a batch of cameras, with random gradients of it."""
+    size = {"width": camera.width, "height": camera.height}
+    with torch.no_grad():
+        tensors = gaussians.tensors().values()
+        splats, counts = project(*tensors, camera.viewmat, camera.K, **size, degree=gaussians.sh_degree, rule=rule)
+        tiles = bin_tiles(splats, counts, **size, rule=rule)
+    generator = torch.Generator(splats.device).manual_seed(1)
+
+    def rand(*shape):
+        return torch.rand(len(splats), camera.height, camera.width, *shape, device=splats.device, generator=generator)
+
+    return Case(splats, tiles, *size.values(), rule, (rand(3), rand() if with_depth else None, rand() if with_depth else None))
+
+
+def measure(case: Case, repeats: int) -> dict:
+    """Agreement, times and sizes of one case."""
+    row = {"tiles": len(case.tiles.ranges), "instances": case.instances, "chunk": case.chunk}
+    row |= {"disagreement": case.disagreements(), "gpu_us": times_in_turn(case.works(), repeats)}
+    return row | {"state_mib": {str(size): round(mib, 1) for size, mib in case.state_mib.items()}}
+
+
+def table(rows: list[dict]) -> str:
+    """Medians and quartiles of all kernels [us], a column for each size; agreement below."""
+    lines = []
+    for row in rows:
+        lines.append(f"{row['configuration']}: {row['instances']:,} instances, states {row['state_mib']} MiB")
+        base = row["gpu_us"][f"chunks of {row['chunk']}"]["median"]
+        for name, t in row["gpu_us"].items():
+            low, high = t["quartiles"]
+            line = f"  {name:<24} {t['median']:9.1f} us [{low:.1f}, {high:.1f}]"
+            if not name.startswith("forward"):
+                line += f"  {t['median'] / base:5.2f} of the product's"
+            if name in row["disagreement"]:
+                errors = row["disagreement"][name]
+                line += f"  off by {errors['instances']:.1e} (instances), {errors['records']:.1e} (records)"
+            lines.append(line)
+        lines.append("  gradients agree" if agrees(row) else f"  GRADIENTS DISAGREE by more than {TOLERANCE:g}")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Compare, time, write, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("garden")
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--only", help="a size's name, or its beginning")
+    parser.add_argument("--depth", action="store_true", help="with gradients of depth and alpha")
+    parser.add_argument("--repeats", type=int, default=REPEATS)
+    a = parser.parse_args()
+    rows = []
+    for name in NAMES:
+        if a.only and not name.startswith(a.only):
+            continue
+        cells, width, height = CONFIGURATIONS[name]
+        gaussians, cameras = garden_inputs(a.garden, tiles=cells, sh_degree=3, width=width, height=height)
+        case = case_of(gaussians, first_camera(cameras), RULES["gsplat"], a.depth)
+        rows.append({"configuration": name, "depth": a.depth} | measure(case, a.repeats))
+        del case, gaussians
+        torch.cuda.empty_cache()
+        if a.out:  # after each size: nothing is lost if the next one fails
+            result = {
+                "device": torch.cuda.get_device_name(),
+                "torch": torch.__version__,
+                "warp": wp.config.version,
+                "rows": rows,
+            }
+            a.out.write_text(json.dumps(result, indent=1) + "\n")
+        print(f"{name} done", flush=True)
+    print(table(rows))
+    if not all(agrees(row) for row in rows):
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main()
