@@ -1,7 +1,9 @@
 """Nearest-neighbour distances against all pairs."""
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
 from tests.reference.knn import mean_square_distances_reference
 from warpgs.kernels.knn import mean_square_distances
@@ -17,6 +19,15 @@ def test_equal_all_pairs(device, dtype, count, k):
     wanted = mean_square_distances_reference(points.double(), k) if count else torch.zeros(0, dtype=torch.float64)
     assert found.shape == (count,)
     assert torch.allclose(found.double(), wanted, rtol=1e-5 if dtype == torch.float32 else 1e-12, atol=0)
+
+
+@pytest.mark.parametrize("count", [1024, 1025, 32_769, 50_000])
+def test_every_level_of_boxes_is_searched(device, count):
+    """One, two and three levels of boxes, and sets that end within a box of each, against a k-d tree."""
+    points = np.random.default_rng(count).normal(size=(count, 3)) ** 3  # dense in the middle, sparse far out
+    found = mean_square_distances(torch.as_tensor(points, device=device), 3).cpu().numpy()
+    distances, _ = cKDTree(points).query(points, k=4)
+    np.testing.assert_allclose(found, (distances[:, 1:] ** 2).mean(1), rtol=1e-12)
 
 
 def test_clusters_lines_and_duplicates(device):

@@ -183,8 +183,9 @@ def run_jobs(
                         yield _outcome(job, status, bool(killed), seconds, "\n".join(lines[-6:]))
                         shutil.rmtree(folder, ignore_errors=True)
                     elif seconds > timeout * job.patience and not killed:
-                        killed.add(pid)
-                        os.killpg(pid, signal.SIGKILL)
+                        with contextlib.suppress(ProcessLookupError):  # it has no group of its own yet, and is asked again
+                            os.killpg(pid, signal.SIGKILL)
+                            killed.add(pid)
         finally:
             for pid in running:
                 with contextlib.suppress(ProcessLookupError):

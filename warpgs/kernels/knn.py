@@ -1,6 +1,7 @@
-"""Exact mean squared distance of each point to its nearest neighbours, by Morton order and boxes."""
+"""Exact mean squared distance of each point to its nearest neighbours, by Morton order and a tree of boxes."""
 
 import functools
+import itertools
 from types import SimpleNamespace
 
 import torch
@@ -9,7 +10,8 @@ import warp as wp
 from warpgs.kernels import bridge
 
 BOX = 32
-"""Points per box and boxes per group. A query enters a group, a box, only if it lies closer than the neighbours so far."""
+"""Points per box, boxes per box of the level above, and most boxes of the highest level. A query enters a box only if it lies
+closer than the neighbours so far."""
 
 MAX_NEIGHBORS = 8
 
@@ -53,7 +55,7 @@ def make_kernels(real):
     @wp.kernel(enable_backward=False, module=f"warpgs.kernels.knn.{real.__name__}")
     def search(
         begin: int, points: wp.array(dtype=vec3), lower: wp.array(dtype=vec3), upper: wp.array(dtype=vec3),
-        group_lower: wp.array(dtype=vec3), group_upper: wp.array(dtype=vec3), k: int,
+        starts: wp.array(dtype=int), k: int,
         # outputs
         mean_squares: wp.array(dtype=real),
     ):  # fmt: skip
@@ -67,12 +69,23 @@ def make_kernels(real):
         for j in range(home * BOX, wp.min((home + 1) * BOX, points.shape[0])):
             if j != i:
                 nearest = insert(nearest, k, wp.length_sq(points[j] - p))
-        for group in range(group_lower.shape[0]):
-            if gap_squared(group_lower[group], group_upper[group], p) < nearest[k - 1]:
-                for box in range(group * BOX, wp.min((group + 1) * BOX, lower.shape[0])):
-                    if box != home and gap_squared(lower[box], upper[box], p) < nearest[k - 1]:
-                        for j in range(box * BOX, wp.min((box + 1) * BOX, points.shape[0])):
-                            nearest = insert(nearest, k, wp.length_sq(points[j] - p))
+        top = starts.shape[0] - 2
+        level = top
+        at = int(0)  # number of the box within its level
+        while at < starts[level + 1] - starts[level]:
+            box = starts[level] + at
+            if gap_squared(lower[box], upper[box], p) < nearest[k - 1]:
+                if level > 0:
+                    level -= 1
+                    at = at * BOX
+                    continue
+                if at != home:
+                    for j in range(at * BOX, wp.min((at + 1) * BOX, points.shape[0])):
+                        nearest = insert(nearest, k, wp.length_sq(points[j] - p))
+            at += 1
+            while level < top and (at % BOX == 0 or at == starts[level + 1] - starts[level]):  # on from the box around
+                at = (at + BOX - 1) // BOX
+                level += 1
         total = real(0.0)
         for j in range(k):
             total += nearest[j]
@@ -126,15 +139,19 @@ def mean_square_distances(points: torch.Tensor, k: int = 3) -> torch.Tensor:
     order = torch.argsort(morton_codes(points), stable=True)
     ordered = points[order].contiguous()
     result, ordered_result = points.new_empty(count), points.new_empty(count)
-    with bridge.stream_of(device):
-        levels = [(ordered, ordered)]
-        for _ in range(2):
-            size = -(-len(levels[-1][0]) // BOX)
-            levels.append((points.new_empty(size, 3), points.new_empty(size, 3)))
-            inputs = [bridge.view(t, kernels.vec3) for level in levels[-2:] for t in level]
-            bridge.launch(kernels.bounds, size, inputs, device, cost=BOX)
-        inputs = [bridge.view(t, kernels.vec3) for t in (ordered, *levels[1], *levels[2])]
-        inputs += [min(k, count - 1), bridge.view(ordered_result, real)]
-        bridge.launch(kernels.search, count, inputs, device, cost=1000)
+    starts = [0]  # of each level of boxes, and their number
+    size = count
+    while len(starts) == 1 or size > BOX:
+        size = -(-size // BOX)
+        starts.append(starts[-1] + size)
+    lower, upper = points.new_empty(2, starts[-1], 3).unbind()
+    inside = (ordered, ordered)
+    for begin, end in itertools.pairwise(starts):
+        level = (lower[begin:end], upper[begin:end])
+        bridge.launch(kernels.bounds, end - begin, [bridge.view(t, kernels.vec3) for t in (*inside, *level)], device, cost=BOX)
+        inside = level
+    inputs = [bridge.view(t, kernels.vec3) for t in (ordered, lower, upper)]
+    inputs += [bridge.view(torch.tensor(starts, dtype=torch.int32, device=device), wp.int32), min(k, count - 1)]
+    bridge.launch(kernels.search, count, [*inputs, bridge.view(ordered_result, real)], device, cost=1000)
     result[order] = ordered_result
     return result
