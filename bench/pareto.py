@@ -104,7 +104,7 @@ def _panel(panel: Panel, left: float, top: float, colors: dict[str, str]) -> lis
     out.append(_text(left + PLOT_WIDTH / 2, bottom + 38, panel.x_label, anchor="middle", size=11, color="#666666"))
 
     if far:
-        words = "; ".join(f"{p.name}: {p.cost:.3g}, {p.value:.2g}" for p in far)
+        words = "; ".join(f"{p.name}: {p.cost:.3g}, {p.value:.3g}" for p in far)
         out.append(_text(left, bottom + 54, f"farther right: {words}", size=10, color="#666666"))
 
     path, at = "", None
