@@ -86,6 +86,22 @@ def test_without_a_cut_every_tile_is_listed(device):
     assert tiles.ranges.cpu().tolist() == [[5 * i, 5 * i + 5] for i in range(9)]
 
 
+@pytest.mark.parametrize("extra", [1, 3, 40])
+def test_tiles_that_are_counted_and_not_found_are_no_tiles(device, extra):
+    """Room for more than a Gaussian touches, as rounding may count: every slot of it says so, and the lists are the same."""
+    gaussians, cam = cloud(60, device=device), camera(96, 80, 1, torch.float32, device)
+    size = {"width": 96, "height": 80, "rule": EXACT}
+    splats, counts = project(*gaussians.tensors().values(), cam.viewmat, cam.K, degree=1, **size)
+    wanted = bin_tiles(splats, counts, **size)
+    more = torch.where((counts > 0) & (torch.arange(60, device=device) % 3 == 0), counts + extra, counts)
+    tiles = bin_tiles(splats, more, **size)
+    length, added = int(wanted.total), int((more - counts).sum())
+    assert added > 0 and int(tiles.total) == length + added
+    assert torch.equal(tiles.ranges, wanted.ranges) and torch.equal(tiles.splat_ids[:length], wanted.splat_ids)
+    assert bool((tiles.tile_ids[length:] == len(tiles.ranges)).all())
+    assert torch.equal(tiles.slots.sort().values, torch.arange(length + added, dtype=torch.int32, device=device))
+
+
 def test_nothing_visible(device):
     """No Gaussians, and Gaussians behind the camera, give empty tiles."""
     cam = camera(40, 30, cameras=1, dtype=torch.float32, device=device)
