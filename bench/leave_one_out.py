@@ -27,7 +27,7 @@ from warpgs.errors import UsageError
 from warpgs.pipeline.config import PRESETS, FitConfig
 from warpgs.pipeline.run import SceneRequest, choose_device, read_scene
 
-COLUMNS = ("scene", "trial", "left_out", "seed", "psnr", "ssim", "gaussians")
+COLUMNS = ("scene", "trial", "left_out", "seed", "psnr", "ssim", "gaussians", "bytes")
 
 
 def trial_config(trial: str) -> FitConfig:
@@ -69,15 +69,15 @@ def _one(task: tuple[SceneRequest, str, str, str, int, str]) -> dict:
     row = fit_once(scene, split, replace(trial_config(trial), seed=seed), torch.device(device))
     gc.collect()  # a fit and its recorded steps refer to each other: without this their device memory piles up
     return {"scene": Path(request.path).resolve().name, "trial": trial, "left_out": name, "seed": seed} | {
-        k: row[k] for k in ("psnr", "ssim", "gaussians")
+        k: row[k] for k in ("psnr", "ssim", "gaussians", "bytes")
     }
 
 
 def table(rows: list[dict], trials: list[str], views: int) -> list[str]:
     """Markdown lines: mean and standard deviation over seeds of the mean over the views left out, by trial and scene."""
     scenes = sorted({r["scene"] for r in rows})
-    lines = ["| trial | " + " | ".join(f"{s} PSNR [dB] | {s} SSIM | {s} worst seed" for s in scenes) + " |"]
-    lines.append("|---" * (1 + 3 * len(scenes)) + "|")
+    lines = ["| trial | " + " | ".join(f"{s} PSNR [dB] | {s} SSIM | {s} worst seed | {s} kB" for s in scenes) + " |"]
+    lines.append("|---" * (1 + 4 * len(scenes)) + "|")
     for trial in trials:
         cells = []
         for scene in scenes:
@@ -86,11 +86,12 @@ def table(rows: list[dict], trials: list[str], views: int) -> list[str]:
             whole = [g for g in by_seed if len(g) == views]
             psnr = [statistics.mean(r["psnr"] for r in g) for g in whole]
             if not psnr:
-                cells += ["", "", ""]
+                cells += ["", "", "", ""]
                 continue
             spread = f" ± {statistics.stdev(psnr):.2f}" if len(psnr) > 1 else ""
             ssim = statistics.mean(r["ssim"] for g in whole for r in g)
-            cells += [f"{statistics.mean(psnr):.2f}{spread} ({len(psnr)})", f"{ssim:.4f}", f"{min(psnr):.2f}"]
+            size = statistics.mean(r["bytes"] for g in whole for r in g) / 1000
+            cells += [f"{statistics.mean(psnr):.2f}{spread} ({len(psnr)})", f"{ssim:.4f}", f"{min(psnr):.2f}", f"{size:,.0f}"]
         lines.append(f"| `{trial}` | " + " | ".join(cells) + " |")
     return lines
 

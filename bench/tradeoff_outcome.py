@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import torch
 
 from warpgs.io.splits import split_views
+from warpgs.pipeline.adaptive import complexity_figures, fit_class
 from warpgs.pipeline.config import PRESETS, FitConfig
 from warpgs.pipeline.evaluate import render_view, score
-from warpgs.pipeline.fit import Fit, run, train_views
+from warpgs.pipeline.fit import run, train_views
 from warpgs.pipeline.results import options_for
 from warpgs.scene import Scene
 
@@ -53,14 +54,14 @@ def fit_once(scene: Scene, split: str, config: FitConfig, device: torch.device) 
     chosen = split_views(scene, split)
     train, test = train_views(scene, chosen.train), train_views(scene, chosen.test)
     wall, cpu = time.perf_counter(), time.process_time()
-    fit = Fit(train, scene.points, config, device, scene.background)
+    fit = fit_class(config)(train, scene.points, config, device, scene.background)
     setup, setup_cpu = time.perf_counter() - wall, time.process_time() - cpu
     run(fit, lambda _: None, lambda _: None, lambda: False)
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     row = {
         "seconds": time.perf_counter() - wall, "setup": setup, "cpu_seconds": time.process_time() - cpu, "setup_cpu": setup_cpu,
-        "gaussians": len(fit.gaussians), "steps": config.steps,
+        "gaussians": len(fit.gaussians), "bytes": complexity_figures(fit)["complexity"]["bytes"], "steps": config.steps,
     }  # fmt: skip
     options = options_for(config.rule, scene.background, fit.gaussians)
     scores = [score(v, render_view(fit.gaussians, v, options)[0]) for v in test]

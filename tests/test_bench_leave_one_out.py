@@ -1,12 +1,14 @@
 """Leaving out training views: what a trial's name means, which views are scored, what the table says."""
 
 import pytest
+import torch
 
 from bench.leave_one_out import folds, table, trial_config
+from bench.tradeoff_outcome import fit_once
 from warpgs.demo import write_demo
 from warpgs.errors import UsageError
 from warpgs.pipeline.config import PRESETS
-from warpgs.pipeline.run import SceneRequest
+from warpgs.pipeline.run import SceneRequest, read_scene
 
 
 def test_a_trial_changes_what_it_names_and_nothing_else():
@@ -34,12 +36,22 @@ def test_every_training_view_is_left_out_once_and_held_out_views_are_not_touched
         assert not any(t in split for t in test)
 
 
+def test_a_trial_is_fitted_as_its_settings_say(tmp_path):
+    """An adaptive trial is judged and trimmed, and its bytes are counted by degree."""
+    spec = write_demo(tmp_path / "scene", views=8, width=64, height=48)
+    scene, _, _ = read_scene(SceneRequest(str(tmp_path / "scene"), spec, 1))
+    plain, adaptive = (
+        fit_once(scene, spec, trial_config(f"quick:steps=60,adaptive={on}"), torch.device("cpu")) for on in ("false", "true")
+    )
+    assert adaptive["gaussians"] < plain["gaussians"] and adaptive["bytes"] < plain["bytes"]
+
+
 def test_the_table_counts_whole_seeds_alone():
-    row = {"scene": "s", "trial": "quick", "ssim": 0.5}
+    row = {"scene": "s", "trial": "quick", "ssim": 0.5, "bytes": 4_000_000}
     rows = [row | {"left_out": v, "seed": 0, "psnr": p} for v, p in (("a", 20.0), ("b", 22.0))]
     rows += [row | {"left_out": v, "seed": 1, "psnr": p} for v, p in (("a", 21.0), ("b", 25.0))]
     rows += [row | {"left_out": "a", "seed": 2, "psnr": 90.0}]
     assert table(rows, ["quick", "paper"], 2)[2:] == [
-        "| `quick` | 22.00 ± 1.41 (2) | 0.5000 | 21.00 |",
-        "| `paper` |  |  |  |",
+        "| `quick` | 22.00 ± 1.41 (2) | 0.5000 | 21.00 | 4,000 |",
+        "| `paper` |  |  |  |  |",
     ]
