@@ -45,24 +45,23 @@ class JudgeConfig:
     keep_db: float = 0.1
     """PSNR that lower degrees may cost on the held-out blocks when growth ends, before the rest of the fit mends it [dB]; what
     is within the noise of that difference may go in any case."""
-    trims: int = 1
-    """Times that the model is made smaller, at equal distances from the end of growth to the last step. With one it keeps the
-    PSNR of the finished model; with several that of the first time, and what training gains afterwards goes for size."""
+    trims: int = 8
+    """Times that the model may be made smaller, at equal distances from the end of growth to the last step. Before the last
+    only where the fit is better than `enough_db`: what such a trim takes, training mends."""
     trim_db: float = 0.1
-    """PSNR on the training views that the last trim may leave the model below that before the first [dB]; 0 for no trims."""
-    mended_db: float = 0.3
-    """What earlier trims may take beyond that, times the share of the steps after growth that is left to mend it [dB]."""
-    enough_db: float = 39.1
-    """PSNR on the training views, `FLOOR` included, that no Gaussian is spent on improving: where a fit is better when it is
-    trimmed first, both losses count from here, so that size follows content and not how well a fit happened to go [dB]. At
-    most 42.1, where there is no error; the default is an error of `FLOOR`."""
+    """PSNR on the training views that a trim may take below what the fit has, or below `enough_db` where it has more [dB]; 0
+    for no trims."""
+    enough_db: float = 36.0
+    """PSNR on the training views, `FLOOR` included, that no Gaussian is spent on improving: size then follows from the content
+    and not from how well a fit happened to go [dB]. An error of four levels of an 8-bit photograph, two of them `FLOOR`'s; 42.1
+    is no error at all, so with more every fit keeps what it has."""
 
     def __post_init__(self):
         if not 0 < self.share <= 0.5:
             raise UsageError(f"judge share {self.share} must lie above 0 and be at most 0.5")
         if self.levels < 1 or self.trims < 1:
             raise UsageError(f"judge: levels {self.levels} and trims {self.trims} must be at least 1")
-        for name in ("noise", "least_db", "keep_db", "trim_db", "mended_db", "enough_db"):
+        for name in ("noise", "least_db", "keep_db", "trim_db", "enough_db"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise UsageError(f"judge {name.replace('_', '-')} must be 0 or more and finite, not {getattr(self, name)}")
 
