@@ -31,9 +31,9 @@ def test_steps_equal_torch(device, dtype):
     assert float((found.cpu().double() - wanted).abs().max()) <= (1e-5 if dtype == torch.float32 else 1e-13) * float(moved)
 
 
-@pytest.mark.parametrize("shape", [(50, 4, 3), (701, 16, 3), (999, 1, 3)])
+@pytest.mark.parametrize("shape", [(50, 4, 3), (701, 9, 3), (701, 16, 3), (999, 1, 3)])
 def test_head_of_a_row_takes_its_own_rate(device, dtype, shape):
-    """The first columns move with head_lr, all others with lr; rows cross the lanes and the segments of the kernel."""
+    """The first columns move with head_lr, all others with lr; rows cross lanes, segments and groups of four."""
     param, grads = problem(dtype, device, shape)
     rates = torch.full((shape[0], shape[1] * 3), 0.01, dtype=torch.float64)
     rates[:, :3] = 0.2

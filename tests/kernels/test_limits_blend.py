@@ -289,6 +289,24 @@ def test_blocks_that_are_left_out_draw_nothing(rule, tile_size):
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("tile_size", [8, 16])
+def test_blocks_at_needles_far_longer_than_the_picture(tile_size):
+    """A block whose corner alone a needle of 1e5 px touches is not left out: as many pixels are drawn as on the CPU."""
+    found = []
+    for device in ("cpu", "cuda:0"):
+        gaussians, cam = needles(300, device), camera(150, 110, cameras=2, dtype=torch.float32, device=device)
+        gaussians.log_scales[:] = torch.tensor([6.5, -4.0, -4.0])
+        gaussians.logit_opacities[:] = -4.0
+        splats, counts = run(gaussians, cam, EXACT, tile_size=tile_size)
+        assert int((splats[..., 10] > 2e4).sum()) > 100  # half widths
+        size = {"width": 150, "height": 110, "rule": EXACT}
+        made = tiles.bin_tiles(splats, counts, tile_size=tile_size, **size)
+        found.append(blend.blend(splats, made, torch.zeros(2, 3, device=device), **size)[1].cpu())
+    off = (found[0] - found[1]).abs() > 2e-3
+    assert int((found[0] > 0).sum()) > 1000 and int(off.sum()) <= 3
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("tile_size", [8, 16])
 def test_lists_are_those_of_the_cpu(tile_size):
     """Gaussians of no tile, of a few, of 32 and of hundreds; windows, cameras and a capacity."""
     found = []

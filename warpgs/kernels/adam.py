@@ -166,7 +166,7 @@ def scheduled_rates(lr: float, step: int, betas: tuple[float, float] = BETAS, he
 
 def adam_scheduled(
     param: torch.Tensor, grad: torch.Tensor, exp_avg: torch.Tensor, exp_avg_sq: torch.Tensor, rates: torch.Tensor,
-    skip: torch.Tensor, *, betas: tuple[float, float] = BETAS, eps: float = EPS, head: int = 0,
+    skip: torch.Tensor, *, head: int, betas: tuple[float, float] = BETAS, eps: float = EPS,
 ) -> None:  # fmt: skip
     """`adam_step` on CUDA in float32, with ``rates`` [3] of `scheduled_rates`; nothing changes where ``skip`` [1] is not 0."""
     inputs = [
