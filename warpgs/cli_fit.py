@@ -93,7 +93,7 @@ def _flags(base: FitConfig) -> type:
         adaptive: bool = base.adaptive
         """Held-out blocks of the training views decide how many Gaussians there are and of which degree."""
         max_gaussians: int = base.density.max_gaussians
-        """No Gaussian is added beyond this number; the same as --density.max-gaussians."""
+        """No more Gaussians than this, from the start on; the same as --density.max-gaussians."""
         judge: JudgeConfig = field(default_factory=lambda: base.judge)
         init: InitConfig = field(default_factory=lambda: base.init)
         loss: LossConfig = field(default_factory=lambda: base.loss)

@@ -1,5 +1,6 @@
 """The loop: repeatable, resumable, and honest when something is wrong."""
 
+import dataclasses
 import json
 import math
 import os
@@ -199,6 +200,20 @@ def test_start_falls_back_to_random_and_says_so():
     assert np.array_equal(cloud.points, again.points)
     with pytest.raises(DataError, match=r"--init.source random"):
         initial_points(views, None, InitConfig(source="points"), np.random.default_rng(0))
+
+
+def test_a_start_of_more_points_than_allowed_is_drawn_from():
+    """Some of the points, each once and the same every time, said so; wider, for they lie farther apart; and no more later."""
+    most = len(seeds()) // 4
+    config = dataclasses.replace(BUSY, density=dataclasses.replace(BUSY.density, gradient=1e-6, max_gaussians=most))
+    whole, fit = fitted(BUSY, 0), fitted(config, 0)
+    kept = (whole.gaussians.means[None] == fit.gaussians.means[:, None]).all(2)
+    assert len(fit.gaussians) == most and bool((kept.sum(1) == 1).all()) and bool((kept.sum(0) <= 1).all())
+    assert torch.equal(fitted(config, 0).gaussians.means, fit.gaussians.means)
+    assert float(fit.gaussians.log_scales.mean()) > float(whole.gaussians.log_scales.mean()) + 0.1
+    assert any(f"{most} of these {len(seeds())} points" in n and "--max-gaussians" in n for n in fit.notes)
+    assert not any("max-gaussians" in n for n in whole.notes)
+    assert len(fitted(config, 25).gaussians) <= most
 
 
 def test_points_of_other_views_are_not_used():

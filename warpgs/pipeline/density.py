@@ -40,7 +40,7 @@ class DensityConfig:
     morton_order: bool = True
     """Whether the Gaussians are sorted along a Morton curve after each event (docs/decisions/009-morton-order.md)."""
     max_gaussians: int = 1_000_000
-    """No Gaussian is added beyond this number."""
+    """No more Gaussians than this, from the start on."""
 
     def __post_init__(self):
         if self.every < 1 or self.start < 0 or self.reset_every < 0 or self.max_gaussians < 1:

@@ -18,7 +18,7 @@ from warpgs.kernels.tiles import available_bytes
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.density import DensityStats, Refinement, refine
 from warpgs.pipeline.graph import BURST, NOT_FINITE, ROOM, Burst, OverLimitError, StepGraph, stack_views
-from warpgs.pipeline.init import initial_gaussians, initial_points
+from warpgs.pipeline.init import at_most, initial_gaussians, initial_points
 from warpgs.pipeline.layers import COARSE, FINE, LONG_AGO, Layers
 from warpgs.pipeline.loss import masked_mse, training_loss
 from warpgs.pipeline.memory import layout_of, most_instances, plan
@@ -75,7 +75,8 @@ class Fit:
         self.config, self.device = config, device
         self.background = torch.tensor(background, dtype=torch.float32, device=device)
         self.generator = torch.Generator().manual_seed(config.seed)
-        start = initial_points(train, points, config.init, np.random.default_rng(config.seed))
+        random = np.random.default_rng(config.seed)
+        start = at_most(initial_points(train, points, config.init, random), config.density.max_gaussians, random)
         cloud, self.notes = start.cloud, [line.strip() for line in f"start: {start.how}".splitlines()]
         self.extent = self._extent([v.camera for v in train], cloud)
         self.phases = plan_phases(config.phases, config.steps)

@@ -250,6 +250,16 @@ def initial_points(views: list[View], points: PointCloud | None, config: InitCon
     return Start(cloud, how)
 
 
+def at_most(start: Start, most: int, generator: np.random.Generator) -> Start:
+    """The start with no more points than that, drawn at random; their Gaussians are wider as they lie farther apart."""
+    count = len(start.cloud)
+    if count <= most:
+        return start
+    keep = np.sort(generator.permutation(count)[:most])
+    how = f"{start.how}\n{most:,} of these {count:,} points, drawn at random, since --max-gaussians allows no more"
+    return start._replace(cloud=PointCloud(start.cloud.points[keep], start.cloud.colors[keep]), how=how)
+
+
 def initial_gaussians(cloud: PointCloud, config: InitConfig, extent: float, device: torch.device) -> Gaussians:
     """One isotropic Gaussian per point, as wide as the root mean square distance to its three neighbours.
 
