@@ -136,9 +136,11 @@ def test_of_a_trimmed_model_no_more_is_hidden_than_of_the_whole():
 @pytest.mark.parametrize("at", [17, 24, 50])
 def test_continued_fit_equals_uninterrupted_one(tmp_path, at):
     """Saved before a judgement, between two, or between trims, and continued: the same bits and the same story at the end."""
-    config = dataclasses.replace(GROWING, dropout=0.3, judge=dataclasses.replace(GROWING.judge, trim_db=0.2, trims=2))
+    config = dataclasses.replace(GROWING, dropout=0.3, judge=dataclasses.replace(GROWING.judge, trim_db=0.2, enough_db=20.0))
     straight = advanced(config, 60)
-    save_checkpoint(tmp_path, *advanced(config, at).state())
+    stopped = advanced(config, at)
+    assert 0 < len(stopped.trims) < len(straight.trims) or at < 50
+    save_checkpoint(tmp_path, *stopped.state())
     resumed = AdaptiveFit(photographs(4), seeds(), config, CPU)
     resumed.load(*load_checkpoint(tmp_path))
     while resumed.step < 60:
@@ -196,14 +198,14 @@ def test_a_card_that_ends_before_black_needs_little():
 
 
 def test_size_follows_content_and_neither_pixels_nor_views():
-    """A smooth wall with default flags: a view a second time, or four times the pixels, add no more than seeds differ by."""
+    """A smooth wall with default flags: a view a second time adds nothing, four times the pixels less than half as much."""
     start = cards.points(400, (2.0, 1.4))
     walls = [cards.photographs(cards.smooth, half=(9, 9), width=w, height=3 * w // 4) for w in (64, 128)]
     again = [*walls[0], dataclasses.replace(walls[0][1], name="again.png")]
     fits = [finished(v, start) for v in (*walls, again)]
     once, fine, twice = (complexity(f)["count"] for f in fits)
     assert all(abs(f._view_psnr(f.gaussians) - JudgeConfig().enough_db) < 0.6 for f in fits)
-    assert once < 80 and twice <= 1.25 * once and fine <= 1.5 * once
+    assert once < 80 and twice <= 1.1 * once and fine <= 1.5 * once
 
 
 def test_command_line_says_what_the_model_takes(tmp_path, capsys):

@@ -256,7 +256,7 @@ def at_most(start: Start, most: int, generator: np.random.Generator) -> Start:
     if count <= most:
         return start
     keep = np.sort(generator.permutation(count)[:most])
-    how = f"{start.how}\n{most:,} of these {count:,} points, drawn at random, since --max-gaussians allows no more"
+    how = f"{start.how}\n{most:,} of these {count:,} points, drawn at random: --max-gaussians is {most:,}"
     return start._replace(cloud=PointCloud(start.cloud.points[keep], start.cloud.colors[keep]), how=how)
 
 

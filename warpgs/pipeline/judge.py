@@ -49,12 +49,12 @@ class JudgeConfig:
     """Times that the model may be made smaller, at equal distances from the end of growth to the last step. Before the last
     only where the fit is better than `enough_db`: what such a trim takes, training mends."""
     trim_db: float = 0.1
-    """PSNR on the training views that a trim may take below what the fit has, or below `enough_db` where it has more [dB]; 0
-    for no trims."""
+    """PSNR on the training views that a trim may take below what the fit has, or below `enough_db` where it has more [dB];
+    before the last step also part of what training will probably mend. 0 for no trims."""
     enough_db: float = 36.0
     """PSNR on the training views, `FLOOR` included, that no Gaussian is spent on improving: size then follows from the content
-    and not from how well a fit happened to go [dB]. An error of four levels of an 8-bit photograph, two of them `FLOOR`'s; 42.1
-    is no error at all, so with more every fit keeps what it has."""
+    and not from how well a fit happened to go [dB]. The default is 37.2 dB without `FLOOR`, an error of 3.5 levels of an 8-bit
+    photograph; 42.1 is no error at all, so with more every fit keeps what it has."""
 
     def __post_init__(self):
         if not 0 < self.share <= 0.5:

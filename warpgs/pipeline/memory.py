@@ -271,7 +271,7 @@ def plan(
             raise UsageError(
                 f"--memory-limit {format_bytes(limit)} is less than the {format_bytes(single.smallest(count))} that the "
                 f"smallest step needs with {count:,} Gaussians and {layout.width} x {layout.height} px; raise the limit, start "
-                "with fewer points (--init.source random --init.random-count N), or --downscale the views"
+                "with fewer points (--max-gaussians N), or --downscale the views"
             )
         cap = single.largest_count(limit, count, cap)
         graphs = layout.step(cap, int(room * instances / count * cap))
