@@ -41,7 +41,8 @@ def test_a_trial_is_fitted_as_its_settings_say(tmp_path):
     spec = write_demo(tmp_path / "scene", views=8, width=64, height=48)
     scene, _, _ = read_scene(SceneRequest(str(tmp_path / "scene"), spec, 1))
     plain, adaptive = (
-        fit_once(scene, spec, trial_config(f"quick:steps=60,adaptive={on}"), torch.device("cpu")) for on in ("false", "true")
+        fit_once(scene, spec, trial_config(f"quick:steps=60,sh_every=10,adaptive={on}"), torch.device("cpu"))
+        for on in ("false", "true")
     )
     assert (
         adaptive["gaussians"] < plain["gaussians"]
