@@ -206,6 +206,7 @@ def test_size_follows_content_and_neither_pixels_nor_views():
     once, fine, twice = (complexity(f)["count"] for f in fits)
     assert all(abs(f._view_psnr(f.gaussians) - JudgeConfig().enough_db) < 0.6 for f in fits)
     assert once < 80 and twice <= 1.1 * once and fine <= 1.5 * once
+    assert all(complexity(finished(v, start, enough_db=30.0))["count"] < 20 for v in (*walls, again))  # measured: 11, 14, 12
 
 
 def test_command_line_says_what_the_model_takes(tmp_path, capsys):
