@@ -9,11 +9,13 @@ from warpgs.geometry import back_project, project_points
 from warpgs.priors.completion import complete
 from warpgs.priors.epipolar import pixel_grid
 from warpgs.priors.sweep import (
+    LARGEST_STEP,
+    UNIT,
     SweepConfig,
-    aggregate,
     best_inverse,
     confirm,
     matching_costs,
+    path_costs,
     plane_homography,
     plane_inverses,
     project_inverse,
@@ -60,33 +62,44 @@ def test_cost_is_least_at_the_true_plane():
     ]
     costs = matching_costs(views[0], views[1:], np.array([0.15, 0.25, 0.35]), 5)
     seen = (slice(3, -3), slice(9, -3))
-    assert costs.shape == (30, 40, 3) and costs[(*seen, 1)].max() < 0.01
-    assert costs[(*seen, 0)].min() > 0.1 and costs[(*seen, 2)].min() > 0.1
-    assert np.allclose(costs[:, :4, 1], 0.5)
+    assert costs.shape == (3, 30, 40) and costs[1][seen].max() < 0.01
+    assert costs[0][seen].min() > 0.1 and costs[2][seen].min() > 0.1
+    assert np.allclose(costs[1, :, :4], 0.5)
 
 
 def test_paths_are_those_of_the_definition():
-    """Against the recursion written out pixel by pixel; an edge of the picture lets depth jump."""
+    """Against the recursion written out pixel by pixel, to the last unit; an edge of the picture lets depth jump."""
     generator = np.random.default_rng(1)
-    costs = generator.uniform(0, 1, (4, 5, 6)).astype(np.float32)
+    costs = generator.integers(0, UNIT + 1, (4, 5, 6)).astype(np.uint16)
     image = generator.uniform(0.4, 0.55, (4, 5, 3)).astype(np.float32)
     p1, p2 = 0.05, 0.6
-    total = np.zeros(costs.shape)
+    total = np.zeros(costs.shape, int)
     for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-        path = np.zeros(costs.shape)
+        path = np.zeros(costs.shape, int)
         for y in range(4)[:: 1 if dy >= 0 else -1]:
             for x in range(5)[:: 1 if dx >= 0 else -1]:
                 path[y, x] = costs[y, x]
                 py, px = y - dy, x - dx
                 if 0 <= py < 4 and 0 <= px < 5:
-                    jump = max(p2 * np.exp(-np.abs(image[y, x] - image[py, px]).max() / 0.06), 1.5 * p1)
+                    jump = round(max(p2 * np.exp(-np.abs(image[y, x] - image[py, px]).max() / 0.06), 1.5 * p1) * UNIT)
                     low = path[py, px].min()
                     for d in range(6):
                         options = [path[py, px, d], low + jump]
-                        options += [path[py, px, k] + p1 for k in (d - 1, d + 1) if 0 <= k < 6]
+                        options += [path[py, px, k] + round(p1 * UNIT) for k in (d - 1, d + 1) if 0 <= k < 6]
                         path[y, x, d] += min(options) - low
         total += path
-    assert np.allclose(aggregate(costs, image, p1, p2), total, atol=1e-5)
+    assert np.array_equal(sum(path_costs(costs, image, p1, p2, down=down).astype(int) for down in (True, False)), total)
+
+
+def test_paths_of_the_dearest_costs_fit_in_16_bits():
+    """Where the best plane changes from pixel to pixel and every other costs 1, nothing wraps around at the largest steps."""
+    costs = np.full((6, 6, 8), UNIT, np.uint16)
+    y, x = np.indices((6, 6))
+    costs[y, x, (3 * y + 5 * x) % 8] = 0
+    parts = [path_costs(costs, np.zeros((6, 6, 3), np.float32), 0.03, LARGEST_STEP, down=down) for down in (True, False)]
+    wide = [p.astype(int) for p in parts]
+    assert max(p.max() for p in wide) > 3 * UNIT and np.array_equal((parts[0] + parts[1]).astype(int), wide[0] + wide[1])
+    assert min(p.min() for p in wide) >= 0 and (wide[0] + wide[1]).max() <= 4 * (1 + LARGEST_STEP) * UNIT + 4 < 2**16
 
 
 def test_parabola_between_planes():
@@ -150,7 +163,10 @@ def test_large_images_are_swept_small_and_masks_hold():
     assert found[1].valid[:, 50:].mean() > 0.6 and np.median(error) < 0.015
 
 
-@pytest.mark.parametrize("bad", [{"window": 4}, {"window": 1}, {"max_planes": 2}, {"spacing": np.nan}, {"near_count": 0}])
+@pytest.mark.parametrize("bad", [
+    {"window": 4}, {"window": 1}, {"max_planes": 2}, {"spacing": np.nan}, {"near_count": 0}, {"large_step": 1.0},
+    {"small_step": 0.7},
+])  # fmt: skip
 def test_bad_settings_are_refused(bad):
     """At once."""
     with pytest.raises(UsageError):

@@ -7,6 +7,7 @@ where another view's own sweep agrees. Compared with optical flow in docs/decisi
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -24,12 +25,15 @@ EDGE = 0.06
 """Step of the picture at which the penalty for a jump in depth falls to 1/e."""
 NO_OPINION = 0.5
 """Cost of correlation 0: where a plane leaves the other image, or nothing has texture."""
-
-
+UNIT = 8192
+"""Cost 1 in the 16-bit whole numbers that volumes hold: to touch memory for the first time takes as long as to compute what
+goes there, and this is half of float32's."""
+LARGEST_STEP = 0.99
+"""P2 up to which the sum of four paths, each at most 1 + P2, stays below 2^16."""
 PLANES_AT_ONCE = 16
-"""Planes whose costs are written together: 64 bytes of each pixel."""
+"""Planes whose costs one thread writes together, 32 bytes of each pixel."""
 MAX_AT_ONCE = 4
-"""Views swept at a time; each takes memory for two volumes of costs."""
+"""Views swept at a time; each takes memory for three volumes."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,7 @@ class SweepConfig:
     spacing: float = 0.5
     """Largest step of a match from one plane to the next [px], while `max_planes` allows it."""
     max_planes: int = 256
-    """Planes at most, at least 8; memory is 8 bytes per pixel and plane."""
+    """Planes at most, at least 8; memory is 6 bytes per pixel and plane, for up to four views."""
     max_pixels: int = 200_000
     """Larger images are swept at a reduced size."""
     small_step: float = 0.03
@@ -63,6 +67,8 @@ class SweepConfig:
         for name in ("spacing", "small_step", "large_step", "max_round_trip", "min_parallax"):
             if not getattr(self, name) > 0:
                 raise UsageError(f"sweep {name.replace('_', '-')} must be above 0, not {getattr(self, name)}")
+        if not max(self.large_step, 1.5 * self.small_step) <= LARGEST_STEP:
+            raise UsageError(f"sweep large-step and 1.5 small-step must be at most {LARGEST_STEP}, where the largest cost is 1")
 
 
 def project_inverse(first: Camera, second: Camera, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
@@ -109,7 +115,7 @@ def plane_homography(first: Camera, second: Camera, inverse: float) -> np.ndarra
 
 
 def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, window: int) -> np.ndarray:
-    """Disagreement of views at D inverse depths, in [0, 1], float32, shape [H, W, D].
+    """Disagreement of views at D inverse depths, in [0, 1], float32, shape [D, H, W].
 
     Of the costs 0.5 (1 - correlation) of the other views half the mean and half the least: a view that does not see the
     point counts, but cannot outvote one that does.
@@ -121,60 +127,76 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
     own, *grays = [cv2.cvtColor(v.image, cv2.COLOR_RGB2GRAY) for v in (view, *others)]
     mean = cv2.blur(own, box)
     variance = np.maximum(cv2.blur(own * own, box) - mean * mean, 0) + NOISE
-    out = np.empty((size[1], size[0], len(inverses)), np.float32)
-    planes = np.empty((PLANES_AT_ONCE, size[1], size[0]), np.float32)  # neighbours in memory are written together
-    for d, inverse in enumerate(inverses):
-        least, total = None, 0
+    planes = np.empty((len(inverses), *own.shape), np.float32)
+    # every step writes into one of these: to make arrays anew takes as long as to fill them
+    warped, product, m, v, cost, least = (np.empty_like(own) for _ in range(6))
+    outside = np.empty(own.shape, bool)
+    for inverse, total in zip(inverses, planes):
+        total.fill(0)
+        least.fill(np.inf)
         for other, gray in zip(others, grays):
             H = plane_homography(view.camera, other.camera, inverse)
-            warped = cv2.warpPerspective(gray, H, size, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=-1)
-            m = cv2.blur(warped, box)
-            v = np.maximum(cv2.blur(warped * warped, box) - m * m, 0) + NOISE
-            cost = 0.5 - 0.5 * (cv2.blur(own * warped, box) - mean * m) / np.sqrt(variance * v)
-            cost[~(warped >= 0)] = NO_OPINION
-            total = total + cost
-            least = cost if least is None else np.minimum(least, cost)
-        at = d % PLANES_AT_ONCE
-        planes[at] = 0.5 * least + total * (0.5 / len(others))
-        if at == PLANES_AT_ONCE - 1 or d == len(inverses) - 1:
-            out[..., d - at : d + 1] = planes[: at + 1].transpose(1, 2, 0)
-    return out
+            cv2.warpPerspective(gray, H, size, warped, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=-1)
+            cv2.blur(warped, box, m)
+            cv2.blur(np.multiply(warped, warped, out=product), box, v)
+            v -= np.multiply(m, m, out=product)
+            np.maximum(v, 0, out=v)
+            v += NOISE
+            v *= variance
+            np.sqrt(v, out=v)
+            cv2.blur(np.multiply(own, warped, out=product), box, cost)
+            cost -= np.multiply(mean, m, out=product)
+            cost /= v
+            cost *= -0.5
+            cost += 0.5
+            np.logical_not(np.greater_equal(warped, 0, out=outside), out=outside)
+            np.copyto(cost, NO_OPINION, where=outside)
+            total += cost
+            np.minimum(least, cost, out=least)
+        total *= 0.5 / len(others)
+        least *= 0.5
+        total += least
+    return planes
 
 
-def aggregate(costs: np.ndarray, image: np.ndarray, small_step: float, large_step: float) -> np.ndarray:
-    """Sum of the semi-global path costs from left, right, above and below, float32, shape [H, W, D].
+def path_costs(costs: np.ndarray, image: np.ndarray, small_step: float, large_step: float, *, down: bool) -> np.ndarray:
+    """Sum of the semi-global path costs from above and below, or from left and right.
 
     Args:
-        costs: Matching costs, float32, shape [H, W, D].
+        costs: Matching costs in units of 1 / `UNIT`, uint16, shape [H, W, D].
         image: Colours in [0, 1] whose edges allow jumps, shape [H, W, 3].
         small_step: Penalty for a change of one plane.
         large_step: Penalty for any other change, times exp(-step of the picture / EDGE).
+        down: Whether paths run along columns; else along rows.
+
+    Returns:
+        Sums in units of 1 / `UNIT`, uint16, shape [H, W, D].
     """
     total = np.zeros_like(costs)
-    for axes in ((0, 1, 2), (1, 0, 2)):
-        c, t, colors = (a.transpose(axes) for a in (costs, total, image))
-        jumps = np.abs(np.diff(colors, axis=0)).max(2)
-        limits = np.maximum(large_step * np.exp(-jumps / EDGE), 1.5 * small_step).astype(np.float32)
-        for order, edge in ((range(len(c)), -1), (range(len(c) - 1, -1, -1), 0)):
-            path = None
-            for k in order:
-                if path is None:
-                    path = c[k].copy()
-                else:
-                    lowest = path.min(1, keepdims=True)
-                    step = np.minimum(path, lowest + limits[k + edge, :, None])
-                    path += np.float32(small_step)
-                    np.minimum(step[:, 1:], path[:, :-1], out=step[:, 1:])
-                    np.minimum(step[:, :-1], path[:, 1:], out=step[:, :-1])
-                    step -= lowest
-                    step += c[k]
-                    path = step
-                t[k] += path
+    c, t, colors = (a if down else a.swapaxes(0, 1) for a in (costs, total, image))
+    jumps = np.abs(np.diff(colors, axis=0)).max(2)
+    limits = np.rint(np.maximum(large_step * np.exp(-jumps / EDGE), 1.5 * small_step) * UNIT).astype(np.uint16)
+    small = np.uint16(round(small_step * UNIT))
+    for order, edge in ((range(len(c)), -1), (range(len(c) - 1, -1, -1), 0)):
+        path = None
+        for k in order:
+            if path is None:
+                path = c[k].copy()
+            else:
+                lowest = path.min(1, keepdims=True)
+                step = np.minimum(path, lowest + limits[k + edge, :, None])
+                path += small
+                np.minimum(step[:, 1:], path[:, :-1], out=step[:, 1:])
+                np.minimum(step[:, :-1], path[:, 1:], out=step[:, :-1])
+                step -= lowest
+                step += c[k]
+                path = step
+            t[k] += path
     return total
 
 
 def best_inverse(costs: np.ndarray, inverses: np.ndarray) -> np.ndarray:
-    """Inverse depth [H, W] of least cost [H, W, D], between planes by the parabola through three costs."""
+    """Inverse depth [H, W] of least cost [H, W, D], in any unit, between planes by the parabola through three costs."""
     k = np.clip(costs.argmin(2), 1, len(inverses) - 2)
     left, middle, right = (np.take_along_axis(costs, (k + o)[..., None], 2)[..., 0].astype(float) for o in (-1, 0, 1))
     bend = left - 2 * middle + right
@@ -236,6 +258,52 @@ def confirm(views: Sequence[View], inverses: Sequence[np.ndarray], index: int, c
     )
 
 
+@contextlib.contextmanager
+def _alone():
+    """OpenCV without threads of its own: its calls here are so short that starting threads takes longer than they save."""
+    import cv2
+
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+def _swept(views: Sequence[View], some: Sequence[int], bounds: Sequence[tuple[float, float]], config: SweepConfig, pool):
+    """Inverse depths [H, W] of some of the views; threads share the planes of all of them, and then the paths."""
+    others = {i: [views[j] for j in nearest_views(views, i, config.near_count)] for i in some}
+    planes = {
+        i: plane_inverses(views[i].camera, [o.camera for o in others[i]], bounds[i], config.spacing, config.max_planes)
+        for i in some
+    }
+    costs = {i: np.empty((*views[i].image.shape[:2], len(planes[i])), np.uint16) for i in some}
+
+    def match(part: tuple[int, int]) -> None:
+        i, first = part
+        chosen = slice(first, first + PLANES_AT_ONCE)
+        found = matching_costs(views[i], others[i], planes[i][chosen], config.window)
+        np.rint(np.clip(found, 0, 1, out=found) * np.float32(UNIT), out=found)  # rounding may leave a cost below 0
+        costs[i][..., chosen] = found.transpose(1, 2, 0)
+
+    def paths(way: tuple[int, bool]) -> np.ndarray:
+        i, down = way
+        return path_costs(costs[i], views[i].image, config.small_step, config.large_step, down=down)
+
+    def best(i: int) -> np.ndarray:
+        if not others[i]:
+            return np.full(views[i].image.shape[:2], planes[i][0])
+        return best_inverse(summed[i, True] + summed[i, False], planes[i])
+
+    seen = [i for i in some if others[i]]
+    ways = [(i, down) for i in seen for down in (True, False)]
+    # numpy and OpenCV let other threads run meanwhile
+    list(pool.map(match, [(i, first) for i in seen for first in range(0, len(planes[i]), PLANES_AT_ONCE)]))
+    summed = dict(zip(ways, pool.map(paths, ways)))
+    return list(pool.map(best, some))
+
+
 def sweep_depths(views: Sequence[View], bounds: Sequence[tuple[float, float]], config: SweepConfig) -> list[ViewDepth]:
     """Depth of every view by sweeping planes against its nearest others.
 
@@ -250,18 +318,10 @@ def sweep_depths(views: Sequence[View], bounds: Sequence[tuple[float, float]], c
     import cv2
 
     small = [_reduced(v, config.max_pixels) for v in views]
-
-    def sweep(i: int) -> np.ndarray:
-        view, others = small[i], [small[j] for j in nearest_views(small, i, config.near_count)]
-        planes = plane_inverses(view.camera, [o.camera for o in others], bounds[i], config.spacing, config.max_planes)
-        if not others:
-            return np.full(view.image.shape[:2], planes[0])
-        costs = matching_costs(view, others, planes, config.window)
-        return best_inverse(aggregate(costs, view.image, config.small_step, config.large_step), planes)
-
-    # numpy and OpenCV let other threads run meanwhile
-    with ThreadPoolExecutor(min(MAX_AT_ONCE, torch.get_num_threads())) as pool:
-        inverses = list(pool.map(sweep, range(len(views))))
+    with _alone(), ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        inverses = []
+        for first in range(0, len(views), MAX_AT_ONCE):
+            inverses += _swept(small, range(len(views))[first : first + MAX_AT_ONCE], bounds, config, pool)
         confirmed = list(pool.map(lambda i: confirm(small, inverses, i, config), range(len(views))))
     out = []
     for i, view in enumerate(views):
