@@ -10,7 +10,7 @@ import torch
 from tests.pipeline.test_method import CONFIG, METHOD, fitted
 from tests.scenes import photographs, priors, seeds
 from warpgs.pipeline.checkpoint import load_checkpoint, save_checkpoint
-from warpgs.pipeline.event_sheet import event_figures, keep_pictures, pictured, sampling_story, view_sheet
+from warpgs.pipeline.event_sheet import event_figures, pictured, pictures_kept, sampling_story, view_sheet
 from warpgs.pipeline.fit import Fit
 from warpgs.pipeline.schedule import PhaseConfig, plan_phases
 from warpgs.report.contact_sheet import DOT, GAP, HEAD, MARGIN, TITLE_SIZE
@@ -26,11 +26,11 @@ def run(tmp_path_factory):
     out, seen = tmp_path_factory.mktemp("run"), []
     views = photographs(3)
     fit = Fit(views, seeds(), CONFIG, CPU, priors=priors(views))
-    keep_pictures(fit, NAMES, out)
-    draw = fit.on_event
-    fit.on_event = lambda step, event: (draw(step, event), seen.append((step, event)))
-    while fit.step < CONFIG.steps:
-        fit.advance()
+    with pictures_kept(fit, NAMES, out):
+        draw = fit.on_event
+        fit.on_event = lambda step, event: (draw(step, event), seen.append((step, event)))
+        while fit.step < CONFIG.steps:
+            fit.advance()
     return fit, out, seen
 
 
@@ -118,19 +118,28 @@ def test_first_picture_outlives_a_continuation(run, tmp_path):
     """Stopped after the first event and continued: the same pictures, byte for byte, as of the fit that never stopped."""
     views = photographs(3)
 
-    def new() -> Fit:
+    def go_on(until: int, begin=None) -> Fit:
         fit = Fit(views, seeds(), CONFIG, CPU, priors=priors(views))
-        keep_pictures(fit, NAMES, tmp_path)
+        if begin is not None:
+            fit.load(*begin)
+        with pictures_kept(fit, NAMES, tmp_path):
+            while fit.step < until:
+                fit.advance()
         return fit
 
-    first = new()
-    while first.step < 10:
-        first.advance()
-    save_checkpoint(tmp_path, *first.state())
+    save_checkpoint(tmp_path, *go_on(10).state())
     assert len(list((tmp_path / "sampling").iterdir())) == 1
-    second = new()
-    second.load(*load_checkpoint(tmp_path))
-    while second.step < CONFIG.steps:
-        second.advance()
+    go_on(CONFIG.steps, load_checkpoint(tmp_path))
     straight, continued = ({f.name: f.read_bytes() for f in (d / "sampling").iterdir()} for d in (run[1], tmp_path))
     assert straight == continued and len(straight) == 2
+
+
+def test_a_picture_that_cannot_be_written_is_said(tmp_path):
+    """A file stands where the folder should be: the fit takes its steps, and the end of the block says so."""
+    views = photographs(3)
+    fit = Fit(views, seeds(), CONFIG, CPU, priors=priors(views))
+    (tmp_path / "sampling").write_text("in the way")
+    with pytest.raises(OSError, match="sampling"), pictures_kept(fit, NAMES, tmp_path):
+        while fit.step < CONFIG.steps:
+            fit.advance()
+    assert fit.step == CONFIG.steps and fit.on_event is None

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -83,32 +87,55 @@ def view_sheet(
     return contact_sheet(f"{name}, step {step:,}", lines, tiles, columns=5, tile_width=320, text=1.25)
 
 
-def event_sheet(
-    names: list[str], step: int, views: list[TrainingView], disparities: list[np.ndarray], event: Event, config: MethodConfig
-) -> np.ndarray:
-    """Up to three of an event's views below each other, colours [rows, columns, 3] in [0, 1]; arguments as in `view_sheet`."""
+def _shown(event: Event) -> list[Drawn]:
+    """Up to three of an event's views."""
     count = len(event.views)
-    chosen = [event.views[i] for i in np.unique(np.linspace(0, count - 1, min(SHOWN, count)).round().astype(int))]
-    return np.concatenate([view_sheet(names[d.view], step, views[d.view], disparities[d.view], d, config) for d in chosen])
+    return [event.views[i] for i in np.unique(np.linspace(0, count - 1, min(SHOWN, count)).round().astype(int))]
 
 
-def keep_pictures(fit: Fit, names: list[str], out: Path) -> None:
-    """Have a fit write the picture of an event into its run folder when it happens.
+def _on_host(drawn: Drawn) -> Drawn:
+    maps = {n: getattr(drawn, n).cpu() for n in ("rendered", "score", "gate", "at")}
+    return dataclasses.replace(drawn, scores=tuple(s.cpu() for s in drawn.scores), **maps)
+
+
+@contextlib.contextmanager
+def pictures_kept(fit: Fit, names: list[str], out: Path) -> Iterator[None]:
+    """Have a fit write pictures of some of its events into its run folder, ``sampling/STEP.png``, while it goes on.
+
+    They are drawn by a thread of their own, which the end of the block waits for.
 
     Args:
         fit: The fit, not yet run.
         names: Of its training views.
-        out: Run folder; pictures are ``sampling/STEP.png``.
+        out: Run folder.
+
+    Raises:
+        ResourceError: A picture could not be written; at the end of the block.
     """
-    steps = pictured(fit.phases)
+    config, steps = fit.config.method, pictured(fit.phases)
 
-    def on_event(step: int, event: Event) -> None:
-        if step in steps:
-            (out / FOLDER).mkdir(exist_ok=True)
-            sheet = event_sheet(names, step, fit.views, fit.disparities, event, fit.config.method)
-            write_bytes(out / FOLDER / f"{step:06d}.png", png(sheet))
+    def draw(step: int, views: list[TrainingView], kept: list[Drawn]) -> None:
+        (out / FOLDER).mkdir(exist_ok=True)
+        sheets = [view_sheet(names[d.view], step, v, fit.disparities[d.view], d, config) for v, d in zip(views, kept)]
+        write_bytes(out / FOLDER / f"{step:06d}.png", png(np.concatenate(sheets)))
 
-    fit.on_event = on_event
+    with ThreadPoolExecutor(1) as thread:
+        drawing = []
+
+        def on_event(step: int, event: Event) -> None:
+            if step in steps:
+                # the thread must not ask the device for anything: steps may be being recorded then
+                kept = [_on_host(d) for d in _shown(event)]
+                views = [dataclasses.replace(fit.views[d.view], photo=fit.views[d.view].photo.cpu()) for d in kept]
+                drawing.append(thread.submit(draw, step, views, kept))
+
+        fit.on_event = on_event
+        try:
+            yield
+        finally:
+            fit.on_event = None
+    for sheet in drawing:
+        sheet.result()
 
 
 def event_figures(fit: Fit) -> dict:

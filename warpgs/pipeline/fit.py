@@ -55,6 +55,7 @@ class Fit:
     def __init__(
         self, train: list[View], points: PointCloud | None, config: FitConfig, device: torch.device,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0), priors: list[Prior] | None = None,
+        ready: Callable[[], object] = lambda: None,
     ):  # fmt: skip
         """Set up the first Gaussians.
 
@@ -65,6 +66,7 @@ class Fit:
             device: Where to work.
             background: Colour behind the scene.
             priors: What is believed of each view; None to find out where sampling or the depth term asks for it.
+            ready: Called before the device is used.
 
         Raises:
             DataError: There is nothing to start from.
@@ -73,12 +75,18 @@ class Fit:
         if not train:
             raise DataError("there is no training view; name at least one in --split")
         self.config, self.device = config, device
-        self.background = torch.tensor(background, dtype=torch.float32, device=device)
         self.generator = torch.Generator().manual_seed(config.seed)
         random = np.random.default_rng(config.seed)
         start = at_most(initial_points(train, points, config.init, random), config.density.max_gaussians, random)
         cloud, self.notes = start.cloud, [line.strip() for line in f"start: {start.how}".splitlines()]
         self.extent = self._extent([v.camera for v in train], cloud)
+        guided = config.loss.depth_weight > 0
+        if priors is None and (config.method.events or guided):
+            regions = [counted_region(v)[0] for v in train]
+            priors, notes = view_priors(train, config.priors, depths=start.depths, regions=regions, cache=cache_folder())
+            self.notes += notes
+        ready()
+        self.background = torch.tensor(background, dtype=torch.float32, device=device)
         self.phases = plan_phases(config.phases, config.steps)
         settle = self.phases.settle / config.steps if self.phases.settle < config.steps else 0.0
         gaussians = initial_gaussians(cloud, config.init, self.extent, device)
@@ -86,24 +94,18 @@ class Fit:
         self.stats, self.layers = DensityStats(len(cloud), device), Layers(len(cloud), device)
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
         self.events: list[dict] = []
-        self.step, self.reset_done = 0, False
-        self.order: list[int] = []
+        self.step, self.reset_done, self.order = 0, False, []
         self.on_event: Callable[[int, Event], None] | None = None
         self.graphs: dict[tuple, StepGraph] = {}
         self.views = [TrainingView.of(v, device) for v in train]
-        if config.method.events or config.loss.depth_weight > 0:
-            if priors is None:
-                regions = [counted_region(v)[0] for v in train]
-                priors, notes = view_priors(train, config.priors, depths=start.depths, regions=regions, cache=cache_folder())
-                self.notes += notes
+        if config.method.events:
             self.disparities = [p.disparity for p in priors]
             """Relative inverse depth of each view in [0, 1], [H, W]: only pictures of events show it."""
-            if config.method.events:
-                depths = start.depths or [None] * len(train)
-                self.views = [v.scored(p, d, config.method) for v, p, d in zip(self.views, priors, depths, strict=True)]
-            if config.loss.depth_weight > 0:
-                self.views, note = guided_views(self.views, priors)
-                self.notes.append(note)
+            depths = start.depths or [None] * len(train)
+            self.views = [v.scored(p, d, config.method) for v, p, d in zip(self.views, priors, depths, strict=True)]
+        if guided:
+            self.views, note = guided_views(self.views, priors)
+            self.notes.append(note)
         self.news: list[str] = []
         """What the user must know of and was not told yet."""
         self._plan()

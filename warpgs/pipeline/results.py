@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -40,6 +41,8 @@ def score_line(scores: dict[str, float]) -> str:
 
 SHOWN_VIEWS = 6
 """Held-out views with pictures in the report; all have files in the run folder."""
+PAINTERS = 4
+"""Threads that encode pictures while others are drawn and scored."""
 
 
 def options_for(
@@ -85,16 +88,23 @@ def evaluate_run(
     options = options_for(rule, background, gaussians, max_instances)
     (out / "renders").mkdir(exist_ok=True)
     (out / "depth").mkdir(exist_ok=True)
-    rows, train_rows = [], []
-    for view in train:
-        train_rows.append(score(view, render_view(gaussians, view, options)[0]))
-    for view in test or train:
-        image, depth, alpha = render_view(gaussians, view, options)
-        rows.append(score(view, image, lpips if test else None))
+    rows, train_rows, saved = [], [], []
+
+    def save(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> None:
         stem = file_stem(view.name)
         row = side_by_side([np.clip(image, 0, 1), view.image, error_map(image, view.image)])
         write_bytes(out / "renders" / f"{stem}.png", png(row))
         write_bytes(out / "depth" / f"{stem}.png", png(depth_map(depth, alpha)))
+
+    with ThreadPoolExecutor(PAINTERS) as painters:
+        for view in test or train:
+            drawn = render_view(gaussians, view, options)
+            saved.append(painters.submit(save, view, *drawn))
+            rows.append(score(view, drawn[0], lpips if test else None))
+        for view in train:
+            train_rows.append(score(view, render_view(gaussians, view, options)[0]))
+    for picture in saved:
+        picture.result()  # or why it could not be written
     return {
         "test": summarize(rows) if test else {}, "train": summarize(train_rows),
         "views": [r.row() for r in rows] if test else [],
@@ -106,14 +116,15 @@ def evaluate_run(
 def _pictures(views: list[View], gaussians: Gaussians, options: RasterizeOptions, rows: dict[str, dict]) -> list[ViewPictures]:
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(SHOWN_VIEWS, len(views))).round().astype(int))]
     result = []
-    for view in chosen:
-        image, depth, alpha = render_view(gaussians, view, options)
-        row = rows.get(view.name)
-        region = f", over {row['region']}" if row and row["region"] != "all" else ""
-        caption = f"PSNR {row['psnr']:.2f} dB{region}, SSIM {row['ssim']:.3f}" if row else "training view"
-        parts = (image, view.image, error_map(image, view.image), depth_map(depth, alpha))
-        result.append(ViewPictures(view.name, caption, *map(png, parts)))
-    return result
+    with ThreadPoolExecutor(PAINTERS) as painters:
+        for view in chosen:
+            image, depth, alpha = render_view(gaussians, view, options)
+            row = rows.get(view.name)
+            region = f", over {row['region']}" if row and row["region"] != "all" else ""
+            caption = f"PSNR {row['psnr']:.2f} dB{region}, SSIM {row['ssim']:.3f}" if row else "training view"
+            parts = (image, view.image, error_map(image, view.image), depth_map(depth, alpha))
+            result.append((view.name, caption, painters.map(png, parts)))
+    return [ViewPictures(name, caption, *parts) for name, caption, parts in result]
 
 
 def write_report(

@@ -25,10 +25,11 @@ from warpgs.pipeline.adaptive import complexity_figures, complexity_sentence, fi
 from warpgs.pipeline.budget import within_budget
 from warpgs.pipeline.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.config import FitConfig
-from warpgs.pipeline.event_sheet import event_figures, keep_pictures, sampling_story
+from warpgs.pipeline.event_sheet import event_figures, pictures_kept, sampling_story
 from warpgs.pipeline.fit import Fit, StepReport, run, train_views
 from warpgs.pipeline.limits import unpack
 from warpgs.pipeline.lpips import load_lpips
+from warpgs.pipeline.rehearsal import rehearsal
 from warpgs.pipeline.results import evaluate_run, protocol_of, score_line, write_report
 from warpgs.pipeline.shrink import trimmed
 from warpgs.pipeline.trade import trade_on
@@ -200,7 +201,8 @@ def fit_scene(request: FitRequest) -> dict:
                 tensors, plain = load_checkpoint(out)
         if device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(device)  # earlier fits of this process are not this one's need
-        fit = fit_class(request.config)(train, scene.points, request.config, device, scene.background)
+        ready = rehearsal(request.config, device)
+        fit = fit_class(request.config)(train, scene.points, request.config, device, scene.background, ready=ready)
     except WarpgsError:
         if not request.resume:
             out.rmdir()  # nothing is in it yet
@@ -216,9 +218,9 @@ def fit_scene(request: FitRequest) -> dict:
     for note in notes:
         print(f"  {note}")
 
-    keep_pictures(fit, [v.name for v in train], out)
     setup = time.perf_counter() - began
-    _train(fit, out, notes)
+    with pictures_kept(fit, [v.name for v in train], out):
+        _train(fit, out, notes)
     trained = time.perf_counter() - began - setup
     peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(device)} if device.type == "cuda" else {}
     write_ply(out / "point_cloud.ply", trimmed(fit.gaussians), scene.normalization)

@@ -1,0 +1,78 @@
+"""A tiny fit beside the preparations of the real one: what a CUDA device loads at first use is there when it is asked for.
+
+Contexts, kernels, libraries and modules of Python are loaded one by one as they are first used, which took two to three seconds
+of a fit on an H200. The files are read and depths looked for on the CPU meanwhile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from warpgs.pipeline.config import FitConfig
+from warpgs.pipeline.evaluate import render_view, score
+from warpgs.pipeline.fit import Fit, run
+from warpgs.pipeline.results import options_for
+from warpgs.scene import Camera, PointCloud, Prior, View
+
+STEPS = 3
+"""With phases, one step for each."""
+SIDE, POINTS = 48, 200
+"""Of the views [px]; number of points."""
+
+
+def _views(generator: np.random.Generator) -> list[View]:
+    K = np.array([[SIDE, 0, SIDE / 2], [0, SIDE, SIDE / 2], [0, 0, 1.0]])
+    cameras = []
+    for x in (-0.2, 0.2):
+        viewmat = np.eye(4)
+        viewmat[0, 3] = x
+        cameras.append(Camera(viewmat, K, SIDE, SIDE))
+    return [View(f"{i}", c, generator.random((SIDE, SIDE, 3), np.float32)) for i, c in enumerate(cameras)]
+
+
+def rehearse(config: FitConfig, device: torch.device) -> Fit:
+    """Fit noise in a few small views with the same settings, refinement and sampling included, and score a view.
+
+    Returns:
+        The fit, done.
+    """
+    generator = np.random.default_rng(0)
+    views = _views(generator)
+    points = generator.uniform([-1, -1, 2], [1, 1, 4], (POINTS, 3))
+    cloud = PointCloud(points, generator.random((POINTS, 3), np.float32))
+    maps = [generator.random((SIDE, SIDE), np.float32) for _ in range(4)]
+    small = replace(
+        config, steps=STEPS, memory_limit=None, init=replace(config.init, source="points"),
+        density=replace(config.density, every=1),
+    )  # fmt: skip
+    black = (0.0, 0.0, 0.0)
+    fit = Fit(views, cloud, small, device, black, [Prior(*maps, "noise", "noise") for _ in views])
+    run(fit, lambda _: None, lambda _: None, lambda: False)
+    score(views[0], render_view(fit.gaussians, views[0], options_for(small.rule, black, fit.gaussians))[0])
+    fit.graphs.clear()  # recordings and fit refer to each other, which would keep their memory
+    return fit
+
+
+def rehearsal(config: FitConfig, device: torch.device) -> Callable[[], object]:
+    """Begin to rehearse in a thread, where the device is a GPU that networks for priors leave alone.
+
+    Returns:
+        What waits for the end and raises what went wrong. Until then nothing else may use the device: steps may be being
+        recorded.
+    """
+    if device.type != "cuda" or config.priors.onnx_provider == "cuda":
+        return lambda: None
+
+    def on_device() -> None:
+        with torch.cuda.device(device):
+            rehearse(config, device)
+
+    thread = ThreadPoolExecutor(1, thread_name_prefix="rehearsal")
+    done = thread.submit(on_device)
+    thread.shutdown(wait=False)
+    return done.result
