@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import time
 from collections.abc import Callable
@@ -11,14 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from warpgs import geometry
 from warpgs.errors import DataError, NotFiniteError
 from warpgs.kernels.dropout import opacity_dropout
 from warpgs.kernels.tiles import available_bytes
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.density import DensityStats, Refinement, refine
 from warpgs.pipeline.graph import BURST, NOT_FINITE, ROOM, Burst, OverLimitError, StepGraph, stack_views
-from warpgs.pipeline.init import at_most, initial_gaussians, initial_points
+from warpgs.pipeline.init import Start, at_most, initial_gaussians, initial_points, scene_extent
 from warpgs.pipeline.layers import COARSE, FINE, LONG_AGO, Layers
 from warpgs.pipeline.loss import masked_mse, training_loss
 from warpgs.pipeline.memory import layout_of, most_instances, plan
@@ -30,7 +30,7 @@ from warpgs.pipeline.schedule import Phase, plan_phases, sh_degree
 from warpgs.priors.cache import cache_folder
 from warpgs.priors.view_prior import view_priors
 from warpgs.rasterizer import RasterizeOptions, rasterize
-from warpgs.scene import Camera, Gaussians, PointCloud, Prior, Scene, View
+from warpgs.scene import Gaussians, PointCloud, Prior, Scene, View
 
 
 @dataclass(frozen=True)
@@ -77,15 +77,21 @@ class Fit:
         self.config, self.device = config, device
         self.generator = torch.Generator().manual_seed(config.seed)
         random = np.random.default_rng(config.seed)
-        start = at_most(initial_points(train, points, config.init, random), config.density.max_gaussians, random)
-        cloud, self.notes = start.cloud, [line.strip() for line in f"start: {start.how}".splitlines()]
-        self.extent = self._extent([v.camera for v in train], cloud)
-        guided = config.loss.depth_weight > 0
+        where = device if config.memory_limit is None else torch.device("cpu")  # depths take more than a step may
+
+        @functools.cache
+        def start() -> Start:
+            ready()
+            return at_most(initial_points(train, points, config.init, random, where), config.density.max_gaussians, random)
+
+        guided, notes = config.loss.depth_weight > 0, []
         if priors is None and (config.method.events or guided):
-            regions = [counted_region(v)[0] for v in train]
-            priors, notes = view_priors(train, config.priors, depths=start.depths, regions=regions, cache=cache_folder())
-            self.notes += notes
-        ready()
+            regions, cache = [counted_region(v)[0] for v in train], cache_folder()
+            # semantics are found while the device is made ready
+            priors, notes = view_priors(train, config.priors, depths=lambda: start().depths, regions=regions, cache=cache)
+        cloud = start().cloud
+        self.notes = [*(line.strip() for line in f"start: {start().how}".splitlines()), *notes]
+        self.extent = scene_extent([v.camera for v in train], cloud)
         self.background = torch.tensor(background, dtype=torch.float32, device=device)
         self.phases = plan_phases(config.phases, config.steps)
         settle = self.phases.settle / config.steps if self.phases.settle < config.steps else 0.0
@@ -101,7 +107,7 @@ class Fit:
         if config.method.events:
             self.disparities = [p.disparity for p in priors]
             """Relative inverse depth of each view in [0, 1], [H, W]: only pictures of events show it."""
-            depths = start.depths or [None] * len(train)
+            depths = start().depths or [None] * len(train)
             self.views = [v.scored(p, d, config.method) for v, p, d in zip(self.views, priors, depths, strict=True)]
         if guided:
             self.views, note = guided_views(self.views, priors)
@@ -109,13 +115,6 @@ class Fit:
         self.news: list[str] = []
         """What the user must know of and was not told yet."""
         self._plan()
-
-    @staticmethod
-    def _extent(cameras: list[Camera], cloud: PointCloud) -> float:
-        """Size of the scene [u]: that of the camera set; where all cameras stand together, a tenth of the cloud's."""
-        extent = geometry.camera_extent(cameras)
-        spread = float(np.linalg.norm(np.std(cloud.points, axis=0)))
-        return max(extent, 0.1 * spread if extent < 1e-3 * spread else 0.0, 1e-6)
 
     @property
     def gaussians(self) -> Gaussians:

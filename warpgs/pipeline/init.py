@@ -18,8 +18,8 @@ from warpgs.pipeline.region import counted_region
 from warpgs.priors.epipolar import EpipolarConfig, flow_depth
 from warpgs.priors.flow import RANGES, flow_between
 from warpgs.priors.matches import triangulate_matches
-from warpgs.priors.sweep import SweepConfig, sweep_depths
-from warpgs.scene import Gaussians, PointCloud, View, ViewDepth
+from warpgs.priors.sweep import CPU, SweepConfig, sweep_depths
+from warpgs.scene import Camera, Gaussians, PointCloud, View, ViewDepth
 
 SOURCES = ("auto", "sweep", "flow", "points", "random")
 MIN_POINTS = 100
@@ -194,24 +194,26 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
     return PointCloud(np.concatenate(points), np.concatenate(colors)), how
 
 
-def confirmed_depths(views: list[View], known: PointCloud, config: InitConfig) -> list[ViewDepth]:
+def confirmed_depths(views: list[View], known: PointCloud, config: InitConfig, device: torch.device = CPU) -> list[ViewDepth]:
     """Depth of each of at least two views that the others confirm, by flow or by sweeping planes between ``known`` points."""
     if config.source == "flow":
         between = flow_between(views, config.flow, config.flow_range)
         return [flow_depth(views, i, between, config.epipolar()) for i in range(len(views))]
     points = np.concatenate([known.points, triangulate_matches(views).points])
     bounds = [depth_bounds(v, points, camera_depths(views)) for v in views]
-    return sweep_depths(views, bounds, SweepConfig(near_count=config.near_views))
+    return sweep_depths(views, bounds, SweepConfig(near_count=config.near_views), device)
 
 
-def confirmed_points(views: list[View], points: PointCloud, config: InitConfig, generator: np.random.Generator) -> Start:
+def confirmed_points(
+    views: list[View], points: PointCloud, config: InitConfig, generator: np.random.Generator, device: torch.device
+) -> Start:
     """Points behind pixels whose depth other views confirm, and what was found in which view, a line each.
 
     Where a random start has more points than that, it is taken instead, and the reason said.
     """
     reason, depths = "a single view has no other to compare with", None
     if len(views) > 1:
-        depths = confirmed_depths(views, points, config)
+        depths = confirmed_depths(views, points, config, device)
         cloud, notes = coarse_points(views, depths, merge_px=config.merge_px, fill_px=config.fill_px, source=config.source)
         if len(cloud) >= MIN_POINTS:
             return Start(cloud, "\n    ".join((notes[-1], *notes[:-1])), depths)
@@ -226,17 +228,20 @@ def seen_points(views: list[View], points: PointCloud | None) -> PointCloud:
     return nothing if points is None else points.seen_by({v.name for v in views})
 
 
-def initial_points(views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator) -> Start:
-    """The points to start from.
+def initial_points(
+    views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator,
+    device: torch.device = CPU,
+) -> Start:  # fmt: skip
+    """The points to start from; a sweep is computed on the device.
 
     Raises:
         DataError: Points were asked for and the scene has none that the training views saw.
     """
     usable = seen_points(views, points)
     if config.source == "auto" and 2 <= len(views) <= config.sweep_up_to:
-        return confirmed_points(views, usable, dataclasses.replace(config, source="sweep"), generator)
+        return confirmed_points(views, usable, dataclasses.replace(config, source="sweep"), generator, device)
     if config.source in ("sweep", "flow"):
-        return confirmed_points(views, usable, config, generator)
+        return confirmed_points(views, usable, config, generator, device)
     if config.source == "points" and len(usable) == 0:
         raise DataError(
             "the scene holds no 3D points that the training views saw, and --init.source points asks for them; "
@@ -258,6 +263,13 @@ def at_most(start: Start, most: int, generator: np.random.Generator) -> Start:
     keep = np.sort(generator.permutation(count)[:most])
     how = f"{start.how}\n{most:,} of these {count:,} points, drawn at random: --max-gaussians is {most:,}"
     return start._replace(cloud=PointCloud(start.cloud.points[keep], start.cloud.colors[keep]), how=how)
+
+
+def scene_extent(cameras: list[Camera], cloud: PointCloud) -> float:
+    """Size of the scene [u]: that of the camera set; where all cameras stand together, a tenth of the cloud's."""
+    extent = geometry.camera_extent(cameras)
+    spread = float(np.linalg.norm(np.std(cloud.points, axis=0)))
+    return max(extent, 0.1 * spread if extent < 1e-3 * spread else 0.0, 1e-6)
 
 
 def initial_gaussians(cloud: PointCloud, config: InitConfig, extent: float, device: torch.device) -> Gaussians:

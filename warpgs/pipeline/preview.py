@@ -70,7 +70,7 @@ def show_priors(request: SceneRequest, config: PriorConfig, source: str, out: Pa
     depths = None
     if config.depth_model is None and len(views) > 1:
         depths = confirmed_depths(views, seen_points(views, scene.points), InitConfig(source=source))
-    priors, said = view_priors(views, config, depths=depths, regions=regions, threads=threads, cache=cache_folder())
+    priors, said = view_priors(views, config, depths=lambda: depths, regions=regions, threads=threads, cache=cache_folder())
     for view, prior in zip(views, priors):
         write_bytes(out / f"{file_stem(view.name)}.png", png(prior_sheet(view, prior)))
     return [*notes, *said, f"{len(views)} sheets in {out}"]

@@ -105,8 +105,8 @@ def sample_pixels(
     allowed = gate & (score > 0)
     count = min(count, int(allowed.sum()))
     if random:
-        noise = torch.empty(score.shape, dtype=torch.float64).exponential_(generator=generator).to(score.device)
-        key = score.double() / noise
+        uniform = torch.rand(score.shape, dtype=torch.float64, generator=generator).to(score.device)
+        key = score.double() / -torch.log1p(-uniform)
     else:
         key = score.double()
     key = torch.where(allowed, key, -1.0)

@@ -16,9 +16,12 @@ import numpy as np
 import torch
 
 from warpgs.errors import UsageError
+from warpgs.kernels.tiles import available_bytes
 from warpgs.priors.epipolar import nearest_views, pixel_grid
 from warpgs.scene import Camera, View, ViewDepth
+from warpgs.sizes import format_bytes
 
+CPU = torch.device("cpu")
 NOISE = (2 / 255) ** 2
 """Variance of a window below which its pattern is noise: correlation fades to 0 there."""
 EDGE = 0.06
@@ -114,6 +117,13 @@ def plane_homography(first: Camera, second: Camera, inverse: float) -> np.ndarra
     return np.linalg.inv(shift) @ H @ shift
 
 
+def gray_of(view: View) -> np.ndarray:
+    """Brightness of its pixels in [0, 1], float32, shape [H, W]."""
+    import cv2
+
+    return cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
+
+
 def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, window: int) -> np.ndarray:
     """Disagreement of views at D inverse depths, in [0, 1], float32, shape [D, H, W].
 
@@ -124,7 +134,7 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
 
     size, box = (view.camera.width, view.camera.height), (window, window)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    own, *grays = [cv2.cvtColor(v.image, cv2.COLOR_RGB2GRAY) for v in (view, *others)]
+    own, *grays = [gray_of(v) for v in (view, *others)]
     mean = cv2.blur(own, box)
     variance = np.maximum(cv2.blur(own * own, box) - mean * mean, 0) + NOISE
     planes = np.empty((len(inverses), *own.shape), np.float32)
@@ -271,14 +281,9 @@ def _alone():
         cv2.setNumThreads(before)
 
 
-def _swept(views: Sequence[View], some: Sequence[int], bounds: Sequence[tuple[float, float]], config: SweepConfig, pool):
-    """Inverse depths [H, W] of some of the views; threads share the planes of all of them, and then the paths."""
-    others = {i: [views[j] for j in nearest_views(views, i, config.near_count)] for i in some}
-    planes = {
-        i: plane_inverses(views[i].camera, [o.camera for o in others[i]], bounds[i], config.spacing, config.max_planes)
-        for i in some
-    }
-    costs = {i: np.empty((*views[i].image.shape[:2], len(planes[i])), np.uint16) for i in some}
+def _swept(views: Sequence[View], others: dict[int, list[View]], planes: dict[int, np.ndarray], config: SweepConfig, pool):
+    """Inverse depths [H, W] of the views that there are planes for; threads share the planes of all, and then the paths."""
+    costs = {i: np.empty((*views[i].image.shape[:2], len(p)), np.uint16) for i, p in planes.items()}
 
     def match(part: tuple[int, int]) -> None:
         i, first = part
@@ -292,25 +297,49 @@ def _swept(views: Sequence[View], some: Sequence[int], bounds: Sequence[tuple[fl
         return path_costs(costs[i], views[i].image, config.small_step, config.large_step, down=down)
 
     def best(i: int) -> np.ndarray:
-        if not others[i]:
-            return np.full(views[i].image.shape[:2], planes[i][0])
         return best_inverse(summed[i, True] + summed[i, False], planes[i])
 
-    seen = [i for i in some if others[i]]
-    ways = [(i, down) for i in seen for down in (True, False)]
+    ways = [(i, down) for i in planes for down in (True, False)]
     # numpy and OpenCV let other threads run meanwhile
-    list(pool.map(match, [(i, first) for i in seen for first in range(0, len(planes[i]), PLANES_AT_ONCE)]))
+    list(pool.map(match, [(i, first) for i in planes for first in range(0, len(planes[i]), PLANES_AT_ONCE)]))
     summed = dict(zip(ways, pool.map(paths, ways)))
-    return list(pool.map(best, some))
+    return list(pool.map(best, planes))
 
 
-def sweep_depths(views: Sequence[View], bounds: Sequence[tuple[float, float]], config: SweepConfig) -> list[ViewDepth]:
+def _inverses(views: Sequence[View], bounds: Sequence[tuple[float, float]], config: SweepConfig, device: torch.device, pool):
+    """Inverse depths [H, W] of every view, and what a user must know of how they were found."""
+    from warpgs.priors import sweep_cuda
+
+    others = {i: [views[j] for j in nearest_views(views, i, config.near_count)] for i in range(len(views))}
+    planes = {
+        i: plane_inverses(views[i].camera, [o.camera for o in found], bounds[i], config.spacing, config.max_planes)
+        for i, found in others.items()
+    }
+    found = {i: np.full(views[i].image.shape[:2], planes[i][0]) for i in planes if not others[i]}
+    left, notes = [i for i in planes if others[i]], []
+    if device.type == "cuda" and left:
+        needed = max(sweep_cuda.needed_bytes(views[i], len(planes[i])) for i in left)
+        if needed < available_bytes(device):
+            found |= {i: sweep_cuda.inverse_depths(views[i], others[i], planes[i], config, device) for i in left}
+            left = []
+        else:
+            notes.append(f"swept on the CPU, since the GPU has no room for {format_bytes(needed)}")
+    for first in range(0, len(left), MAX_AT_ONCE):
+        some = left[first : first + MAX_AT_ONCE]
+        found |= zip(some, _swept(views, others, {i: planes[i] for i in some}, config, pool))
+    return [found[i] for i in range(len(views))], notes
+
+
+def sweep_depths(
+    views: Sequence[View], bounds: Sequence[tuple[float, float]], config: SweepConfig, device: torch.device = CPU
+) -> list[ViewDepth]:
     """Depth of every view by sweeping planes against its nearest others.
 
     Args:
         views: The views; a single one confirms nothing.
         bounds: Nearest and farthest depth of each view [u], 0 < near < far.
         config: Planes, smoothing and checks.
+        device: Where to compute costs and paths; the CPU does it where a GPU has no room.
 
     Returns:
         One depth per view at its own size; what was reduced or found nothing is in its notes.
@@ -319,13 +348,11 @@ def sweep_depths(views: Sequence[View], bounds: Sequence[tuple[float, float]], c
 
     small = [_reduced(v, config.max_pixels) for v in views]
     with _alone(), ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        inverses = []
-        for first in range(0, len(views), MAX_AT_ONCE):
-            inverses += _swept(small, range(len(views))[first : first + MAX_AT_ONCE], bounds, config, pool)
+        inverses, said = _inverses(small, bounds, config, device, pool)
         confirmed = list(pool.map(lambda i: confirm(small, inverses, i, config), range(len(views))))
     out = []
     for i, view in enumerate(views):
-        found, notes = confirmed[i], []
+        found, notes = confirmed[i], list(said)
         depth, valid, sensitivity = found.depth, found.valid, found.sensitivity
         size = (view.camera.width, view.camera.height)
         if small[i] is not view:

@@ -206,7 +206,7 @@ def view_priors(
     views: Sequence[View],
     config: PriorConfig,
     *,
-    depths: Sequence[ViewDepth] | None = None,
+    depths: Callable[[], Sequence[ViewDepth] | None] = lambda: None,
     regions: Sequence[np.ndarray | None] | None = None,
     threads: int = 0,
     cache: Path | None = None,
@@ -216,7 +216,7 @@ def view_priors(
     Args:
         views: The training views.
         config: Networks and how to feed them.
-        depths: For each view the depth that the others confirm; read where no depth network is named.
+        depths: Gives for each view the depth that the others confirm; asked last, and where no depth network is named.
         regions: For each view the pixels that show its object, bool [H, W], or None: stands in where the foreground is unknown.
         threads: CPU threads of a network; 0 for as many as the process may use.
         cache: Folder that keeps what networks give; None, or ``config.cache`` off, for no keeping.
@@ -232,16 +232,15 @@ def view_priors(
     store = MapCache(Path(cache)) if config.cache and cache is not None else None
     notes: list[str] = []
     # both are opened before either runs: a wrong file is found at once
-    if config.depth_model is not None:
-        disparity = _depth_network(views, config, threads, store, notes)
-    else:
-        disparity = _depth_views(views, depths, notes)
+    disparity = None if config.depth_model is None else _depth_network(views, config, threads, store, notes)
     if config.segmentation_model is not None:
         maps = _segmentation_network(views, config, threads, store, notes)
     else:
         maps = _classical(views, notes)
     found = [maps(i) for i in range(len(views))]
     found = _fall_back(found, views, regions or [None] * len(views), config.segmentation_model is None, notes)
+    if disparity is None:
+        disparity = _depth_views(views, depths(), notes)
     priors = []
     for i, (m, source) in enumerate(found):
         d, where = disparity(i)

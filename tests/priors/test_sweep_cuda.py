@@ -1,0 +1,108 @@
+"""The sweep in torch finds what the one on the CPU does, step by step; its code is the same on any device."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+
+from tests.priors.rigs import still_life
+from warpgs.priors import sweep, sweep_cuda
+from warpgs.priors.sweep import UNIT, SweepConfig, sweep_depths
+from warpgs.scene import Camera, View
+
+CPU = torch.device("cpu")
+PLANES = np.linspace(1 / 12, 1 / 2, 40)
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+def device(request):
+    """Where torch works."""
+    return torch.device(request.param)
+
+
+def test_costs_agree(device):
+    """To the rounding of correlations where there is little pattern; a cost of no opinion is one in both."""
+    views, _ = still_life()
+    wanted = sweep.matching_costs(views[1], [views[0], views[2]], PLANES, 7)
+    found = sweep_cuda.matching_costs(views[1], [views[0], views[2]], PLANES, 7, device).cpu().numpy().transpose(2, 0, 1)
+    off = np.abs(found - wanted)
+    assert off.max() < 2e-3 and np.quantile(off, 0.999) < 2e-4 and off.mean() < 5e-6  # on a CPU 4.5e-4, 4.6e-5, 1.2e-6
+    silent = wanted == sweep.NO_OPINION
+    assert 0.001 < silent.mean() < 0.5 and (found[silent] == sweep.NO_OPINION).mean() > 0.999
+
+
+def test_costs_of_another_size_agree(device):
+    """The other view has other sides, and planes behind its camera have no opinion in either."""
+    generator = np.random.default_rng(0)
+    texture = generator.uniform(0.1, 0.9, (30, 60, 3)).astype(np.float32)
+    K = np.array([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]])
+    behind = np.eye(4)
+    behind[:3, 3] = [-0.5, 0.1, -3.0]
+    views = [View("a", Camera(np.eye(4), K, 40, 30), texture[:, :40]), View("b", Camera(behind, K, 60, 30), texture)]
+    inverses = np.array([0.15, 0.25, 0.5, 1.0])
+    wanted = sweep.matching_costs(views[0], views[1:], inverses, 5)
+    found = sweep_cuda.matching_costs(views[0], views[1:], inverses, 5, device).cpu().numpy().transpose(2, 0, 1)
+    assert np.isfinite(found).all() and np.abs(found - wanted).max() < 1e-4 and (wanted != sweep.NO_OPINION).mean() > 0.3
+
+
+def test_paths_agree(device):
+    """Of whole costs, which float32 sums without rounding: the same to the rounding of a penalty."""
+    generator = np.random.default_rng(1)
+    costs = generator.integers(0, UNIT + 1, (9, 7, 12)).astype(np.uint16)
+    image = generator.uniform(0.4, 0.55, (9, 7, 3)).astype(np.float32)
+    wanted = sum(sweep.path_costs(costs, image, 0.05, 0.6, down=down).astype(int) for down in (True, False))
+    scaled = torch.from_numpy(costs.astype(np.float32)).to(device) / UNIT
+    found = sweep_cuda.path_costs(scaled, image, 0.05, 0.6).cpu().numpy() * UNIT
+    assert np.abs(found - wanted).max() < 8 and np.abs(found - wanted).mean() < 1.5  # half a unit for each step of a path
+
+
+def test_parabola_agrees(device):
+    """Between planes, at the first and last plane, and where costs are flat."""
+    generator = np.random.default_rng(2)
+    costs = generator.integers(0, 1000, (6, 5, 40)).astype(np.float32)
+    costs[0], costs[1, :, 0], costs[2, :, -1] = 7.0, -1.0, -1.0
+    wanted = sweep.best_inverse(costs, PLANES)
+    assert np.allclose(sweep_cuda.best_inverse(torch.from_numpy(costs).to(device), PLANES), wanted, rtol=1e-12)
+
+
+def test_depths_agree(device):
+    """Of a view of the still life: nearly all the same, and as near to the truth."""
+    views, depths = still_life()
+    config, others = SweepConfig(), [views[0], views[2]]
+    planes = sweep.plane_inverses(views[1].camera, [o.camera for o in others], (2, 12), config.spacing, config.max_planes)
+    with ThreadPoolExecutor(2) as pool:
+        wanted, _ = sweep._inverses(views, [(2, 12)] * 3, config, CPU, pool)
+    found = sweep_cuda.inverse_depths(views[1], others, planes, config, device)
+    assert found.shape == depths[1].shape and np.quantile(np.abs(found / wanted[1] - 1), 0.95) < 2e-4
+    error = np.abs(1 / (found * depths[1]) - 1)
+    assert np.median(error) < 0.008
+
+
+def test_a_gpu_without_room_leaves_it_to_the_cpu(monkeypatch):
+    """The same depths as on the CPU, and a note that says so and how much was missing."""
+    views, _ = still_life()
+    monkeypatch.setattr(sweep, "available_bytes", lambda _: 0)
+    found = sweep_depths(views, [(2, 12)] * 3, SweepConfig(), torch.device("cuda"))
+    for a, b in zip(found, sweep_depths(views, [(2, 12)] * 3, SweepConfig())):
+        assert np.array_equal(a.depth, b.depth) and "no room for" in a.notes[0] and "MiB" in a.notes[0] and not b.notes
+
+
+@pytest.mark.cuda
+def test_the_gpu_takes_no_more_than_it_says():
+    """Peak memory of a view is below `needed_bytes`."""
+    views, _ = still_life()
+    device, planes = torch.device("cuda"), np.linspace(1 / 12, 1 / 2, 200)
+    sweep_cuda.inverse_depths(views[1], [views[0], views[2]], planes, SweepConfig(), device)
+    torch.cuda.reset_peak_memory_stats(device)
+    before = torch.cuda.memory_allocated(device)
+    sweep_cuda.inverse_depths(views[1], [views[0], views[2]], planes, SweepConfig(), device)
+    assert torch.cuda.max_memory_allocated(device) - before < sweep_cuda.needed_bytes(views[1], len(planes))
+
+
+@pytest.mark.cuda
+def test_a_gpu_confirms_as_much():
+    """Of the still life, within half a per cent of the pixels."""
+    views, _ = still_life()
+    for a, b in zip(*(sweep_depths(views, [(2, 12)] * 3, SweepConfig(), d) for d in (CPU, torch.device("cuda")))):
+        assert abs(a.coverage - b.coverage) < 0.005
