@@ -114,6 +114,11 @@ def dropout(count: int) -> Cost:
     return Cost(REAL * count, 20 * count)
 
 
+def scanlines(pixels: int, planes: int) -> Cost:
+    """Costs in, and sums in and out, by each of four paths, 2 bytes each; 8 operations a path and plane."""
+    return Cost(4 * 6 * pixels * planes, 32 * pixels * planes)
+
+
 def knn(count: int) -> Cost:
     """Positions in, distances out, a sort of 64-bit codes with 64-bit numbers; 32 distances to neighbours on the curve."""
     return Cost(16 * count + 8 * 32 * count, 32 * 8 * count)

@@ -13,7 +13,20 @@ from pathlib import Path
 import torch
 import warp as wp
 
-from warpgs.kernels import adam, blend, blend_cpu, blend_cuda, bridge, dropout, knn, project, ssim_cpu, ssim_cuda, tiles
+from warpgs.kernels import (
+    adam,
+    blend,
+    blend_cpu,
+    blend_cuda,
+    bridge,
+    dropout,
+    knn,
+    project,
+    scanlines,
+    ssim_cpu,
+    ssim_cuda,
+    tiles,
+)
 from warpgs.kernels.native import BLOCK
 from warpgs.sizes import format_bytes
 
@@ -33,6 +46,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         (project.make_forward(real, cuda), THREADS), (project.make_backward(real, cuda), BLOCK),
         (tiles.make_kernels(real, cuda).pack_counts, THREADS), (tiles.make_kernels(real, cuda).find_ranges, THREADS),
         (tiles.make_emit(real, cuda), THREADS), (knn.make_kernels(real).search, THREADS), (dropout.make_kernel(), THREADS),
+        (scanlines.make_kernel(), scanlines.BLOCK),
     ]  # fmt: skip
     if not cuda:
         blending, scoring = (

@@ -54,6 +54,7 @@ OPS = {
     "project": ["kernels/test_project.py", LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "test_rasterizer.py"],
     "project_adam": ["kernels/test_project_adam.py"],
     "project_backward": ["kernels/test_project.py", LIMITS_PROJECT, EXTREMES, "test_rasterizer.py"],
+    "scanlines": ["kernels/test_scanlines.py"],
     "sh": ["kernels/test_sh.py", "kernels/test_project.py"],
     "ssim": ["kernels/test_ssim.py", LIMITS],
     "tiles": ["kernels/test_tiles.py", LIMITS_BLEND, "test_rasterizer.py", "test_window.py"],

@@ -59,8 +59,8 @@ def test_a_fit_is_the_same_after_a_rehearsal():
     device, views = torch.device("cuda"), photographs(3)
     config = dataclasses.replace(PRESETS["quick"], steps=20)
     fits = []
-    for ready in (lambda: None, rehearsal(config, device)):
-        fit = Fit(views, seeds(), config, device, priors=priors(views), ready=ready)
+    for begin in (lambda *_: lambda: None, rehearsal):
+        fit = Fit(views, seeds(), config, device, priors=priors(views), ready=begin(config, device))
         run(fit, lambda _: None, lambda _: None, lambda: False)
         fits.append(fit.gaussians.tensors())
     assert all(torch.equal(fits[0][n], fits[1][n]) for n in fits[0])

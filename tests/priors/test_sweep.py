@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests.priors.rigs import rig, still_life
+from tests.reference.scanlines import scanline_costs
 from warpgs.errors import UsageError
 from warpgs.geometry import back_project, project_points
 from warpgs.priors.completion import complete
@@ -70,36 +71,28 @@ def test_cost_is_least_at_the_true_plane():
 def test_paths_are_those_of_the_definition():
     """Against the recursion written out pixel by pixel, to the last unit; an edge of the picture lets depth jump."""
     generator = np.random.default_rng(1)
-    costs = generator.integers(0, UNIT + 1, (4, 5, 6)).astype(np.uint16)
+    costs = generator.integers(0, UNIT + 1, (4, 5, 6)).astype(np.int16)
     image = generator.uniform(0.4, 0.55, (4, 5, 3)).astype(np.float32)
     p1, p2 = 0.05, 0.6
-    total = np.zeros(costs.shape, int)
-    for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-        path = np.zeros(costs.shape, int)
-        for y in range(4)[:: 1 if dy >= 0 else -1]:
-            for x in range(5)[:: 1 if dx >= 0 else -1]:
-                path[y, x] = costs[y, x]
-                py, px = y - dy, x - dx
-                if 0 <= py < 4 and 0 <= px < 5:
-                    jump = round(max(p2 * np.exp(-np.abs(image[y, x] - image[py, px]).max() / 0.06), 1.5 * p1) * UNIT)
-                    low = path[py, px].min()
-                    for d in range(6):
-                        options = [path[py, px, d], low + jump]
-                        options += [path[py, px, k] + round(p1 * UNIT) for k in (d - 1, d + 1) if 0 <= k < 6]
-                        path[y, x, d] += min(options) - low
-        total += path
-    assert np.array_equal(sum(path_costs(costs, image, p1, p2, down=down).astype(int) for down in (True, False)), total)
+
+    def limit(a: np.ndarray, b: np.ndarray) -> int:
+        return round(max(p2 * np.exp(-np.abs(a - b).max() / 0.06), 1.5 * p1) * UNIT)
+
+    down = np.array([[limit(image[y, x], image[y + 1, x]) for x in range(5)] for y in range(3)])
+    across = np.array([[limit(image[y, x], image[y, x + 1]) for x in range(4)] for y in range(4)])
+    found = sum(path_costs(costs, image, p1, p2, down=way).astype(int) for way in (True, False))
+    assert np.array_equal(found, scanline_costs(costs, down, across, round(p1 * UNIT))) and np.ptp(down) > 500
 
 
 def test_paths_of_the_dearest_costs_fit_in_16_bits():
     """Where the best plane changes from pixel to pixel and every other costs 1, nothing wraps around at the largest steps."""
-    costs = np.full((6, 6, 8), UNIT, np.uint16)
+    costs = np.full((6, 6, 8), UNIT, np.int16)
     y, x = np.indices((6, 6))
     costs[y, x, (3 * y + 5 * x) % 8] = 0
     parts = [path_costs(costs, np.zeros((6, 6, 3), np.float32), 0.03, LARGEST_STEP, down=down) for down in (True, False)]
-    wide = [p.astype(int) for p in parts]
-    assert max(p.max() for p in wide) > 3 * UNIT and np.array_equal((parts[0] + parts[1]).astype(int), wide[0] + wide[1])
-    assert min(p.min() for p in wide) >= 0 and (wide[0] + wide[1]).max() <= 4 * (1 + LARGEST_STEP) * UNIT + 4 < 2**16
+    wide = sum(p.astype(int) for p in parts)
+    assert np.array_equal((parts[0] + parts[1]).astype(int), wide) and wide.max() > 3 * UNIT and wide.min() >= 0
+    assert 4 * (1 + LARGEST_STEP) * UNIT + 4 < 2**15
 
 
 def test_parabola_between_planes():

@@ -117,6 +117,8 @@ def warp_stream(device: torch.device) -> wp.Stream:
     return _warp_stream(device, torch._C._cuda_getCurrentRawStream(index))
 
 
+_LOADING = threading.Lock()
+"""Compiling one module from several threads at once is not safe."""
 _SORTING = threading.RLock()
 """Warp has one stream for all threads of a device: a thread keeps it while it sorts."""
 
@@ -220,13 +222,13 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
         _recorded(kernel, device, block_dim).launch(count, inputs, warp_stream(device))
         return
     inputs = [a.array() if isinstance(a, View) else a for a in inputs]
+    with _LOADING:
+        kernel.module.load("cpu", block_dim=1)  # launches on a CPU are compiled for blocks of one thread
     threads = torch.get_num_threads()
     # A kernel of Warp 1.19 for x86 keeps a pointer into its stack in a static variable, which only optimised code leaves out.
     if threads == 1 or count == 1 or count * cost < SERIAL_WORK or wp.config.mode == "debug":
         wp.launch(kernel, count, inputs=[0, *inputs], device="cpu", record_tape=False)
         return
-    # Compiling from several threads at once is not safe; launches on a CPU are compiled for blocks of one thread.
-    kernel.module.load("cpu", block_dim=1)
     first = wp.launch(kernel, count, inputs=[0, *inputs], device="cpu", record_cmd=True)
     chunks = min(count, threads * (CHUNKS_PER_THREAD if threads <= FEW_THREADS else CHUNKS_PER_THREAD // 2))
     left = iter(range(chunks))  # threads take the next range when they are done with one

@@ -17,12 +17,13 @@ from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.evaluate import render_view, score
 from warpgs.pipeline.fit import Fit, run
 from warpgs.pipeline.results import options_for
+from warpgs.priors.sweep import SweepConfig, sweep_depths
 from warpgs.scene import Camera, PointCloud, Prior, View
 
 STEPS = 3
 """With phases, one step for each."""
-SIDE, POINTS = 48, 200
-"""Of the views [px]; number of points."""
+SIDE, POINTS, PLANES = 48, 200, 8
+"""Sides of the views [px]; number of points, and of planes."""
 
 
 def _views(generator: np.random.Generator) -> list[View]:
@@ -36,7 +37,7 @@ def _views(generator: np.random.Generator) -> list[View]:
 
 
 def rehearse(config: FitConfig, device: torch.device) -> Fit:
-    """Fit noise in a few small views with the same settings, refinement and sampling included, and score a view.
+    """Sweep and fit noise in two small views with the same settings, refinement and sampling included, and score one.
 
     Returns:
         The fit, done.
@@ -51,6 +52,7 @@ def rehearse(config: FitConfig, device: torch.device) -> Fit:
         density=replace(config.density, every=1),
     )  # fmt: skip
     black = (0.0, 0.0, 0.0)
+    sweep_depths(views, [(2, 4)] * len(views), SweepConfig(max_planes=PLANES), device)
     fit = Fit(views, cloud, small, device, black, [Prior(*maps, "noise", "noise") for _ in views])
     run(fit, lambda _: None, lambda _: None, lambda: False)
     score(views[0], render_view(fit.gaussians, views[0], options_for(small.rule, black, fit.gaussians))[0])

@@ -9,7 +9,7 @@ import numpy as np
 
 from warpgs.files import write_bytes
 from warpgs.io.splits import Split
-from warpgs.pipeline.evaluate import guesses, render_view, score, summarize, variants
+from warpgs.pipeline.evaluate import ViewMetrics, guesses, render_view, score, summarize, variants
 from warpgs.pipeline.lpips import Lpips
 from warpgs.rasterizer import RasterizeOptions
 from warpgs.report.curve import curve
@@ -42,7 +42,7 @@ def score_line(scores: dict[str, float]) -> str:
 SHOWN_VIEWS = 6
 """Held-out views with pictures in the report; all have files in the run folder."""
 PAINTERS = 4
-"""Threads that encode pictures while others are drawn and scored."""
+"""Threads that score and encode pictures while others are drawn."""
 
 
 def options_for(
@@ -88,26 +88,28 @@ def evaluate_run(
     options = options_for(rule, background, gaussians, max_instances)
     (out / "renders").mkdir(exist_ok=True)
     (out / "depth").mkdir(exist_ok=True)
-    rows, train_rows, saved = [], [], []
 
-    def save(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> None:
+    def finish(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:
         stem = file_stem(view.name)
         row = side_by_side([np.clip(image, 0, 1), view.image, error_map(image, view.image)])
         write_bytes(out / "renders" / f"{stem}.png", png(row))
         write_bytes(out / "depth" / f"{stem}.png", png(depth_map(depth, alpha)))
+        return score(view, image, lpips if test else None)
 
-    with ThreadPoolExecutor(PAINTERS) as painters:
-        for view in test or train:
-            drawn = render_view(gaussians, view, options)
-            saved.append(painters.submit(save, view, *drawn))
-            rows.append(score(view, drawn[0], lpips if test else None))
-        for view in train:
-            train_rows.append(score(view, render_view(gaussians, view, options)[0]))
-    for picture in saved:
-        picture.result()  # or why it could not be written
+    def compare(view: View, image: np.ndarray, *_) -> ViewMetrics:
+        return score(view, image)
+
+    tasks, jobs = [(finish, v) for v in test or train] + [(compare, v) for v in train if test], []
+    with ThreadPoolExecutor(PAINTERS if lpips is None else 1) as painters:  # LPIPS takes much memory a view
+        for work, view in tasks:
+            jobs.append(painters.submit(work, view, *render_view(gaussians, view, options)))
+            if len(jobs) > 2 * PAINTERS:
+                jobs[-2 * PAINTERS].result()  # not all pictures at once
+        found = [j.result() for j in jobs]
+    rows, train_rows = found[: len(test)], found[-len(train) :]
     return {
-        "test": summarize(rows) if test else {}, "train": summarize(train_rows),
-        "views": [r.row() for r in rows] if test else [],
+        "test": summarize(rows), "train": summarize(train_rows),
+        "views": [r.row() for r in rows],
         "guesses": guesses(train, test) if test else {},
         "variants": variants(lpips),
     }  # fmt: skip

@@ -188,9 +188,11 @@ def fit_scene(request: FitRequest) -> dict:
     try:
         device, where = choose_device(request.device)
         lpips = None if request.lpips_weights is None else load_lpips(request.lpips_weights, device)
+        ready = rehearsal(request.config, device)
         scene, split, notes = read_scene(request.scene)
         train, test = train_views(scene, split.train), train_views(scene, split.test)
         if request.time_budget is not None:
+            ready()  # that uses the device
             config, note = within_budget(request.config, request.time_budget, train, device)
             request, notes = replace(request, config=config), [*notes, note]
         notes = [*request.notes, *notes]
@@ -201,7 +203,6 @@ def fit_scene(request: FitRequest) -> dict:
                 tensors, plain = load_checkpoint(out)
         if device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(device)  # earlier fits of this process are not this one's need
-        ready = rehearsal(request.config, device)
         fit = fit_class(request.config)(train, scene.points, request.config, device, scene.background, ready=ready)
     except WarpgsError:
         if not request.resume:

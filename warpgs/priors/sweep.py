@@ -28,11 +28,11 @@ EDGE = 0.06
 """Step of the picture at which the penalty for a jump in depth falls to 1/e."""
 NO_OPINION = 0.5
 """Cost of correlation 0: where a plane leaves the other image, or nothing has texture."""
-UNIT = 8192
+UNIT = 4096
 """Cost 1 in the 16-bit whole numbers that volumes hold: to touch memory for the first time takes as long as to compute what
 goes there, and this is half of float32's."""
 LARGEST_STEP = 0.99
-"""P2 up to which the sum of four paths, each at most 1 + P2, stays below 2^16."""
+"""P2 up to which the sum of four paths, each at most 1 + P2, stays below 2^15."""
 PLANES_AT_ONCE = 16
 """Planes whose costs one thread writes together, 32 bytes of each pixel."""
 MAX_AT_ONCE = 4
@@ -169,24 +169,28 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
     return planes
 
 
+def step_limits(colors: np.ndarray, small_step: float, large_step: float) -> np.ndarray:
+    """P2 of the steps along the first axis of a picture [L, B, 3], in units of 1 / `UNIT`, int16, shape [L - 1, B]."""
+    jumps = np.abs(np.diff(colors, axis=0)).max(2)
+    return np.rint(np.maximum(large_step * np.exp(-jumps / EDGE), 1.5 * small_step) * UNIT).astype(np.int16)
+
+
 def path_costs(costs: np.ndarray, image: np.ndarray, small_step: float, large_step: float, *, down: bool) -> np.ndarray:
     """Sum of the semi-global path costs from above and below, or from left and right.
 
     Args:
-        costs: Matching costs in units of 1 / `UNIT`, uint16, shape [H, W, D].
+        costs: Matching costs in units of 1 / `UNIT`, int16, shape [H, W, D].
         image: Colours in [0, 1] whose edges allow jumps, shape [H, W, 3].
         small_step: Penalty for a change of one plane.
         large_step: Penalty for any other change, times exp(-step of the picture / EDGE).
         down: Whether paths run along columns; else along rows.
 
     Returns:
-        Sums in units of 1 / `UNIT`, uint16, shape [H, W, D].
+        Sums in units of 1 / `UNIT`, int16, shape [H, W, D].
     """
     total = np.zeros_like(costs)
     c, t, colors = (a if down else a.swapaxes(0, 1) for a in (costs, total, image))
-    jumps = np.abs(np.diff(colors, axis=0)).max(2)
-    limits = np.rint(np.maximum(large_step * np.exp(-jumps / EDGE), 1.5 * small_step) * UNIT).astype(np.uint16)
-    small = np.uint16(round(small_step * UNIT))
+    limits, small = step_limits(colors, small_step, large_step), np.int16(round(small_step * UNIT))
     for order, edge in ((range(len(c)), -1), (range(len(c) - 1, -1, -1), 0)):
         path = None
         for k in order:
@@ -283,7 +287,7 @@ def _alone():
 
 def _swept(views: Sequence[View], others: dict[int, list[View]], planes: dict[int, np.ndarray], config: SweepConfig, pool):
     """Inverse depths [H, W] of the views that there are planes for; threads share the planes of all, and then the paths."""
-    costs = {i: np.empty((*views[i].image.shape[:2], len(p)), np.uint16) for i, p in planes.items()}
+    costs = {i: np.empty((*views[i].image.shape[:2], len(p)), np.int16) for i, p in planes.items()}
 
     def match(part: tuple[int, int]) -> None:
         i, first = part

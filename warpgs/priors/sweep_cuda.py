@@ -1,7 +1,4 @@
-"""`sweep` on a GPU: the same costs, paths and parabola in float32, by torch.
-
-Torch and not kernels of our own: it takes a tenth of a second a view, and only once a fit.
-"""
+"""`sweep` on a GPU: costs and parabola by torch, in float32, paths by a kernel, in the same whole numbers."""
 
 from __future__ import annotations
 
@@ -10,20 +7,21 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from warpgs.priors.sweep import EDGE, NO_OPINION, NOISE, PLANES_AT_ONCE, SweepConfig, gray_of, plane_homography
+from warpgs.kernels.scanlines import scanline_costs
+from warpgs.priors.sweep import NO_OPINION, NOISE, PLANES_AT_ONCE, UNIT, SweepConfig, gray_of, plane_homography, step_limits
 from warpgs.scene import View
 
-VOLUMES = 4
-"""Float32 volumes [H, W, D] that one view takes at a time, what their parts take included."""
+MAPS = 24
+"""Float32 maps of a plane that its costs take while they are computed."""
 
 
 def needed_bytes(view: View, planes: int) -> int:
-    """Device memory that `inverse_depths` takes for a view and that many planes [bytes]."""
-    return 4 * VOLUMES * planes * view.camera.width * view.camera.height
+    """Device memory that `inverse_depths` takes for a view and that many planes, at most [bytes]."""
+    return view.camera.width * view.camera.height * (4 * planes + 4 * MAPS * min(planes, PLANES_AT_ONCE))
 
 
 def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, window: int, device: torch.device) -> torch.Tensor:
-    """As `sweep.matching_costs`, but float32 of shape [H, W, D] on the device."""
+    """As `sweep.matching_costs`, but in units of 1 / `UNIT`, int16, shape [H, W, D], on the device."""
 
     def box(maps: torch.Tensor) -> torch.Tensor:
         r = window // 2
@@ -35,7 +33,7 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
     pixels = torch.stack([columns, rows, torch.ones_like(rows)]).reshape(3, -1).to(device, torch.float32)
     mean = box(own)
     variance = (box(own * own) - mean * mean).clamp(min=0) + NOISE
-    costs = torch.empty(height, width, len(inverses), device=device)
+    costs = torch.empty(height, width, len(inverses), dtype=torch.int16, device=device)
     for first in range(0, len(inverses), PLANES_AT_ONCE):
         chosen, least, total = inverses[first : first + PLANES_AT_ONCE], None, 0
         for other, gray in zip(others, grays):
@@ -52,36 +50,18 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
             cost = torch.where(warped >= 0, cost, NO_OPINION)
             total = total + cost
             least = cost if least is None else torch.minimum(least, cost)
-        costs[..., first : first + len(chosen)] = (0.5 * least + total * (0.5 / len(others)))[:, 0].permute(1, 2, 0)
+        found = (0.5 * least + total * (0.5 / len(others))).clamp(0, 1) * UNIT
+        costs[..., first : first + len(chosen)] = found.round()[:, 0].permute(1, 2, 0).to(torch.int16)
     return costs
 
 
-def _add_paths(total: torch.Tensor, costs: torch.Tensor, limits: torch.Tensor, small_step: float) -> None:
-    """Add the costs of paths along the first axis and against it to ``total``; all [L, B, D], ``limits`` [L - 1, B]."""
-    last = len(costs) - 1
-    both = torch.stack([limits, limits.flip(0)], 1)[..., None]
-    path = costs[[0, last]]
-    total[0] += path[0]
-    total[last] += path[1]
-    for k in range(1, last + 1):
-        lowest, beside = path.amin(2, keepdim=True), path + small_step
-        path = torch.minimum(path, lowest + both[k - 1])
-        torch.minimum(path[..., 1:], beside[..., :-1], out=path[..., 1:])
-        torch.minimum(path[..., :-1], beside[..., 1:], out=path[..., :-1])
-        path -= lowest
-        path[0] += costs[k]
-        path[1] += costs[last - k]
-        total[k] += path[0]
-        total[last - k] += path[1]
-
-
 def path_costs(costs: torch.Tensor, image: np.ndarray, small_step: float, large_step: float) -> torch.Tensor:
-    """As the sum of `sweep.path_costs` down and across, but of float32 costs [H, W, D] on their device, in their unit."""
-    total, colors = torch.zeros_like(costs), torch.from_numpy(image).to(costs.device)
-    for c, t, i in ((costs, total, colors), (costs.transpose(0, 1), total.transpose(0, 1), colors.transpose(0, 1))):
-        jumps = i.diff(dim=0).abs().amax(2)
-        _add_paths(t, c, (large_step * torch.exp(-jumps / EDGE)).clamp(min=1.5 * small_step), small_step)
-    return total
+    """As the sum of `sweep.path_costs` down and across, of costs [H, W, D] on their device."""
+    down, across = (
+        torch.from_numpy(step_limits(colors, small_step, large_step).astype(np.int32)).to(costs.device)
+        for colors in (image, image.swapaxes(0, 1))
+    )
+    return scanline_costs(costs, down, across.T, round(small_step * UNIT))
 
 
 def best_inverse(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
