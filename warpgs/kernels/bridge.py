@@ -222,8 +222,8 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
         _recorded(kernel, device, block_dim).launch(count, inputs, warp_stream(device))
         return
     inputs = [a.array() if isinstance(a, View) else a for a in inputs]
-    with _LOADING:
-        kernel.module.load("cpu", block_dim=1)  # launches on a CPU are compiled for blocks of one thread
+    with _LOADING:  # launches on a CPU are compiled for blocks of one thread
+        kernel.module.load("cpu", block_dim=1)
     threads = torch.get_num_threads()
     # A kernel of Warp 1.19 for x86 keeps a pointer into its stack in a static variable, which only optimised code leaves out.
     if threads == 1 or count == 1 or count * cost < SERIAL_WORK or wp.config.mode == "debug":

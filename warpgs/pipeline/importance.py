@@ -45,9 +45,10 @@ def blur(image: torch.Tensor, sigma: float = BLUR) -> torch.Tensor:
     offsets = torch.arange(-radius, radius + 1, dtype=image.dtype, device=image.device)
     window = torch.exp(-0.5 * (offsets / sigma) ** 2)
     window = window / window.sum()
-    padded = torch.nn.functional.pad(image[None, None], (radius,) * 4, mode="replicate")
-    across = torch.nn.functional.conv2d(padded, window[None, None, None, :])
-    return torch.nn.functional.conv2d(across, window[None, None, :, None])[0, 0]
+    padded = torch.nn.functional.pad(image[None, None], (radius,) * 4, mode="replicate")[0, 0]
+    # sums of windows rather than a convolution, for which CUDA would load a library of its own
+    across = (padded.unfold(1, len(window), 1) * window).sum(-1)
+    return (across.unfold(0, len(window), 1) * window).sum(-1)
 
 
 def normalized(score: torch.Tensor, valid: torch.Tensor | None = None) -> torch.Tensor:

@@ -117,10 +117,13 @@ def sample_pixels(
 def back_project(camera: Camera, pixels: torch.Tensor, depths: torch.Tensor) -> torch.Tensor:
     """World points [S, 3] behind pixel positions [S, 2] (x, y; centres at +0.5) at z-depths [S] [u]: R^T (d K^-1 [x y 1] - t).
 
-    The camera's tensors are float32 or float64 on the device of the others.
+    The camera's tensors are float32 or float64 on the device of the others. Of K the focal lengths and the centre count, as in
+    projection.
     """
-    rays = torch.cat([pixels, torch.ones_like(pixels[:, :1])], 1) @ torch.linalg.inv(camera.K).T
-    return (depths[:, None] * rays - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+    K, viewmat = camera.K, camera.viewmat
+    x, y = ((pixels[:, i] - K[i, 2]) / K[i, i] * depths for i in range(2))
+    moved = torch.stack([x, y, depths], 1) - viewmat[:3, 3]
+    return (moved[:, :, None] * viewmat[:3, :3]).sum(1)  # a product of matrices would load another library on CUDA
 
 
 def fine_gaussians(

@@ -29,8 +29,8 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
 
     own, *grays = [torch.from_numpy(gray_of(v))[None, None].to(device) for v in (view, *others)]
     width, height = view.camera.width, view.camera.height
-    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    pixels = torch.stack([columns, rows, torch.ones_like(rows)]).reshape(3, -1).to(device, torch.float32)
+    x = torch.arange(width, dtype=torch.float32, device=device)
+    y = torch.arange(height, dtype=torch.float32, device=device)[:, None]
     mean = box(own)
     variance = (box(own * own) - mean * mean).clamp(min=0) + NOISE
     costs = torch.empty(height, width, len(inverses), dtype=torch.int16, device=device)
@@ -38,9 +38,10 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
         chosen, least, total = inverses[first : first + PLANES_AT_ONCE], None, 0
         for other, gray in zip(others, grays):
             to_other = np.stack([plane_homography(view.camera, other.camera, w) for w in chosen])
-            p = torch.from_numpy(to_other).to(device, torch.float32) @ pixels
-            size = torch.tensor([other.camera.width - 1, other.camera.height - 1], dtype=torch.float32, device=device)
-            at = (p[:, :2] / p[:, 2:]).transpose(1, 2).reshape(len(chosen), height, width, 2) * (2 / size) - 1
+            H = torch.from_numpy(to_other).to(device, torch.float32)[..., None, None]  # [P, 3, 3, 1, 1]
+            p = [H[:, i, 0] * x + H[:, i, 1] * y + H[:, i, 2] for i in range(3)]
+            last = (other.camera.width - 1, other.camera.height - 1)
+            at = torch.stack([2 / n * p[i] / p[2] - 1 for i, n in enumerate(last)], -1)  # [P, H, W, 2]
             # outside is -1, which is less than any colour, also where a pixel is partly outside
             raised = (gray + 1).expand(len(chosen), -1, -1, -1)
             warped = torch.nn.functional.grid_sample(raised, at, align_corners=True) - 1
