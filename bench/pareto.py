@@ -9,9 +9,11 @@ from dataclasses import dataclass
 from bench.plot import PALETTE, _text, spread
 
 PLOT_WIDTH, PLOT_HEIGHT = 330, 250
-LEFT, RIGHT, TOP, BOTTOM = 66, 110, 76, 66
+LEFT, RIGHT, TOP, BOTTOM = 66, 150, 76, 66
 FAR = 5.0
-"""Costs this many times the least are named below the plot instead of shown, if they are few: they would squeeze the rest."""
+"""Costs this many times the least are named below the plot instead of shown, if they are few: they would squeeze the rest. So
+are, on a linear axis, values that fall behind the worst of front and presets by more than `BEHIND` times what those span."""
+BEHIND = 2.0
 FEW = 2
 HEAD, LEGEND = 40, 22
 """Room for the title and for the line that explains the colours [px]."""
@@ -68,10 +70,19 @@ def _ticks(low: float, high: float, log: bool) -> list[float]:
     return [m * 10.0**e for e in range(first, last + 1, every) for m in marks if low <= m * 10.0**e <= high]
 
 
+def _behind(point: Point, panel: Panel, best: Sequence[Point]) -> bool:
+    if panel.log_y:
+        return False
+    values = [p.value for p in panel.points if p in best or p.preset]
+    low, high = min(values), max(values)
+    room = BEHIND * (high - low)
+    return point.value < low - room if panel.upwards else point.value > high + room
+
+
 def _panel(panel: Panel, left: float, top: float, colors: dict[str, str]) -> list[str]:
     best, out = front(panel.points, panel.upwards), []
     least = min(p.cost for p in panel.points)
-    far = [p for p in panel.points if p.cost > FAR * least]
+    far = [p for p in panel.points if p.cost > FAR * least or _behind(p, panel, best)]
     far = far if len(far) <= FEW else []
     points = [p for p in panel.points if p not in far]
     costs = [p.cost for p in points]
@@ -105,7 +116,7 @@ def _panel(panel: Panel, left: float, top: float, colors: dict[str, str]) -> lis
 
     if far:
         words = "; ".join(f"{p.name}: {p.cost:.3g}, {p.value:.3g}" for p in far)
-        out.append(_text(left, bottom + 54, f"farther right: {words}", size=10, color="#666666"))
+        out.append(_text(left, bottom + 54, f"outside: {words}", size=10, color="#666666"))
 
     path, at = "", None
     best = [p for p in best if p not in far]

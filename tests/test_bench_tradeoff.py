@@ -36,9 +36,17 @@ def test_chart_shows_what_is_beaten_hollow():
     points = (point("a", 1, 5), point("b", 2, 3), point("c", 3, 4), pareto.Point("mine", "preset", 5, 2, 0.5, preset=True))
     svg = pareto.chart("title", [pareto.Panel("panel", "what", "time", "error", points)] * 2)
     assert svg.count("<circle") == 2 + 2 * 3 and svg.count("<rect") == 1 + 2 and svg.count('r="4" fill="#ffffff"') == 2
-    assert "mine" in svg and "nan" not in svg and "inf" not in svg and "farther right" not in svg
+    assert "mine" in svg and "nan" not in svg and "inf" not in svg and "outside" not in svg
     far = pareto.chart("title", [pareto.Panel("panel", "what", "time", "error", (*points, point("away", 50, 1)))])
-    assert "farther right: away: 50, 1" in far and far.count("<circle") == 2 + 3
+    assert "outside: away: 50, 1" in far and far.count("<circle") == 2 + 3
+
+
+def test_values_far_behind_are_named_instead_of_shown():
+    """On a linear axis, beyond twice what front and presets span; on a logarithmic one all are shown."""
+    points = (point("a", 1, 10), point("b", 2, 11), point("c", 1.5, 7.9), point("d", 1.5, 8.1))
+    svg = pareto.chart("t", [pareto.Panel("p", "", "x", "y", points, upwards=True, log_y=False)])
+    assert "outside: c: 1.5, 7.9" in svg and svg.count("<circle") == 3 + 1
+    assert "outside" not in pareto.chart("t", [pareto.Panel("p", "", "x", "y", points, upwards=True)])
 
 
 def test_the_truth_is_the_model(device):
