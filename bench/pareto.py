@@ -76,6 +76,8 @@ def _behind(point: Point, panel: Panel, best: Sequence[Point]) -> bool:
     values = [p.value for p in panel.points if p in best or p.preset]
     low, high = min(values), max(values)
     room = BEHIND * (high - low)
+    if room == 0:
+        return False
     return point.value < low - room if panel.upwards else point.value > high + room
 
 

@@ -47,6 +47,8 @@ def test_values_far_behind_are_named_instead_of_shown():
     svg = pareto.chart("t", [pareto.Panel("p", "", "x", "y", points, upwards=True, log_y=False)])
     assert "outside: c: 1.5, 7.9" in svg and svg.count("<circle") == 3 + 1
     assert "outside" not in pareto.chart("t", [pareto.Panel("p", "", "x", "y", points, upwards=True)])
+    alone = (pareto.Point("a", "k", 1, 10, preset=True), point("b", 2, 9.99), point("c", 3, 9.98))
+    assert "outside" not in pareto.chart("t", [pareto.Panel("p", "", "x", "y", alone, upwards=True, log_y=False)])
 
 
 def test_the_truth_is_the_model(device):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import threading
 from pathlib import Path
 
 from warpgs.errors import ResourceError
@@ -15,7 +16,7 @@ def write_bytes(path: Path, *chunks: bytes) -> None:
     Raises:
         ResourceError: The disk is full or the folder not writable; what was there before is untouched.
     """
-    temporary = path.with_name(f"{path.name}.tmp.{os.getpid()}")
+    temporary = path.with_name(f"{path.name}.tmp.{os.getpid()}.{threading.get_ident()}")
     try:
         with temporary.open("wb") as f:
             for chunk in chunks:

@@ -46,7 +46,6 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         (project.make_forward(real, cuda), THREADS), (project.make_backward(real, cuda), BLOCK),
         (tiles.make_kernels(real, cuda).pack_counts, THREADS), (tiles.make_kernels(real, cuda).find_ranges, THREADS),
         (tiles.make_emit(real, cuda), THREADS), (knn.make_kernels(real).search, THREADS), (dropout.make_kernel(), THREADS),
-        (scanlines.make_kernel(), scanlines.BLOCK),
     ]  # fmt: skip
     if not cuda:
         blending, scoring = (
@@ -61,7 +60,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         return [(kernel, 1) for kernel in [*(k for k, _ in common), *own]]
     blending, warps = blend_cuda.make_kernels(TILE), 32 * blend_cuda.WARPS
     own = [(blending.forward, warps), (blending.order_tiles, 1024), (blending.contributions, TILE * TILE)]
-    own.append((blend.make_segments(real).gather_weights, THREADS))
+    own += [(blend.make_segments(real).gather_weights, THREADS), (scanlines.make_kernel(), scanlines.BLOCK)]
     for depth, chunk in itertools.product((False, True), blend_cuda.CHUNKS):  # with a depth term, and without
         passes = blend_cuda.make_backward(TILE, depth, chunk, False)
         own += [(passes.backward, warps), (passes.gather, THREADS)]

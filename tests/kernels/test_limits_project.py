@@ -203,6 +203,17 @@ def test_squares_are_three_sigma_rounded_up(device):
     assert torch.equal(found, wanted[:, None].expand(-1, 2))
 
 
+def test_squares_grow_with_the_longest_axis(device, dtype):
+    """Beyond 65,536 px, where axes are shrunk while they are squared, as below."""
+    gaussians, cam = facing(3, dtype=dtype, device=device)
+    sizes = torch.tensor([1e4, 1e6, 1e8], dtype=dtype, device=device)
+    gaussians.log_scales[:] += sizes.log()[:, None]
+    splats, counts = run(gaussians, cam, RULES["inria"])
+    share = splats[0, :, 10:] / sizes[:, None]
+    assert counts.tolist() == [[1, 1, 1]] and bool((share > 3).all())
+    assert torch.allclose(share, share[:1].expand_as(share), rtol=1e-4)
+
+
 def test_no_cut_asks_for_every_tile_however_far(device):
     """Half sides without a cut cover any picture."""
     gaussians, cam = facing(1, device=device)

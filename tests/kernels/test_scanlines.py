@@ -41,12 +41,13 @@ def test_penalties_decide(device):
 
 def test_the_dearest_costs_fit(device):
     """Costs and penalties of `LARGEST` together, the best plane another in every pixel: still below 2^15."""
-    costs = np.full((6, 6, 8), LARGEST // 2, np.int16)
+    cost, penalty = 4096, LARGEST - 4096
+    costs = np.full((6, 6, 8), cost, np.int16)
     y, x = np.indices((6, 6))
     costs[y, x, (3 * y + 5 * x) % 8] = 0
-    limits = np.full((5, 6), LARGEST // 2 - 1, np.int32), np.full((6, 5), LARGEST // 2 - 1, np.int32)
-    found = computed(device, costs, *limits, LARGEST // 2 - 1)
-    assert np.array_equal(found, defined(costs, *limits, LARGEST // 2 - 1)) and found.min() >= 0 and found.max() > 3 * 2**13
+    limits = np.full((5, 6), penalty, np.int32), np.full((6, 5), penalty, np.int32)
+    found = computed(device, costs, *limits, penalty)
+    assert np.array_equal(found, defined(costs, *limits, penalty)) and found.min() >= 0 and found.max() > 3 * 2**13
 
 
 def test_memory_order_does_not_matter(device):

@@ -9,6 +9,8 @@ import torch
 
 from tests.pipeline.test_method import CONFIG, METHOD, fitted
 from tests.scenes import photographs, priors, seeds
+from warpgs.errors import ResourceError
+from warpgs.pipeline import event_sheet
 from warpgs.pipeline.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.event_sheet import event_figures, pictured, pictures_kept, sampling_story, view_sheet
 from warpgs.pipeline.fit import Fit
@@ -134,12 +136,26 @@ def test_first_picture_outlives_a_continuation(run, tmp_path):
     assert straight == continued and len(straight) == 2
 
 
-def test_a_picture_that_cannot_be_written_is_said(tmp_path):
-    """A file stands where the folder should be: the fit takes its steps, and the end of the block says so."""
+def test_a_folder_that_cannot_be_made_is_said_before_the_first_step(tmp_path):
+    """A file stands where it should be."""
     views = photographs(3)
     fit = Fit(views, seeds(), CONFIG, CPU, priors=priors(views))
     (tmp_path / "sampling").write_text("in the way")
-    with pytest.raises(OSError, match="sampling"), pictures_kept(fit, NAMES, tmp_path):
-        while fit.step < CONFIG.steps:
+    with pytest.raises(ResourceError, match="sampling: cannot be made"), pictures_kept(fit, NAMES, tmp_path):
+        pytest.fail("begun")
+
+
+@pytest.mark.parametrize("until", [CONFIG.steps, 10])
+def test_a_picture_that_cannot_be_written_is_said(tmp_path, monkeypatch, until):
+    """At the next event, or at the end of the block where there is none; the fit is left as it was."""
+
+    def full(path, data):
+        raise ResourceError(f"{path.name}: no space left")
+
+    monkeypatch.setattr(event_sheet, "write_bytes", full)
+    views = photographs(3)
+    fit = Fit(views, seeds(), CONFIG, CPU, priors=priors(views))
+    with pytest.raises(ResourceError, match="no space left"), pictures_kept(fit, NAMES, tmp_path):
+        while fit.step < until:
             fit.advance()
-    assert fit.step == CONFIG.steps and fit.on_event is None
+    assert fit.on_event is None and (fit.step == 10) == (until == 10)

@@ -84,13 +84,28 @@ def test_depths_agree(device):
     assert np.median(error) < 0.008
 
 
-def test_a_gpu_without_room_leaves_it_to_the_cpu(monkeypatch):
-    """The same depths as on the CPU, and a note that says so and how much was missing."""
+def test_a_small_gpu_leaves_it_to_the_cpu(monkeypatch):
+    """The same depths as on the CPU, and one note that says so and how much there should be."""
     views, _ = still_life()
-    monkeypatch.setattr(sweep, "available_bytes", lambda _: 0)
+    monkeypatch.setattr(sweep, "installed_bytes", lambda _: 2**20)
     found = sweep_depths(views, [(2, 12)] * 3, SweepConfig(), torch.device("cuda"))
     for a, b in zip(found, sweep_depths(views, [(2, 12)] * 3, SweepConfig())):
-        assert np.array_equal(a.depth, b.depth) and "no room for" in a.notes[0] and "MiB" in a.notes[0] and not b.notes
+        assert np.array_equal(a.depth, b.depth) and not b.notes
+    assert "a GPU should have" in found[0].notes[0] and "MiB" in found[0].notes[0] and not found[1].notes
+
+
+@pytest.mark.parametrize("size", [(40, 3), (3, 40), (3, 3), (40, 1), (1, 1)])
+def test_tiny_pictures_are_left_to_the_cpu(size, monkeypatch):
+    """Narrower than half a window: torch mirrors no border there."""
+    width, height = size
+    K = np.array([[40.0, 0, width / 2], [0, 40, height / 2], [0, 0, 1]])
+    aside = np.eye(4)
+    aside[0, 3] = -0.5
+    image = np.random.default_rng(0).random((height, width, 3), np.float32)
+    views = [View("a", Camera(np.eye(4), K, width, height), image), View("b", Camera(aside, K, width, height), image)]
+    monkeypatch.setattr(sweep, "installed_bytes", lambda _: 2**40)
+    found = sweep_depths(views, [(2, 12)] * 2, SweepConfig(), torch.device("cuda"))
+    assert [f.depth.shape for f in found] == [(height, width)] * 2
 
 
 @pytest.mark.cuda

@@ -1,8 +1,11 @@
+from concurrent.futures import ThreadPoolExecutor
+
 import cv2
 import numpy as np
 import pytest
 
 from warpgs.errors import DataError, ResourceError
+from warpgs.files import write_bytes
 from warpgs.report.film import write_mp4
 from warpgs.report.pictures import GRAY, depth_map, error_map, png, side_by_side
 
@@ -93,3 +96,11 @@ def test_frames_of_two_sizes_are_refused(tmp_path):
     with pytest.raises(DataError, match="frame 1 is 32 x 32 px, the first 16 x 16 px"):
         write_mp4(tmp_path / "a.mp4", [np.zeros((16, 16, 3)), np.zeros((32, 32, 3))])
     assert not list(tmp_path.iterdir())
+
+
+def test_threads_may_write_one_file(tmp_path):
+    """The file is one of what they wrote, whole, and nothing else is left."""
+    contents = [bytes([i]) * 50_000 for i in range(8)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda c: [write_bytes(tmp_path / "a.png", c) for _ in range(20)], contents))
+    assert (tmp_path / "a.png").read_bytes() in contents and len(list(tmp_path.iterdir())) == 1

@@ -118,7 +118,8 @@ def warp_stream(device: torch.device) -> wp.Stream:
 
 
 _LOADING = threading.Lock()
-"""Compiling one module from several threads at once is not safe."""
+"""Held while a CPU module is loaded, since to compile one from several threads at once is not safe; and in debug mode, in
+which kernels are not safe either, while one runs."""
 _SORTING = threading.RLock()
 """Warp has one stream for all threads of a device: a thread keeps it while it sorts."""
 
@@ -226,8 +227,10 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
         kernel.module.load("cpu", block_dim=1)
     threads = torch.get_num_threads()
     # A kernel of Warp 1.19 for x86 keeps a pointer into its stack in a static variable, which only optimised code leaves out.
-    if threads == 1 or count == 1 or count * cost < SERIAL_WORK or wp.config.mode == "debug":
-        wp.launch(kernel, count, inputs=[0, *inputs], device="cpu", record_tape=False)
+    debugging = wp.config.mode == "debug"
+    if threads == 1 or count == 1 or count * cost < SERIAL_WORK or debugging:
+        with _LOADING if debugging else contextlib.nullcontext():
+            wp.launch(kernel, count, inputs=[0, *inputs], device="cpu", record_tape=False)
         return
     first = wp.launch(kernel, count, inputs=[0, *inputs], device="cpu", record_cmd=True)
     chunks = min(count, threads * (CHUNKS_PER_THREAD if threads <= FEW_THREADS else CHUNKS_PER_THREAD // 2))

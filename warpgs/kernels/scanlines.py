@@ -11,7 +11,7 @@ BLOCK = 32
 """Threads of a block: there are some hundred lines, which more blocks spread over more multiprocessors."""
 FAR_AWAY = 2**20
 """More than any path costs."""
-LARGEST = 2**13
+LARGEST = 2**13 - 1
 """Costs plus penalties up to this keep the sum of four paths within 16 bits with a sign."""
 
 

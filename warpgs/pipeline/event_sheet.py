@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from warpgs.errors import ResourceError
 from warpgs.files import write_bytes
 from warpgs.pipeline.fit import Fit
 from warpgs.pipeline.method import Drawn, Event, MethodConfig, TrainingView
@@ -110,12 +111,17 @@ def pictures_kept(fit: Fit, names: list[str], out: Path) -> Iterator[None]:
         out: Run folder.
 
     Raises:
-        ResourceError: A picture could not be written; at the end of the block.
+        ResourceError: The folder cannot be made; or a picture could not be written, at the next event or the end of the block.
     """
     config, steps = fit.config.method, pictured(fit.phases)
 
+    if config.events:
+        try:
+            (out / FOLDER).mkdir(exist_ok=True)
+        except OSError as e:
+            raise ResourceError(f"{out / FOLDER}: cannot be made ({e.strerror}); make room there") from e
+
     def draw(step: int, views: list[TrainingView], kept: list[Drawn]) -> None:
-        (out / FOLDER).mkdir(exist_ok=True)
         sheets = [view_sheet(names[d.view], step, v, fit.disparities[d.view], d, config) for v, d in zip(views, kept)]
         write_bytes(out / FOLDER / f"{step:06d}.png", png(np.concatenate(sheets)))
 
@@ -123,6 +129,9 @@ def pictures_kept(fit: Fit, names: list[str], out: Path) -> Iterator[None]:
         drawing = []
 
         def on_event(step: int, event: Event) -> None:
+            for sheet in drawing:
+                if sheet.done():
+                    sheet.result()  # or what went wrong
             if step in steps:
                 # the thread must not ask the device for anything: steps may be being recorded then
                 kept = [_on_host(d) for d in _shown(event)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 import time
 from collections.abc import Callable
@@ -18,17 +17,15 @@ from warpgs.kernels.tiles import available_bytes
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.density import DensityStats, Refinement, refine
 from warpgs.pipeline.graph import BURST, NOT_FINITE, ROOM, Burst, OverLimitError, StepGraph, stack_views
-from warpgs.pipeline.init import Start, at_most, initial_gaussians, initial_points, scene_extent
+from warpgs.pipeline.init import initial_gaussians, scene_extent
 from warpgs.pipeline.layers import COARSE, FINE, LONG_AGO, Layers
 from warpgs.pipeline.loss import masked_mse, training_loss
 from warpgs.pipeline.memory import layout_of, most_instances, plan
 from warpgs.pipeline.method import Event, TrainingView, guided_views, sampling_event
 from warpgs.pipeline.optimizer import Optimizer
-from warpgs.pipeline.region import counted_region
+from warpgs.pipeline.preparation import prepare
 from warpgs.pipeline.resolution import halved
 from warpgs.pipeline.schedule import Phase, plan_phases, sh_degree
-from warpgs.priors.cache import cache_folder
-from warpgs.priors.view_prior import view_priors
 from warpgs.rasterizer import RasterizeOptions, rasterize
 from warpgs.scene import Gaussians, PointCloud, Prior, Scene, View
 
@@ -77,20 +74,8 @@ class Fit:
         self.config, self.device = config, device
         self.generator = torch.Generator().manual_seed(config.seed)
         random = np.random.default_rng(config.seed)
-        where = device if config.memory_limit is None else torch.device("cpu")  # depths take more than a step may
-
-        @functools.cache
-        def start() -> Start:
-            ready()
-            return at_most(initial_points(train, points, config.init, random, where), config.density.max_gaussians, random)
-
-        guided, notes = config.loss.depth_weight > 0, []
-        if priors is None and (config.method.events or guided):
-            regions, cache = [counted_region(v)[0] for v in train], cache_folder()
-            # semantics are found while the device is made ready
-            priors, notes = view_priors(train, config.priors, depths=lambda: start().depths, regions=regions, cache=cache)
-        cloud = start().cloud
-        self.notes = [*(line.strip() for line in f"start: {start().how}".splitlines()), *notes]
+        made = prepare(train, points, config, random, device, priors, ready)
+        cloud, self.notes = made.start.cloud, made.notes
         self.extent = scene_extent([v.camera for v in train], cloud)
         self.background = torch.tensor(background, dtype=torch.float32, device=device)
         self.phases = plan_phases(config.phases, config.steps)
@@ -105,12 +90,12 @@ class Fit:
         self.graphs: dict[tuple, StepGraph] = {}
         self.views = [TrainingView.of(v, device) for v in train]
         if config.method.events:
-            self.disparities = [p.disparity for p in priors]
+            self.disparities = [p.disparity for p in made.priors]
             """Relative inverse depth of each view in [0, 1], [H, W]: only pictures of events show it."""
-            depths = start().depths or [None] * len(train)
-            self.views = [v.scored(p, d, config.method) for v, p, d in zip(self.views, priors, depths, strict=True)]
-        if guided:
-            self.views, note = guided_views(self.views, priors)
+            depths = made.start.depths or [None] * len(train)
+            self.views = [v.scored(p, d, config.method) for v, p, d in zip(self.views, made.priors, depths, strict=True)]
+        if config.loss.depth_weight > 0:
+            self.views, note = guided_views(self.views, made.priors)
             self.notes.append(note)
         self.news: list[str] = []
         """What the user must know of and was not told yet."""

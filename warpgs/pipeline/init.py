@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -42,7 +43,7 @@ class InitConfig:
     """sweep or flow (a point per pixel whose depth other views confirm), points (the reconstruction's), random, or auto: sweep
     for few views, else points where the scene has at least 100 that training views saw, else random."""
     sweep_up_to: int = 0
-    """auto: most views that are swept, which takes some seconds a view."""
+    """auto: most views that are swept, which takes a second a view on two cores."""
     random_count: int = 20_000
     """Number of random points."""
     opacity: float = 0.1
@@ -194,19 +195,25 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
     return PointCloud(np.concatenate(points), np.concatenate(colors)), how
 
 
-def confirmed_depths(views: list[View], known: PointCloud, config: InitConfig, device: torch.device = CPU) -> list[ViewDepth]:
-    """Depth of each of at least two views that the others confirm, by flow or by sweeping planes between ``known`` points."""
+def confirmed_depths(
+    views: list[View], known: PointCloud, config: InitConfig, device: Callable[[], torch.device] = lambda: CPU
+) -> list[ViewDepth]:
+    """Depth of each of at least two views that the others confirm, by flow or by sweeping planes between ``known`` points.
+
+    ``device`` gives where to sweep, once that may be used.
+    """
     if config.source == "flow":
         between = flow_between(views, config.flow, config.flow_range)
         return [flow_depth(views, i, between, config.epipolar()) for i in range(len(views))]
     points = np.concatenate([known.points, triangulate_matches(views).points])
     bounds = [depth_bounds(v, points, camera_depths(views)) for v in views]
-    return sweep_depths(views, bounds, SweepConfig(near_count=config.near_views), device)
+    return sweep_depths(views, bounds, SweepConfig(near_count=config.near_views), device())
 
 
 def confirmed_points(
-    views: list[View], points: PointCloud, config: InitConfig, generator: np.random.Generator, device: torch.device
-) -> Start:
+    views: list[View], points: PointCloud, config: InitConfig, generator: np.random.Generator,
+    device: Callable[[], torch.device],
+) -> Start:  # fmt: skip
     """Points behind pixels whose depth other views confirm, and what was found in which view, a line each.
 
     Where a random start has more points than that, it is taken instead, and the reason said.
@@ -228,25 +235,35 @@ def seen_points(views: list[View], points: PointCloud | None) -> PointCloud:
     return nothing if points is None else points.seen_by({v.name for v in views})
 
 
-def initial_points(
-    views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator,
-    device: torch.device = CPU,
-) -> Start:  # fmt: skip
-    """The points to start from; a sweep is computed on the device.
+def sweeps(config: InitConfig, views: int) -> bool:
+    """Whether a fit of that many views starts from a sweep."""
+    return config.source == "sweep" or (config.source == "auto" and 2 <= views <= config.sweep_up_to)
 
-    Raises:
-        DataError: Points were asked for and the scene has none that the training views saw.
-    """
-    usable = seen_points(views, points)
-    if config.source == "auto" and 2 <= len(views) <= config.sweep_up_to:
-        return confirmed_points(views, usable, dataclasses.replace(config, source="sweep"), generator, device)
-    if config.source in ("sweep", "flow"):
-        return confirmed_points(views, usable, config, generator, device)
-    if config.source == "points" and len(usable) == 0:
+
+def check_points(views: list[View], points: PointCloud | None, config: InitConfig) -> None:
+    """Raise DataError where points are asked for and the scene has none that the training views saw."""
+    if config.source == "points" and len(seen_points(views, points)) == 0:
         raise DataError(
             "the scene holds no 3D points that the training views saw, and --init.source points asks for them; "
             "use --init.source random, or give a reconstruction with points"
         )
+
+
+def initial_points(
+    views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator,
+    device: Callable[[], torch.device] = lambda: CPU,
+) -> Start:  # fmt: skip
+    """The points to start from; ``device`` gives where to sweep, once that may be used.
+
+    Raises:
+        DataError: Points were asked for and the scene has none that the training views saw.
+    """
+    check_points(views, points, config)
+    usable = seen_points(views, points)
+    if config.source == "auto" and sweeps(config, len(views)):
+        return confirmed_points(views, usable, dataclasses.replace(config, source="sweep"), generator, device)
+    if config.source in ("sweep", "flow"):
+        return confirmed_points(views, usable, config, generator, device)
     if config.source == "points" or (config.source == "auto" and len(usable) >= MIN_POINTS):
         return Start(usable, f"{len(usable):,} points of the reconstruction that the training views saw")
     cloud, how = random_points(views, config.random_count, generator)

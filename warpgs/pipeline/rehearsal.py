@@ -1,12 +1,14 @@
 """A tiny fit beside the preparations of the real one: what a CUDA device loads at first use is there when it is asked for.
 
 Contexts, kernels, libraries and modules of Python are loaded one by one as they are first used, which took two to three seconds
-of a fit on an H200. The files are read and depths looked for on the CPU meanwhile.
+of a fit on an H200. Semantics and matches are found on the CPU meanwhile.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import threading
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -16,6 +18,7 @@ import torch
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.evaluate import render_view, score
 from warpgs.pipeline.fit import Fit, run
+from warpgs.pipeline.init import sweeps
 from warpgs.pipeline.results import options_for
 from warpgs.priors.sweep import SweepConfig, sweep_depths
 from warpgs.scene import Camera, PointCloud, Prior, View
@@ -36,11 +39,19 @@ def _views(generator: np.random.Generator) -> list[View]:
     return [View(f"{i}", c, generator.random((SIDE, SIDE, 3), np.float32)) for i, c in enumerate(cameras)]
 
 
-def rehearse(config: FitConfig, device: torch.device) -> Fit:
-    """Sweep and fit noise in two small views with the same settings, refinement and sampling included, and score one.
+def rehearse(config: FitConfig, device: torch.device, stopped: Callable[[], bool] = lambda: False) -> Fit:
+    """Fit noise in two small views with the same settings, refinement and sampling included, and score one.
+
+    Args:
+        config: Settings of the real fit. Where that sweeps on the device, these views are swept, too.
+        device: Where to work.
+        stopped: Asked after each step whether nobody waits any more.
 
     Returns:
         The fit, done.
+
+    Raises:
+        KeyboardInterrupt: ``stopped`` said so.
     """
     generator = np.random.default_rng(0)
     views = _views(generator)
@@ -52,29 +63,34 @@ def rehearse(config: FitConfig, device: torch.device) -> Fit:
         density=replace(config.density, every=1),
     )  # fmt: skip
     black = (0.0, 0.0, 0.0)
-    sweep_depths(views, [(2, 4)] * len(views), SweepConfig(max_planes=PLANES), device)
+    if sweeps(config.init, len(views)) and config.memory_limit is None:
+        sweep_depths(views, [(2, 4)] * len(views), SweepConfig(max_planes=PLANES), device)
     fit = Fit(views, cloud, small, device, black, [Prior(*maps, "noise", "noise") for _ in views])
-    run(fit, lambda _: None, lambda _: None, lambda: False)
+    run(fit, lambda _: None, lambda _: None, stopped)
     score(views[0], render_view(fit.gaussians, views[0], options_for(small.rule, black, fit.gaussians))[0])
     fit.graphs.clear()  # recordings and fit refer to each other, which would keep their memory
     return fit
 
 
-def rehearsal(config: FitConfig, device: torch.device) -> Callable[[], object]:
-    """Begin to rehearse in a thread, where the device is a GPU that networks for priors leave alone.
+@contextlib.contextmanager
+def rehearsal(config: FitConfig, device: torch.device) -> Iterator[Callable[[], object]]:
+    """Rehearse in a thread within the block, where the device is a GPU that networks for priors leave alone.
 
-    Returns:
-        What waits for the end and raises what went wrong. Until then nothing else may use the device: steps may be being
-        recorded.
+    Gives what waits for the end and raises what went wrong; until then nothing else may use the device, since steps may be
+    being recorded. However the block ends, the thread has ended by then.
     """
     if device.type != "cuda" or config.priors.onnx_provider == "cuda":
-        return lambda: None
+        yield lambda: None
+        return
+    stop = threading.Event()
 
     def on_device() -> None:
         with torch.cuda.device(device):
-            rehearse(config, device)
+            rehearse(config, device, stop.is_set)
 
-    thread = ThreadPoolExecutor(1, thread_name_prefix="rehearsal")
-    done = thread.submit(on_device)
-    thread.shutdown(wait=False)
-    return done.result
+    with ThreadPoolExecutor(1, thread_name_prefix="rehearsal") as thread:
+        done = thread.submit(on_device)
+        try:
+            yield done.result
+        finally:
+            stop.set()

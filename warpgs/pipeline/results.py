@@ -103,8 +103,8 @@ def evaluate_run(
     with ThreadPoolExecutor(PAINTERS if lpips is None else 1) as painters:  # LPIPS takes much memory a view
         for work, view in tasks:
             jobs.append(painters.submit(work, view, *render_view(gaussians, view, options)))
-            if len(jobs) > 2 * PAINTERS:
-                jobs[-2 * PAINTERS].result()  # not all pictures at once
+            if len(jobs) > PAINTERS:
+                jobs[-PAINTERS].result()  # not all pictures at once
         found = [j.result() for j in jobs]
     rows, train_rows = found[: len(test)], found[-len(train) :]
     return {

@@ -188,11 +188,9 @@ def fit_scene(request: FitRequest) -> dict:
     try:
         device, where = choose_device(request.device)
         lpips = None if request.lpips_weights is None else load_lpips(request.lpips_weights, device)
-        ready = rehearsal(request.config, device)
         scene, split, notes = read_scene(request.scene)
         train, test = train_views(scene, split.train), train_views(scene, split.test)
         if request.time_budget is not None:
-            ready()  # that uses the device
             config, note = within_budget(request.config, request.time_budget, train, device)
             request, notes = replace(request, config=config), [*notes, note]
         notes = [*request.notes, *notes]
@@ -201,9 +199,11 @@ def fit_scene(request: FitRequest) -> dict:
             _check_same(record, json.loads((out / CONFIG).read_text("utf-8")), out)
             if (out / "checkpoint.safetensors").is_file():
                 tensors, plain = load_checkpoint(out)
+        c = request.config
+        with rehearsal(c, device) as ready:
+            fit = fit_class(c)(train, scene.points, c, device, scene.background, ready=ready)
         if device.type == "cuda":
-            torch.cuda.reset_peak_memory_stats(device)  # earlier fits of this process are not this one's need
-        fit = fit_class(request.config)(train, scene.points, request.config, device, scene.background, ready=ready)
+            torch.cuda.reset_peak_memory_stats(device)  # the steps' need is told, not the start's or an earlier fit's
     except WarpgsError:
         if not request.resume:
             out.rmdir()  # nothing is in it yet

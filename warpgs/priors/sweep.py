@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from warpgs.errors import UsageError
-from warpgs.kernels.tiles import available_bytes
+from warpgs.kernels.tiles import installed_bytes
 from warpgs.priors.epipolar import nearest_views, pixel_grid
 from warpgs.scene import Camera, View, ViewDepth
 from warpgs.sizes import format_bytes
@@ -35,6 +35,8 @@ LARGEST_STEP = 0.99
 """P2 up to which the sum of four paths, each at most 1 + P2, stays below 2^15."""
 PLANES_AT_ONCE = 16
 """Planes whose costs one thread writes together, 32 bytes of each pixel."""
+GPU_SHARE = 0.25
+"""Part of a GPU's memory that a sweep may take."""
 MAX_AT_ONCE = 4
 """Views swept at a time; each takes memory for three volumes."""
 
@@ -301,7 +303,9 @@ def _swept(views: Sequence[View], others: dict[int, list[View]], planes: dict[in
         return path_costs(costs[i], views[i].image, config.small_step, config.large_step, down=down)
 
     def best(i: int) -> np.ndarray:
-        return best_inverse(summed[i, True] + summed[i, False], planes[i])
+        total = summed[i, True]
+        total += summed[i, False]
+        return best_inverse(total, planes[i])
 
     ways = [(i, down) for i in planes for down in (True, False)]
     # numpy and OpenCV let other threads run meanwhile
@@ -323,11 +327,13 @@ def _inverses(views: Sequence[View], bounds: Sequence[tuple[float, float]], conf
     left, notes = [i for i in planes if others[i]], []
     if device.type == "cuda" and left:
         needed = max(sweep_cuda.needed_bytes(views[i], len(planes[i])) for i in left)
-        if needed < available_bytes(device):
+        smallest = min(min(v.image.shape[:2]) for v in views)
+        # not by what is free now: a fit that is continued must find the same depths again
+        if needed > GPU_SHARE * installed_bytes(device):
+            notes.append(f"swept on the CPU: a GPU should have {format_bytes(needed / GPU_SHARE)} of memory for it")
+        elif smallest > config.window // 2:  # torch mirrors no border wider than the picture
             found |= {i: sweep_cuda.inverse_depths(views[i], others[i], planes[i], config, device) for i in left}
             left = []
-        else:
-            notes.append(f"swept on the CPU, since the GPU has no room for {format_bytes(needed)}")
     for first in range(0, len(left), MAX_AT_ONCE):
         some = left[first : first + MAX_AT_ONCE]
         found |= zip(some, _swept(views, others, {i: planes[i] for i in some}, config, pool))
@@ -343,7 +349,7 @@ def sweep_depths(
         views: The views; a single one confirms nothing.
         bounds: Nearest and farthest depth of each view [u], 0 < near < far.
         config: Planes, smoothing and checks.
-        device: Where to compute costs and paths; the CPU does it where a GPU has no room.
+        device: Where to compute costs and paths; the CPU does it where a GPU has too little memory, or pictures are tiny.
 
     Returns:
         One depth per view at its own size; what was reduced or found nothing is in its notes.
@@ -356,7 +362,7 @@ def sweep_depths(
         confirmed = list(pool.map(lambda i: confirm(small, inverses, i, config), range(len(views))))
     out = []
     for i, view in enumerate(views):
-        found, notes = confirmed[i], list(said)
+        found, notes = confirmed[i], list(said if i == 0 else ())
         depth, valid, sensitivity = found.depth, found.valid, found.sensitivity
         size = (view.camera.width, view.camera.height)
         if small[i] is not view:

@@ -40,11 +40,12 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
             to_other = np.stack([plane_homography(view.camera, other.camera, w) for w in chosen])
             H = torch.from_numpy(to_other).to(device, torch.float32)[..., None, None]  # [P, 3, 3, 1, 1]
             p = [H[:, i, 0] * x + H[:, i, 1] * y + H[:, i, 2] for i in range(3)]
-            last = (other.camera.width - 1, other.camera.height - 1)
-            at = torch.stack([2 / n * p[i] / p[2] - 1 for i, n in enumerate(last)], -1)  # [P, H, W, 2]
+            sides = (other.camera.width, other.camera.height)
+            # with centres as grid_sample has them without align_corners; with it, torch would load cuDNN
+            at = torch.stack([(2 * p[i] / p[2] + 1) / n - 1 for i, n in enumerate(sides)], -1)  # [P, H, W, 2]
             # outside is -1, which is less than any colour, also where a pixel is partly outside
             raised = (gray + 1).expand(len(chosen), -1, -1, -1)
-            warped = torch.nn.functional.grid_sample(raised, at, align_corners=True) - 1
+            warped = torch.nn.functional.grid_sample(raised, at, align_corners=False) - 1
             m = box(warped)
             v = (box(warped * warped) - m * m).clamp(min=0) + NOISE
             cost = 0.5 - 0.5 * (box(own * warped) - mean * m) / (variance * v).sqrt()
