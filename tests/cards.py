@@ -62,6 +62,18 @@ def smooth(x: np.ndarray, y: np.ndarray, place: float) -> np.ndarray:
     return np.stack([0.5 + 0.3 * np.sin(2 * x), 0.5 + 0.3 * np.cos(3 * y), 0.4 + 0.2 * x * y], -1)
 
 
+def waves(x: np.ndarray, y: np.ndarray, place: float) -> np.ndarray:
+    """Slow waves in several directions."""
+    red = 0.5 + 0.2 * np.sin(1.3 * x + 0.7 * y) + 0.15 * np.cos(2.1 * y - 1.1 * x)
+    return np.stack([red, 0.45 + 0.25 * np.cos(1.7 * x - 0.4 * y), 0.5 + 0.2 * np.sin(2.3 * y) * np.cos(0.9 * x)], -1)
+
+
+def rings(x: np.ndarray, y: np.ndarray, place: float) -> np.ndarray:
+    """Slow rings around the middle."""
+    r = np.sqrt(x * x + y * y + 0.05)
+    return np.stack([0.5 + 0.3 * np.cos(2.2 * r), 0.5 + 0.25 * np.sin(1.8 * r + 0.5), 0.35 + 0.2 * np.cos(1.2 * r - 0.3)], -1)
+
+
 def half_mirror(x: np.ndarray, y: np.ndarray, place: float) -> np.ndarray:
     """Left a matt pattern, right a pattern whose brightness goes with the direction it is seen from."""
     pattern = 0.5 + 0.25 * np.sin(25 * x) * np.cos(25 * y)

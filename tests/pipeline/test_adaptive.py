@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from tests import cards
 from tests.scenes import photographs, priors, seeds
 from warpgs.cli import main
 from warpgs.demo import split_spec, write_demo
-from warpgs.pipeline.adaptive import AdaptiveFit, complexity_figures, complexity_sentence, fit_class
+from warpgs.pipeline.adaptive import NEAR, AdaptiveFit, complexity_figures, complexity_sentence, fit_class
 from warpgs.pipeline.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.config import PRESETS, FitConfig
 from warpgs.pipeline.density import DensityConfig
@@ -98,7 +99,7 @@ def test_trimmed_within_the_loss_and_everything_by_row_stays_aligned():
 
 
 def test_what_a_fit_is_better_than_enough_goes_for_size():
-    """Below enough there is one trim, within its loss; above it the loss counts from enough, and there are more."""
+    """Far below enough there is one trim, within its loss; above it the loss counts from enough, and there are more."""
     (own,) = advanced(with_trims(), 60).trims
     assert own["step"] == 60 and own["psnr"][0] - 0.1 <= own["psnr"][1] < own["psnr"][0] < JudgeConfig().enough_db
     enough = own["psnr"][0] - 0.5
@@ -106,19 +107,22 @@ def test_what_a_fit_is_better_than_enough_goes_for_size():
     assert less["psnr"][0] == own["psnr"][0] and less["after"] < own["after"]
     assert enough - 0.1 <= less["psnr"][1] < own["psnr"][1]
     several = advanced(with_trims(enough_db=enough), 60).trims
-    assert len(several) > 1 and all(t["psnr"][0] > enough for t in several[:-1])
+    assert len(several) > 1 and all(t["psnr"][0] > enough - NEAR for t in several[:-1])
     assert several[-1]["step"] == 60 and several[-1]["psnr"][0] - several[-1]["psnr"][1] <= 0.1 + max(
         0, several[-1]["psnr"][0] - enough
     )
 
 
 def test_a_trim_counts_on_half_of_what_training_mended_of_the_one_before():
-    """Except the last, which nothing mends; and nothing goes before the last while a fit is short of enough."""
+    """Except the last, which nothing mends. Before it less goes the farther a fit is below enough, and far below nothing."""
     fit = AdaptiveFit(photographs(3), seeds(), with_trims(enough_db=30.0), CPU)
     fit.step = 50
-    assert fit._spare(30.0) == 0 and fit._spare(31.5) == pytest.approx(0.1 + 1.5)
+    assert fit._spare(30.0) == pytest.approx(0.1) and fit._spare(31.5) == pytest.approx(0.1 + 1.5)
+    assert fit._spare(30.0 - NEAR / 2) == pytest.approx(0.05) and fit._spare(30.0 - NEAR) == 0 == fit._spare(math.nan)
     fit.trims = [{"psnr": [33.0, 31.0]}]
     assert fit._spare(31.5) == pytest.approx(0.1 + 1.5 + 0.25) and fit._spare(30.5) == pytest.approx(0.1 + 0.5)
+    fit.trims = [{"psnr": [29.0, 27.6]}]
+    assert fit._spare(28.0) == pytest.approx(0.05 + 0.2)
     fit.step = 60
     assert fit._spare(31.5) == pytest.approx(0.1 + 1.5) and fit._spare(29.0) == pytest.approx(0.1)
 
@@ -207,6 +211,17 @@ def test_size_follows_content_and_neither_pixels_nor_views():
     assert all(abs(f._view_psnr(f.gaussians) - JudgeConfig().enough_db) < 0.6 for f in fits)
     assert once < 80 and twice <= 1.1 * once and fine <= 1.5 * once
     assert all(complexity(finished(v, start, enough_db=30.0))["count"] < 20 for v in (*walls, again))  # measured: 11, 14, 12
+
+
+@pytest.mark.parametrize(("colour", "most"), [(cards.waves, 200), (cards.rings, 130)])
+def test_walls_that_hardly_reach_enough_are_small_too(colour, most):
+    """Two that chose no setting. Measured with default flags: 155, 175 and 141; 91, 58 and 62."""
+    walls = [cards.photographs(colour, half=(9, 9), width=w, height=3 * w // 4) for w in (64, 128)]
+    again = [*walls[0], dataclasses.replace(walls[0][1], name="again.png")]
+    fits = [finished(v, cards.points(400, (2.0, 1.4))) for v in (*walls, again)]
+    once, fine, twice = (complexity(f)["count"] for f in fits)
+    assert once < most and twice <= 1.1 * once and fine <= 1.25 * once
+    assert all(f._view_psnr(f.gaussians) > 35.5 for f in fits)
 
 
 def test_command_line_says_what_the_model_takes(tmp_path, capsys):

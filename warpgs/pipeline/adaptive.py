@@ -28,6 +28,10 @@ MENDED_AGAIN = 0.5
 """Part of what training mended of one trim that it is expected to mend of the next: a smaller model mends less. With all of it
 smooth walls ended up to 1.1 dB below enough, with half of it at enough (docs/complexity.md)."""
 
+NEAR = 4.0
+"""Below enough by less than this a trim may take the less the farther [dB]. With an edge there a tenth of a decibel decided
+whether a smooth wall kept 167 or 696 Gaussians (docs/complexity.md)."""
+
 
 @dataclass(frozen=True)
 class Level:
@@ -231,16 +235,20 @@ class AdaptiveFit(Fit):
         return float((-10 * torch.log10(torch.stack(errors) + FLOOR)).mean())
 
     def _spare(self, psnr: float) -> float:
-        """What a trim may take now of that PSNR on the training views [dB]; 0 before the last step of a fit short of enough.
+        """What a trim may take now of that PSNR on the training views [dB]; 0 before the last step of a fit far from enough.
 
-        That is `judge.trim_db`, what the fit has beyond enough, and before the last step what training is expected to mend.
+        That is `judge.trim_db`, less below enough; what the fit has beyond enough; and before the last step what training is
+        expected to mend.
         """
         c, last = self.config.judge, self.step == self.config.steps
         over = psnr - c.enough_db
-        if not (last or over > 0):
+        if last:
+            return c.trim_db + max(over, 0.0)
+        share = 1 + over / NEAR
+        if not share > 0:
             return 0.0
-        mended = psnr - self.trims[-1]["psnr"][1] if self.trims and not last else 0.0
-        return c.trim_db + max(over, 0.0) + MENDED_AGAIN * max(mended, 0.0)
+        mended = psnr - self.trims[-1]["psnr"][1] if self.trims else 0.0
+        return min(share, 1.0) * c.trim_db + max(over, 0.0) + MENDED_AGAIN * max(mended, 0.0)
 
     def _trim(self) -> None:
         """Make the model smaller, within what the fit can spare on its training views."""

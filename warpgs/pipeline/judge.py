@@ -47,7 +47,7 @@ class JudgeConfig:
     is within the noise of that difference may go in any case."""
     trims: int = 8
     """Times that the model may be made smaller, at equal distances from the end of growth to the last step. Before the last
-    only where the fit is better than `enough_db`: what such a trim takes, training mends."""
+    only where the fit is better than `enough_db` or near it: what such a trim takes, training mends."""
     trim_db: float = 0.1
     """PSNR on the training views that a trim may take below what the fit has, or below `enough_db` where it has more [dB];
     before the last step also part of what training will probably mend. 0 for no trims."""
