@@ -10,6 +10,7 @@ Axes as in an OpenCV camera: +x right, +y down, +z away from the viewer. Lengths
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -58,7 +59,7 @@ class Texture:
 
 
 @dataclass(frozen=True)
-class Shape:
+class Shape(abc.ABC):
     """A textured shape at a place. Subclasses know its geometry in the local frame ``x_local = R^T (x - center)``."""
 
     center: tuple[float, float, float]
@@ -77,6 +78,7 @@ class Shape:
         """World positions [u] in the local frame, shape [N, 3]."""
         return (x - np.asarray(self.center, x.dtype)) @ self.rotation.astype(x.dtype)
 
+    @abc.abstractmethod
     def hit(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
         """Distance to the first hit in front of the origin.
 
@@ -87,11 +89,10 @@ class Shape:
         Returns:
             Distances [u], shape [N]; infinite where the ray misses.
         """
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def normal(self, p: np.ndarray) -> np.ndarray:
         """Outward unit normals in the local frame at local surface positions ``p``; both shape [N, 3]."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
