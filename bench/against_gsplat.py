@@ -18,9 +18,9 @@ import torch
 import warp as wp
 
 from bench.garden import garden_inputs
+from bench.harness import recorded
 from warpgs import RasterizeOptions, rasterize
 from warpgs.constants import RULES
-from warpgs.kernels import bridge
 from warpgs.kernels.project import project
 from warpgs.pipeline.graph import BURST, Burst, StepGraph, Views
 from warpgs.pipeline.loss import LossConfig
@@ -75,28 +75,6 @@ def count_instances(gaussians: Gaussians, camera: Camera) -> int:
         tensors = gaussians.tensors().values()
         counts = project(*tensors, camera.viewmat, camera.K, **size, degree=0, rule=RULES["gsplat"])[1]
     return int(counts.sum())
-
-
-def recorded(work):
-    """Work as one CUDA graph, replayed."""
-    stream = torch.cuda.Stream()
-    stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream):
-        for _ in range(3):
-            work()
-    torch.cuda.current_stream().wait_stream(stream)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, stream=stream):
-        here = bridge.warp_stream(torch.device("cuda"))
-        wp.capture_begin(stream=here, external=True)
-        held = work()
-        lent = wp.capture_end(stream=here)
-
-    def replay():
-        graph.replay()
-        return held, lent
-
-    return replay
 
 
 def our_step(gaussians: Gaussians, camera: Camera, target: torch.Tensor):

@@ -18,6 +18,7 @@ import torch
 import warp as wp
 
 from bench.roofline import Cost
+from warpgs.kernels import bridge
 
 REPEATS = 30
 WARM_UP = 3
@@ -160,6 +161,28 @@ def peak_bytes(task: Task, device: torch.device) -> int:
     if task.program in IN_WARP and wp.is_mempool_enabled(pool):
         peak += wp.get_mempool_used_mem_current(pool)
     return peak
+
+
+def recorded(work: Callable[[], object]) -> Callable[[], object]:
+    """Work as one CUDA graph, replayed: what it takes without the host. It must not look at the device."""
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        for _ in range(3):
+            work()
+    torch.cuda.current_stream().wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph, stream=stream):
+        here = bridge.warp_stream(torch.device("cuda"))
+        wp.capture_begin(stream=here, external=True)
+        held = work()
+        lent = wp.capture_end(stream=here)
+
+    def replay():
+        graph.replay()
+        return held, lent
+
+    return replay
 
 
 def backward_of(outputs: torch.Tensor, inputs: Sequence[torch.Tensor]) -> Callable[[], object]:

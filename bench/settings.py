@@ -48,8 +48,19 @@ class Setting:
         """Whether its error is real and its time is not."""
         return self.half or self.stale > 0
 
-    def draw(self, gaussians: Gaussians, camera: Camera, max_instances: int | None = None) -> torch.Tensor:
-        """Colours, shape [H, W, 3]."""
+    def instances(self, gaussians: Gaussians, camera: Camera) -> int:
+        """(Gaussian, tile) instances of a picture."""
+        like, size = gaussians.means, {"width": camera.width, "height": camera.height}
+        view, K = (torch.as_tensor(t, dtype=like.dtype, device=like.device)[None] for t in (camera.viewmat, camera.K))
+        with torch.no_grad():
+            tensors = gaussians.tensors().values()
+            counts = project(*tensors, view, K, **size, degree=0, rule=self.rule, tile_size=self.tile_size)[1]
+        return int(counts.sum())
+
+    def draw(
+        self, gaussians: Gaussians, camera: Camera, max_instances: int | None = None, capacity: int | None = None
+    ) -> torch.Tensor:
+        """Colours, shape [H, W, 3]; bounds as in `RasterizeOptions`."""
         if self.half:
             sh = gaussians.sh  # its gradient is passed straight through the rounding
             gaussians = dataclasses.replace(gaussians, sh=sh + (sh.half().to(sh.dtype) - sh).detach())
@@ -57,7 +68,7 @@ class Setting:
             return self._draw_stale(gaussians, camera)
         options = RasterizeOptions(
             rule=self.rule, tile_size=self.tile_size, sh_degree=self.degree, deterministic=self.deterministic,
-            max_instances=max_instances,
+            max_instances=max_instances, capacity=capacity,
         )  # fmt: skip
         return rasterize(gaussians, camera, options).rgb
 

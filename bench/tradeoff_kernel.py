@@ -11,11 +11,11 @@ from collections.abc import Callable
 import torch
 
 from bench.frozen import Frozen
-from bench.harness import measure_in_turn
+from bench.harness import measure_in_turn, recorded
 from bench.settings import UNCUT, Setting, settings
 from warpgs.kernels.bridge import set_threads
 from warpgs.kernels.project import project
-from warpgs.scene import Gaussians
+from warpgs.scene import Camera, Gaussians
 
 VISIBLE = 0.5 / 255
 """Half of what an 8-bit channel resolves."""
@@ -82,6 +82,24 @@ def predicted_seconds(scene: Frozen, repeats: int) -> float:
     return pairs * TRUTH_NS[kind] * 1e-9 + (repeats + 5) * (uncut + 25 * drawing)
 
 
+def _works(s: Setting, leaves: Gaussians, camera: Camera, upstream: torch.Tensor) -> list[Callable[[], object]]:
+    """A picture, and a picture with its gradients; on CUDA recorded, as fits take them: at these sizes the host is slower."""
+    inputs, cuda = list(leaves.tensors().values()), leaves.means.is_cuda and not s.simulated
+    room = {}
+    if cuda:  # nothing that is recorded may look at the device or copy from the host
+        matrices = (torch.as_tensor(t, dtype=torch.float32, device=leaves.means.device) for t in (camera.viewmat, camera.K))
+        camera = Camera(*matrices, camera.width, camera.height)
+        room = {"capacity": max(1, s.instances(leaves, camera))}
+
+    def forward():
+        return s.draw(leaves, camera, **room)
+
+    def both():
+        return torch.autograd.grad(s.draw(leaves, camera, **room), inputs, upstream)
+
+    return [recorded(forward), recorded(both)] if cuda else [forward, both]
+
+
 def measure_scene(scene: Frozen, repeats: int, chosen: list[Setting] | None = None) -> list[dict]:
     """A row for each setting of one scene."""
     g, device = scene.gaussians, scene.gaussians.means.device
@@ -103,13 +121,7 @@ def measure_scene(scene: Frozen, repeats: int, chosen: list[Setting] | None = No
         })  # fmt: skip
         del rgb, gradients
 
-        def forward(s=s, leaves=leaves):
-            return s.draw(leaves, scene.camera)
-
-        def both(s=s, leaves=leaves, inputs=inputs):
-            return torch.autograd.grad(s.draw(leaves, scene.camera), inputs, upstream)
-
-        works += [forward, both]
+        works += _works(s, leaves, scene.camera, upstream)
     gc.collect()
     times = times_in_turn(works, device, repeats)
     for row, forward, both in zip(rows, times[::2], times[1::2]):
