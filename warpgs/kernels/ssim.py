@@ -70,7 +70,7 @@ def make_kernels(real):
         s = f.vec3()
         for k in range(wp.max(-RADIUS, -y), wp.min(RADIUS + 1, height - y)):
             j = i + k * columns
-            s = f.add_partials(s, f.tap(k) * v_result[j], by_mean[j], by_variance[j], by_gap[j])
+            s += f.tap(k) * v_result[j] * f.vec3(by_mean[j], by_variance[j], by_gap[j])
         o = i + (2 * row + 1) * PADDING
         m0[o] = s[0]
         m1[o] = s[1]

@@ -80,11 +80,6 @@ def make_functions(real):
         return vec5(s[0] + u, s[1] + v, s[2] + u * p, s[3] + v * q, s[4] + w * d * d)
 
     @wp.func
-    def add_partials(s: vec3, w: real, by_mean: real, by_variance: real, by_gap: real) -> vec3:
-        """The three sums with one pixel more."""
-        return vec3(s[0] + w * by_mean, s[1] + w * by_variance, s[2] + w * by_gap)
-
-    @wp.func
     def score(s0: real, s1: real, s2: real, s3: real, s4: real) -> vec4:
         """The similarity, and its partials by mean, variance and gap, from the five sums."""
         ma = s0
@@ -107,7 +102,7 @@ def make_functions(real):
         by_mean = real(2.0) * (structure * (mb - luminance * ma) * r1 - ma * v - (ma - mb) * g)
         return vec4(luminance * structure, by_mean, v, g)
 
-    return SimpleNamespace(tap=tap, at=at, across=across, add_pair=add_pair, add_partials=add_partials, score=score,
+    return SimpleNamespace(tap=tap, at=at, across=across, add_pair=add_pair, score=score,
                            vec3=vec3, vec4=vec4, vec5=vec5)  # fmt: skip
 
 
