@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
+from warpgs import recording
 from warpgs.bands import Frame, blend_in_bands, contributions_in_bands
 from warpgs.constants import RULES, Rule
 from warpgs.errors import UsageError
@@ -46,6 +47,14 @@ class RasterizeOptions:
     max_instances: int | None = None
     """Draw a picture of more (Gaussian, tile) instances than this in bands that have no more, and each band again for its
     gradients: the same picture in less memory and more time. None for all at once. Not with ``capacity``."""
+    record: bool = True
+    """On CUDA, replay what a loop repeats (docs/recording.md): the same bits sooner, and the memory of a forward pass is kept.
+    Of calls with gradients, summed in a fixed order, and without opacity_factors, contributions and bounds."""
+
+    def repeatable(self) -> bool:
+        """Whether calls with these options may be recorded."""
+        others = (self.opacity_factors, self.memory_budget, self.capacity, self.max_instances)
+        return self.record and self.deterministic and not self.contributions and all(o is None for o in others)
 
 
 def _checked_window(camera: Camera, options: RasterizeOptions) -> tuple[int, int, int, int]:
@@ -65,6 +74,11 @@ def _checked_window(camera: Camera, options: RasterizeOptions) -> tuple[int, int
 def _as_batch(array, like: torch.Tensor, rows: int) -> torch.Tensor:
     tensor = torch.as_tensor(array, dtype=like.dtype, device=like.device)
     return tensor.reshape(-1, rows, rows) if tensor.ndim < 3 else tensor
+
+
+def _backgrounds(background, viewmats: torch.Tensor) -> torch.Tensor:
+    background = torch.as_tensor(background, dtype=viewmats.dtype, device=viewmats.device)
+    return background.expand(len(viewmats), 3) if background.ndim == 1 else background
 
 
 def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = RasterizeOptions()) -> Render:
@@ -100,21 +114,26 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
     if most is not None and (options.capacity is not None or most < 1):
         raise UsageError("max_instances must be at least 1 and does not go with a capacity")
     viewmats, Ks = _as_batch(camera.viewmat, means, 4), _as_batch(camera.K, means, 3)
-    background = means.new_zeros(3) if options.background is None else options.background
-    background = torch.as_tensor(background, dtype=means.dtype, device=means.device)
-    backgrounds = background.expand(len(viewmats), 3) if background.ndim == 1 else background
     x, y, width, height = window = _checked_window(camera, options)
     size = {"width": width, "height": height}
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
+    backgrounds = None if options.background is None else _backgrounds(options.background, viewmats)
+    sources = (*gaussians.tensors().values(), viewmats, Ks)
+    if means.is_cuda and options.repeatable():
+        frame = recording.Frame(camera.width, camera.height, window, degree, rule, options.tile_size)
+        found = recording.recorder(means.device).render(sources, backgrounds, frame)
+        if found is not None:
+            return _render(camera, *found)
+    backgrounds = _backgrounds(means.new_zeros(3), viewmats) if backgrounds is None else backgrounds
 
     splats, tile_counts = project(
-        *gaussians.tensors().values(), viewmats, Ks, width=camera.width, height=camera.height, degree=degree, rule=rule,
+        *sources, width=camera.width, height=camera.height, degree=degree, rule=rule,
         tile_size=options.tile_size, window=window, opacity_factors=options.opacity_factors,
     )  # fmt: skip
     if most is not None and int(tile_counts.sum()) > most:
         frame = Frame(camera.width, camera.height, window, degree, rule, options.tile_size, most, options.deterministic)
         factors = () if options.opacity_factors is None else (options.opacity_factors,)
-        sources = (*gaussians.tensors().values(), viewmats, Ks, *factors)
+        sources = (*sources, *factors)
         pictures = blend_in_bands(splats, backgrounds, frame, sources)
         weights = contributions_in_bands(splats, frame, sources) if options.contributions else (None, None)
         return _render(camera, pictures, splats, tile_counts, *weights)

@@ -75,7 +75,7 @@ def _frame(origin: tuple[int, int], width: int, height: int, tile_size: int) -> 
     return [*origin, width, height, columns, columns * rows]
 
 
-def _forward(splats, tiles, backgrounds, origin, width, height, rule, keep, deterministic=True):
+def composite(splats, tiles, backgrounds, origin, width, height, rule, keep, deterministic=True):
     """Pictures, and what the backward pass needs: rgb, alpha, depth, transmittances, weights, ends, states (CUDA only)."""
     if _native(splats):
         return blend_cuda.forward(splats, tiles, backgrounds, origin, width, height, rule, keep, deterministic)
@@ -121,13 +121,15 @@ def _backward(splats, tiles, backgrounds, origin, width, height, rule, _, saved,
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, splats, backgrounds, tiles, origin, width, height, rule, deterministic):
+    def forward(ctx, splats, backgrounds, tiles, origin, width, height, rule, deterministic, made):
         splats, backgrounds = splats.contiguous(), backgrounds.contiguous()
         keep = any(ctx.needs_input_grad)
-        rgb, alpha, depth, *rest = _forward(splats, tiles, backgrounds, origin, width, height, rule, keep, deterministic)
+        if made is None:
+            made = composite(splats, tiles, backgrounds, origin, width, height, rule, keep, deterministic)
+        rgb, alpha, depth, *rest = made[:7]
         if keep:
             # all of it as saved tensors: those are freed once the gradient is taken
-            ctx.save_for_backward(splats, backgrounds, rgb, depth, *rest, *tiles.tensors())
+            ctx.save_for_backward(splats, backgrounds, rgb, depth, *rest, *tiles.tensors(), *made[7:])
             ctx.tile_size, ctx.how = tiles.size, (origin, width, height, rule, deterministic)
         ctx.set_materialize_grads(False)
         return rgb, alpha, depth
@@ -136,7 +138,7 @@ class _Blend(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, v_rgb, v_alpha, v_depth):
         splats, backgrounds, *tensors = ctx.saved_tensors
-        saved, tiles = tensors[:6], Tiles(ctx.tile_size, *tensors[6:])
+        saved, tiles = tensors[:6], Tiles(ctx.tile_size, *tensors[6:13])
         if v_rgb is None:
             v_rgb = torch.zeros_like(saved[0])
         v_backgrounds = None
@@ -145,7 +147,7 @@ class _Blend(torch.autograd.Function):
             v_backgrounds = torch.stack([(saved[2] * v_rgb[..., k]).sum((1, 2)) for k in range(3)], 1)
         work = blend_cuda.backward if _native(splats) else _backward
         v_splats = work(splats, tiles, backgrounds, *ctx.how, saved, v_rgb, v_alpha, v_depth)
-        return v_splats, v_backgrounds, None, None, None, None, None, None
+        return v_splats, v_backgrounds, None, None, None, None, None, None, None
 
 
 def _check(splats: torch.Tensor, tiles: Tiles, width: int, height: int, **backgrounds) -> None:
@@ -194,7 +196,22 @@ def blend(
         ValueError: A shape or device disagrees, or the tiles belong to another image size.
     """
     _check(splats, tiles, width, height, backgrounds=(backgrounds, "C 3"))
-    return _Blend.apply(splats, backgrounds, tiles, origin, width, height, rule, deterministic)
+    return _Blend.apply(splats, backgrounds, tiles, origin, width, height, rule, deterministic, None)
+
+
+def blended(
+    splats: torch.Tensor, backgrounds: torch.Tensor, tiles: Tiles, frame: tuple, made: tuple[torch.Tensor, ...]
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """What `blend` returns, where that was computed before, with the same gradients. Nothing is checked.
+
+    Args:
+        splats: As for `blend`.
+        backgrounds: As for `blend`.
+        tiles: As for `blend`.
+        frame: Origin, width, height, rule and whether sums are deterministic.
+        made: What `composite` returned, and what else is to be kept for as long as that is needed.
+    """
+    return _Blend.apply(splats, backgrounds, tiles, *frame, made)
 
 
 def contributions(
@@ -220,7 +237,7 @@ def contributions(
     _check(splats, tiles, width, height)
     splats = splats.detach().contiguous()
     real, device = bridge.real_of(splats), splats.device
-    ends = _forward(splats, tiles, splats.new_zeros(len(splats), 3), origin, width, height, rule, keep=False)[5]
+    ends = composite(splats, tiles, splats.new_zeros(len(splats), 3), origin, width, height, rule, keep=False)[5]
     if _native(splats):
         weights = blend_cuda.instance_weights(splats, tiles, origin, width, height, rule, ends)
     else:

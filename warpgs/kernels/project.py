@@ -1,6 +1,7 @@
 """Project 3D Gaussians to image-space ellipses: activations, EWA covariance, its factor, colour, and tile counts."""
 
 import functools
+from collections.abc import Sequence
 
 import torch
 import warp as wp
@@ -158,22 +159,26 @@ def _native(tensor: torch.Tensor) -> bool:
     return tensor.is_cuda and tensor.dtype == torch.float32
 
 
+def _draw(tensors: list[torch.Tensor], factors, size, window, sh_count, rule, tile) -> tuple[torch.Tensor, torch.Tensor]:
+    """Records [C * N, 12] and tile counts [C * N] of contiguous tensors."""
+    means, real = tensors[0], bridge.real_of(tensors[0])
+    count = len(tensors[5]) * len(means)
+    splats = means.new_empty(count, RECORD)
+    tile_counts = torch.empty(count, dtype=torch.int32, device=means.device)
+    inputs = [
+        *_inputs(*tensors), bridge.view(factors, real), *size, *window, tile, sh_count,
+        rule.near, rule.low_pass, rule.alpha_cut, rule.square_sigma,
+        bridge.view(splats, real), bridge.view(tile_counts, wp.int32),
+    ]  # fmt: skip
+    bridge.launch(make_forward(real, _native(means)), count, inputs, means.device, cost=5)
+    return splats, tile_counts
+
+
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx, means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks, factors, size, window, sh_count, rule, tile
-    ):
-        real = bridge.real_of(means)
+    def forward(ctx, means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks, size, sh_count, rule, draw):
         tensors = [t.contiguous() for t in (means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks)]
-        count = len(viewmats) * len(means)
-        splats = means.new_empty(count, RECORD)
-        tile_counts = torch.empty(count, dtype=torch.int32, device=means.device)
-        inputs = [
-            *_inputs(*tensors), bridge.view(factors, real), *size, *window, tile, sh_count,
-            rule.near, rule.low_pass, rule.alpha_cut, rule.square_sigma,
-            bridge.view(splats, real), bridge.view(tile_counts, wp.int32),
-        ]  # fmt: skip
-        bridge.launch(make_forward(real, _native(means)), count, inputs, means.device, cost=5)
+        splats, tile_counts = draw(tensors)
         ctx.save_for_backward(*tensors, splats, tile_counts)
         ctx.size, ctx.sh_count, ctx.rule = size, sh_count, rule
         ctx.mark_non_differentiable(tile_counts)
@@ -207,7 +212,7 @@ class _Project(torch.autograd.Function):
         threads = -(-count // BLOCK) * BLOCK if native else count
         bridge.launch(make_backward(real, native), threads, inputs, device, cost=10 * cameras, block_dim=BLOCK)
         camera_gradients = (v_viewmats.sum(1), v_Ks.sum(1)) if wants_camera else (None, None)
-        return *gradients, *camera_gradients, None, None, None, None, None, None
+        return *gradients, *camera_gradients, None, None, None, None
 
 
 def project(
@@ -274,7 +279,21 @@ def project(
     else:
         bridge.check(means=(means, "N 3"), opacity_factors=(opacity_factors, "N"))
     factors = opacity_factors.detach().contiguous()
+    size, window = (width, height), window or (0, 0, width, height)
     return _Project.apply(
-        means, quats, log_scales, logit_opacities, sh_coefficients, viewmats, Ks, factors,
-        (width, height), window or (0, 0, width, height), sh_count, rule, tile_size,
+        means, quats, log_scales, logit_opacities, sh_coefficients, viewmats, Ks, size, sh_count, rule,
+        lambda tensors: _draw(tensors, factors, size, window, sh_count, rule, tile_size),
     )  # fmt: skip
+
+
+def projected(
+    tensors: Sequence[torch.Tensor],
+    size: tuple[int, int],
+    degree: int,
+    rule: Rule,
+    splats: torch.Tensor,
+    tile_counts: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """What `project` returns for its seven tensors, where that is known, with the same gradients. Nothing is checked."""
+    made = splats.view(-1, RECORD), tile_counts.view(-1)
+    return _Project.apply(*tensors, size, sh.coefficient_count(degree), rule, lambda _: made)

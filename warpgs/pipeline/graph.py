@@ -6,11 +6,9 @@ choice of the view to Adam, and replayed in bursts; rates and views of a burst a
 
 from __future__ import annotations
 
-import gc
 from dataclasses import dataclass
 
 import torch
-import warp as wp
 
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
@@ -113,29 +111,14 @@ class StepGraph:
         burst.give_back(0 if most is not None else DEAD_BYTES)
         stream = burst.stream
         stream.wait_stream(torch.cuda.current_stream())
-        self.graph = torch.cuda.CUDAGraph()
         with torch.cuda.stream(stream):
             # a first run loads kernels and makes room in caches, which may not happen while recording
             burst.hold()
             self._step()
             burst.release()
             stream.synchronize()
-            self._record()
+            self.graph, self.lent = bridge.capture(self._step)
         torch.cuda.current_stream().wait_stream(stream)
-
-    def _record(self) -> None:
-        # torch.cuda.graph would collect garbage and empty the cache each time, which takes 80 ms
-        here, collecting = bridge.warp_stream(self.burst.device), gc.isenabled()
-        gc.disable()  # it might free another graph, which must not happen while recording
-        self.graph.capture_begin()
-        wp.capture_begin(stream=here, external=True)
-        try:
-            self._step()
-        finally:
-            self.lent = wp.capture_end(stream=here)  # holds what Warp lends to the graph
-            self.graph.capture_end()
-            if collecting:
-                gc.enable()
 
     def _project(self, viewmat: torch.Tensor, K: torch.Tensor, factors: torch.Tensor | None = None):
         gaussians = self.optimizer.gaussians.tensors().values()
