@@ -11,14 +11,17 @@ some backward pass still needs the rest, calls run as if there were no recording
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
+import warp as wp
+from torch.autograd.function import once_differentiable
 from torch.multiprocessing.reductions import StorageWeakRef
 
 from warpgs.constants import Rule
 from warpgs.kernels import bridge
-from warpgs.kernels.blend import blended, composite
+from warpgs.kernels.blend import background_gradient, composite, gradients
 from warpgs.kernels.project import project, projected
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, available_bytes, bin_tiles
 
@@ -46,17 +49,9 @@ class Frame:
     rule: Rule
     tile_size: int
 
-    def size(self) -> dict[str, int]:
-        """Of the picture, as `project` takes it."""
-        return {"width": self.width, "height": self.height}
-
-    def part(self) -> dict[str, int]:
-        """Of the window, as `bin_tiles` takes it."""
-        return {"width": self.window[2], "height": self.window[3]}
-
 
 class Recording:
-    """Projection, binning and blending of one set of tensors, replayed for any camera."""
+    """Projection, binning and blending of one set of tensors, replayed for any camera; and the backward pass of blending."""
 
     def __init__(self, sources: tuple[torch.Tensor, ...], frame: Frame, instances: int):
         """Record.
@@ -70,70 +65,109 @@ class Recording:
         device = viewmats.device
         self.frame, self.capacity = frame, int(ROOM * instances) + 1024
         self.viewmats, self.Ks, self.backgrounds = viewmats.clone(), Ks.clone(), viewmats.new_zeros(len(viewmats), 3)
-        self.instances = torch.zeros(1, dtype=torch.int64, pin_memory=True)
-        """Of the last replay, on the host."""
+        self._on_host = wp.zeros(1, dtype=wp.int64, device="cpu", pinned=True)
+        self.instances = self._on_host.numpy()
+        """Of the last replay."""
         self.counted = torch.cuda.Event()
         self.lease: StorageWeakRef | None = None
-        how = {"degree": frame.degree, "rule": frame.rule, "tile_size": frame.tile_size}
+        self.count: torch.cuda.CUDAGraph | None = None
+        window, how = frame.window, {"degree": frame.degree, "rule": frame.rule, "tile_size": frame.tile_size}
+        self.how = (window[:2], *window[2:], frame.rule, True)
 
         def count():
-            made = project(*inputs, self.viewmats, self.Ks, **frame.size(), **how, window=frame.window)
-            return *made, made[1].sum().view(1)
+            made = project(*inputs, self.viewmats, self.Ks, width=frame.width, height=frame.height, **how, window=window)
+            total = made[1].sum().view(1)
+            with bridge.stream_of(device):
+                wp.copy(self._on_host, bridge.view(total, wp.int64).array())
+            return *made, total
 
         def draw():
-            overflow = torch.zeros(1, dtype=torch.int32, device=device)  # nobody looks: the sum of the counts tells before
-            origin, rule = frame.window[:2], frame.rule
-            binned = bin_tiles(
-                self.splats, self.tile_counts, **frame.part(), tile_size=frame.tile_size, rule=rule, origin=origin,
-                capacity=self.capacity, overflow=overflow,
+            overflow = torch.zeros(1, dtype=torch.int32, device=device)  # nobody looks: the count on the host tells before
+            tiles = bin_tiles(
+                self.splats, self.tile_counts, width=window[2], height=window[3], tile_size=frame.tile_size, rule=frame.rule,
+                origin=window[:2], capacity=self.capacity, overflow=overflow,
             )  # fmt: skip
-            of = (origin, *frame.window[2:], rule, True)
-            return binned, composite(self.splats, binned, self.backgrounds, *of)
+            return tiles, composite(self.splats, tiles, self.backgrounds, *self.how[:-1], keep=True)
 
+        def draw_backward():
+            return gradients(self.splats, self.tiles, self.backgrounds, self.how, self.saved, self.v_rgb, None, None, False)[0]
+
+        self._lent: list[object] = []
         stream = torch.cuda.Stream(device)
         stream.wait_stream(torch.cuda.current_stream(device))
         with torch.cuda.stream(stream), torch.no_grad():
-            self.splats, self.tile_counts, _ = count()  # a first run loads what may not be loaded while recording
-            draw()
-            stream.synchronize()
-            self.count, self._first = bridge.capture(count)
-            self.splats, self.tile_counts, self.total = self._first[0]
-            self.draw, self._second = bridge.capture(draw, self.count.pool())
-            self.tiles, self.made = self._second[0]
+            for capture in (False, True):  # a first run loads what may not be loaded while recording
+                self.count, (self.splats, self.tile_counts, self._total) = self._run(count, capture)
+                self.draw, (self.tiles, (rgb, alpha, depth, *rest)) = self._run(draw, capture)
+                self.saved, self.v_rgb = (rgb, depth, *rest), torch.zeros_like(rgb)
+                self.shown = [self.splats, self.tile_counts.view(torch.float32), rgb, alpha, depth]
+                self.draw_backward, self.v_splats = self._run(draw_backward, capture)
+                stream.synchronize()
         torch.cuda.current_stream(device).wait_stream(stream)
+
+    def _run(self, work: Callable[[], object], capture: bool):
+        """A graph of ``work``, or None, and what it returned."""
+        if not capture:
+            return None, work()
+        graph, (result, lent) = bridge.capture(work, None if self.count is None else self.count.pool())
+        self._lent.append(lent)
+        return graph, result
 
     def replay(self, sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor | None):
         """Pictures, records and tile counts of the seven tensors that `project` takes; None where that takes another way."""
         if self.lease is not None and not self.lease.expired():
             return None
-        viewmats, Ks = sources[5:]
         with torch.no_grad():
-            self.viewmats.copy_(viewmats)
-            self.Ks.copy_(Ks)
+            torch._foreach_copy_([self.viewmats, self.Ks], list(sources[5:]))
             if backgrounds is None:
                 backgrounds = self.backgrounds  # black since they were made
             else:
                 self.backgrounds.copy_(backgrounds)
             self.count.replay()
-            self.instances.copy_(self.total, non_blocking=True)
             self.counted.record()
             self.draw.replay()
-            splats, tile_counts, rgb = self.splats.clone(), self.tile_counts.clone(), self.made[0].clone()
-            alpha, depth = torch.stack(self.made[1:3]).unbind()
+            copies = [torch.empty_like(t) for t in self.shown]
+            torch._foreach_copy_(copies, self.shown)
         self.counted.synchronize()
         if self.overflowed():
             return None
+        splats, tile_counts, *pictures = copies
         f, lease = self.frame, torch.empty(0)
-        splats, tile_counts = projected(sources, (f.width, f.height), f.degree, f.rule, splats, tile_counts)
-        frame = (f.window[:2], *f.window[2:], f.rule, True)
-        # whoever saves the rest for a backward pass saves the lease with it
-        pictures = blended(splats, backgrounds, self.tiles, frame, (rgb, alpha, depth, *self.made[3:], lease))
+        made = splats, tile_counts.view(torch.int32)
+        splats, tile_counts = projected(sources, (f.width, f.height), f.degree, f.rule, *made)
+        pictures = _Replayed.apply(splats, backgrounds, self, pictures, lease)
         self.lease = StorageWeakRef(lease.untyped_storage())
         return pictures, splats, tile_counts
 
+    def backward(self, v_rgb, v_alpha, v_depth, wants_backgrounds: bool) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Gradients of records and backgrounds of the last replay."""
+        if v_rgb is None or v_alpha is not None or v_depth is not None:
+            of = (self.splats, self.tiles, self.backgrounds, self.how, self.saved)
+            return gradients(*of, v_rgb, v_alpha, v_depth, wants_backgrounds)
+        self.v_rgb.copy_(v_rgb)
+        self.draw_backward.replay()
+        return self.v_splats.clone(), background_gradient(self.saved[2], v_rgb) if wants_backgrounds else None
+
     def overflowed(self) -> bool:
         """Whether the last replay had more instances than there is room for."""
-        return int(self.instances) > self.capacity
+        return int(self.instances[0]) > self.capacity
+
+
+class _Replayed(torch.autograd.Function):
+    """Pictures that a replay left. What their backward pass needs stays with the recording while the lease is saved."""
+
+    @staticmethod
+    def forward(ctx, splats, backgrounds, recording, pictures, lease):
+        ctx.save_for_backward(lease)
+        ctx.recording = recording
+        ctx.set_materialize_grads(False)
+        return tuple(pictures)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *v_pictures):
+        _ = ctx.saved_tensors  # torch's error where the graph was freed
+        return *ctx.recording.backward(*v_pictures, ctx.needs_input_grad[1]), None, None, None
 
 
 @dataclass
@@ -176,8 +210,9 @@ class Recorder:
     def _record(self, key: tuple, sources: tuple[torch.Tensor, ...], frame: Frame) -> None:
         self.forget()
         with torch.no_grad():
-            how = {"degree": frame.degree, "rule": frame.rule, "tile_size": frame.tile_size, "window": frame.window}
-            instances = int(project(*sources, **frame.size(), **how)[1].sum())
+            size = {"width": frame.width, "height": frame.height, "window": frame.window}
+            how = {"degree": frame.degree, "rule": frame.rule, "tile_size": frame.tile_size}
+            instances = int(project(*sources, **size, **how)[1].sum())
         self.recorded = key
         if ROOM * instances * BYTES_PER_INSTANCE < SHARE * available_bytes(sources[0].device):
             self.recording = Recording(sources, frame, instances)

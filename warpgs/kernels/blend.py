@@ -119,35 +119,44 @@ def _backward(splats, tiles, backgrounds, origin, width, height, rule, _, saved,
     return v_splats
 
 
+def gradients(
+    splats, tiles, backgrounds, how: tuple, saved, v_rgb, v_alpha, v_depth, wants_backgrounds: bool
+) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """Gradients of records and backgrounds from those of the pictures, where any of them may be None.
+
+    ``how`` is what `composite` takes after backgrounds, less ``keep``; ``saved`` what it returned, less alpha.
+    """
+    v_rgb = torch.zeros_like(saved[0]) if v_rgb is None else v_rgb
+    v_backgrounds = background_gradient(saved[2], v_rgb) if wants_backgrounds else None
+    work = blend_cuda.backward if _native(splats) else _backward
+    return work(splats, tiles, backgrounds, *how, saved, v_rgb, v_alpha, v_depth), v_backgrounds
+
+
+def background_gradient(transmittances: torch.Tensor, v_rgb: torch.Tensor) -> torch.Tensor:
+    """Shape [C, 3]. A product of matrices would sum the pixels one by one, and err several times as much."""
+    return torch.stack([(transmittances * v_rgb[..., k]).sum((1, 2)) for k in range(3)], 1)
+
+
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, splats, backgrounds, tiles, origin, width, height, rule, deterministic, made):
+    def forward(ctx, splats, backgrounds, tiles, origin, width, height, rule, deterministic):
         splats, backgrounds = splats.contiguous(), backgrounds.contiguous()
         keep = any(ctx.needs_input_grad)
-        if made is None:
-            made = composite(splats, tiles, backgrounds, origin, width, height, rule, keep, deterministic)
-        rgb, alpha, depth, *rest = made[:7]
+        rgb, alpha, depth, *rest = composite(splats, tiles, backgrounds, origin, width, height, rule, keep, deterministic)
         if keep:
             # all of it as saved tensors: those are freed once the gradient is taken
-            ctx.save_for_backward(splats, backgrounds, rgb, depth, *rest, *tiles.tensors(), *made[7:])
+            ctx.save_for_backward(splats, backgrounds, rgb, depth, *rest, *tiles.tensors())
             ctx.tile_size, ctx.how = tiles.size, (origin, width, height, rule, deterministic)
         ctx.set_materialize_grads(False)
         return rgb, alpha, depth
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, v_rgb, v_alpha, v_depth):
+    def backward(ctx, *v_pictures):
         splats, backgrounds, *tensors = ctx.saved_tensors
-        saved, tiles = tensors[:6], Tiles(ctx.tile_size, *tensors[6:13])
-        if v_rgb is None:
-            v_rgb = torch.zeros_like(saved[0])
-        v_backgrounds = None
-        if ctx.needs_input_grad[1]:
-            # a product of matrices would sum the pixels one by one, and err several times as much
-            v_backgrounds = torch.stack([(saved[2] * v_rgb[..., k]).sum((1, 2)) for k in range(3)], 1)
-        work = blend_cuda.backward if _native(splats) else _backward
-        v_splats = work(splats, tiles, backgrounds, *ctx.how, saved, v_rgb, v_alpha, v_depth)
-        return v_splats, v_backgrounds, None, None, None, None, None, None, None
+        saved, tiles = tensors[:6], Tiles(ctx.tile_size, *tensors[6:])
+        found = gradients(splats, tiles, backgrounds, ctx.how, saved, *v_pictures, ctx.needs_input_grad[1])
+        return *found, None, None, None, None, None, None
 
 
 def _check(splats: torch.Tensor, tiles: Tiles, width: int, height: int, **backgrounds) -> None:
@@ -196,22 +205,7 @@ def blend(
         ValueError: A shape or device disagrees, or the tiles belong to another image size.
     """
     _check(splats, tiles, width, height, backgrounds=(backgrounds, "C 3"))
-    return _Blend.apply(splats, backgrounds, tiles, origin, width, height, rule, deterministic, None)
-
-
-def blended(
-    splats: torch.Tensor, backgrounds: torch.Tensor, tiles: Tiles, frame: tuple, made: tuple[torch.Tensor, ...]
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """What `blend` returns, where that was computed before, with the same gradients. Nothing is checked.
-
-    Args:
-        splats: As for `blend`.
-        backgrounds: As for `blend`.
-        tiles: As for `blend`.
-        frame: Origin, width, height, rule and whether sums are deterministic.
-        made: What `composite` returned, and what else is to be kept for as long as that is needed.
-    """
-    return _Blend.apply(splats, backgrounds, tiles, *frame, made)
+    return _Blend.apply(splats, backgrounds, tiles, origin, width, height, rule, deterministic)
 
 
 def contributions(

@@ -160,17 +160,17 @@ def _native(tensor: torch.Tensor) -> bool:
 
 
 def _draw(tensors: list[torch.Tensor], factors, size, window, sh_count, rule, tile) -> tuple[torch.Tensor, torch.Tensor]:
-    """Records [C * N, 12] and tile counts [C * N] of contiguous tensors."""
+    """Records [C, N, 12] and tile counts [C, N] of contiguous tensors."""
     means, real = tensors[0], bridge.real_of(tensors[0])
-    count = len(tensors[5]) * len(means)
-    splats = means.new_empty(count, RECORD)
-    tile_counts = torch.empty(count, dtype=torch.int32, device=means.device)
+    cameras, count = len(tensors[5]), len(means)
+    splats = means.new_empty(cameras, count, RECORD)
+    tile_counts = torch.empty(cameras, count, dtype=torch.int32, device=means.device)
     inputs = [
         *_inputs(*tensors), bridge.view(factors, real), *size, *window, tile, sh_count,
         rule.near, rule.low_pass, rule.alpha_cut, rule.square_sigma,
-        bridge.view(splats, real), bridge.view(tile_counts, wp.int32),
+        bridge.view(splats.view(-1, RECORD), real), bridge.view(tile_counts.view(-1), wp.int32),
     ]  # fmt: skip
-    bridge.launch(make_forward(real, _native(means)), count, inputs, means.device, cost=5)
+    bridge.launch(make_forward(real, _native(means)), cameras * count, inputs, means.device, cost=5)
     return splats, tile_counts
 
 
@@ -183,7 +183,7 @@ class _Project(torch.autograd.Function):
         ctx.size, ctx.sh_count, ctx.rule = size, sh_count, rule
         ctx.mark_non_differentiable(tile_counts)
         ctx.set_materialize_grads(False)  # else torch makes zeros for the counts
-        return splats.view(len(viewmats), len(means), RECORD), tile_counts.view(len(viewmats), len(means))
+        return splats, tile_counts
 
     @staticmethod
     @once_differentiable
@@ -192,12 +192,9 @@ class _Project(torch.autograd.Function):
         real = bridge.real_of(splats)
         m = make_projection(real)
         device = splats.device
-        v_splats = torch.zeros_like(splats) if v_splats is None else v_splats.contiguous().view(-1, RECORD)
-        # One allocation for the five, each from a multiple of 16 bytes on, as kernels that read four at a time want it.
-        sizes = [-(-t.numel() // 4) * 4 for t in tensors[:5]]
+        v_splats = torch.zeros_like(splats) if v_splats is None else v_splats.contiguous()
         native = _native(splats)  # writes zeros itself
-        flat = (splats.new_empty if native else splats.new_zeros)(sum(sizes)).split(sizes)
-        gradients = [part[: t.numel()].view(t.shape) for part, t in zip(flat, tensors)]
+        gradients = [(torch.empty_like if native else torch.zeros_like)(t) for t in tensors[:5]]
         cameras, count = len(tensors[5]), len(tensors[0])
         wants_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
         rows = (cameras, count) if wants_camera else (0, 0)
@@ -206,7 +203,8 @@ class _Project(torch.autograd.Function):
         outputs = [bridge.view(g, t) for g, t in zip(gradients, (m.vec3, m.vec4, m.vec3, real, m.vec3))]
         inputs = [
             *_inputs(*tensors), *ctx.size, ctx.sh_count, ctx.rule.near, ctx.rule.low_pass,
-            bridge.view(splats, real), bridge.view(tile_counts, wp.int32), bridge.view(v_splats, real),
+            bridge.view(splats.view(-1, RECORD), real), bridge.view(tile_counts.view(-1), wp.int32),
+            bridge.view(v_splats.view(-1, RECORD), real),
             int(wants_camera), *outputs, bridge.view(v_viewmats, m.mat44), bridge.view(v_Ks, m.mat33),
         ]  # fmt: skip
         threads = -(-count // BLOCK) * BLOCK if native else count
@@ -295,5 +293,4 @@ def projected(
     tile_counts: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """What `project` returns for its seven tensors, where that is known, with the same gradients. Nothing is checked."""
-    made = splats.view(-1, RECORD), tile_counts.view(-1)
-    return _Project.apply(*tensors, size, sh.coefficient_count(degree), rule, lambda _: made)
+    return _Project.apply(*tensors, size, sh.coefficient_count(degree), rule, lambda _: (splats, tile_counts))
