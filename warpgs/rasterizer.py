@@ -48,8 +48,8 @@ class RasterizeOptions:
     """Draw a picture of more (Gaussian, tile) instances than this in bands that have no more, and each band again for its
     gradients: the same picture in less memory and more time. None for all at once. Not with ``capacity``."""
     record: bool = True
-    """On CUDA, replay what a loop repeats (docs/recording.md): the same bits sooner, and the memory of a forward pass is kept.
-    Of calls with gradients, summed in a fixed order, and without opacity_factors, contributions and bounds."""
+    """On CUDA, replay what a loop repeats: the same bits in half the time, for half as much memory again. Of small calls with
+    gradients, in a fixed order, without opacity_factors, contributions and bounds (docs/decisions/010-recorded-calls.md)."""
 
     def repeatable(self) -> bool:
         """Whether calls with these options may be recorded."""
