@@ -34,7 +34,7 @@ def make_backward(tile_size: int, with_depth: bool, size: int, skip: bool):
     file = str(Path(__file__).with_name("bucket.cu"))  # an absolute path stands for itself
     numbers = {
         "SIDE": tile_size, "STATE": blend_cuda.STATE, "SCALE": blend_cuda.SCALE, "WARPS": blend_cuda.WARPS,
-        "VALUES": blend_cuda.VALUES, "STRIDE": blend_cuda.STRIDE,
+        "VALUES": 10, "STRIDE": blend_cuda.STRIDE,
         "PER": size // 32, "SKIP": str(skip).lower(), "WITH_DEPTH": str(with_depth).lower(),
     }  # fmt: skip
 

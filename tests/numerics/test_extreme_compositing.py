@@ -268,7 +268,7 @@ def test_colour_is_clamped_at_zero(device, dtype, color, shown):
 def exponential(cuda: bool):
     """A kernel that applies what the blending kernels of a device use for exp(-x / 2)."""
     falloff = make_falloff(wp.float32)
-    numbers = {"SIDE": 16, "STATE": 5, "WARPS": 2, "VALUES": 10, "STRIDE": 12, "SCALE": blend_cuda.SCALE}
+    numbers = {"SIDE": 16, "STATE": 5, "WARPS": 2, "STRIDE": 12, "SCALE": blend_cuda.SCALE}
 
     @wp.func_native(source("blend_common.cu", **numbers) + f"return falloff({blend_cuda.SCALE} * e1, {blend_cuda.SCALE} * e2);")
     def native(e1: float, e2: float) -> float: ...

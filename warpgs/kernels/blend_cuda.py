@@ -23,12 +23,13 @@ MANY = 4096
 """Tiles beyond which the larger chunk is the faster one (docs/decisions/005-cuda-blending.md)."""
 STATE = 5
 """Floats of that state: transmittance, colour and depth sum so far."""
-VALUES = 10
-"""Sums of an instance: along the two factor rows, three for the factor, opacity, colour, depth."""
 WARPS = 2
 """Warps in a block; each works alone."""
+THREADS = 1024
+"""Threads of the one block that puts tiles in order."""
 STRIDE = 12
-"""Floats from one instance's sums to the next, so that rows are 16-byte aligned."""
+"""Floats from one instance's sums to the next, so that rows are 16-byte aligned. There are ten at most: along the two factor
+rows, three for the factor, opacity, colour, depth."""
 
 # 2^-(e1^2 + e2^2) = exp(-|U d|^2 / 2) where e = SCALE U d
 SCALE = "0.84932180028801904272f"  # sqrt(log2(e) / 2)
@@ -36,7 +37,7 @@ SCALE = "0.84932180028801904272f"  # sqrt(log2(e) / 2)
 
 def _source(name: str, tile_size: int, **numbers) -> str:
     """A body, behind what all bodies share."""
-    numbers |= {"SIDE": tile_size, "STATE": STATE, "SCALE": SCALE, "WARPS": WARPS, "VALUES": VALUES, "STRIDE": STRIDE}
+    numbers |= {"SIDE": tile_size, "STATE": STATE, "SCALE": SCALE, "WARPS": WARPS, "STRIDE": STRIDE}
     return source("blend_common.cu", f"blend_{name}.cu", **numbers)
 
 
@@ -58,7 +59,7 @@ def make_kernels(tile_size: int):
         states: wp.array2d(dtype=float),
     ): ...  # fmt: skip
 
-    @wp.func_native(source("blend_order.cu"))
+    @wp.func_native(source("blend_order.cu", THREADS=THREADS))
     def order_body(ranges: wp.array(dtype=int), count: int, order: wp.array(dtype=int)): ...
 
     @wp.func_native(_source("contributions", tile_size))
@@ -204,11 +205,11 @@ def forward(
     alpha, depth, transmittances, weights = splats.new_empty(4, *shape).unbind()
     ends = torch.empty(shape, dtype=torch.int32, device=device)
     pixels = tiles.size * tiles.size
-    chunk = chunk_of(tiles, deterministic) if keep else 0
-    states = splats.new_empty(tiles.slots.shape[0] // chunk + 1 if keep else 0, STATE * pixels)
+    chunk = chunk_of(tiles, deterministic) if keep else bridge.MAX_SIZE  # of which no instance is a multiple but the first
+    states = splats.new_empty(tiles.slots.shape[0] // chunk + 1, STATE * pixels)
     k, count = make_kernels(tiles.size), tiles.ranges.shape[0]
     order = torch.empty(count, dtype=torch.int32, device=device)
-    bridge.launch(k.order_tiles, 1024, [*_ints(tiles.ranges), count, *_ints(order)], device, block_dim=1024)
+    bridge.launch(k.order_tiles, THREADS, [*_ints(tiles.ranges), count, *_ints(order)], device, block_dim=THREADS)
     inputs = [
         *_floats(splats), *_ints(order, tiles.ranges, tiles.splat_ids), *_floats(backgrounds),
         *_frame(origin, width, height, tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),

@@ -35,7 +35,7 @@ while (top_instance > floor) {
     top_instance = first;
     // the Gaussian of this lane in a batch is known a batch before its record is loaded
     int batch = (stop_at - 1) & ~31;
-    int next_id = batch + lane >= first && batch + lane < stop_at ? splat_ids.data[batch + lane] : 0;
+    int next_id = splat_ids.data[min(batch + lane, stop_at - 1)];
     const int camera = tile / tiles, in_camera = tile - camera * tiles;
     const int left = (in_camera % columns) * SIDE, top = (in_camera / columns) * SIDE;
     const float px = origin_x + left + lane % 8 + 0.5f, py = origin_y + top + lane / 8 + 0.5f;  // of the pixel in the first block
@@ -94,8 +94,7 @@ while (top_instance > floor) {
     for (; batch + 32 > first; batch -= 32) {
         const int i = batch + lane, id = next_id;
         const bool mine = i >= first && i < stop_at;
-        if (i - 32 >= first)
-            next_id = splat_ids.data[i - 32];
+        next_id = splat_ids.data[max(i - 32, 0)];
         unsigned mask = 0;
         int target = 0;
         __syncwarp();
@@ -124,7 +123,7 @@ while (top_instance > floor) {
             todo &= ~(1u << j);
             const unsigned blocks = __shfl_sync(ALL, mask, j);
             const float4 a = s_a[warp][j], b = s_b[warp][j], c = s_c[warp][j];
-            float v[VALUES] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+            float v[STRIDE] = {};
             bool any = false;
             float dx[WIDE], p[WIDE];
             #pragma unroll

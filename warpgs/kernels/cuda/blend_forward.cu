@@ -23,7 +23,7 @@ int next_id = i + 32 < end ? splat_ids.data[i + 32] : 0;  // known a batch befor
 for (int batch = begin & ~31; batch < end; batch += 32) {
     if (__all_sync(ALL, done))
         break;
-    if (chunk > 0 && batch % chunk == 0 && batch > begin) {
+    if (batch % chunk == 0 && batch > begin) {
         float* state = states.data + (long long)(batch / chunk) * (STATE * PIXELS) + block * 32 + lane;
         state[0] = T;
         state[PIXELS] = red;

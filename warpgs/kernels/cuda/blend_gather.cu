@@ -7,7 +7,7 @@ const bool valid = i < counts.shape[0];
 const bool seen = valid && counts.data[i] > 0;
 const int count = atomic ? (int)seen : seen ? counts.data[i] : 0;
 const long long start = count == 0 ? 0 : atomic ? i : starts.data[i];  // atomic: the row of the Gaussian is its one slot
-float v[VALUES] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+float v[STRIDE] = {};
 if (count <= SHORT)
     for (int s = 0; s < count; ++s) {
         const float4* row = reinterpret_cast<const float4*>(v_slots.data + STRIDE * (start + s));
@@ -25,12 +25,12 @@ while (heavy) {
     heavy &= heavy - 1u;
     const int many = __shfl_sync(ALL, count, owner);
     const long long from = __shfl_sync(ALL, start, owner);
-    float u[VALUES] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+    float u[STRIDE] = {};
     for (int s = lane; s < many; s += 32)
         for (int k = 0; k < values; ++k)
             u[k] += v_slots.data[STRIDE * (from + s) + k];
     #pragma unroll
-    for (int k = 0; k < VALUES; ++k) {
+    for (int k = 0; k < values; ++k) {
         for (int distance = 16; distance > 0; distance /= 2)
             u[k] += __shfl_xor_sync(ALL, u[k], distance);
         if (lane == owner)

@@ -1,17 +1,16 @@
 // Tiles with long lists first, so that none of them starts when the others are done: a counting sort by the number of binary
 // digits of the length, in one thread block. The order among equals differs from run to run; no result depends on it.
 constexpr int HELD = 8;  // lengths that a thread asks for before it needs the first: one block alone cannot hide the waits
-__shared__ int s_starts[34];  // by rank: 0 for the longest lists, 32 for empty ones, 33 for what is no tile
-const int lane = threadIdx.x % 32, threads = blockDim.x;
-for (int i = threadIdx.x; i < 34; i += threads)
-    s_starts[i] = 0;
+__shared__ int s_starts[THREADS];  // by rank: 0 for the longest lists, 32 for empty ones, 33 for what is no tile
+const int lane = threadIdx.x % 32;
+s_starts[threadIdx.x] = 0;
 __syncthreads();
 auto deal = [&](bool place) {
-    for (int begin = threadIdx.x; begin - (int)threadIdx.x < count; begin += HELD * threads) {
+    for (int begin = threadIdx.x; begin - (int)threadIdx.x < count; begin += HELD * THREADS) {
         int rank[HELD];
         #pragma unroll
         for (int k = 0; k < HELD; ++k) {
-            const int tile = begin + k * threads;
+            const int tile = begin + k * THREADS;
             rank[k] = 33;
             if (tile < count)
                 rank[k] = __clz(ranges.data[2 * tile + 1] - ranges.data[2 * tile]);
@@ -26,7 +25,7 @@ auto deal = [&](bool place) {
                 at = atomicAdd(&s_starts[rank[k]], __popc(alike));
             at = __shfl_sync(0xffffffffu, at, leader) + __popc(alike & ((1u << lane) - 1u));
             if (place && rank[k] < 33)
-                order.data[at] = begin + k * threads;
+                order.data[at] = begin + k * THREADS;
         }
     }
 };
