@@ -113,6 +113,23 @@ def test_sums_take_one_pass_where_a_row_fills_a_step(monkeypatch, width, ways):
     assert torch.allclose(sums, torch.stack([(1 - ssim(a, b)).sum(), (a - b).abs().sum()]), rtol=1e-5)
 
 
+def test_a_pixel_reaches_five_pixels(device):
+    """A change of one changes the map around it alone, and so does an upstream gradient: each pixel of a picture in turn."""
+    side = 38  # three blocks each way
+    a, b = torch.rand(2, side, side, 3, generator=torch.Generator().manual_seed(0)).to(device).unbind()
+    rows, columns = (t.flatten() for t in torch.meshgrid(*[torch.arange(side)] * 2, indexing="ij"))
+    far = ((rows[:, None] - rows).abs() > 5) | ((columns[:, None] - columns).abs() > 5)  # [touched, seen]
+    wanted = ssim(a, b)
+    for few in torch.arange(side * side).chunk(8):
+        many = a.expand(len(few), -1, -1, -1).clone()
+        many.view(len(few), -1, 3)[torch.arange(len(few)), few] += 50
+        changed = (ssim(many, b.expand_as(many)) != wanted).view(len(few), -1, 3).any(-1).cpu()
+        assert not bool((changed & far[few]).any()) and bool(changed[torch.arange(len(few)), few].all())
+        found = ssim(many.requires_grad_(), b.expand_as(many)).view(len(few), -1, 3)[torch.arange(len(few)), few]
+        (gradient,) = torch.autograd.grad(found.sum(), many)
+        assert not bool((gradient.view(len(few), -1, 3) != 0).any(-1).cpu()[far[few]].any())
+
+
 @pytest.mark.parametrize(("height", "width"), [(16, 16), (15, 32), (32, 17), (17, 33), (8, 11)])
 def test_pictures_that_fill_the_blocks(device, dtype, height, width):
     """Whole blocks, and one row or column more or less than that, in a batch: map, sums and both gradients."""

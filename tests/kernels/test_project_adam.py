@@ -135,6 +135,17 @@ def test_skipped_step_changes_nothing(device, dtype):
         assert all(torch.equal(t, state.all()[n]) for n, t in other.all().items())
 
 
+def test_only_coefficients_have_a_head(device, dtype):
+    """The first of the three rates of the other tensors is not looked at."""
+    state = State(cloud(150, dtype, device), camera(40, 32, 1, dtype, device), 1)
+    found, wanted = state.copy(), state.copy()
+    rates = torch.tensor([scheduled_rates(0.01, 1) for _ in RATES], dtype=dtype, device=device)
+    wanted.fused(1, rates=rates.view(-1))
+    rates[:4, 0] = torch.nan
+    found.fused(1, rates=rates.view(-1))
+    assert all(torch.equal(t, wanted.all()[n]) for n, t in found.all().items())
+
+
 def test_clamped_colours_and_jacobians(device, dtype):
     """Where the colour is clamped at zero or the mean lies far outside the image, the gradients are still those."""
     gaussians = hand_placed(dtype, device)
