@@ -31,12 +31,13 @@ CUDA_ARGUMENTS = {"deterministic", "block_dim"}
 
 LIMITS, LIMITS_PROJECT, LIMITS_BLEND = (f"kernels/test_limits{what}.py" for what in ("", "_project", "_blend"))
 SPANS, CUTS = "kernels/test_spans.py", "kernels/test_bridge.py"
+RECORDS, BODIES, FENCES = (f"kernels/test_{what}.py" for what in ("limits_gradients", "native", "fences"))
 EXTREMES, LAYERS = "numerics/test_extreme_projection.py", "numerics/test_extreme_compositing.py"
 OPS = {
     "adam": ["kernels/test_adam.py", LIMITS],
     "blend": ["kernels/test_blend.py", "test_rasterizer.py", LIMITS_BLEND],
-    "blend_cpu": ["kernels/test_blend.py", LIMITS_BLEND, LAYERS, "test_window.py"],
-    "blend_cuda": ["kernels/test_blend.py", "test_rasterizer.py", LIMITS_BLEND, LAYERS, "test_window.py"],
+    "blend_cpu": ["kernels/test_blend.py", LIMITS_BLEND, RECORDS, LAYERS, "test_window.py"],
+    "blend_cuda": ["kernels/test_blend.py", "test_rasterizer.py", LIMITS_BLEND, RECORDS, LAYERS, "test_window.py"],
     "bridge": [CUTS, "kernels/test_adam.py", "kernels/test_sh.py", "kernels/test_tiles.py"],
     "compiler": ["kernels/test_blend.py"],
     "dropout": ["kernels/test_dropout.py"],
@@ -50,22 +51,25 @@ OPS = {
         "test_rasterizer.py",
         LIMITS_PROJECT,
         LIMITS_BLEND,
+        RECORDS,
     ],
     "project": ["kernels/test_project.py", LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "test_rasterizer.py"],
     "project_adam": ["kernels/test_project_adam.py"],
-    "project_backward": ["kernels/test_project.py", LIMITS_PROJECT, EXTREMES, "test_rasterizer.py"],
+    "project_backward": ["kernels/test_project.py", LIMITS_PROJECT, RECORDS, EXTREMES, "test_rasterizer.py"],
     "scanlines": ["kernels/test_scanlines.py"],
     "sh": ["kernels/test_sh.py", "kernels/test_project.py"],
     "ssim": ["kernels/test_ssim.py", LIMITS],
-    "tiles": ["kernels/test_tiles.py", LIMITS_BLEND, "test_rasterizer.py", "test_window.py"],
+    "tiles": ["kernels/test_tiles.py", LIMITS_BLEND, RECORDS, "test_rasterizer.py", "test_window.py"],
 }
 """The tests of a file by the beginning of its name, the longest that fits; those that fail soonest come first."""
 
 CUDA_OPS = {
-    "adam": ["pipeline/test_graph.py"], "bridge": ["kernels/test_project.py", "pipeline/test_graph.py"],
-    "project_adam": ["pipeline/test_graph.py"], "tiles": ["pipeline/test_graph.py"],
+    "adam": [FENCES, "pipeline/test_graph.py"], "blend_cuda": [BODIES, FENCES],
+    "bridge": [BODIES, "kernels/test_project.py", "pipeline/test_graph.py"], "native": [BODIES, FENCES], "project": [FENCES],
+    "project_adam": [FENCES, "pipeline/test_graph.py"], "project_backward": [FENCES], "ssim": [FENCES],
+    "tiles": [BODIES, FENCES, "pipeline/test_graph.py"],
 }  # fmt: skip
-"""More of them for CUDA: steps that are recorded and replayed."""
+"""More of them for CUDA: bodies one by one, memory beside a tensor, steps that are recorded and replayed."""
 
 SKIPPED = ("tests/kernels/test_blend.py::test_gradcheck",)
 """Tests that take most of a minute, and check what another in the list checks to the same digits by other means."""
