@@ -191,11 +191,11 @@ def gpu_times(work, repeats: int = REPEATS) -> tuple[dict, Counter]:
     return {"median": round(statistics.median(totals), 4), "spread": [round(min(totals), 4), round(max(totals), 4)]}, kernels
 
 
-def peak_memory(work, forward=None) -> float:
+def peak_memory(work) -> float:
     """Memory above what was loaded before [MiB]: torch's high-water mark, and that of Warp's pool where it grew.
 
-    Where a loop of ``work`` is recorded, what the recording keeps counts; its memory for what is gone after each picture does
-    not show in torch's count, and is that of ``forward``, a picture with as much room.
+    Where a loop of ``work`` is recorded, what the recording keeps counts, and what its graphs use and torch's mark does not show:
+    all memory set aside for them, in whole segments, so rather too much.
     """
     own = recorder(torch.device("cuda", torch.cuda.current_device()))
     own.forget()
@@ -204,23 +204,20 @@ def peak_memory(work, forward=None) -> float:
     torch.cuda.empty_cache()
     device = wp.device_from_torch(torch.device("cuda", torch.cuda.current_device()))
     loaded, pool = torch.cuda.memory_allocated(), wp.get_mempool_used_mem_current(device)
-
-    def peak(run) -> int:
-        torch.cuda.synchronize()
-        torch.cuda.reset_peak_memory_stats()
-        run()
-        torch.cuda.synchronize()
-        return torch.cuda.max_memory_allocated() - loaded
-
     for _ in range(CALLS):
         work()
-    gone = 0
+    torch.cuda.synchronize()
+    torch.cuda.reset_peak_memory_stats()
+    work()
+    torch.cuda.synchronize()
+    highest, warp_peak = torch.cuda.max_memory_allocated() - loaded, wp.get_mempool_used_mem_high(device) - pool
+    unseen = 0
     if own.recording is not None:
-        kept, room = torch.cuda.memory_allocated() - loaded, own.recording.capacity
-        gone = max(0, peak(lambda: forward(room)) - 2 * kept)
-    highest = peak(work)
+        mine = own.recording.count_graph.pool()
+        segments = [s for s in torch.cuda.memory_snapshot() if tuple(s["segment_pool_id"]) == tuple(mine)]
+        unseen = sum(s["total_size"] - s["active_size"] for s in segments)
     own.forget()
-    return (highest + gone + max(0, wp.get_mempool_used_mem_high(device) - pool)) / 2**20
+    return (highest + unseen + max(0, warp_peak)) / 2**20
 
 
 def compare(path: str, name: str, kernels: bool) -> dict:
@@ -240,14 +237,10 @@ def compare(path: str, name: str, kernels: bool) -> dict:
     one = {f"{who}, one thread": in_calling_thread(works[who]) for who in ("warpgs", "gsplat dense")}
     row = {"configuration": name, "gaussians": len(gaussians), "wall_ms": wall_times(works | one)}
     row |= {"gpu_ms": {}, "peak_mib": {}}
-
-    def picture(capacity: int):
-        return rasterize(gaussians, camera, RasterizeOptions(rule="gsplat", capacity=capacity))
-
     for who, work in works.items():
         row["gpu_ms"][who], by_kernel = gpu_times(work)
         if who != "warpgs graph":  # its memory is taken when it is recorded
-            row["peak_mib"][who] = round(peak_memory(work, picture if who == "warpgs" else None), 1)
+            row["peak_mib"][who] = round(peak_memory(work), 1)
         if kernels and who == "warpgs":
             row["kernels_us"] = {k: round(v, 1) for k, v in by_kernel.most_common(24)}
     peers = [who for who in works if who.startswith("gsplat")]

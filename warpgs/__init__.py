@@ -11,12 +11,16 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 __version__ = "0.1.0"
 
-__all__ = ["Camera", "Gaussians", "RasterizeOptions", "Render", "Scene", "choose_knobs", "load_scene", "rasterize"]
+__all__ = [
+    "Camera", "Gaussians", "RasterizeOptions", "Render", "Scene", "choose_knobs", "forget_recordings", "load_scene",
+    "rasterize",
+]  # fmt: skip
 
 if TYPE_CHECKING:
     from warpgs.io.load import load_scene
     from warpgs.prices import choose_knobs
     from warpgs.rasterizer import RasterizeOptions, rasterize
+    from warpgs.recording import forget_recordings
     from warpgs.scene import Camera, Gaussians, Render, Scene
 
 _HOMES = {
@@ -27,6 +31,7 @@ _HOMES = {
     "RasterizeOptions": "warpgs.rasterizer",
     "rasterize": "warpgs.rasterizer",
     "choose_knobs": "warpgs.prices",
+    "forget_recordings": "warpgs.recording",
     "load_scene": "warpgs.io.load",
 }
 

@@ -144,6 +144,22 @@ def stream_of(device: torch.device):
             where.set_stream(before, sync=False)
 
 
+_CAPTURING = threading.Lock()
+"""Held while a graph is recorded."""
+
+
+@contextlib.contextmanager
+def _no_collection():
+    """Without garbage collection, which might free another graph; that must not happen while recording."""
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()
+
+
 def capture(work: Callable[[], object], pool: tuple[int, int] | None = None) -> tuple[torch.cuda.CUDAGraph, object]:
     """Record what torch and Warp do in ``work`` on torch's current stream, which must not be the default one.
 
@@ -155,18 +171,18 @@ def capture(work: Callable[[], object], pool: tuple[int, int] | None = None) -> 
         The graph, and what must live as long as it does: what ``work`` returned, and what Warp lent to the graph.
     """
     # torch.cuda.graph would collect garbage and empty the cache each time, which takes 80 ms
-    graph, here, collecting = torch.cuda.CUDAGraph(), warp_stream(torch.device("cuda")), gc.isenabled()
-    gc.disable()  # it might free another graph, which must not happen while recording
-    # what other threads do meanwhile is no part of it, and no error
-    graph.capture_begin(pool=pool, capture_error_mode="thread_local")
-    wp.capture_begin(stream=here, external=True)
-    try:
-        result = work()
-    finally:
-        lent = wp.capture_end(stream=here)
-        graph.capture_end()
-        if collecting:
-            gc.enable()
+    graph, here = torch.cuda.CUDAGraph(), warp_stream(torch.device("cuda"))
+    with _CAPTURING, _no_collection():
+        # other threads may allocate and wait meanwhile
+        graph.capture_begin(pool=pool, capture_error_mode="thread_local")
+        try:
+            wp.capture_begin(stream=here, external=True)
+            try:
+                result = work()
+            finally:
+                lent = wp.capture_end(stream=here)
+        finally:
+            graph.capture_end()
     return graph, (result, lent)
 
 
