@@ -194,7 +194,7 @@ def gpu_times(work, repeats: int = REPEATS) -> tuple[dict, Counter]:
 def peak_memory(work) -> float:
     """Memory above what was loaded before [MiB]: torch's high-water mark, and that of Warp's pool where it grew.
 
-    Where a loop of ``work`` is recorded, what the recording keeps counts, and what its graphs use and torch's mark does not show:
+    Where a loop of ``work`` is recorded, what the recording keeps counts, and what its graphs use and that mark does not show:
     all memory set aside for them, in whole segments, so rather too much.
     """
     own = recorder(torch.device("cuda", torch.cuda.current_device()))
