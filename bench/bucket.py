@@ -20,7 +20,7 @@ import warp as wp
 
 from bench.against_gsplat import CONFIGURATIONS, first_camera, quartiles
 from bench.garden import garden_inputs
-from bench.kernels.bucket import SIZES, make_backward
+from bench.kernels.bucket import SIZES, VALUES, make_backward
 from warpgs.constants import RULES, Rule
 from warpgs.kernels import blend_cuda, bridge
 from warpgs.kernels.project import project
@@ -79,7 +79,7 @@ class Case:
         how = (splats, tiles, torch.full((len(splats), 3), 0.3, device=splats.device), (0, 0), width, height, rule)
         chunk = blend_cuda.chunk_of(tiles, True)
         self.chunk, self.instances, self.tiles = chunk, len(tiles.slots), tiles
-        self.values = 9 if upstream[1] is None else blend_cuda.VALUES
+        self.values = 9 if upstream[1] is None else VALUES
         self.forward, states = {}, {}
         for size in SIZES:
             with mock.patch.object(blend_cuda, "chunk_of", return_value=size):
@@ -93,7 +93,7 @@ class Case:
         assert self.backward.inputs[STATES].tensor is states[chunk]
         self.v_slots = self.backward.inputs[-1].tensor
         self.state_mib = {size: t.numel() * 4 / 2**20 for size, t in states.items()}
-        with_depth = self.values == blend_cuda.VALUES
+        with_depth = self.values == VALUES
         kernels = {f"chunks of {n}": (blend_cuda.make_backward(tiles.size, with_depth, n, False).backward, n) for n in SIZES}
         kernels["bucket 32, all pixels"] = make_backward(tiles.size, with_depth, 32, False), 32
         kernels |= {f"bucket {n}": (make_backward(tiles.size, with_depth, n, True), n) for n in SIZES}

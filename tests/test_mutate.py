@@ -7,7 +7,7 @@ import tokenize
 import pytest
 
 from tests.mutate import claims, report, rules
-from tests.mutate.__main__ import all_tests, arguments, check_unmutated, job_of
+from tests.mutate.__main__ import all_tests, arguments, check_unmutated, job_of, run
 from tests.mutate.candidates import KERNELS, ROOT, Candidate, all_candidates, candidates_of, draw
 from tests.mutate.edit import Edit
 from tests.mutate.native import native_edits
@@ -231,3 +231,23 @@ def test_which_tests_run_where(monkeypatch):
     ends["tests/kernels/test_knn.py on the CPU"] = "broken"
     with pytest.raises(SystemExit, match=r"fail without a mutant: .*test_knn"):
         check_unmutated(found, arguments([]))
+
+
+def test_a_full_device_kills_no_mutant(candidates, monkeypatch, tmp_path):
+    """Who met it among others runs again by itself, and that counts; who meets it alone is killed."""
+    drawn, seen = [(c, True) for c in candidates[:3]], []
+    full, fails = "Warp CUDA error 2: out of memory", "E   assert False"
+    words = {c.id: w for (c, _), w in zip(drawn, ([full, ""], [fails, "not asked"], [full, full]))}
+
+    def instead(jobs, root, cache, *, workers, **_):
+        seen.append((workers, [j.name for j in jobs]))
+        for j in jobs:
+            output = words[j.name][len(seen) - 1]
+            yield Outcome(j.name, "killed" if output else "survived", 1.0, output)
+
+    monkeypatch.setattr("tests.mutate.__main__.run_jobs", instead)
+    kept = {"mutants": {}, "untested": []}
+    run(drawn, kept, arguments(["--workers", "8", "--json", str(tmp_path / "m.json")]))
+    a, b, c = words
+    assert seen == [(8, [a, b, c]), (1, [a, c])]
+    assert {k: v["status"] for k, v in kept["mutants"].items()} == {a: "survived", b: "killed", c: "killed"}

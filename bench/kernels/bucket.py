@@ -12,6 +12,8 @@ import warp as wp
 from warpgs.kernels import blend_cuda
 from warpgs.kernels.native import source
 
+VALUES = 10
+"""Sums of an instance."""
 SIZES = (32, 64, 128)
 """Instances of a bucket: one, two or four Gaussians a lane. The forward pass must leave states at multiples of it."""
 
@@ -34,7 +36,7 @@ def make_backward(tile_size: int, with_depth: bool, size: int, skip: bool):
     file = str(Path(__file__).with_name("bucket.cu"))  # an absolute path stands for itself
     numbers = {
         "SIDE": tile_size, "STATE": blend_cuda.STATE, "SCALE": blend_cuda.SCALE, "WARPS": blend_cuda.WARPS,
-        "VALUES": 10, "STRIDE": blend_cuda.STRIDE,
+        "VALUES": VALUES, "STRIDE": blend_cuda.STRIDE,
         "PER": size // 32, "SKIP": str(skip).lower(), "WITH_DEPTH": str(with_depth).lower(),
     }  # fmt: skip
 

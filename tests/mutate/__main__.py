@@ -8,11 +8,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from tests.mutate import claims, report, rules
 from tests.mutate.candidates import KERNELS, ROOT, Candidate, all_candidates, draw
-from tests.mutate.process import COPIED, Job, preload, run_jobs
+from tests.mutate.process import COPIED, Job, Outcome, preload, run_jobs
 
 
 def arguments(args: list[str] | None = None) -> argparse.Namespace:
@@ -108,11 +109,24 @@ def tree_digest(tests: list[tuple[str, bool]]) -> str:
 
 
 def run(mutants: list[tuple[Candidate, bool]], kept: dict, options: argparse.Namespace) -> None:
-    """Run mutants, each on CUDA or not, and write each result down as it comes."""
+    """Run mutants, each on CUDA or not, and write each result down as it comes.
+
+    Tests that several mutants run at a time may find a device's memory full: such a mutant is run again, by itself.
+    """
     by_id = {c.id: c for c, _ in mutants}
     jobs = [job_of(c, cuda, kept["untested"]) for c, cuda in mutants]
     limits = {"workers": options.workers, "timeout": options.timeout, "test_timeout": options.test_timeout}
-    for i, o in enumerate(run_jobs(jobs, ROOT, options.cache, **limits), 1):
+    crowded = []
+
+    def outcomes() -> Iterator[Outcome]:
+        for o in run_jobs(jobs, ROOT, options.cache, **limits):
+            if options.workers > 1 and o.status == "killed" and "out of memory" in o.output:
+                crowded.append(next(j for j in jobs if j.name == o.name))
+            else:
+                yield o
+        yield from run_jobs(crowded, ROOT, options.cache, **limits | {"workers": 1})
+
+    for i, o in enumerate(outcomes(), 1):
         c = by_id[o.name]
         kept["mutants"][o.name] = {
             "file": c.file, "line": c.number, "function": c.edit.function, "source": c.line, "change": c.change,
