@@ -182,15 +182,17 @@ def test_what_cannot_be_recorded_is_not(recorder, monkeypatch):
 
 def test_options_that_decide_more_than_the_picture_are_not_recorded():
     """Each of them by itself."""
-    assert RasterizeOptions().repeatable() and RasterizeOptions(background=torch.ones(3), sh_degree=1).repeatable()
+    assert RasterizeOptions(record=True, background=torch.ones(3), sh_degree=1).repeatable()
+    assert not RasterizeOptions().repeatable()
     for other in (
-        {"record": False}, {"deterministic": False}, {"contributions": True}, {"capacity": 5}, {"memory_budget": 5},
+        {"deterministic": False}, {"contributions": True}, {"capacity": 5}, {"memory_budget": 5},
         {"max_instances": 5}, {"opacity_factors": torch.ones(3)},
     ):  # fmt: skip
-        assert not RasterizeOptions(**other).repeatable()
+        assert not RasterizeOptions(record=True, **other).repeatable()
 
 
 CUDA = torch.device("cuda", 0)
+RECORD = RasterizeOptions(record=True)
 
 
 def scene(count: int = 400, width: int = 70, height: int = 50) -> tuple[Gaussians, list[Camera]]:
@@ -318,13 +320,13 @@ def test_hooks_and_checkpoints_are_drawn_as_usual(fresh):
     def gradient(draw):
         return torch.autograd.grad(draw(g, cams[0]).rgb.sum(), params)
 
-    wanted = gradient(lambda *of: rasterize(*of, RasterizeOptions(record=False)))
+    wanted = gradient(rasterize)
     for _ in range(2 * CALLS):
         with torch.autograd.graph.save_on_cpu(pin_memory=True):
-            assert equal([gradient(rasterize)], [wanted])
+            assert equal([gradient(lambda *of: rasterize(*of, RECORD))], [wanted])
     assert fresh.replays == 0
     for _ in range(2 * CALLS):
-        again = torch.utils.checkpoint.checkpoint(lambda: rasterize(g, cams[0]).rgb, use_reentrant=False)
+        again = torch.utils.checkpoint.checkpoint(lambda: rasterize(g, cams[0], RECORD).rgb, use_reentrant=False)
         assert equal([torch.autograd.grad(again.sum(), params)], [wanted])
 
 
@@ -353,7 +355,7 @@ def test_a_device_that_is_not_the_current_one(fresh):
     g, cams = scene()
     with torch.cuda.device(1):
         for _ in range(CALLS + 2):
-            rasterize(g, cams[0]).rgb.sum().backward()
+            rasterize(g, cams[0], RECORD).rgb.sum().backward()
     assert fresh.replays == 0
 
 
@@ -379,7 +381,7 @@ def test_a_recording_keeps_no_parameters(fresh):
     """Their memory is free again once nobody else holds them."""
     g, cams = scene(30_000)
     for _ in range(CALLS + 1):
-        rasterize(g, cams[0]).rgb.sum().backward()
+        rasterize(g, cams[0], RECORD).rgb.sum().backward()
     assert fresh.replays == 2
     held = torch.cuda.memory_allocated()
     size = sum(t.numel() * t.element_size() for t in g.tensors().values())

@@ -47,9 +47,9 @@ class RasterizeOptions:
     max_instances: int | None = None
     """Draw a picture of more (Gaussian, tile) instances than this in bands that have no more, and each band again for its
     gradients: the same picture in less memory and more time. None for all at once. Not with ``capacity``."""
-    record: bool = True
-    """On CUDA, replay what a loop repeats: the same bits in half the time, for half as much memory again. Of small calls with
-    gradients, in a fixed order, without opacity_factors, contributions and bounds (docs/decisions/010-recorded-calls.md)."""
+    record: bool = False
+    """On CUDA, replay what a loop repeats: the same bits in half the time, for twice the memory. Of small calls with gradients,
+    in a fixed order, without opacity_factors, contributions and bounds (docs/decisions/010-recorded-calls.md)."""
 
     def repeatable(self) -> bool:
         """Whether calls with these options may be recorded."""

@@ -5,13 +5,10 @@ import torch
 from bench import inputs, peers, roofline
 from bench.harness import OURS, Task
 from bench.pairs import instances_and_pairs
-from warpgs import RasterizeOptions, rasterize
+from warpgs import rasterize
 
 AXES = ("count", "image", "degree", "cameras", "threads")
 PROGRAMS = {OURS: ("forward", "both"), **dict.fromkeys(peers.RASTERIZERS, ("forward", "both"))}
-
-PLAIN = RasterizeOptions(record=False)
-"""Kernel by kernel: a recorded loop is measured by `bench.against_gsplat`."""
 
 LARGEST = {peers.DENSE: 1_000}
 """Most Gaussians that a peer is given at all."""
@@ -35,7 +32,7 @@ def tasks(point, device, wanted):
     upstream = torch.rand(point.cameras, point.height, point.width, 3, device=device)
     tensors = list(gaussians.tensors().values())
     forward_cost, backward_cost = costs(point, device)
-    for program, draw in {OURS: lambda g, c: rasterize(g, c, PLAIN).rgb, **peers.RASTERIZERS}.items():
+    for program, draw in {OURS: lambda g, c: rasterize(g, c).rgb, **peers.RASTERIZERS}.items():
 
         def forward(draw=draw):
             return draw(gaussians, camera)

@@ -9,7 +9,7 @@ import torch
 from bench import inputs, peers, roofline
 from bench.harness import OURS, Task
 from bench.kernels.bench_render import costs
-from warpgs import RasterizeOptions, rasterize
+from warpgs import rasterize
 from warpgs.pipeline.loss import LossConfig, photometric_loss
 from warpgs.pipeline.optimizer import Optimizer, OptimizerConfig
 from warpgs.scene import Camera
@@ -39,7 +39,7 @@ def tasks(point, device, wanted):
         optimizer = Optimizer(gaussians, OptimizerConfig(means_lr_final=RATE, **rates), extent=1.0)
 
         def step():
-            picture = rasterize(optimizer.gaussians, camera, RasterizeOptions(record=False)).rgb
+            picture = rasterize(optimizer.gaussians, camera).rgb
             photometric_loss(picture, target, None, loss)[0].backward()
             optimizer.step(0.5)
 

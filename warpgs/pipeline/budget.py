@@ -11,7 +11,7 @@ import torch
 from warpgs.errors import UsageError
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.loss import LossConfig, photometric_loss
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.rasterizer import rasterize
 from warpgs.scene import Camera, Gaussians, View
 
 PIXELS_PER_GAUSSIAN = 4
@@ -45,10 +45,10 @@ def probe_seconds(width: int, height: int, device: torch.device) -> float:
     gaussians = Gaussians(**{n: t.to(device).requires_grad_() for n, t in tensors.items()})
     K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]], device=device)
     camera, target = Camera(torch.eye(4, device=device), K, width, height), torch.rand(height, width, 3, generator=g).to(device)
-    seconds, options = [], RasterizeOptions(record=False)
+    seconds = []
     for _ in range(REPEATS + 1):
         began = time.perf_counter()
-        loss, _ = photometric_loss(rasterize(gaussians, camera, options).rgb, target, None, LossConfig())
+        loss, _ = photometric_loss(rasterize(gaussians, camera).rgb, target, None, LossConfig())
         torch.autograd.grad(loss, list(gaussians.tensors().values()))
         loss.item()
         if device.type == "cuda":

@@ -127,9 +127,12 @@ class Fit:
             settings = torch.tensor(self._settings(self.step), dtype=torch.float32, device=self.device)
             factors = opacity_dropout(len(self.optimizer.gaussians), settings, c.seed)
         options = RasterizeOptions(
-            rule=c.rule, sh_degree=phase.degree, background=self.background, opacity_factors=factors, max_instances=self.most,
-            record=False,  # step by step is what recorded steps are held against
-        )  # fmt: skip
+            rule=c.rule,
+            sh_degree=phase.degree,
+            background=self.background,
+            opacity_factors=factors,
+            max_instances=self.most,
+        )
         render = rasterize(self.optimizer.gaussians, view.camera, options)
         render.splats.retain_grad()
         disparity = view.disparity if phase.guided else None
