@@ -1,0 +1,226 @@
+"""Calls that repeat are replayed on CUDA: the same bits, whatever a loop does with what it got."""
+
+import dataclasses
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+import torch.utils.checkpoint
+
+from tests.splats import camera, cloud, leaves
+from warpgs import recording
+from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.recording import CALLS, forget_recordings
+from warpgs.scene import Camera, Gaussians
+
+pytestmark = pytest.mark.cuda
+
+CUDA = torch.device("cuda", 0)
+RECORD = RasterizeOptions(record=True)
+
+
+def scene(count: int = 400, width: int = 70, height: int = 50) -> tuple[Gaussians, list[Camera]]:
+    """Leaves on the GPU, and cameras that turn."""
+    g, cams = leaves(cloud(count, device=CUDA)), camera(width, height, 4, torch.float32, CUDA)
+    return g, [Camera(v, k, width, height) for v, k in zip(cams.viewmat, cams.K)]
+
+
+@pytest.fixture
+def fresh():
+    """The recorder of the GPU, without a recording."""
+    own = recording.recorder(CUDA)
+    own.forget()
+    own.replays = 0
+    yield own
+    own.forget()
+
+
+def loop(record: bool, steps: int = 9, change: float = 0.01, **options):
+    """Everything that a loop sees whose parameters move in place; of each step pictures, records, counts and gradients."""
+    g, cams = scene()
+    seen, params = [], list(g.tensors().values())
+    for step in range(steps):
+        r = rasterize(g, cams[step % 4], RasterizeOptions(record=record, **options))
+        loss = (r.rgb**2).sum()
+        if step % 3 == 0:  # another backward kernel
+            loss = loss + r.alpha.sum() + 0.1 * r.depth.sum()
+        gradients = torch.autograd.grad(loss, params, retain_graph=True)
+        (own,) = torch.autograd.grad(loss, r.splats)
+        seen.append([t.detach() for t in (r.rgb, r.alpha, r.depth, r.splats, r.tile_counts, *gradients, own)])
+        with torch.no_grad():
+            for p in params:
+                p += change * torch.sin(torch.arange(p.numel(), device=CUDA) + step).view(p.shape)
+    return seen
+
+
+def equal(a: list, b: list) -> bool:
+    return len(a) == len(b) and all(torch.equal(x, y) for s, t in zip(a, b) for x, y in zip(s, t, strict=True))
+
+
+@pytest.mark.parametrize("options", [{}, {"rule": "gsplat", "tile_size": 8}, {"sh_degree": 0, "window": (16, 0, 32, 32)}])
+def test_a_loop_sees_the_same_bits(fresh, options):
+    """Pictures, records, counts and gradients of every step, those of earlier steps too when all is over."""
+    background = torch.tensor([0.2, 0.5, 0.1], device=CUDA)
+    for more in ({}, {"background": background}):
+        fresh.forget()
+        before = fresh.replays
+        assert equal(loop(True, **options, **more), loop(False, **options, **more))
+        assert fresh.replays - before == 9 - CALLS + 1
+
+
+def test_more_instances_than_room_are_drawn_as_usual(fresh):
+    """Gaussians that grow twice: the same bits, and recorded anew."""
+    g, cams = scene(3000)
+
+    def picture(record):
+        r = rasterize(g, cams[0], RasterizeOptions(record=record))
+        return [r.rgb.detach(), *torch.autograd.grad(r.rgb.sum(), list(g.tensors().values()))]
+
+    replays = []
+    for step in range(14):
+        assert equal([picture(True)], [picture(False)])
+        replays.append(fresh.replays)
+        if step in (5, 6):
+            with torch.no_grad():
+                g.log_scales.add_(1)
+    assert replays[5] == 4 == replays[11] and replays[-1] == 6  # it did not pay, so the sixth call is recorded, not the third
+
+
+def test_open_backward_passes_keep_what_they_need(fresh):
+    """Two pictures before either gradient, a graph that is kept, and one that is thrown away unused."""
+    g, cams = scene()
+    params = list(g.tensors().values())
+
+    def draw(i, record=True):
+        return rasterize(g, cams[i], RasterizeOptions(record=record)).rgb
+
+    def gradients(*pictures, **how):
+        return torch.autograd.grad(sum((k + 1) * p.sum() for k, p in enumerate(pictures)), params, **how)
+
+    for _ in range(CALLS):
+        gradients(draw(0))
+    assert fresh.replays == 1
+    wanted = gradients(draw(1, False), draw(2, False))
+    both = draw(1), draw(2)
+    assert fresh.replays == 2 and equal([gradients(*both)], [wanted])
+    kept = draw(3)
+    once = gradients(kept, retain_graph=True)
+    other = gradients(draw(0))
+    assert fresh.replays == 3 and equal([gradients(kept)], [once]) and equal([other], [gradients(draw(0, False))])
+    thrown = draw(1)
+    assert fresh.replays == 4
+    del thrown, kept, both
+    draw(2)
+    assert fresh.replays == 5
+
+
+def test_batches_and_gradients_of_records(fresh):
+    """Four cameras at once, each with a background of its own and stored column by column; what densification looks at."""
+    g, _ = scene()
+    cams = camera(70, 50, 4, torch.float32, CUDA)
+    cams = dataclasses.replace(cams, viewmat=cams.viewmat.mT.contiguous().mT)
+    backgrounds, seen = torch.rand(4, 3, device=CUDA), {}
+    for record in (True, False):
+        for _ in range(CALLS + 1):
+            for t in g.tensors().values():
+                t.grad = None
+            r = rasterize(g, cams, RasterizeOptions(record=record, background=backgrounds))
+            r.splats.retain_grad()
+            (r.rgb * r.rgb).sum().backward()
+        seen[record] = [r.rgb.detach(), r.splats.grad, *(t.grad for t in g.tensors().values())]
+    assert fresh.replays == 2 and equal([seen[True]], [seen[False]])
+
+
+def test_hooks_and_checkpoints_are_drawn_as_usual(fresh):
+    """Saved tensors that go elsewhere, and a picture that is drawn again for its gradient."""
+    g, cams = scene()
+    params = list(g.tensors().values())
+
+    def gradient(draw):
+        return torch.autograd.grad(draw(g, cams[0]).rgb.sum(), params)
+
+    wanted = gradient(rasterize)
+    for _ in range(2 * CALLS):
+        with torch.autograd.graph.save_on_cpu(pin_memory=True):
+            assert equal([gradient(lambda *of: rasterize(*of, RECORD))], [wanted])
+    assert fresh.replays == 0
+    for _ in range(2 * CALLS):
+        again = torch.utils.checkpoint.checkpoint(lambda: rasterize(g, cams[0], RECORD).rgb, use_reentrant=False)
+        assert equal([torch.autograd.grad(again.sum(), params)], [wanted])
+
+
+def test_threads_draw_what_they_would_alone(fresh):
+    """Four at once, each with Gaussians of its own; at most one of them has the recording."""
+
+    def work(seed):
+        g = leaves(cloud(300, device=CUDA, seed=seed))
+        cam, found = camera(70, 50, None, torch.float32, CUDA), {}
+        for record in (False, True):
+            for _ in range(12):
+                r = rasterize(g, cam, RasterizeOptions(record=record))
+                found[record] = [r.rgb.detach(), *torch.autograd.grad(r.rgb.sum(), list(g.tensors().values()))]
+        return equal([found[True]], [found[False]])
+
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(work, range(4))) == [True] * 4
+
+
+def test_a_device_that_is_not_the_current_one(fresh):
+    """Its calls run as usual."""
+    if torch.cuda.device_count() < 2:
+        pytest.skip("needs a second CUDA device to be the current one")
+    g, cams = scene()
+    with torch.cuda.device(1):
+        for _ in range(CALLS + 2):
+            rasterize(g, cams[0], RECORD).rgb.sum().backward()
+    assert fresh.replays == 0
+
+
+def test_cameras_and_backgrounds_have_gradients(fresh):
+    """The pose, the intrinsics and the colour behind, each a tensor of its own at every call."""
+
+    def run(record):
+        g, cams = scene()
+        seen = []
+        for step in range(6):
+            c = cams[step % 4]
+            v, k, b = (t.clone().requires_grad_() for t in (c.viewmat, c.K, torch.full((3,), 0.1 * step, device=CUDA)))
+            r = rasterize(g, dataclasses.replace(c, viewmat=v, K=k), RasterizeOptions(background=b, record=record))
+            seen.append(torch.autograd.grad((r.rgb**2).sum() + r.depth.sum(), [v, k, b, g.means]))
+        return seen
+
+    assert equal(run(True), run(False)) and fresh.replays == 6 - CALLS + 1
+
+
+def test_a_recording_keeps_no_parameters(fresh):
+    """Their memory is free again once nobody else holds them."""
+    g, cams = scene(30_000)
+    for _ in range(CALLS + 1):
+        rasterize(g, cams[0], RECORD).rgb.sum().backward()
+    assert fresh.replays == 2
+    held = torch.cuda.memory_allocated()
+    size = sum(t.numel() * t.element_size() for t in g.tensors().values())
+    del g
+    assert held - torch.cuda.memory_allocated() >= 2 * size
+    held = torch.cuda.memory_allocated()
+    forget_recordings()
+    assert held - torch.cuda.memory_allocated() > 30_000 * 48
+
+
+def test_streams_do_not_share(fresh):
+    """A loop that moves to another stream is recorded there anew, and sees its own steps."""
+    found = {}
+    for record in (True, False):
+        g, cams = scene()
+        found[record] = []
+        for stream in (torch.cuda.current_stream(), torch.cuda.Stream()):
+            stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(stream):
+                for _ in range(2 * CALLS):
+                    r = rasterize(g, cams[0], RasterizeOptions(record=record))
+                    (step,) = torch.autograd.grad(r.rgb.sum(), g.means)
+                    with torch.no_grad():
+                        g.means.sub_(1e-4 * step)
+                    found[record].append([r.rgb.detach(), step])
+            torch.cuda.current_stream().wait_stream(stream)
+    assert fresh.replays == 2 * (CALLS + 1) and equal(found[True], found[False])
