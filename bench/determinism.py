@@ -31,7 +31,7 @@ def scene(count: int, width: int, height: int, device: torch.device) -> tuple[Ga
 def gradients_of(g: Gaussians, cam: Camera, *, deterministic: bool) -> list[torch.Tensor]:
     """Colour, alpha and depth, and the gradients of a fixed mix of them in the five tensors of ``g``."""
     leaves = {n: t.detach().requires_grad_() for n, t in g.tensors().items()}
-    r = rasterize(Gaussians(**leaves), cam, RasterizeOptions(deterministic=deterministic))
+    r = rasterize(Gaussians(**leaves), cam, RasterizeOptions(deterministic=deterministic, record=False))
     loss = r.rgb.square().sum() + (r.alpha * r.depth).sum()
     return [t.detach() for t in (r.rgb, r.alpha, r.depth)] + list(torch.autograd.grad(loss, list(leaves.values())))
 

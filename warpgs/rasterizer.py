@@ -47,9 +47,9 @@ class RasterizeOptions:
     max_instances: int | None = None
     """Draw a picture of more (Gaussian, tile) instances than this in bands that have no more, and each band again for its
     gradients: the same picture in less memory and more time. None for all at once. Not with ``capacity``."""
-    record: bool = False
-    """On CUDA, replay what a loop repeats: the same bits in half the time, for twice the memory. Of small calls with gradients,
-    in a fixed order, without opacity_factors, contributions and bounds (docs/decisions/010-recorded-calls.md)."""
+    record: bool = True
+    """On CUDA, replay what a loop repeats: the same bits in half the time. Of small calls with gradients, in a fixed order,
+    without opacity_factors, contributions and bounds (docs/decisions/010-recorded-calls.md)."""
 
     def repeatable(self) -> bool:
         """Whether calls with these options may be recorded."""
@@ -72,6 +72,8 @@ def _checked_window(camera: Camera, options: RasterizeOptions) -> tuple[int, int
 
 
 def _as_batch(array, like: torch.Tensor, rows: int) -> torch.Tensor:
+    if isinstance(array, torch.Tensor) and array.ndim == 3 and array.dtype == like.dtype and array.device == like.device:
+        return array
     tensor = torch.as_tensor(array, dtype=like.dtype, device=like.device)
     return tensor.reshape(-1, rows, rows) if tensor.ndim < 3 else tensor
 
@@ -149,4 +151,5 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
 
 
 def _render(camera: Camera, pictures: tuple[torch.Tensor, ...], *rest) -> Render:
-    return Render(*(p[0] if len(camera.viewmat.shape) == 2 else p for p in pictures), *rest)
+    # not p[0], whose gradient would be a copy among zeros
+    return Render(*(p.squeeze(0) if len(camera.viewmat.shape) == 2 else p for p in pictures), *rest)

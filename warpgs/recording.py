@@ -1,42 +1,34 @@
-"""Calls of the rasterizer that repeat: on CUDA their kernels are recorded once as graphs, and replayed.
+"""Calls of the rasterizer that repeat: on CUDA their kernels are recorded as graphs, and replayed.
 
 At training sizes the host takes longer to start twenty kernels than the GPU to run them. A loop repeats its calls: the same
-tensors, with other values in them, and another camera. The third such call in a row is recorded: projection, then binning and
-blending, and the backward pass of blending. From then on the three graphs are replayed. The bits are the same.
-
-What a replay writes is overwritten by the next. So whatever is shown is copied first, and while some backward pass still needs
-the rest, calls run as if there were no recording.
+tensors, with other values in them, and another camera. What it asks memory for repeats, too, and so torch gives it the same
+addresses. Kernels that were recorded at addresses are therefore replayed where a call gets those again, and started one by one
+where it does not. The bits are the same, and so is the memory, but for room for a few more instances.
 """
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
-from dataclasses import dataclass, field
+import functools
+from dataclasses import dataclass
 
 import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
-from torch.multiprocessing.reductions import StorageWeakRef
 
 from warpgs.constants import Rule
-from warpgs.kernels import bridge
-from warpgs.kernels.blend import background_gradient, composite, gradients
-from warpgs.kernels.project import project, projected
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, available_bytes, bin_tiles
+from warpgs.graphs import PAID, Graphs, Work
+from warpgs.kernels import blend, bridge, project, sh
+from warpgs.kernels.memory import Memory, fetch
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, Tiles, available_bytes, bin_tiles
 
 CALLS = 3
-"""The call that records, of equal ones in a row."""
-PAID = 30
-"""Replays after which a recording was worth its while. After one that was not, twice as many calls are waited for."""
-ROOM = 1.1
-"""Instances that a recording has room for, as a multiple of the most that its calls were seen to have."""
+"""The call from which on kernels are recorded, of equal ones in a row. Where that did not pay, twice as many the next time."""
+ROOM = 1.05
+"""Instances that there is room for, as a multiple of the most that such calls were seen to have."""
 MOST = 2**19
 """Records beyond which the GPU takes longer than the host, so that a recording would gain nothing."""
 SHARE = 0.05
-"""Part of the free memory that lists and states of a recording may take; beyond it calls are not recorded."""
-DEAD_BYTES = 2**30
-"""Memory of dropped recordings, which torch keeps for nobody, that may pile up before it is given back."""
+"""Part of the free memory that lists and states may take; beyond it calls are not recorded."""
 
 
 @dataclass(frozen=True)
@@ -54,217 +46,233 @@ class Frame:
     tile_size: int
 
 
-class Recording:
-    """Projection, binning and blending of one set of tensors, replayed for any camera; and the backward pass of blending."""
+class Plan:
+    """Rendering of one set of tensors for any camera, and its gradients, as four works."""
 
-    def __init__(self, sources: tuple[torch.Tensor, ...], frame: Frame, instances: int, stream: torch.cuda.Stream):
-        """Record.
+    def __init__(self, frame: Frame, cameras: int, capacity: int, graphs: Graphs):
+        """Nothing is drawn yet.
 
         Args:
-            sources: The seven tensors that `project` takes. Of the first five the addresses are recorded, and nothing is kept.
             frame: What is drawn.
-            instances: Most (Gaussian, tile) instances that such a call was seen to have.
-            stream: Where to record.
+            cameras: Pictures at a time.
+            capacity: Instances that there is room for.
+            graphs: Where to record.
         """
-        *inputs, viewmats, Ks = (t.detach() for t in sources)
-        device, (x, y, width, height) = viewmats.device, frame.window
-        self.frame, self.capacity, self.replays = frame, int(ROOM * instances) + 1024, 0
-        self.viewmats, self.Ks, self.backgrounds = viewmats.clone(), Ks.clone(), viewmats.new_zeros(len(viewmats), 3)
-        self.v_rgb = viewmats.new_zeros(len(viewmats), height, width, 3)
+        x, y, width, height = frame.window
+        self.frame, self.cameras, self.capacity, self.device = frame, cameras, capacity, graphs.device
         self.part = ((x, y), width, height, frame.rule)
-        self._on_host = wp.zeros(1, dtype=wp.int64, device="cpu", pinned=True)
-        self.instances = self._on_host.numpy()
-        """Of the last replay."""
-        self.counted = torch.cuda.Event()
-        self.lease: StorageWeakRef | None = None
+        self.drawn = 0
+        self.instances = 0
+        """Of the last call."""
+        on_gpu = self.device.type == "cuda"
+        self._on_host = wp.zeros(1, dtype=wp.int64, device="cpu", pinned=on_gpu)
+        self._seen, self._stream = self._on_host.numpy(), graphs.stream
+        self._counted_by_now = torch.cuda.Event() if on_gpu else None
+        self._table = wp.zeros(2, dtype=wp.uint64, device="cpu", pinned=on_gpu)
+        self._addresses = self._table.numpy()
+        self._count, self._draw = Work(self._counted, graphs), Work(self._composed, graphs)
+        self._blend_back, self._project_back = Work(self._v_splats, graphs), Work(self._v_sources, graphs)
+        self._none = torch.empty(0, device=self.device)
+        self._black: torch.Tensor | None = None
 
-        def count():
-            how = {"degree": frame.degree, "rule": frame.rule, "tile_size": frame.tile_size, "window": frame.window}
-            made = project(*inputs, self.viewmats, self.Ks, width=frame.width, height=frame.height, **how)
-            total = made[1].sum().view(1)
-            with bridge.stream_of(device):
-                wp.copy(self._on_host, bridge.view(total, wp.int64).array())
-            return *made, total
-
-        def draw():
-            overflow = torch.zeros(1, dtype=torch.int32, device=device)  # nobody looks: the count on the host tells before
-            tiles = bin_tiles(
-                self.splats, self.tile_counts, width=width, height=height, tile_size=frame.tile_size, rule=frame.rule,
-                origin=(x, y), capacity=self.capacity, overflow=overflow,
-            )  # fmt: skip
-            return tiles, composite(self.splats, tiles, self.backgrounds, *self.part, keep=True)
-
-        self._lent: list[object] = []
-        self.count_graph: torch.cuda.CUDAGraph | None = None
-        stream.wait_stream(torch.cuda.current_stream(device))
-        with torch.cuda.stream(stream), torch.no_grad():
-            for capture in (False, True):  # a first run loads what may not be loaded while recording
-                self.count_graph, (self.splats, self.tile_counts, self._total) = self._run(count, capture)
-                self.draw_graph, (self.tiles, (rgb, alpha, depth, *rest)) = self._run(draw, capture)
-                self.saved = (rgb, depth, *rest)
-                self.shown = [self.splats, self.tile_counts.view(torch.float32), rgb, alpha, depth]
-                self.backward_graph, (self.v_splats, _) = self._run(
-                    lambda: self._gradients(self.v_rgb, None, None, False), capture
-                )
-                stream.synchronize()
-        torch.cuda.current_stream(device).wait_stream(stream)
-
-    def _run(self, work: Callable[[], object], capture: bool):
-        """A graph of ``work``, or None, and what it returned."""
-        if not capture:
-            return None, work()
-        graph, (result, lent) = bridge.capture(work, None if self.count_graph is None else self.count_graph.pool())
-        self._lent.append(lent)
-        return graph, result
-
-    def busy(self) -> bool:
-        """Whether a backward pass may still need what the last replay left."""
-        return self.lease is not None and not self.lease.expired()
-
-    def full(self) -> bool:
-        """Whether the last replay had more instances than there is room for, so that nothing it left may be used."""
-        return int(self.instances[0]) > self.capacity
-
-    def replay(self, sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor | None):
-        """Pictures, records and tile counts of the seven tensors that `project` takes; None where it is then `full`."""
-        with torch.no_grad():
-            torch._foreach_copy_([self.viewmats, self.Ks], list(sources[5:]))
-            if backgrounds is None:
-                backgrounds = self.backgrounds  # black since they were made
-            else:
-                self.backgrounds.copy_(backgrounds)
-            self.count_graph.replay()
-            self.counted.record()
-            self.draw_graph.replay()
-            copies = [torch.empty_like(t) for t in self.shown]
-            torch._foreach_copy_(copies, self.shown)
-        self.counted.synchronize()
-        if self.full():
+    def render(self, sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor | None):
+        """Pictures, records and tile counts of the seven tensors that `project` takes; None where there is no room."""
+        viewmats, Ks = sources[5].contiguous(), sources[6].contiguous()
+        self._addresses[:] = viewmats.data_ptr(), Ks.data_ptr()  # nobody reads them any more: the last call was waited for
+        (cameras, *made), _ = self._count(*sources[:5])
+        if self._counted_by_now is not None:
+            self._counted_by_now.record(self._stream)
+        if backgrounds is None:
+            if self._black is None:
+                self._black = torch.zeros(len(sources[5]), 3, device=self.device)
+            backgrounds = self._black
+        backgrounds = backgrounds.contiguous()
+        pictures, block = self._draw(*made, backgrounds.detach())
+        splats = _projected(*sources, self, cameras, made)
+        pictures = _drawn(splats, backgrounds, self, made[1], pictures, block)
+        if self._counted_by_now is not None:
+            self._counted_by_now.synchronize()  # not before: the device goes on meanwhile
+        self.instances = int(self._seen[0])
+        if self.instances > self.capacity:
             return None
-        splats, tile_counts, *pictures = copies
-        f, made = self.frame, (splats, tile_counts.view(torch.int32))
-        splats, tile_counts = projected(sources, (f.width, f.height), f.degree, f.rule, *made)
-        pictures = self.lend(splats, backgrounds, pictures)
-        self.replays += 1
-        return pictures, splats, tile_counts
+        self.drawn += 1
+        return pictures, splats, made[1]
 
-    def lend(self, splats: torch.Tensor, backgrounds: torch.Tensor, pictures: list[torch.Tensor]) -> tuple[torch.Tensor, ...]:
-        """The pictures as what follows from records and backgrounds; `busy` until their backward pass is done or given up."""
-        lease = torch.empty(0)
-        lease.recording = self  # only so: whoever keeps a picture whose gradient was taken keeps no recording
-        pictures = _Replayed.apply(splats, backgrounds, pictures, lease)
-        self.lease = StorageWeakRef(lease.untyped_storage())
-        return pictures
+    def _seven(self, sources, cameras: torch.Tensor) -> list[torch.Tensor]:
+        """What `project` takes, of which the last two were put into one."""
+        first = 16 * self.cameras
+        return [*sources, cameras[:first].view(-1, 4, 4), cameras[first:].view(-1, 3, 3)]
 
-    def backward(self, v_rgb, v_alpha, v_depth, wants_backgrounds: bool) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Gradients of records and backgrounds of the last replay."""
-        if v_rgb is None or v_alpha is not None or v_depth is not None:
-            return self._gradients(v_rgb, v_alpha, v_depth, wants_backgrounds)
-        self.v_rgb.copy_(v_rgb)
-        self.backward_graph.replay()
-        return self.v_splats.clone(), background_gradient(self.saved[2], v_rgb) if wants_backgrounds else None
+    def _how(self) -> tuple[tuple[int, int], int, Rule]:
+        return (self.frame.width, self.frame.height), sh.coefficient_count(self.frame.degree), self.frame.rule
 
-    def _gradients(self, *of) -> tuple[torch.Tensor, torch.Tensor | None]:
-        return gradients(self.splats, self.tiles, self.backgrounds, (*self.part, True), self.saved, *of)
+    def _counted(self, memory: Memory, *sources: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        # a copy, since gradients are still to come when the next call's cameras are at the same addresses
+        cameras = memory.own((25 * self.cameras,), torch.float32, self.device)
+        fetch(self._table.ptr, 16 * self.cameras, cameras)
+        size, sh_count, rule = self._how()
+        how = (self._none, size, self.frame.window, sh_count, rule, self.frame.tile_size)
+        _, counts = project.records(self._seven(sources, cameras), *how, memory)
+        total = memory.scratch((1,), torch.int64, self.device)
+        torch.sum(counts.view(-1), 0, keepdim=True, dtype=torch.int64, out=total)
+        with bridge.stream_of(self.device):
+            wp.copy(self._on_host, bridge.view(total, wp.int64).array())
+        return ()
+
+    def _composed(self, memory: Memory, splats, counts, backgrounds) -> tuple[torch.Tensor, ...]:
+        origin, width, height, rule = self.part
+        overflow = memory.scratch((1,), torch.int32, self.device).zero_()  # nobody looks: the count tells before
+        tiles = bin_tiles(
+            splats, counts, width=width, height=height, tile_size=self.frame.tile_size, rule=rule, origin=origin,
+            capacity=self.capacity, overflow=overflow, memory=memory,
+        )  # fmt: skip
+        _, _, _, *rest = blend.composite(splats, tiles, backgrounds, *self.part, keep=True, deterministic=True, memory=memory)
+        return *(t for t in tiles.tensors() if t is not tiles.counts), *rest
+
+    def _v_splats(self, memory: Memory, splats, counts, backgrounds, rgb, depth, block, *v_pictures) -> tuple[()]:
+        ranges, ids, slots, starts, tile_ids, total, *rest = self._draw.kept(block)
+        tiles = Tiles(self.frame.tile_size, ranges, ids, slots, starts, counts.view(-1), tile_ids, total)
+        blend.gradients(splats, tiles, backgrounds, (*self.part, True), (rgb, depth, *rest), *v_pictures, memory)
+        return ()
+
+    def _v_sources(self, memory: Memory, *of: torch.Tensor) -> tuple[()]:
+        *sources, cameras, splats, counts, v_splats = of
+        project.gradients(self._seven(sources, cameras), *self._how(), splats, counts, v_splats, False, memory)
+        return ()
+
+    def blend_back(self, saved: tuple[torch.Tensor, ...], v_pictures: tuple[torch.Tensor | None, ...], wants_backgrounds: bool):
+        """Gradients of records and backgrounds."""
+        v_pictures = [None if v is None else v.contiguous() for v in v_pictures]
+        (v_splats,), _ = self._blend_back(*saved, *v_pictures)
+        if not wants_backgrounds:
+            return v_splats, None
+        transmittances = self._draw.kept(saved[5])[6]
+        return v_splats, blend.background_gradient(transmittances, v_pictures[0])
+
+    def project_back(self, saved: tuple[torch.Tensor, ...], v_splats: torch.Tensor | None, wants_camera: bool):
+        """Gradients of the seven tensors that `project` takes."""
+        *sources, cameras, splats, counts = saved
+        if v_splats is None or wants_camera:
+            return project.gradients(self._seven(sources, cameras), *self._how(), splats, counts, v_splats, wants_camera)
+        found, _ = self._project_back(*saved, v_splats.contiguous())
+        return *found, None, None
 
 
-class _Replayed(torch.autograd.Function):
-    """Pictures that a replay left. The lease is saved, and with it lives what their backward pass needs."""
+def _once(backward):
+    """What torch's `once_differentiable` does, where that has anything to do."""
+    checked = once_differentiable(backward)
+
+    @functools.wraps(backward)
+    def once(ctx, *gradients):
+        return (checked if torch.is_grad_enabled() else backward)(ctx, *gradients)
+
+    return once
+
+
+class _Projected(torch.autograd.Function):
+    """Records, as what follows from the tensors they were made of."""
 
     @staticmethod
-    def forward(ctx, splats, backgrounds, pictures, lease):
-        ctx.save_for_backward(lease)
+    def forward(ctx, means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks, plan, cameras, made):
+        ctx.save_for_backward(means, quats, log_scales, logit_opacities, coefficients, cameras, *made)
+        ctx.plan = plan
+        ctx.set_materialize_grads(False)
+        return made[0]
+
+    @staticmethod
+    @_once
+    def backward(ctx, v_splats):
+        wants_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
+        return *ctx.plan.project_back(ctx.saved_tensors, v_splats, wants_camera), None, None, None
+
+
+class _Drawn(torch.autograd.Function):
+    """Pictures, as what follows from records and backgrounds."""
+
+    @staticmethod
+    def forward(ctx, splats, backgrounds, plan, counts, pictures, block):
+        rgb, _, depth = pictures
+        ctx.save_for_backward(splats, counts, backgrounds, rgb, depth, block)
+        ctx.plan = plan
         ctx.set_materialize_grads(False)
         return tuple(pictures)
 
     @staticmethod
-    @once_differentiable
+    @_once
     def backward(ctx, *v_pictures):
-        (lease,) = ctx.saved_tensors
-        return *lease.recording.backward(*v_pictures, ctx.needs_input_grad[1]), None, None
+        return *ctx.plan.blend_back(ctx.saved_tensors, v_pictures, ctx.needs_input_grad[1]), None, None, None, None
 
 
-@dataclass
+# Function.apply itself, which looks for functorch's wrappers first, takes as long again as what it calls
+_projected, _drawn = (super(torch.autograd.Function, node).apply for node in (_Projected, _Drawn))
+
+
 class Recorder:
-    """What the calls on one device were, and the recording of the last that came often enough."""
+    """What the calls on one stream were, and the plan of those that came often enough."""
 
-    last: tuple | None = None
-    times: int = 0
-    wanted: int = CALLS
-    """Equal calls in a row that it takes."""
-    most: tuple[tuple, int] | None = None
-    """The call that had more instances than there was room for, and how many."""
-    recorded: tuple | None = None
-    recording: Recording | None = None
-    replays: int = 0
-    """Calls that were replayed."""
-    kept: int = 0
-    """Bytes that torch held after something was last given back."""
-    stream: torch.cuda.Stream | None = None
-    lock: threading.Lock = field(default_factory=threading.Lock)
+    def __init__(self, graphs: Graphs):
+        self.graphs = graphs
+        self.plan: Plan | None = None
+        self.wanted = CALLS
+        """Equal calls in a row that it takes."""
+        self._key, self._times, self._too_large = None, 0, False
+        self._most: tuple[tuple | None, int] = (None, 0)
+        """A call that had more instances than there was room for, and how many."""
 
     def render(self, sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor | None, frame: Frame):
-        """What `Recording.replay` returns; None where the call is to run as usual."""
+        """What `Plan.render` returns; None where the call is to run as usual."""
         key = call_key(sources, backgrounds, frame)
-        if key is None or not self.lock.acquire(blocking=False):
+        if key is None or not self.graphs.lock.acquire(blocking=False):
             return None
         try:
-            if key == self.recorded:
-                self.last = None
-            else:
-                self.times = self.times + 1 if key == self.last else 1
-                self.last = key
-                if self.times < self.wanted:
-                    return None
-                self._record(key, sources, frame)
-            if self.recording is None or self.recording.busy():
-                return None
-            found = self.recording.replay(sources, backgrounds)
-            if found is None:
-                self.most = (key, int(self.recording.instances[0]))
+            if key != self._key:
                 self._drop()
-            else:
-                self.replays += 1
+                self._key = key
+            self._times += 1
+            if self._times < self.wanted or self._too_large:
+                return None
+            if self.plan is None:
+                self._make(sources, frame)
+            if self.plan is None:
+                return None
+            try:
+                found = self.plan.render(sources, backgrounds)
+            except BaseException:
+                self._drop()  # the device may still be at it
+                raise
+            if found is None:
+                self._most = (key, self.plan.instances)
+                self._drop()
             return found
         finally:
-            self.lock.release()
+            self.graphs.lock.release()
 
-    def _record(self, key: tuple, sources: tuple[torch.Tensor, ...], frame: Frame) -> None:
-        self._drop()
-        device = sources[0].device
+    def _make(self, sources: tuple[torch.Tensor, ...], frame: Frame) -> None:
         with torch.no_grad():
             size = {"width": frame.width, "height": frame.height, "window": frame.window}
             how = {"degree": frame.degree, "rule": frame.rule, "tile_size": frame.tile_size}
-            instances = int(project(*sources, **size, **how)[1].sum())
-        if self.most is not None and self.most[0] == key:
-            instances = max(instances, self.most[1])
-        if ROOM * instances * BYTES_PER_INSTANCE > SHARE * available_bytes(device):
-            self.recorded = key  # not asked again
-            return
-        if torch.cuda.memory_reserved(device) - self.kept > DEAD_BYTES:
-            torch.cuda.empty_cache()
-            self.kept = torch.cuda.memory_reserved(device)
-        self.stream = self.stream or torch.cuda.Stream(device)
-        try:
-            self.recording = Recording(sources, frame, instances, self.stream)
-        except torch.OutOfMemoryError:
-            torch.cuda.empty_cache()  # of what was tried; the call itself may well fit
-        self.recorded = key
+            instances = int(project.project(*sources, **size, **how)[1].sum())
+        if self._most[0] == self._key:
+            instances = max(instances, self._most[1])
+        self._too_large = ROOM * instances * BYTES_PER_INSTANCE > SHARE * available_bytes(self.graphs.device)
+        if not self._too_large:
+            self.plan = Plan(frame, len(sources[5]), int(ROOM * instances) + 1024, self.graphs)
 
     def _drop(self) -> None:
-        if self.recording is not None:
-            self.wanted = CALLS if self.recording.replays >= PAID else 2 * self.wanted
-        self.last, self.times, self.recorded, self.recording = None, 0, None, None
+        if self.plan is not None:
+            self.wanted = CALLS if self.plan.drawn >= PAID else 2 * self.wanted
+        self.plan, self._key, self._times, self._too_large = None, None, 0, False
 
     def forget(self) -> None:
-        """Drop the recording, as if there had been no call."""
-        with self.lock:
+        """Begin anew, as if there had been no call."""
+        with self.graphs.lock:
             self._drop()
-            self.wanted, self.most = CALLS, None
+            self.graphs.release()
+            self.wanted, self._most = CALLS, (None, 0)
 
 
 def call_key(sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor | None, frame: Frame) -> tuple | None:
-    """What calls must share to share a recording.
+    """What calls must share to share a plan.
 
     None for what cannot be recorded, and for what need not be: large calls, and those without gradients.
     """
@@ -280,28 +288,30 @@ def call_key(sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor | None
         if not (t.is_contiguous() and t.dtype == torch.float32 and t.device == means.device):
             return None
         places.append((t.data_ptr(), t.shape))
-    stream = bridge.warp_stream(means.device).cuda_stream
-    return *places, viewmats.shape, sources[6].shape, backgrounds is None, frame, stream
+    return *places, viewmats.shape, sources[6].shape, backgrounds is None, frame
 
 
 def _usual_surroundings(device: torch.device) -> bool:
     """Not while a graph is being captured, on no other device than the current one, and without hooks on saved tensors.
 
-    Such hooks may drop the lease, and checkpointing wants the same number of tensors each time.
+    Checkpointing, which has such hooks, wants the same number of saved tensors each time.
     """
     hooks = torch._C._autograd._top_saved_tensors_default_hooks(True)
-    return hooks is None and device.index == torch.cuda.current_device() and not torch.cuda.is_current_stream_capturing()
+    # those of torch.cuda take several times as long
+    return hooks is None and device.index == torch._C._cuda_getDevice() and not torch._C._cuda_isCurrentStreamCapturing()
 
 
-_RECORDERS: dict[torch.device, Recorder] = {}
+_RECORDERS: dict[tuple[torch.device, int], Recorder] = {}
 
 
 def recorder(device: torch.device) -> Recorder:
-    """That of a CUDA device."""
-    return _RECORDERS.setdefault(device, Recorder())
+    """That of torch's current stream of a CUDA device."""
+    key = (device, bridge.warp_stream(device).cuda_stream)
+    own = _RECORDERS.get(key)
+    return own or _RECORDERS.setdefault(key, Recorder(Graphs(device)))
 
 
 def forget_recordings() -> None:
     """Give back the memory of what was recorded; loops that go on are recorded anew."""
-    for own in _RECORDERS.values():
+    for own in list(_RECORDERS.values()):
         own.forget()

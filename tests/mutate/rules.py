@@ -44,6 +44,7 @@ OPS = {
     "falloff": [SPANS, "kernels/test_blend.py", LIMITS_BLEND],
     "functions": ["kernels/test_project.py", SPANS, LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "test_window.py"],
     "knn": ["kernels/test_knn.py", LIMITS],
+    "memory": ["kernels/test_memory.py", "test_graphs.py", "test_recording.py"],
     "native": [
         "kernels/test_project.py",
         "kernels/test_project_adam.py",

@@ -9,6 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from warpgs.constants import Rule
 from warpgs.kernels import blend_cpu, blend_cuda, bridge
+from warpgs.kernels.memory import TORCH, Memory
 from warpgs.kernels.tiles import Tiles, grid
 
 VALUES = 10
@@ -75,15 +76,17 @@ def _frame(origin: tuple[int, int], width: int, height: int, tile_size: int) -> 
     return [*origin, width, height, columns, columns * rows]
 
 
-def composite(splats, tiles, backgrounds, origin, width, height, rule, keep, deterministic=True):
+def composite(
+    splats, tiles, backgrounds, origin, width, height, rule, keep, deterministic=True, memory: Memory = TORCH
+):  # fmt: skip
     """Pictures, and what the backward pass needs: rgb, alpha, depth, transmittances, weights, ends, states (CUDA only)."""
     if _native(splats):
-        return blend_cuda.forward(splats, tiles, backgrounds, origin, width, height, rule, keep, deterministic)
+        return blend_cuda.forward(splats, tiles, backgrounds, origin, width, height, rule, keep, deterministic, memory)
     real, device = bridge.real_of(splats), splats.device
     shape = (len(backgrounds), height, width)
-    rgb = splats.new_empty(*shape, 3)
-    alpha, depth, transmittances, weights = (splats.new_empty(shape) for _ in range(4))
-    ends = torch.empty(shape, dtype=torch.int32, device=device)
+    rgb, alpha, depth = (memory.own(s, splats.dtype, device) for s in ((*shape, 3), shape, shape))
+    transmittances, weights = (memory.kept(shape, splats.dtype, device) for _ in range(2))
+    ends = memory.kept(shape, torch.int32, device)
     inputs = [
         *_tile_inputs(splats, tiles, real), bridge.view(backgrounds, real), *_frame(origin, width, height, tiles.size),
         rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), rule.transmittance_stop, int(rule.inclusive_stop),
@@ -92,15 +95,15 @@ def composite(splats, tiles, backgrounds, origin, width, height, rule, keep, det
         bridge.view(ends.view(-1), wp.int32),
     ]  # fmt: skip
     _launch(blend_cpu.make_kernels(real, tiles.size).forward, len(tiles.ranges), inputs, device)
-    return rgb, alpha, depth, transmittances, weights, ends, splats.new_empty(0)
+    return rgb, alpha, depth, transmittances, weights, ends, memory.kept((0,), splats.dtype, device)
 
 
-def _backward(splats, tiles, backgrounds, origin, width, height, rule, _, saved, v_rgb, v_alpha, v_depth):
+def _backward(splats, tiles, backgrounds, origin, width, height, rule, _, saved, v_rgb, v_alpha, v_depth, memory):
     """Gradient of the records by the generic kernels; ``saved`` as in blend_cuda.backward."""
     _, depth, transmittances, weights, ends, _ = saved
     real, device = bridge.real_of(splats), splats.device
-    v_splats = torch.zeros_like(splats)
-    v_slots = splats.new_zeros(len(tiles.slots), VALUES)
+    v_splats = memory.own(splats.shape, splats.dtype, device).zero_()
+    v_slots = memory.scratch((len(tiles.slots), VALUES), splats.dtype, device).zero_()
     upstream = [bridge.view(v_rgb.contiguous().view(-1, 3), real)]
     for v in (v_alpha, v_depth):
         upstream.append(bridge.view((torch.zeros_like(depth) if v is None else v.contiguous()).view(-1), real))
@@ -119,21 +122,20 @@ def _backward(splats, tiles, backgrounds, origin, width, height, rule, _, saved,
     return v_splats
 
 
-def gradients(
-    splats, tiles, backgrounds, how: tuple, saved, v_rgb, v_alpha, v_depth, wants_backgrounds: bool
-) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Gradients of records and backgrounds from those of the pictures, where any of them may be None.
+def gradients(splats, tiles, backgrounds, how: tuple, saved, v_rgb, v_alpha, v_depth, memory: Memory = TORCH) -> torch.Tensor:
+    """Gradient of the records from those of the pictures, where any of them may be None.
 
     ``how`` is what `composite` takes after backgrounds, less ``keep``; ``saved`` what it returned, less alpha.
     """
     v_rgb = torch.zeros_like(saved[0]) if v_rgb is None else v_rgb
-    v_backgrounds = background_gradient(saved[2], v_rgb) if wants_backgrounds else None
     work = blend_cuda.backward if _native(splats) else _backward
-    return work(splats, tiles, backgrounds, *how, saved, v_rgb, v_alpha, v_depth), v_backgrounds
+    return work(splats, tiles, backgrounds, *how, saved, v_rgb, v_alpha, v_depth, memory)
 
 
-def background_gradient(transmittances: torch.Tensor, v_rgb: torch.Tensor) -> torch.Tensor:
+def background_gradient(transmittances: torch.Tensor, v_rgb: torch.Tensor | None) -> torch.Tensor:
     """Shape [C, 3]. A product of matrices would sum the pixels one by one, and err several times as much."""
+    if v_rgb is None:
+        return transmittances.new_zeros(len(transmittances), 3)
     return torch.stack([(transmittances * v_rgb[..., k]).sum((1, 2)) for k in range(3)], 1)
 
 
@@ -155,8 +157,9 @@ class _Blend(torch.autograd.Function):
     def backward(ctx, *v_pictures):
         splats, backgrounds, *tensors = ctx.saved_tensors
         saved, tiles = tensors[:6], Tiles(ctx.tile_size, *tensors[6:])
-        found = gradients(splats, tiles, backgrounds, ctx.how, saved, *v_pictures, ctx.needs_input_grad[1])
-        return *found, None, None, None, None, None, None
+        v_splats = gradients(splats, tiles, backgrounds, ctx.how, saved, *v_pictures)
+        v_backgrounds = background_gradient(saved[2], v_pictures[0]) if ctx.needs_input_grad[1] else None
+        return v_splats, v_backgrounds, None, None, None, None, None, None
 
 
 def _check(splats: torch.Tensor, tiles: Tiles, width: int, height: int, **backgrounds) -> None:

@@ -12,6 +12,7 @@ import warp as wp
 
 from warpgs.constants import Rule
 from warpgs.kernels import bridge
+from warpgs.kernels.memory import TORCH, Memory
 from warpgs.kernels.native import source
 from warpgs.kernels.tiles import Tiles, grid
 
@@ -196,19 +197,19 @@ def chunk_of(tiles: Tiles, deterministic: bool) -> int:
 
 def forward(
     splats, tiles: Tiles, backgrounds, origin: tuple[int, int], width: int, height: int, rule: Rule, keep: bool,
-    deterministic: bool,
+    deterministic: bool, memory: Memory = TORCH,
 ):  # fmt: skip
     """Pictures and what the backward pass needs of them: rgb, alpha, depth, transmittances, weights, ends, states."""
     device = splats.device
     shape = (backgrounds.shape[0], height, width)
-    rgb = splats.new_empty(*shape, 3)
-    alpha, depth, transmittances, weights = splats.new_empty(4, *shape).unbind()
-    ends = torch.empty(shape, dtype=torch.int32, device=device)
+    rgb, alpha, depth = (memory.own(s, torch.float32, device) for s in ((*shape, 3), shape, shape))
+    transmittances, weights = memory.kept((2, *shape), torch.float32, device).unbind()
+    ends = memory.kept(shape, torch.int32, device)
     pixels = tiles.size * tiles.size
     chunk = chunk_of(tiles, deterministic) if keep else bridge.MAX_SIZE  # of which no instance is a multiple but the first
-    states = splats.new_empty(tiles.slots.shape[0] // chunk + 1, STATE * pixels)
+    states = memory.kept((tiles.slots.shape[0] // chunk + 1, STATE * pixels), torch.float32, device)
     k, count = make_kernels(tiles.size), tiles.ranges.shape[0]
-    order = torch.empty(count, dtype=torch.int32, device=device)
+    order = memory.scratch((count,), torch.int32, device)
     bridge.launch(k.order_tiles, THREADS, [*_ints(tiles.ranges), count, *_ints(order)], device, block_dim=THREADS)
     inputs = [
         *_floats(splats), *_ints(order, tiles.ranges, tiles.splat_ids), *_floats(backgrounds),
@@ -222,7 +223,7 @@ def forward(
 
 def backward(
     splats, tiles: Tiles, backgrounds, origin: tuple[int, int], width: int, height: int, rule: Rule, deterministic: bool,
-    saved, v_rgb, v_alpha, v_depth,
+    saved, v_rgb, v_alpha, v_depth, memory: Memory = TORCH,
 ):  # fmt: skip
     """Gradient of the records, shape [C, N, 12], from what `forward` returned and the gradients of its pictures."""
     rgb, depth, transmittances, weights, ends, states = saved
@@ -234,8 +235,11 @@ def backward(
         v_alpha, v_depth = (torch.zeros_like(depth) if v is None else v.contiguous() for v in (v_alpha, v_depth))
     else:
         v_alpha = v_depth = depth  # never read
-    v_splats = torch.empty_like(splats) if deterministic else torch.zeros_like(splats)
-    v_slots = splats.new_empty(count, STRIDE) if deterministic else v_splats.view(-1, STRIDE)
+    v_splats = memory.own(splats.shape, torch.float32, device)
+    if deterministic:
+        v_slots = memory.scratch((count, STRIDE), torch.float32, device)
+    else:
+        v_slots = v_splats.zero_().view(-1, STRIDE)
     inputs = [
         *_floats(splats), *_ints(tiles.tile_ids, tiles.ranges, tiles.splat_ids, tiles.slots),
         bridge.view(tiles.total, wp.int64), count, *_floats(backgrounds), *_frame(origin, width, height, tiles.size),

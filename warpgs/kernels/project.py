@@ -10,6 +10,7 @@ from torch.autograd.function import once_differentiable
 from warpgs.constants import LARGEST_COEFFICIENT, Rule
 from warpgs.kernels import bridge, sh
 from warpgs.kernels.functions import make_projection, make_spans
+from warpgs.kernels.memory import TORCH, Memory
 from warpgs.kernels.native import BLOCK
 from warpgs.kernels.native import make_functions as make_native
 from warpgs.kernels.project_backward import make_backward
@@ -159,12 +160,25 @@ def _native(tensor: torch.Tensor) -> bool:
     return tensor.is_cuda and tensor.dtype == torch.float32
 
 
-def _draw(tensors: list[torch.Tensor], factors, size, window, sh_count, rule, tile) -> tuple[torch.Tensor, torch.Tensor]:
-    """Records [C, N, 12] and tile counts [C, N] of contiguous tensors."""
+def records(
+    tensors: Sequence[torch.Tensor], factors, size, window, sh_count, rule, tile, memory: Memory = TORCH
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """What `project` returns for contiguous tensors, as plain numbers. Nothing is checked.
+
+    Args:
+        tensors: The seven that `project` takes.
+        factors: Those of opacities, or none, shape [0].
+        size: Width and height of the picture [px].
+        window: As in `project`, not None.
+        sh_count: Coefficients a channel that are used.
+        rule: Cut-offs.
+        tile: Side of a tile [px].
+        memory: Where to put the records.
+    """
     means, real = tensors[0], bridge.real_of(tensors[0])
     cameras, count = len(tensors[5]), len(means)
-    splats = means.new_empty(cameras, count, RECORD)
-    tile_counts = torch.empty(cameras, count, dtype=torch.int32, device=means.device)
+    splats = memory.own((cameras, count, RECORD), means.dtype, means.device)
+    tile_counts = memory.own((cameras, count), torch.int32, means.device)
     inputs = [
         *_inputs(*tensors), bridge.view(factors, real), *size, *window, tile, sh_count,
         rule.near, rule.low_pass, rule.alpha_cut, rule.square_sigma,
@@ -176,11 +190,13 @@ def _draw(tensors: list[torch.Tensor], factors, size, window, sh_count, rule, ti
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks, size, sh_count, rule, draw):
+    def forward(
+        ctx, means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks, factors, size, window, sh_count, rule, tile
+    ):  # fmt: skip
         tensors = [t.contiguous() for t in (means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks)]
-        splats, tile_counts = draw(tensors)
+        splats, tile_counts = records(tensors, factors, size, window, sh_count, rule, tile)
         ctx.save_for_backward(*tensors, splats, tile_counts)
-        ctx.size, ctx.sh_count, ctx.rule = size, sh_count, rule
+        ctx.how = (size, sh_count, rule)
         ctx.mark_non_differentiable(tile_counts)
         ctx.set_materialize_grads(False)  # else torch makes zeros for the counts
         return splats, tile_counts
@@ -189,28 +205,48 @@ class _Project(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, v_splats, _):
         *tensors, splats, tile_counts = ctx.saved_tensors
-        real = bridge.real_of(splats)
-        m = make_projection(real)
-        device = splats.device
-        v_splats = torch.zeros_like(splats) if v_splats is None else v_splats.contiguous()
-        native = _native(splats)  # writes zeros itself
-        gradients = [(torch.empty_like if native else torch.zeros_like)(t) for t in tensors[:5]]
-        cameras, count = len(tensors[5]), len(tensors[0])
         wants_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
-        rows = (cameras, count) if wants_camera else (0, 0)
-        make = splats.new_zeros if wants_camera else splats.new_empty
-        v_viewmats, v_Ks = make(*rows, 4, 4), make(*rows, 3, 3)
-        outputs = [bridge.view(g, t) for g, t in zip(gradients, (m.vec3, m.vec4, m.vec3, real, m.vec3))]
-        inputs = [
-            *_inputs(*tensors), *ctx.size, ctx.sh_count, ctx.rule.near, ctx.rule.low_pass,
-            bridge.view(splats.view(-1, RECORD), real), bridge.view(tile_counts.view(-1), wp.int32),
-            bridge.view(v_splats.view(-1, RECORD), real),
-            int(wants_camera), *outputs, bridge.view(v_viewmats, m.mat44), bridge.view(v_Ks, m.mat33),
-        ]  # fmt: skip
-        threads = -(-count // BLOCK) * BLOCK if native else count
-        bridge.launch(make_backward(real, native), threads, inputs, device, cost=10 * cameras, block_dim=BLOCK)
-        camera_gradients = (v_viewmats.sum(1), v_Ks.sum(1)) if wants_camera else (None, None)
-        return *gradients, *camera_gradients, None, None, None, None
+        return *gradients(tensors, *ctx.how, splats, tile_counts, v_splats, wants_camera), *(None,) * 6
+
+
+def gradients(
+    tensors: Sequence[torch.Tensor], size, sh_count, rule, splats, tile_counts, v_splats, wants_camera: bool,
+    memory: Memory = TORCH,
+) -> list[torch.Tensor | None]:  # fmt: skip
+    """Gradients of the seven tensors from that of the records, which may be None. Nothing is checked.
+
+    Args:
+        tensors: The seven that `project` takes, contiguous.
+        size: Width and height of the picture [px].
+        sh_count: Coefficients a channel that are used.
+        rule: Cut-offs.
+        splats: What `records` returned, as is the next.
+        tile_counts: See there.
+        v_splats: Gradient of the records.
+        wants_camera: Whether those of viewmats and Ks are wanted; else they are None.
+        memory: Where to put the gradients.
+    """
+    real, device = bridge.real_of(splats), splats.device
+    m = make_projection(real)
+    v_splats = torch.zeros_like(splats) if v_splats is None else v_splats.contiguous()
+    native = _native(splats)  # writes zeros itself
+    found = [memory.own(t.shape, t.dtype, device) for t in tensors[:5]]
+    if not native:
+        for t in found:
+            t.zero_()
+    cameras, count = len(tensors[5]), len(tensors[0])
+    rows = (cameras, count) if wants_camera else (0, 0)
+    v_viewmats, v_Ks = (splats.new_zeros(*rows, n, n) if wants_camera else splats.new_empty(*rows, n, n) for n in (4, 3))
+    outputs = [bridge.view(g, t) for g, t in zip(found, (m.vec3, m.vec4, m.vec3, real, m.vec3))]
+    inputs = [
+        *_inputs(*tensors), *size, sh_count, rule.near, rule.low_pass,
+        bridge.view(splats.view(-1, RECORD), real), bridge.view(tile_counts.view(-1), wp.int32),
+        bridge.view(v_splats.view(-1, RECORD), real),
+        int(wants_camera), *outputs, bridge.view(v_viewmats, m.mat44), bridge.view(v_Ks, m.mat33),
+    ]  # fmt: skip
+    threads = -(-count // BLOCK) * BLOCK if native else count
+    bridge.launch(make_backward(real, native), threads, inputs, device, cost=10 * cameras, block_dim=BLOCK)
+    return [*found, *((v_viewmats.sum(1), v_Ks.sum(1)) if wants_camera else (None, None))]
 
 
 def project(
@@ -279,18 +315,6 @@ def project(
     factors = opacity_factors.detach().contiguous()
     size, window = (width, height), window or (0, 0, width, height)
     return _Project.apply(
-        means, quats, log_scales, logit_opacities, sh_coefficients, viewmats, Ks, size, sh_count, rule,
-        lambda tensors: _draw(tensors, factors, size, window, sh_count, rule, tile_size),
+        means, quats, log_scales, logit_opacities, sh_coefficients, viewmats, Ks,
+        factors, size, window, sh_count, rule, tile_size,
     )  # fmt: skip
-
-
-def projected(
-    tensors: Sequence[torch.Tensor],
-    size: tuple[int, int],
-    degree: int,
-    rule: Rule,
-    splats: torch.Tensor,
-    tile_counts: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """What `project` returns for its seven tensors, where that is known, with the same gradients. Nothing is checked."""
-    return _Project.apply(*tensors, size, sh.coefficient_count(degree), rule, lambda _: (splats, tile_counts))

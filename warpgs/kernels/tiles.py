@@ -12,6 +12,7 @@ from warpgs.constants import Rule
 from warpgs.errors import ResourceError
 from warpgs.kernels import bridge
 from warpgs.kernels.functions import make_spans
+from warpgs.kernels.memory import TORCH, Memory
 from warpgs.kernels.native import make_functions as make_native
 
 LIST_BYTES = 20
@@ -305,6 +306,7 @@ def bin_tiles(
     capacity: int | None = None,
     overflow: torch.Tensor | None = None,
     origin: tuple[int, int] = (0, 0),
+    memory: Memory = TORCH,
 ) -> Tiles:
     """List for every tile the Gaussians that touch it, front to back. Not differentiable.
 
@@ -321,6 +323,7 @@ def bin_tiles(
         overflow: Set to 1 where there are more instances than ``capacity``: the lists are then cut short and must not be
             used. Int32, shape [1]; needed with ``capacity``.
         origin: Left and top [px] of the window of that width and height which `project` was given; a tile's corner.
+        memory: Where to put the lists.
 
     Returns:
         The sorted instances; M is ``capacity`` where one is given.
@@ -336,25 +339,20 @@ def bin_tiles(
         raise ValueError(f"tile_counts must be int32 of shape {[sizes['C'], sizes['N']]}, not {list(tile_counts.shape)}")
     device, real, native = splats.device, bridge.real_of(splats), splats.is_cuda
     k = make_kernels(real, native)
-    columns, rows = grid(width, height, tile_size)
-    tiles, count = columns * rows, sizes["C"] * sizes["N"]
-    no_tile = sizes["C"] * tiles
+    (columns, rows), count = grid(width, height, tile_size), sizes["C"] * sizes["N"]
+    tiles, no_tile = columns * rows, sizes["C"] * columns * rows
     if no_tile > bridge.MAX_SIZE:
         raise ResourceError(
             f"{sizes['C']:,} images of {width} x {height} px have {no_tile:,} tiles of {tile_size} px, beyond the "
             f"{bridge.MAX_SIZE:,} that can be numbered; draw fewer cameras at once, or a window of each"
         )
     counts = tile_counts.contiguous().view(-1)
-    ranges = torch.zeros(no_tile, 2, dtype=torch.int32, device=device)
-    ints = functools.partial(torch.empty, dtype=torch.int32, device=device)
+    ranges = memory.kept((no_tile, 2), torch.int32, device).zero_()
     if count == 0:
-        none = torch.zeros(1, dtype=torch.int64, device=device)
-        return Tiles(tile_size, ranges, *(ints(0) for _ in range(3)), counts, ints(0), none)
+        return Tiles(tile_size, ranges, counts, counts, counts, counts, counts, counts.new_zeros(1, dtype=torch.int64))
 
     splats = splats.detach().contiguous().view(count, -1)
-    splats_view, counts_view = bridge.view(splats, real), bridge.view(counts, wp.int32)
-    longs = functools.partial(torch.empty, dtype=torch.int64, device=device)
-    fixed = capacity is not None
+    splats_view, counts_view, fixed = bridge.view(splats, real), bridge.view(counts, wp.int32), capacity is not None
     with bridge.stream_of(device):
         if fixed:
             visible, total = count, capacity
@@ -363,12 +361,13 @@ def bin_tiles(
                 many = torch.stack([(counts > 0).sum(), counts.sum(dtype=torch.int64)])
                 _check_total(*reversed(many.tolist()), device, tiles, budget_bytes)
             # One look at the device, before the sorts, tells how many are visible and how many tiles they touch.
-            packed, threads = (longs(-(-count // 32)), -(-count // 256) * 256) if native else (longs(count), count)
+            sums, threads = (-(-count // 32), -(-count // 256) * 256) if native else (count, count)
+            packed = memory.scratch((sums,), torch.int64, device)
             bridge.launch(k.pack_counts, threads, [counts_view, bridge.view(packed, wp.int64)], device)
             torch.cumsum(packed, 0, out=packed)
             visible, total = divmod(int(packed[-1]), VISIBLE)
             _check_total(total, visible, device, tiles, budget_bytes)
-        depths, order = torch.empty(2 * visible, dtype=splats.dtype, device=device), ints(2 * visible)
+        depths, order = (memory.scratch((2 * visible,), t, device) for t in (splats.dtype, torch.int32))
         depths_view, order_view = bridge.view(depths, real), bridge.view(order, wp.int32)
         if fixed:
             bridge.launch(k.depth_keys, count, [splats_view, counts_view, depths_view, order_view], device)
@@ -376,11 +375,12 @@ def bin_tiles(
             inputs = [splats_view, counts_view, bridge.view(packed, wp.int64), depths_view, order_view]
             bridge.launch(k.visible_keys, threads, inputs, device)
         wp.utils.radix_sort_pairs(depths_view.array(), order_view.array(), visible)
-        ends = longs(max(visible, 1))
+        ends = memory.kept((max(visible, 1),), torch.int64, device)
         ends_view = bridge.view(ends, wp.int64)
         bridge.launch(k.ordered_counts, visible, [order_view, counts_view, ends_view], device)
         ends = torch.cumsum(ends, 0, out=ends) if visible > 0 else ends.zero_()
-        starts, keys, slots, owners = ints(count), ints(2 * total), ints(2 * total), ints(total)
+        starts, keys, slots = (memory.kept((n,), torch.int32, device) for n in (count, 2 * total, 2 * total))
+        owners = memory.scratch((total,), torch.int32, device)
         if fixed:
             keys[:total].fill_(no_tile)
         keys_view, slots_view, owners_view = (bridge.view(t, wp.int32) for t in (keys, slots, owners))

@@ -132,6 +132,7 @@ class Fit:
             background=self.background,
             opacity_factors=factors,
             max_instances=self.most,
+            record=False,  # it would make room for more than was planned
         )
         render = rasterize(self.optimizer.gaussians, view.camera, options)
         render.splats.retain_grad()
