@@ -15,19 +15,20 @@ VALUES = 10
 def make_backward(real, tile_size: int):
     """The kernel for one scalar type and tile size."""
     f = make_functions(real)
-    # The tile lies in columns as wide as a strip, each a few rows longer than the tile: falloffs are taken several at a time.
-    length = tile_size + ABREAST
-    tile_reals = wp.types.vector(length * tile_size, real)
-    tile_ints = wp.types.vector(length * tile_size, wp.int32)
-    part_ints = wp.types.vector(tile_size * (tile_size // STRIP), wp.int32)
-    column_reals = wp.types.vector(length, real)
-    column_strips = wp.types.vector(length * STRIP, real)
+    # The tile lies in columns as wide as a strip, one beside the other. One row longer than it: see `make_kernels`.
+    count = tile_size * (tile_size // STRIP)
+    tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
+    tile_ints = wp.types.vector(tile_size * (tile_size + 1), wp.int32)
+    list_reals = wp.types.vector(count, real)
+    list_ints = wp.types.vector(count, wp.int32)
+    row_reals = wp.types.vector(tile_size, real)
     strip_reals = wp.types.vector(STRIP, real)
     strip_sums = wp.types.vector(VALUES * STRIP, real)
     half_sums = wp.types.vector(VALUES * (STRIP // 2), real)
     value_reals = wp.types.vector(VALUES, real)
     side = wp.constant(tile_size)
-    tall = wp.constant(length)
+    strips = wp.constant(count)
+    bits = wp.constant(count - 1)
     strip = wp.constant(STRIP)
     half = wp.constant(STRIP // 2)
     parts = wp.constant(tile_size // STRIP)
@@ -60,12 +61,12 @@ def make_backward(real, tile_size: int):
         v_z = tile_reals()
         v_w = tile_reals()
         end = tile_ints()
-        strip_end = part_ints()
+        strip_end = list_ints()
         instance = int(0)
         for row in range(wp.min(side, height - top)):
             for column in range(wp.min(side, width - left)):
                 part = column // strip
-                p = (part * tall + row) * strip + column - part * strip
+                p = (part * side + row) * strip + column - part * strip
                 o = (camera * height + top + row) * width + left + column
                 t[p] = transmittances[o]
                 g0[p] = v_rgb[o, 0]
@@ -82,18 +83,25 @@ def make_backward(real, tile_size: int):
                 strip_end[part * side + row] = wp.max(strip_end[part * side + row], ends[o])
                 instance = wp.max(instance, ends[o])
 
-        dys = column_reals()
-        e12 = column_reals()
-        e22 = column_reals()
-        start = column_reals()
-        alphas = column_strips()
-        inverses = column_strips()
-        slopes = column_strips()
+        # of a Gaussian, by strip; and the strips that it reaches
+        dxs = list_reals()
+        dys = list_reals()
+        e22 = list_reals()
+        start = list_reals()
+        hits = list_ints()
+        list = list_ints()
+        alphas = tile_reals()
+        inverses = tile_reals()
+        slopes = tile_reals()
+        vs = tile_reals()
+        ws = tile_reals()
+        row_dy = row_reals()
+        row_e12 = row_reals()
+        row_e22 = row_reals()
         e1 = f.abreast()
         e2_squared = f.abreast()
         ramp = strip_reals()
         s1 = strip_reals()
-        s1_all = strip_reals()
         s2 = strip_reals()
         s11 = strip_reals()
         s12 = strip_reals()
@@ -127,12 +135,28 @@ def make_backward(real, tile_size: int):
             for row in range(side):
                 dy = real(origin_y + top + row) + real(0.5) - my
                 e2 = u22 * dy
-                dys[row] = dy
-                e12[row] = f.apart(u12 * dy)
-                e22[row] = f.apart(e2 * e2)
+                row_dy[row] = dy
+                row_e12[row] = f.apart(u12 * dy)
+                row_e22[row] = f.apart(e2 * e2)
+            for part in range(parts):
+                dx = real(origin_x + left + part * strip) + real(0.5) - mx
+                at = f.apart(u11 * dx)
+                for row in range(side):
+                    o = part * side + row
+                    dxs[o] = dx
+                    dys[o] = row_dy[row]
+                    e22[o] = row_e22[row]
+                    start[o] = at + row_e12[row]
+                    until = strip_end[o]
+                    hit = f.reaches(start[o], u11, e22[o], bounds[0], bounds[1]) and instance < until
+                    hits[o] = wp.where(hit, 1, 0)
+            reaching = int(0)
+            for o in range(strips):  # without a branch, which would be mispredicted once for each row or so
+                list[reaching & bits] = o
+                reaching += hits[o]
             for lane in range(strip):
                 ramp[lane] = f.apart(u11 * real(lane))
-                s1_all[lane] = real(0.0)
+                s1[lane] = real(0.0)
                 s2[lane] = real(0.0)
                 s11[lane] = real(0.0)
                 s12[lane] = real(0.0)
@@ -142,71 +166,68 @@ def make_backward(real, tile_size: int):
                 s_c1[lane] = real(0.0)
                 s_c2[lane] = real(0.0)
                 sz[lane] = real(0.0)
-            for part in range(parts):
-                x0 = real(origin_x + left + part * strip) + real(0.5) - mx
-                at = f.apart(u11 * x0)
-                first = int(side)
-                last = int(0)
-                for row in range(side):
-                    start[row] = at + e12[row]
-                    until = strip_end[part * side + row]
-                    hit = f.reaches(start[row], u11, e22[row], bounds[0], bounds[1]) and instance < until
-                    first = wp.min(first, wp.where(hit, row, side))
-                    last = wp.max(last, wp.where(hit, row + 1, 0))
-                away = wp.max(part * tall * strip, 0)
-                row = int(first)
-                while row < last:
-                    o = wp.max(row, 0)
-                    row += abreast
-                    for lane in range(strip):
-                        for n in range(abreast):
-                            e1[n] = start[o + n] + ramp[lane]
-                            e2_squared[n] = e22[o + n]
-                        g = f.falloffs(wp.cw_mul(e1, e1) + e2_squared)
-                        for n in range(abreast):
-                            q = (o + n) * strip + lane
-                            raw = opacity * g[n]
-                            alpha = wp.where(alpha_max < raw, alpha_max, raw)
-                            until = end[away + q]
-                            drawn = alpha >= alpha_cut and instance < until
-                            alpha = wp.where(drawn, alpha, real(0.0))
-                            alphas[q] = alpha
-                            inverses[q] = real(1.0) / (real(1.0) - alpha)
-                            slopes[q] = wp.where(drawn and raw <= alpha_max, g[n], real(0.0))
+            k = int(0)
+            while k < reaching:
+                base = wp.max(k, 0)
+                k += abreast  # the last few may be some that are not reached: nobody reads theirs
                 for lane in range(strip):
-                    s1[lane] = real(0.0)
-                row = int(first)
-                while row < last:
-                    o = wp.max(row, 0)
-                    base = wp.max((part * tall + row) * strip, 0)
-                    row += 1
-                    dy = dys[o]
-                    for lane in range(strip):
-                        p = base + lane
-                        q = o * strip + lane
-                        d = c0 * g0[p] + c1 * g1[p] + c2 * g2[p] + distance * v_z[p] + v_w[p]
-                        v = (t[p] * d - behind[p]) * inverses[q] * slopes[q]
-                        before = t[p] * inverses[q]
-                        w = alphas[q] * before
-                        t[p] = before
-                        behind[p] = behind[p] + w * d
-                        v_e1 = v * (start[o] + ramp[lane])
-                        v_y = v * dy
-                        s1[lane] = s1[lane] + v_e1
-                        s2[lane] = s2[lane] + v_y
-                        s12[lane] = s12[lane] + v_e1 * dy
-                        s22[lane] = s22[lane] + v_y * dy
-                        so[lane] = so[lane] + v
-                        s_c0[lane] = s_c0[lane] + w * g0[p]
-                        s_c1[lane] = s_c1[lane] + w * g1[p]
-                        s_c2[lane] = s_c2[lane] + w * g2[p]
-                        sz[lane] = sz[lane] + w * v_z[p]
+                    for n in range(abreast):
+                        o = list[base + n] & bits
+                        e1[n] = start[o] + ramp[lane]
+                        e2_squared[n] = e22[o]
+                    g = f.falloffs(wp.cw_mul(e1, e1) + e2_squared)
+                    for n in range(abreast):
+                        q = (base + n) * strip + lane
+                        raw = opacity * g[n]
+                        alpha = wp.where(alpha_max < raw, alpha_max, raw)
+                        until = end[(list[base + n] & bits) * strip + lane]
+                        drawn = alpha >= alpha_cut and instance < until
+                        alpha = wp.where(drawn, alpha, real(0.0))
+                        alphas[q] = alpha
+                        inverses[q] = real(1.0) / (real(1.0) - alpha)
+                        slopes[q] = wp.where(drawn and raw <= alpha_max, g[n], real(0.0))
+            k = int(0)
+            while k < reaching:
+                base = wp.max(k, 0) * strip
+                o = list[wp.max(k, 0)] & bits
+                k += 1
                 for lane in range(strip):
-                    s1_all[lane] = s1_all[lane] + s1[lane]
-                    s11[lane] = s11[lane] + s1[lane] * (x0 + real(lane))
+                    p = o * strip + lane
+                    q = base + lane
+                    d = c0 * g0[p] + c1 * g1[p] + c2 * g2[p] + distance * v_z[p] + v_w[p]
+                    before = t[p] * inverses[q]
+                    w = alphas[q] * before
+                    vs[q] = (t[p] * d - behind[p]) * inverses[q] * slopes[q]
+                    ws[q] = w
+                    t[p] = before
+                    behind[p] = behind[p] + w * d
+            # Apart from the loop above, because what both need does not fit into 16 registers.
+            k = int(0)
+            while k < reaching:
+                base = wp.max(k, 0) * strip
+                o = list[wp.max(k, 0)] & bits
+                k += 1
+                dx = dxs[o]
+                dy = dys[o]
+                for lane in range(strip):
+                    p = o * strip + lane
+                    v = vs[base + lane]
+                    w = ws[base + lane]
+                    v_e1 = v * (start[o] + ramp[lane])
+                    v_y = v * dy
+                    s1[lane] = s1[lane] + v_e1
+                    s2[lane] = s2[lane] + v_y
+                    s11[lane] = s11[lane] + v_e1 * (dx + real(lane))
+                    s12[lane] = s12[lane] + v_e1 * dy
+                    s22[lane] = s22[lane] + v_y * dy
+                    so[lane] = so[lane] + v
+                    s_c0[lane] = s_c0[lane] + w * g0[p]
+                    s_c1[lane] = s_c1[lane] + w * g1[p]
+                    s_c2[lane] = s_c2[lane] + w * g2[p]
+                    sz[lane] = sz[lane] + w * v_z[p]
             # Into one array per width, because additions vectorise only where nothing may overlap.
             for lane in range(strip):
-                sums[0 * strip + lane] = s1_all[lane]
+                sums[0 * strip + lane] = s1[lane]
                 sums[1 * strip + lane] = s2[lane]
                 sums[2 * strip + lane] = s11[lane]
                 sums[3 * strip + lane] = s12[lane]
