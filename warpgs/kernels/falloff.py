@@ -77,9 +77,7 @@ def make_functions(real):
         return wp.where(real(1.0e30) < product, real(1.0e30), product)
 
     @wp.func
-    def bounds_of(
-        mx: real, my: real, u11: real, u22: real, half_width: real, half_height: real, whole_tiles: wp.int32
-    ) -> vec2:
+    def bounds_of(mx: real, my: real, u11: real, u22: real, half_width: real, half_height: real, whole_tiles: wp.int32) -> vec2:
         """How far e1 at the middle of a strip may lie from 0, less the ellipse; and the ellipse: the largest |U d|^2."""
         margin = real(0.01) + real(2.0e-6) * (wp.abs(mx) + half_width)
         slack = real(0.01) + real(2.0e-6) * (wp.abs(my) + half_height)
