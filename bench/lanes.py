@@ -1,6 +1,9 @@
 """CPU blending per lane, against naive kernels, on a seeded cloud; prints what the cloud is made of.
 
-A lane is one (Gaussian, pixel) pair that the row loop evaluates: rows are clipped to the Gaussian's box, columns are not.
+A lane is one (Gaussian, pixel) pair that the inner loop evaluates: those of the strips of eight pixels that the Gaussian's
+ellipse touches, until the last pixel of the strip is finished. The forward pass looks for finished strips once for each
+batch, and so evaluates a few more. A boxed lane is a pixel of a row of the tile that the box touches, until the tile is
+finished: what was evaluated while boxes were clipped by rows alone, and what a kernel that clips less may be compared by.
 The naive kernels have no box: a thread walks its tile's list. All times are those of the whole op, its memory included.
 Interleaved, and the minimum of each, because other work on the machine only ever adds; one thread by its CPU time, two by
 the clock on the wall.
@@ -21,6 +24,7 @@ from bench.inputs import camera
 from bench.naive import Naive
 from warpgs.constants import RULES
 from warpgs.kernels.blend import blend
+from warpgs.kernels.falloff import STRIP
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import Tiles, bin_tiles
 
@@ -55,18 +59,27 @@ def cloud(count: int) -> tuple[torch.Tensor, Tiles]:
     return splats, bin_tiles(splats, counts, **size, rule=rule)
 
 
-def lanes(splats: torch.Tensor, tiles: Tiles, drawn_until: torch.Tensor) -> int:
-    """Lanes of the instances before the last one that each tile draws, by the formula of the kernels."""
+def lanes(splats: torch.Tensor, tiles: Tiles, pixel_ends: torch.Tensor) -> tuple[int, int]:
+    """Lanes evaluated and boxed lanes, by the formulas of the kernels; ``pixel_ends`` has the shape of the picture."""
+    side, strips = tiles.size, tiles.size // STRIP
+    ends = pixel_ends.view(HEIGHT // side, side, WIDTH // side, strips, STRIP).amax(4).permute(0, 2, 1, 3).flatten(0, 1)
     first, last = tiles.ranges.long().unbind(1)
-    last = torch.minimum(last, drawn_until)
-    tile = torch.repeat_interleave(torch.arange(len(first)), (last - first).clamp(min=0))
-    begin = torch.cumsum((last - first).clamp(min=0), 0) - (last - first).clamp(min=0)
-    instance = torch.arange(len(tile)) - begin[tile] + first[tile]
-    s = splats[0, tiles.splat_ids[instance].long()]
-    center = s[:, 1] - (tile // (WIDTH // tiles.size)) * tiles.size - 0.5
-    half = s[:, 11] + 0.01 + 2e-6 * (s[:, 1].abs() + s[:, 11])
-    rows = (center + half).clamp(-1, tiles.size - 1).floor() + 1 - (center - half).clamp(0, tiles.size).ceil()
-    return int(rows.clamp(min=0).sum()) * tiles.size
+    count = (torch.minimum(last, ends.amax((1, 2))) - first).clamp(min=0)
+    tile = torch.repeat_interleave(torch.arange(len(first)), count)
+    instance = torch.arange(len(tile)) - (torch.cumsum(count, 0) - count - first)[tile]
+    mx, my, u11, u12, u22, *_, half_width, half_height = splats[0, tiles.splat_ids[instance].long()].unbind(1)
+    top, left = tile // (WIDTH // side) * side + 0.5, tile % (WIDTH // side) * side + 0.5
+    margin, slack = (0.01 + 2e-6 * (m.abs() + half) for m, half in ((mx, half_width), (my, half_height)))
+    evaluated = boxed = 0
+    for row in range(side):
+        dy = top + row - my
+        boxed += side * int((dy.abs() <= half_height + slack).sum())
+        for strip in range(strips):
+            middle = left + STRIP * strip + (STRIP - 1) / 2 - mx
+            least = ((u11 * middle + u12 * dy).abs() - u11 * ((STRIP - 1) / 2 + margin)).clamp(min=0)
+            reached = least**2 + (u22 * dy) ** 2 <= (u22 * (half_height + slack)) ** 2
+            evaluated += STRIP * int((reached & (instance < ends[tile, row, strip])).sum())
+    return evaluated, boxed
 
 
 def fastest(works: dict[str, Callable[[], object]], repeats: int, clock: Callable[[], int]) -> dict[str, float]:
@@ -93,14 +106,14 @@ def main() -> None:
     naive = Naive(splats, tiles, background, **size, rule=rule)
     v_rgb = torch.rand(rgb.shape, generator=torch.Generator().manual_seed(1))
     naive.forward()
-    pixel_ends = naive.kept[1].view(HEIGHT // tiles.size, tiles.size, WIDTH // tiles.size, tiles.size)
-    evaluated = lanes(splats, tiles, pixel_ends.amax((1, 3)).view(-1).long())
+    evaluated, boxed = lanes(splats.detach(), tiles, naive.kept[1].long())
     instances = len(tiles.slots)
     print(
         f"{a.gaussians:,} Gaussians on {WIDTH} x {HEIGHT} px: sigma {SIGMAS[0]:g} to {SIGMAS[1]:g} px, "
         f"opacity {OPACITIES[0]:g} to {OPACITIES[1]:g}, both log-uniform\n"
         f"{instances:,} instances, {instances / len(tiles.ranges):.0f} a tile; {instances * tiles.size**2 / 1e6:.1f}M pairs "
-        f"in their tiles, {evaluated / 1e6:.1f}M lanes evaluated; mean alpha of the image {float(alpha.detach().mean()):.2f}"
+        f"in their tiles, {boxed / 1e6:.1f}M boxed lanes, {evaluated / 1e6:.1f}M evaluated; "
+        f"mean alpha of the image {float(alpha.detach().mean()):.2f}"
     )
 
     def forward() -> torch.Tensor:
@@ -121,8 +134,8 @@ def main() -> None:
         slow = one["naive " + name]
         gains = "  ".join(f"{n} threads {walls[1][name] / walls[n][name]:.2f} x" for n in counts[1:])
         print(
-            f"{name:<9} {one[name] / 1e6:8.2f} ms  {one[name] / evaluated:.2f} ns a lane  naive {slow / 1e6:8.1f} ms  "
-            f"{slow / one[name]:5.1f} x  {gains}"
+            f"{name:<9} {one[name] / 1e6:8.2f} ms  {one[name] / evaluated:.2f} ns a lane  {one[name] / boxed:.2f} boxed  "
+            f"naive {slow / 1e6:8.1f} ms  {slow / one[name]:5.1f} x  {gains}"
         )
 
 

@@ -1,4 +1,4 @@
-"""Which rows and columns a Gaussian's box and ellipse touch: the shared functions themselves, against a fine search."""
+"""Which rows, columns and strips a Gaussian's box and ellipse touch: the shared functions themselves, against a fine search."""
 
 import functools
 import math
@@ -15,7 +15,7 @@ COUNT = 4000
 @functools.cache
 def make_probe():
     """A kernel that calls the functions in float64, one case an item."""
-    s, f = functions.make_spans(wp.float64), falloff.make_functions(wp.float64, 16)
+    s, f = functions.make_spans(wp.float64), falloff.make_functions(wp.float64)
     vec3 = wp.types.vector(3, wp.float64)
 
     @wp.kernel(enable_backward=False)
@@ -30,17 +30,22 @@ def make_probe():
         columns = s.tile_columns(
             cases[i, 0], cases[i, 1], factor, cases[i, 5], cases[i, 6], cases[i, 7], int(cases[i, 8]), origin, size, tile_size
         )
-        within = f.rows_of(cases[i, 1], cases[i, 7], whole_tiles, origin)
+        bounds = f.bounds_of(
+            cases[i, 0], cases[i, 1], cases[i, 2], cases[i, 4], cases[i, 6], cases[i, 7], whole_tiles
+        )  # fmt: skip
+        dx = wp.float64(origin) + wp.float64(0.5) - cases[i, 0]
+        dy = wp.float64(origin) + wp.float64(0.5) - cases[i, 1]
+        start, e2 = cases[i, 2] * dx + cases[i, 3] * dy, cases[i, 4] * dy
         for k in range(2):
             spans[i, k] = rows[k]
             spans[i, 2 + k] = columns[k]
-            spans[i, 4 + k] = within[k]
+        spans[i, 4] = int(f.reaches(start, cases[i, 2], e2 * e2, bounds[0], bounds[1]))
 
     return probe
 
 
 def probe(cases: torch.Tensor, device, whole_tiles=0, origin=16, size=53, tile_size=16) -> torch.Tensor:
-    spans = torch.zeros(len(cases), 6, dtype=torch.int32, device=device)
+    spans = torch.zeros(len(cases), 5, dtype=torch.int32, device=device)
     inputs = [bridge.view(cases.to(device), wp.float64), whole_tiles, origin, size, tile_size, bridge.view(spans, wp.int32)]
     bridge.launch(make_probe(), len(cases), inputs, device)
     return spans.cpu()
@@ -92,15 +97,27 @@ def test_rows_of_tiles_are_those_of_the_box(device, tile_size, far):
     assert 0 < int((found[:, 1] > found[:, 0]).sum()) < COUNT
 
 
-def test_rows_within_a_tile(device):
-    """Rows counted from the tile's top; all of them where tiles are drawn whole."""
-    cases = ellipses()
-    found = probe(cases, device)[:, 4:]
-    margin = margin_of(cases[:, 1], cases[:, 7])
-    first = torch.ceil(cases[:, 1] - cases[:, 7] - margin - 16.5).clamp(0, 16)
-    last = torch.floor(cases[:, 1] + cases[:, 7] + margin - 16.5).clamp(-1, 15)
-    assert torch.equal(found, torch.stack([first, last + 1], -1).int())
-    assert bool((probe(cases, device, whole_tiles=1)[:, 4:] == torch.tensor([0, 16])).all())
+@pytest.mark.parametrize("far", [1.0, 1e4])
+def test_strips_are_those_of_the_ellipse(device, far):
+    """Eight pixels in a row, widened by the margins: reached where the ellipse touches them, and all where tiles are whole."""
+    cases = ellipses(far=far)
+    mx, my, u11, u12, u22, _, half_width, half_height, _ = (t[:, None] for t in cases.unbind(-1))
+    if far > 1:  # beside the ellipse, at a height of it
+        share = torch.linspace(-1, 1, COUNT, dtype=torch.float64)[:, None]
+        my[:] = 16.5 - share * half_height
+        mx[:] = 20.0 + u12 / u11 * share * half_height
+        mx[::2] += (u22 * half_height / u11 * (1 - share**2).sqrt())[::2] + 8 * share[::2].flip(0)
+    radius, dy = u22 * (half_height + margin_of(my, half_height)), 16.5 - my
+    side = 3.5 + margin_of(mx, half_width)
+    dx = 20.0 - mx + side * torch.linspace(-1, 1, 4001, dtype=torch.float64)
+    least = ((u11 * dx + u12 * dy) ** 2).amin(1, True) + (u22 * dy) ** 2
+    # the search itself is coarse: what lies nearer to the edge than its step is left out
+    step = (2 * u11 * side / 4000 * (radius + u11 * side / 4000)).clamp_min(1e-9)
+    sure = ((least - radius**2).abs() > step)[:, 0]
+    found = probe(cases, device)[:, 4].bool()
+    assert torch.equal(found[sure], (least <= radius**2)[sure, 0])
+    assert float(sure.double().mean()) > 0.9 and 0.02 < float(found.double().mean()) < 0.98
+    assert bool(probe(cases, device, whole_tiles=1)[:, 4].all())
 
 
 @pytest.mark.parametrize("far", [1.0, 1e4])

@@ -5,7 +5,7 @@ import re
 
 SPEED = {
     "AHEAD", "SHORT", "CHUNKS_PER_THREAD", "FEW_THREADS", "SERIAL_WORK", "SEGMENT", "LANES", "BATCH", "BLOCK", "BOX", "SMALL",
-    "MANY", "WARPS",
+    "MANY", "WARPS", "STRIP", "ABREAST",
 }  # fmt: skip
 """Sizes of portions of work; every value that divides as its comment says gives the same numbers."""
 

@@ -1,7 +1,7 @@
 """Blending kernels in plain Warp, one task per tile: the CPU's kernels, and the float64 kernels on every device.
 
-A task walks the Gaussians of its tile and, for each, the pixel rows its box touches. The innermost loop runs over the
-pixels of a row without branches and is kept rolled, so that the compiler vectorises it (docs/blend.md, section 5).
+A task cuts the rows of its tile into strips. The innermost loops run over the pixels of one strip without branches and are
+kept rolled, so that the compiler vectorises them (docs/blend.md, section 5).
 """
 
 import functools
@@ -9,33 +9,35 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from warpgs.kernels.blend_cpu_backward import make_backward
 from warpgs.kernels.compiler import ROLLED
-from warpgs.kernels.falloff import make_functions
+from warpgs.kernels.falloff import ABREAST, STRIP, make_functions
 
-VALUES = 10
-"""Gradient values of an instance."""
-BATCH = 32
-"""Gaussians that the forward pass takes at a time, row by row; between batches it looks for pixels still open."""
+BATCH = 64
+"""Gaussians that the forward pass takes at a time, strip by strip; a power of 2, as indices are bounded by its bits."""
 
 
 @functools.cache
 def make_kernels(real, tile_size: int):
     """Forward, backward and contribution kernels for one scalar type and tile size."""
-    f = make_functions(real, tile_size)
+    f = make_functions(real)
     # Vectors rather than local arrays: the compiler must see that they do not overlap. One row longer than the tile, so that
     # they do not lie 4096 bytes apart, where a load is taken to wait for a store to the other.
     tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
     tile_ints = wp.types.vector(tile_size * (tile_size + 1), wp.int32)
-    row_reals = wp.types.vector(tile_size, real)
-    row_ints = wp.types.vector(tile_size, wp.int32)
-    batch_values = wp.types.vector(10 * BATCH, real)
+    strip_reals = wp.types.vector(STRIP, real)
+    strip_ints = wp.types.vector(STRIP, wp.int32)
+    batch_reals = wp.types.vector(BATCH, real)
     batch_ints = wp.types.vector(BATCH, wp.int32)
-    side_sums = wp.types.vector(VALUES * tile_size, real)
-    half_sums = wp.types.vector(VALUES * (tile_size // 2), real)
-    value_reals = wp.types.vector(VALUES, real)
-    half = wp.constant(tile_size // 2)
+    batch_strips = wp.types.vector(BATCH * STRIP, real)
     side = wp.constant(tile_size)
     pixels = wp.constant(tile_size * tile_size)
+    strip = wp.constant(STRIP)
+    parts = wp.constant(tile_size // STRIP)
+    abreast = wp.constant(ABREAST)
+    batch = wp.constant(BATCH)
+    bits = wp.constant(BATCH - 1)
+    finished = wp.constant(real(2.0))
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def forward(
@@ -52,9 +54,10 @@ def make_kernels(real, tile_size: int):
         top = (in_camera // columns) * side
         left = (in_camera - (in_camera // columns) * columns) * side
 
-        # The state of the tile: transmittance, below ``stop`` once the pixel is finished, negative where it was finished
-        # before a Gaussian instead of by one; sums; one past the last instance blended.
+        # The state of the tile: transmittance; the least that a Gaussian must leave of it to be blended, above 1 once the
+        # pixel is finished; sums; one past the last instance blended.
         t = tile_reals()
+        floor = tile_reals()
         red = tile_reals()
         green = tile_reals()
         blue = tile_reals()
@@ -64,100 +67,146 @@ def make_kernels(real, tile_size: int):
         for p in range(pixels):
             # pixels outside the image are finished before they begin
             inside = top + p // side < height and left + p - (p // side) * side < width
-            t[p] = wp.where(inside, real(1.0), real(-1.0))
-        # The same for one row, in registers, and the Gaussians of a batch: values, u11 dx, and by row which of them reach it.
-        row_t = row_reals()
-        row_red = row_reals()
-        row_green = row_reals()
-        row_blue = row_reals()
-        row_z = row_reals()
-        row_total = row_reals()
-        row_end = row_ints()
-        values = batch_values()
-        tops = batch_ints()
-        bottoms = batch_ints()
+            t[p] = real(1.0)
+            # inclusive: blend, then stop; exclusive: stop instead of blending
+            floor[p] = wp.where(inside, wp.where(inclusive != 0, real(-1.0), stop), finished)
+        # The same for one strip, in registers.
+        strip_t = strip_reals()
+        strip_floor = strip_reals()
+        strip_red = strip_reals()
+        strip_green = strip_reals()
+        strip_blue = strip_reals()
+        strip_z = strip_reals()
+        strip_total = strip_reals()
+        strip_end = strip_ints()
+        # The Gaussians of a batch: values, u11 times the pixels of a strip; what they share in a row; which reach a strip.
+        mx = batch_reals()
+        my = batch_reals()
+        u11 = batch_reals()
+        u12 = batch_reals()
+        u22 = batch_reals()
+        opacity = batch_reals()
+        c0 = batch_reals()
+        c1 = batch_reals()
+        c2 = batch_reals()
+        distance = batch_reals()
+        aside = batch_reals()
+        limit = batch_reals()
+        ramp = batch_strips()
+        e12 = batch_reals()
+        e22 = batch_reals()
+        start = batch_reals()
+        hits = batch_ints()
         list = batch_ints()
+        alphas = batch_strips()
+        e1 = f.abreast()
+        e2_squared = f.abreast()
 
-        # inclusive: blend, then stop; exclusive: stop instead of blending
-        leave = wp.where(inclusive != 0, real(-1.0), stop)
         last = ranges[tile, 1]
         first = ranges[tile, 0]
         while first < last:
-            for j in range(BATCH):
-                tops[j] = side  # reaches no row
+            count = wp.min(batch, last - first)
+            for j in range(count):
+                mx[j] = splats[splat_ids[first + j], 0]  # alone, so that many records are on their way at once
+            for j in range(batch):
+                limit[j] = real(-1.0)  # reaches nothing
             j = int(0)
-            while j < wp.min(BATCH, last - first):
+            while j < count:
                 i = splat_ids[wp.max(first + j, 0)]
                 if i < 0:
                     break  # never; but a loop that may end early is not vectorised, which here would mean slow gathers
-                for k in range(10):
-                    values[j * 10 + k] = splats[i, k]
-                rows = f.rows_of(splats[i, 1], splats[i, 11], whole_tiles, origin_y + top)
-                tops[j] = rows[0]
-                bottoms[j] = rows[1]
+                my[j] = splats[i, 1]
+                u11[j] = splats[i, 2]
+                u12[j] = splats[i, 3]
+                u22[j] = splats[i, 4]
+                opacity[j] = splats[i, 5]
+                c0[j] = splats[i, 6]
+                c1[j] = splats[i, 7]
+                c2[j] = splats[i, 8]
+                distance[j] = splats[i, 9]
+                bounds = f.bounds_of(mx[j], my[j], u11[j], u22[j], splats[i, 10], splats[i, 11], whole_tiles)
+                aside[j] = bounds[0]
+                limit[j] = bounds[1]
                 j += 1
+            for j in range(batch):
+                for lane in range(strip):
+                    ramp[j * strip + lane] = f.apart(u11[j] * real(lane))
             left_open = int(0)
             for row in range(side):
-                base = wp.max(row * side, 0)
-                row_open = int(0)
-                for lane in range(side):
-                    row_t[lane] = t[base + lane]
-                    row_open += wp.where(row_t[lane] >= stop, 1, 0)
-                if row_open > 0:
-                    reaching = int(0)
-                    for j in range(BATCH):  # without a branch, which would be mispredicted once for each Gaussian
-                        list[wp.max(reaching, 0)] = j
-                        reaching += wp.where(row >= tops[j], wp.where(row < bottoms[j], 1, 0), 0)
-                    for lane in range(side):
-                        row_red[lane] = red[base + lane]
-                        row_green[lane] = green[base + lane]
-                        row_blue[lane] = blue[base + lane]
-                        row_z[lane] = z[base + lane]
-                        row_total[lane] = total[base + lane]
-                        row_end[lane] = end[base + lane]
-                    k = int(0)
-                    while k < reaching:
-                        j = list[wp.max(k, 0)]
-                        k += 1
-                        v = wp.max(j * 10, 0)
-                        x0 = real(origin_x + left) + real(0.5) - values[v]
-                        dy = real(origin_y + top + row) + real(0.5) - values[v + 1]
-                        u11 = values[v + 2]
-                        e12 = values[v + 3] * dy
-                        e2 = values[v + 4] * dy
-                        e22 = e2 * e2
-                        opacity = values[v + 5]
-                        c0 = values[v + 6]
-                        c1 = values[v + 7]
-                        c2 = values[v + 8]
-                        distance = values[v + 9]
-                        number = first + j + 1
-                        for lane in range(side):
-                            e1 = f.apart(u11 * (x0 + real(lane))) + e12
-                            raw = opacity * f.falloff(e1 * e1 + e22)
-                            alpha = wp.where(alpha_max < raw, alpha_max, raw)
-                            before = row_t[lane]
-                            drawn = alpha >= alpha_cut and before >= stop
-                            blended = drawn and before * (real(1.0) - alpha) >= leave
-                            alpha = wp.where(blended, alpha, real(0.0))
-                            w = alpha * before
-                            row_t[lane] = before * wp.where(drawn and not blended, real(-1.0), real(1.0) - alpha)
-                            row_end[lane] = wp.max(row_end[lane], wp.where(blended, number, 0))
-                            row_red[lane] = row_red[lane] + w * c0
-                            row_green[lane] = row_green[lane] + w * c1
-                            row_blue[lane] = row_blue[lane] + w * c2
-                            row_z[lane] = row_z[lane] + w * distance
-                            row_total[lane] = row_total[lane] + w
-                    for lane in range(side):
-                        t[base + lane] = row_t[lane]
-                        red[base + lane] = row_red[lane]
-                        green[base + lane] = row_green[lane]
-                        blue[base + lane] = row_blue[lane]
-                        z[base + lane] = row_z[lane]
-                        total[base + lane] = row_total[lane]
-                        end[base + lane] = row_end[lane]
-                left_open += row_open
-            first += BATCH
+                y = real(origin_y + top + row) + real(0.5)
+                for j in range(batch):
+                    dy = y - my[j]
+                    e2 = u22[j] * dy
+                    e12[j] = f.apart(u12[j] * dy)
+                    e22[j] = f.apart(e2 * e2)
+                for part in range(parts):
+                    base = wp.max(row * side + part * strip, 0)
+                    strip_open = int(0)
+                    for lane in range(strip):
+                        strip_floor[lane] = floor[base + lane]
+                        strip_open += wp.where(strip_floor[lane] < finished, 1, 0)
+                    if strip_open > 0:
+                        x = real(origin_x + left + part * strip) + real(0.5)
+                        for j in range(batch):
+                            start[j] = f.apart(u11[j] * (x - mx[j])) + e12[j]
+                            hits[j] = wp.where(f.reaches(start[j], u11[j], e22[j], aside[j], limit[j]), 1, 0)
+                        reaching = int(0)
+                        for j in range(batch):  # without a branch, which would be mispredicted once for each Gaussian
+                            list[reaching & bits] = j
+                            reaching += hits[j]
+                        k = int(0)
+                        while k < reaching:
+                            o = wp.max(k, 0)
+                            k += abreast  # the last few may be some that do not reach the strip: nobody reads theirs
+                            for lane in range(strip):
+                                for n in range(abreast):
+                                    j = list[o + n] & bits
+                                    e1[n] = start[j] + ramp[j * strip + lane]
+                                    e2_squared[n] = e22[j]
+                                g = f.falloffs(wp.cw_mul(e1, e1) + e2_squared)
+                                for n in range(abreast):
+                                    raw = opacity[list[o + n] & bits] * g[n]
+                                    alpha = wp.where(alpha_max < raw, alpha_max, raw)
+                                    alphas[(o + n) * strip + lane] = wp.where(alpha >= alpha_cut, alpha, real(0.0))
+                        for lane in range(strip):
+                            strip_t[lane] = t[base + lane]
+                            strip_red[lane] = red[base + lane]
+                            strip_green[lane] = green[base + lane]
+                            strip_blue[lane] = blue[base + lane]
+                            strip_z[lane] = z[base + lane]
+                            strip_total[lane] = total[base + lane]
+                            strip_end[lane] = end[base + lane]
+                        k = int(0)
+                        while k < reaching:
+                            o = wp.max(k, 0)
+                            k += 1
+                            j = list[o] & bits
+                            number = first + j + 1
+                            for lane in range(strip):
+                                alpha = alphas[o * strip + lane]
+                                before = strip_t[lane]
+                                after = before * (real(1.0) - alpha)
+                                blended = after >= strip_floor[lane]
+                                w = wp.where(blended, alpha, real(0.0)) * before
+                                strip_t[lane] = wp.where(blended, after, before)
+                                strip_floor[lane] = wp.where(after < stop, finished, strip_floor[lane])
+                                strip_end[lane] = wp.where(w > real(0.0), number, strip_end[lane])
+                                strip_red[lane] = strip_red[lane] + w * c0[j]
+                                strip_green[lane] = strip_green[lane] + w * c1[j]
+                                strip_blue[lane] = strip_blue[lane] + w * c2[j]
+                                strip_z[lane] = strip_z[lane] + w * distance[j]
+                                strip_total[lane] = strip_total[lane] + w
+                        for lane in range(strip):
+                            t[base + lane] = strip_t[lane]
+                            floor[base + lane] = strip_floor[lane]
+                            red[base + lane] = strip_red[lane]
+                            green[base + lane] = strip_green[lane]
+                            blue[base + lane] = strip_blue[lane]
+                            z[base + lane] = strip_z[lane]
+                            total[base + lane] = strip_total[lane]
+                            end[base + lane] = strip_end[lane]
+                    left_open += strip_open
+            first += batch
             if left_open == 0:
                 first = last
 
@@ -165,7 +214,6 @@ def make_kernels(real, tile_size: int):
             for lane in range(wp.min(side, width - left)):
                 p = row * side + lane
                 o = (camera * height + top + row) * width + left + lane
-                t[p] = wp.abs(t[p])
                 rgb[o, 0] = red[p] + t[p] * backgrounds[camera, 0]
                 rgb[o, 1] = green[p] + t[p] * backgrounds[camera, 1]
                 rgb[o, 2] = blue[p] + t[p] * backgrounds[camera, 2]
@@ -174,165 +222,6 @@ def make_kernels(real, tile_size: int):
                 transmittances[o] = t[p]
                 weights[o] = total[p]
                 ends[o] = end[p]
-
-    @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
-    def backward(
-        begin: int, splats: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), splat_ids: wp.array(dtype=int),
-        slots: wp.array(dtype=int), backgrounds: wp.array2d(dtype=real),
-        origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
-        alpha_cut: real, alpha_max: real, whole_tiles: int,
-        transmittances: wp.array(dtype=real), weights: wp.array(dtype=real), depth: wp.array(dtype=real),
-        ends: wp.array(dtype=int),
-        v_rgb: wp.array2d(dtype=real), v_alpha: wp.array(dtype=real), v_depth: wp.array(dtype=real),
-        # outputs, zero on entry
-        v_slots: wp.array2d(dtype=real),
-    ):  # fmt: skip
-        tile = begin + wp.tid()
-        camera = tile // tiles
-        in_camera = tile - camera * tiles
-        top = (in_camera // columns) * side
-        left = (in_camera - (in_camera // columns) * columns) * side
-
-        # A Gaussian's whole effect on a pixel is one number d = c . v_rgb + z v_z + v_w (docs/blend.md, section 3).
-        t = tile_reals()  # transmittance behind the current instance, then before it
-        behind = tile_reals()  # sum of w d over what lies behind, background included
-        g0 = tile_reals()
-        g1 = tile_reals()
-        g2 = tile_reals()
-        v_z = tile_reals()
-        v_w = tile_reals()
-        end = tile_ints()
-        instance = int(0)
-        for row in range(wp.min(side, height - top)):
-            for lane in range(wp.min(side, width - left)):
-                p = row * side + lane
-                o = (camera * height + top + row) * width + left + lane
-                t[p] = transmittances[o]
-                g0[p] = v_rgb[o, 0]
-                g1[p] = v_rgb[o, 1]
-                g2[p] = v_rgb[o, 2]
-                if weights[o] > real(0.0):
-                    v_z[p] = v_depth[o] / weights[o]
-                    v_w[p] = -v_z[p] * depth[o]
-                v_w[p] = v_w[p] + v_alpha[o]
-                behind[p] = t[p] * (
-                    backgrounds[camera, 0] * g0[p] + backgrounds[camera, 1] * g1[p] + backgrounds[camera, 2] * g2[p]
-                )
-                end[p] = ends[o]
-                instance = wp.max(instance, ends[o])
-
-        ux = row_reals()
-        s1 = row_reals()
-        s2 = row_reals()
-        s11 = row_reals()
-        s12 = row_reals()
-        s22 = row_reals()
-        so = row_reals()
-        s_c0 = row_reals()
-        s_c1 = row_reals()
-        s_c2 = row_reals()
-        sz = row_reals()
-        sums = side_sums()
-        halves = half_sums()
-        totals = value_reals()
-        while instance > ranges[tile, 0]:
-            instance -= 1
-            i = splat_ids[instance]
-            mx = splats[i, 0]
-            my = splats[i, 1]
-            u11 = splats[i, 2]
-            u12 = splats[i, 3]
-            u22 = splats[i, 4]
-            opacity = splats[i, 5]
-            c0 = splats[i, 6]
-            c1 = splats[i, 7]
-            c2 = splats[i, 8]
-            distance = splats[i, 9]
-            rows = f.rows_of(my, splats[i, 11], whole_tiles, origin_y + top)
-            x0 = real(origin_x + left) + real(0.5) - mx
-            for lane in range(side):
-                ux[lane] = f.apart(u11 * (x0 + real(lane)))
-                s1[lane] = real(0.0)
-                s2[lane] = real(0.0)
-                s11[lane] = real(0.0)
-                s12[lane] = real(0.0)
-                s22[lane] = real(0.0)
-                so[lane] = real(0.0)
-                s_c0[lane] = real(0.0)
-                s_c1[lane] = real(0.0)
-                s_c2[lane] = real(0.0)
-                sz[lane] = real(0.0)
-            for row in range(rows[0], rows[1]):
-                dy = real(origin_y + top + row) + real(0.5) - my
-                e12 = u12 * dy
-                e2 = u22 * dy
-                e22 = e2 * e2
-                e2y = e2 * dy
-                base = wp.max(row * side, 0)
-                for lane in range(side):
-                    p = base + lane
-                    dx = x0 + real(lane)
-                    e1 = ux[lane] + e12
-                    g = f.falloff(e1 * e1 + e22)
-                    raw = opacity * g
-                    alpha = wp.where(alpha_max < raw, alpha_max, raw)
-                    drawn = alpha >= alpha_cut and instance < end[p]
-                    alpha = wp.where(drawn, alpha, real(0.0))
-                    inverse = real(1.0) / (real(1.0) - alpha)
-                    before = t[p] * inverse
-                    w = alpha * before
-                    d = c0 * g0[p] + c1 * g1[p] + c2 * g2[p] + distance * v_z[p] + v_w[p]
-                    v = before * d - behind[p] * inverse
-                    v = wp.where(drawn and raw <= alpha_max, v * g, real(0.0))
-                    t[p] = before
-                    behind[p] = behind[p] + w * d
-                    v_e1 = v * e1
-                    s1[lane] = s1[lane] + v_e1
-                    s2[lane] = s2[lane] + v * e2
-                    s11[lane] = s11[lane] + v_e1 * dx
-                    s12[lane] = s12[lane] + v_e1 * dy
-                    s22[lane] = s22[lane] + v * e2y
-                    so[lane] = so[lane] + v
-                    s_c0[lane] = s_c0[lane] + w * g0[p]
-                    s_c1[lane] = s_c1[lane] + w * g1[p]
-                    s_c2[lane] = s_c2[lane] + w * g2[p]
-                    sz[lane] = sz[lane] + w * v_z[p]
-            # Into one array per width, because additions vectorise only where nothing may overlap.
-            for lane in range(side):
-                sums[0 * side + lane] = s1[lane]
-                sums[1 * side + lane] = s2[lane]
-                sums[2 * side + lane] = s11[lane]
-                sums[3 * side + lane] = s12[lane]
-                sums[4 * side + lane] = s22[lane]
-                sums[5 * side + lane] = so[lane]
-                sums[6 * side + lane] = s_c0[lane]
-                sums[7 * side + lane] = s_c1[lane]
-                sums[8 * side + lane] = s_c2[lane]
-                sums[9 * side + lane] = sz[lane]
-            for k in range(VALUES):
-                for lane in range(half):
-                    halves[k * half + lane] = sums[k * side + lane] + sums[k * side + half + lane]
-            for k in range(VALUES):
-                o = k * half
-                if wp.static(tile_size == 16):
-                    even = (halves[o] + halves[o + 4]) + (halves[o + 2] + halves[o + 6])
-                    odd = (halves[o + 1] + halves[o + 5]) + (halves[o + 3] + halves[o + 7])
-                    totals[k] = even + odd
-                else:
-                    rest = halves[o]
-                    for lane in range(1, half):
-                        rest += halves[o + lane]
-                    totals[k] = rest
-            slot = slots[instance]
-            v_e1 = opacity * totals[0]
-            v_e2 = opacity * totals[1]
-            v_slots[slot, 0] = u11 * v_e1
-            v_slots[slot, 1] = u12 * v_e1 + u22 * v_e2
-            v_slots[slot, 2] = -opacity * totals[2]
-            v_slots[slot, 3] = -opacity * totals[3]
-            v_slots[slot, 4] = -opacity * totals[4]
-            for k in range(5, VALUES):
-                v_slots[slot, k] = totals[k]
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def contributions(
@@ -347,7 +236,7 @@ def make_kernels(real, tile_size: int):
         in_camera = tile - camera * tiles
         top = (in_camera // columns) * side
         left = (in_camera - (in_camera // columns) * columns) * side
-        ux = row_reals()
+        ramp = strip_reals()
         t = tile_reals()
         end = tile_ints()
         last = int(0)
@@ -359,26 +248,31 @@ def make_kernels(real, tile_size: int):
                 last = wp.max(last, end[p])
         for instance in range(ranges[tile, 0], last):
             i = splat_ids[instance]
-            rows = f.rows_of(splats[i, 1], splats[i, 11], whole_tiles, origin_y + top)
-            x0 = real(origin_x + left) + real(0.5) - splats[i, 0]
-            for lane in range(side):
-                ux[lane] = f.apart(splats[i, 2] * (x0 + real(lane)))
+            u11 = splats[i, 2]
+            bounds = f.bounds_of(splats[i, 0], splats[i, 1], u11, splats[i, 4], splats[i, 10], splats[i, 11], whole_tiles)
+            for lane in range(strip):
+                ramp[lane] = f.apart(u11 * real(lane))
             weight_sum = real(0.0)
             weight_max = real(0.0)
-            for row in range(rows[0], rows[1]):
+            for row in range(side):
                 dy = real(origin_y + top + row) + real(0.5) - splats[i, 1]
-                e12 = splats[i, 3] * dy
                 e2 = splats[i, 4] * dy
-                for lane in range(side):
-                    p = row * side + lane
-                    e1 = ux[lane] + e12
-                    alpha = wp.min(alpha_max, splats[i, 5] * f.falloff(e1 * e1 + e2 * e2))
-                    if alpha >= alpha_cut and instance < end[p]:
-                        w = alpha * t[p]
-                        t[p] = t[p] * (real(1.0) - alpha)
-                        weight_sum += w
-                        weight_max = wp.max(weight_max, w)
+                e12 = f.apart(splats[i, 3] * dy)
+                e22 = f.apart(e2 * e2)
+                for part in range(parts):
+                    x = real(origin_x + left + part * strip) + real(0.5)
+                    start = f.apart(u11 * (x - splats[i, 0])) + e12
+                    if f.reaches(start, u11, e22, bounds[0], bounds[1]):
+                        for lane in range(strip):
+                            p = row * side + part * strip + lane
+                            e1 = start + ramp[lane]
+                            alpha = wp.min(alpha_max, splats[i, 5] * f.falloff(e1 * e1 + e22))
+                            if alpha >= alpha_cut and instance < end[p]:
+                                w = alpha * t[p]
+                                t[p] = t[p] * (real(1.0) - alpha)
+                                weight_sum += w
+                                weight_max = wp.max(weight_max, w)
             weights[slots[instance], 0] = weight_sum
             weights[slots[instance], 1] = weight_max
 
-    return SimpleNamespace(forward=forward, backward=backward, contributions=contributions)
+    return SimpleNamespace(forward=forward, backward=make_backward(real, tile_size), contributions=contributions)

@@ -1,58 +1,72 @@
-"""What the CPU's blending passes compute alike, to the bit: the rows a Gaussian reaches, and how it falls off."""
+"""What the CPU's blending passes compute alike, to the bit: which pixels a Gaussian reaches, and how it falls off."""
 
 import functools
 from types import SimpleNamespace
 
 import warp as wp
 
+STRIP = 8
+"""Pixels of a row that are worked on together. More would not leave the sums of a strip in the 16 registers of AVX2."""
+ABREAST = 4
+"""Falloffs computed side by side: each is a chain of twenty operations that wait for one another."""
+
 
 @functools.cache
-def make_falloff(real):
-    """exp(-x / 2) for x >= 0. In float32 by a polynomial, because a call to the C library would not vectorise."""
+def make_falloffs(real, count: int):
+    """exp(-x / 2) for ``count`` numbers x >= 0. In float32 by a polynomial: a call to the C library would not vectorise."""
+    reals = wp.types.vector(count, real)
+
     if real is wp.float64:
 
         @wp.func
-        def falloff64(x: real) -> real:
-            return wp.exp(real(-0.5) * x)
+        def falloffs64(x: reals) -> reals:
+            found = reals()
+            for n in range(wp.static(count)):
+                found[n] = wp.exp(real(-0.5) * x[n])
+            return found
 
-        return falloff64
+        return falloffs64
 
     @wp.func
-    def falloff32(x: real) -> real:
+    def falloffs32(x: reals) -> reals:
         # exp(-x / 2) = 2^n 2^f, |f| <= 1/2. Adding 1.5 * 2^23 rounds to an integer and leaves it in the low bits.
         # The bound keeps the result, times any opacity that can be seen, a normal number: others are slow.
-        y = wp.max(x * real(-0.7213475204444817), real(-110.0))
-        shifted = y + real(12582912.0)
-        f = y - (shifted - real(12582912.0))
+        y = wp.max(x * real(-0.7213475204444817), reals(real(-110.0)))
+        shifted = y + reals(real(12582912.0))
+        f = y - (shifted - reals(real(12582912.0)))
         # minimax polynomial of 2^f by relative error, 9.2e-8, with constant term 1
-        p = real(1.3264726641879386e-3)
-        p = p * f + real(9.671512958571476e-3)
-        p = p * f + real(5.550733747694458e-2)
-        p = p * f + real(2.4022242080135733e-1)
-        p = p * f + real(6.931469775948987e-1)
-        p = p * f + real(1.0)
+        p = reals(real(1.3264726641879386e-3))
+        p = wp.cw_mul(p, f) + reals(real(9.671512958571476e-3))
+        p = wp.cw_mul(p, f) + reals(real(5.550733747694458e-2))
+        p = wp.cw_mul(p, f) + reals(real(2.4022242080135733e-1))
+        p = wp.cw_mul(p, f) + reals(real(6.931469775948987e-1))
+        p = wp.cw_mul(p, f) + reals(real(1.0))
         # 2^n by adding n to the exponent bits
-        return wp.cast(wp.cast(p, wp.int32) + (wp.cast(shifted, wp.int32) << 23), wp.float32)
+        for n in range(wp.static(count)):
+            p[n] = wp.cast(wp.cast(p[n], wp.int32) + (wp.cast(shifted[n], wp.int32) << 23), wp.float32)
+        return p
 
-    return falloff32
+    return falloffs32
 
 
 @functools.cache
-def make_functions(real, tile_size: int):
-    """The functions for one scalar type and tile size."""
-    vec2i = wp.types.vector(2, wp.int32)
-    side = wp.constant(tile_size)
+def make_falloff(real):
+    """The same for one number."""
+    one = wp.types.vector(1, real)
+    falloffs = make_falloffs(real, 1)
 
     @wp.func
-    def rows_of(my: real, half_height: real, whole_tiles: wp.int32, top: wp.int32) -> vec2i:
-        """Rows of the tile, counted from its top, whose pixel centres may lie in the Gaussian's box."""
-        if whole_tiles != 0:
-            return vec2i(0, side)
-        margin = real(0.01) + real(2.0e-6) * (wp.abs(my) + half_height)
-        center = my - real(top) - real(0.5)
-        first = wp.ceil(wp.clamp(center - half_height - margin, real(0.0), real(side)))
-        last = wp.floor(wp.clamp(center + half_height + margin, real(-1.0), real(side) - real(1.0)))
-        return vec2i(int(first), int(last) + 1)
+    def falloff(x: real) -> real:
+        return falloffs(one(x))[0]
+
+    return falloff
+
+
+@functools.cache
+def make_functions(real):
+    """The functions for one scalar type."""
+    vec2 = wp.types.vector(2, real)
+    half_strip = wp.constant(real((STRIP - 1) / 2))
 
     @wp.func
     def apart(product: real) -> real:
@@ -62,4 +76,21 @@ def make_functions(real, tile_size: int):
         """
         return wp.where(real(1.0e30) < product, real(1.0e30), product)
 
-    return SimpleNamespace(falloff=make_falloff(real), rows_of=rows_of, apart=apart)
+    @wp.func
+    def bounds_of(mx: real, my: real, u11: real, u22: real, half_width: real, half_height: real, whole_tiles: wp.int32) -> vec2:
+        """How far e1 at the middle of a strip may lie from 0, less the ellipse; and the ellipse: the largest |U d|^2."""
+        margin = real(0.01) + real(2.0e-6) * (wp.abs(mx) + half_width)
+        slack = real(0.01) + real(2.0e-6) * (wp.abs(my) + half_height)
+        radius = u22 * (half_height + slack)
+        return vec2(wp.abs(u11) * (half_strip + margin), wp.where(whole_tiles != 0, real(wp.inf), radius * radius))
+
+    @wp.func
+    def reaches(start: real, u11: real, e22: real, aside: real, limit: real) -> bool:
+        """Whether the ellipse touches a strip, whose first pixel has ``start`` for e1: the least |U d|^2 on it is in."""
+        least = wp.max(wp.abs(start + u11 * half_strip) - aside, real(0.0))
+        return least * least + e22 <= limit
+
+    return SimpleNamespace(
+        apart=apart, bounds_of=bounds_of, reaches=reaches,
+        falloff=make_falloff(real), falloffs=make_falloffs(real, ABREAST), abreast=wp.types.vector(ABREAST, real),
+    )  # fmt: skip
