@@ -114,6 +114,11 @@ def dropout(count: int) -> Cost:
     return Cost(REAL * count, 20 * count)
 
 
+def burst(pixels: int) -> Cost:
+    """A photograph in and out."""
+    return Cost(6 * REAL * pixels, 0)
+
+
 def scanlines(pixels: int, planes: int) -> Cost:
     """Costs in, and sums in and out, by each of four paths, 2 bytes each; 8 operations a path and plane."""
     return Cost(4 * 6 * pixels * planes, 32 * pixels * planes)

@@ -47,7 +47,7 @@ def stages(fit: Fit) -> dict[str, dict[str, float]]:
     def backward_of(outputs, sources, upstream=None):
         return lambda: torch.autograd.grad(outputs, sources, upstream, retain_graph=True)
 
-    value = photometric_loss(image, target, None, loss)[0]
+    value = photometric_loss(image, target, None, loss)
     params = list(fit.optimizer.params.values())
 
     def optimize():

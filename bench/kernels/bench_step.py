@@ -40,7 +40,7 @@ def tasks(point, device, wanted):
 
         def step():
             picture = rasterize(optimizer.gaussians, camera).rgb
-            photometric_loss(picture, target, None, loss)[0].backward()
+            photometric_loss(picture, target, None, loss).backward()
             optimizer.step(0.5)
 
         yield Task(OURS, "step", step, cost(point, device))

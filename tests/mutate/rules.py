@@ -38,6 +38,7 @@ OPS = {
     "blend": ["kernels/test_blend.py", "test_rasterizer.py", LIMITS_BLEND],
     "blend_cpu": ["kernels/test_blend.py", LIMITS_BLEND, RECORDS, LAYERS, "test_window.py"],
     "blend_cuda": ["kernels/test_blend.py", "test_rasterizer.py", LIMITS_BLEND, RECORDS, LAYERS, "test_window.py"],
+    "burst": ["kernels/test_burst.py"],
     "bridge": [CUTS, "kernels/test_adam.py", "kernels/test_sh.py", "kernels/test_tiles.py"],
     "compiler": ["kernels/test_blend.py"],
     "dropout": ["kernels/test_dropout.py"],

@@ -14,6 +14,7 @@ from warpgs.constants import RULES
 from warpgs.errors import ResourceError
 from warpgs.kernels import bridge
 from warpgs.kernels.blend import blend
+from warpgs.kernels.burst import NOT_FINITE, begin_step, end_step
 from warpgs.kernels.dropout import opacity_dropout
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, available_bytes, bin_tiles
@@ -29,8 +30,6 @@ ROOM = 1.3
 """Instances that a recording has room for, as a multiple of the most that any view has when it is recorded."""
 DEAD_BYTES = 2**30
 """Memory of recordings no longer used that may pile up. To give it back takes milliseconds, in which the device waits."""
-NOT_FINITE = 2
-"""Value of the stop flag after a loss that is no number; 1 after more instances than there is room for."""
 
 
 @dataclass(frozen=True)
@@ -139,40 +138,40 @@ class StepGraph:
 
     def _step(self) -> None:
         burst, views, size = self.burst, self.views, {"width": self.width, "height": self.height}
-        view = burst.view_rows.index_select(0, burst.counter)
-        rates = burst.rate_rows.index_select(0, burst.counter)[0]
-        target = views.targets.index_select(0, view)[0]
-        mask = None if views.masks is None else views.masks.index_select(0, view)[0]
-        disparity = None if views.disparities is None else views.disparities.index_select(0, view)[0]
-        settings, factors = burst.setting_rows.index_select(0, burst.counter)[0], None
+        rows = (burst.view_rows, burst.rate_rows, burst.setting_rows, views.viewmats, views.Ks, views.targets)
+        rates, settings, viewmat, K, target = begin_step(burst.counter, *rows)
+        mask, disparity = (self._of_view(t) for t in (views.masks, views.disparities))
+        factors = None
         if self.dropout_seed is not None:
             factors = opacity_dropout(len(self.optimizer.gaussians), settings, self.dropout_seed)
-        viewmat, K = views.viewmats.index_select(0, view), views.Ks.index_select(0, view)
         with torch.set_grad_enabled(not self.fused):
             splats, counts = self._project(viewmat, K, factors)
         splats.requires_grad_()
         tiles = bin_tiles(splats, counts, **size, rule=self.rule, capacity=self.capacity, overflow=burst.stop)
-        rgb, *rest = (p[0] for p in blend(splats, tiles, self.background, **size, rule=self.rule))
+        # not p[0], whose gradient would be a copy among zeros
+        rgb, *rest = (p.squeeze(0) for p in blend(splats, tiles, self.background, **size, rule=self.rule))
         loss = training_loss((rgb, *rest), target, mask, disparity, self.loss)
         params = self.optimizer.params
-        *gradients, v_splats = torch.autograd.grad(loss, [*(() if self.fused else params.values()), splats])
+        *gradients, v_splats = torch.autograd.grad(loss, [*(() if self.fused else params.values()), splats], burst.one)
         with torch.no_grad():
-            burst.stop.masked_fill_(~torch.isfinite(loss), NOT_FINITE)
+            going = end_step(loss, masked_mse(rgb, target, mask), burst.counter, burst.stop, burst.history)
             if self.fused:
                 of = (viewmat, K, splats, counts, v_splats)
                 how = {"degree": self.degree, "rule": self.rule, **size}
                 self.optimizer.step_projected(*of, rates, burst.stop, self.share, **how)
             else:
                 self.optimizer.step_scheduled(dict(zip(params, gradients)), rates, burst.stop, self.share)
-            going = burst.stop == 0
             if self.protected is not None:
                 layers, protect = self.protected
                 layers.hold_up(params["logit_opacities"].detach(), settings[1], protect, going)
             if self.stats is not None:
                 self.stats.add_gradient(v_splats, counts > 0, self.width, self.height, weight=going)
-            mse = masked_mse(rgb, target, mask)
-            burst.history.index_copy_(0, burst.counter, torch.stack([loss, mse])[None])
-            burst.counter += going
+
+    def _of_view(self, maps: torch.Tensor | None) -> torch.Tensor | None:
+        """The step's view of maps [V, H, W]; before the step is counted."""
+        if maps is None:
+            return None
+        return maps.index_select(0, self.burst.view_rows.index_select(0, self.burst.counter))[0]
 
     def replay(self) -> None:
         """One step; the burst's counter says which."""
@@ -200,6 +199,8 @@ class Burst:
         """0 while all is well, else why the burst stopped."""
         self.history = torch.zeros(BURST, 2, device=device)
         """Loss and mean squared error of each step."""
+        self.one = torch.ones((), device=device)
+        """Gradient of the loss."""
 
     def give_back(self, dead: int) -> None:
         """Return to the device what torch keeps for nobody, once that may be more than ``dead`` bytes.

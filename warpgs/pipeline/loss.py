@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import torch
@@ -36,10 +37,14 @@ class LossConfig:
             raise UsageError(f"loss ssim weight {self.ssim_weight} must lie between 0 and 1")
 
 
-def photometric_loss(
-    rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None, config: LossConfig
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Loss of a rendered image, and its L1 part.
+@functools.cache
+def _weights(share: float, count: int, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    """Of the sums of 1 - SSIM and of absolute differences over ``count`` numbers; kept for good, as graphs refer to it."""
+    return torch.tensor([share / count, (1 - share) / count], dtype=dtype, device=device)
+
+
+def photometric_loss(rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None, config: LossConfig) -> torch.Tensor:
+    """Loss of a rendered image.
 
     Args:
         rgb: Rendered colours, shape [H, W, 3].
@@ -48,21 +53,21 @@ def photometric_loss(
         config: Weights.
 
     Returns:
-        Loss and L1, shape []; both 0 where no pixel counts.
+        The loss, shape []; 0 where no pixel counts.
     """
     share = config.ssim_weight
     if mask is None and share > 0:
-        unlike, error = differences(rgb, target).unbind()
-        l1 = error / target.numel()
-        return (1 - share) * l1 + share * unlike / target.numel(), l1.detach()
+        sums = differences(rgb, target)
+        # a product and a sum, where terms one by one would be a dozen kernels on a GPU
+        return (sums * _weights(share, target.numel(), sums.dtype, sums.device)).sum()
     if mask is not None:
         rgb, target = rgb * mask[..., None], target * mask[..., None]
     pixels = target.shape[0] * target.shape[1] if mask is None else mask.sum().clamp_min(1)
     l1 = (rgb - target).abs().sum() / (3 * pixels)
     if share == 0:
-        return l1, l1.detach()
+        return l1
     structural = ((1 - ssim(rgb, target)) * mask[..., None]).sum() / (3 * pixels)
-    return (1 - share) * l1 + share * structural, l1.detach()
+    return (1 - share) * l1 + share * structural
 
 
 def depth_disagreement(
@@ -108,7 +113,7 @@ def training_loss(
     ``pictures`` are colour, alpha and depth; the rest is as in `photometric_loss` and `depth_disagreement`.
     """
     rgb, alpha, depth = pictures
-    loss, _ = photometric_loss(rgb, target, mask, config)
+    loss = photometric_loss(rgb, target, mask, config)
     if disparity is None:
         return loss
     return loss + config.depth_weight * depth_disagreement(depth, alpha, disparity, mask)
