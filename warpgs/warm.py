@@ -19,6 +19,7 @@ from warpgs.kernels import (
     blend_cpu,
     blend_cuda,
     bridge,
+    burst,
     dropout,
     knn,
     project,
@@ -61,6 +62,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     blending, warps = blend_cuda.make_kernels(TILE), 32 * blend_cuda.WARPS
     own = [(blending.forward, warps), (blending.order_tiles, 1024), (blending.contributions, TILE * TILE)]
     own += [(blend.make_segments(real).gather_weights, THREADS), (scanlines.make_kernel(), scanlines.BLOCK)]
+    own += [(burst.make_kernels().begin_step, THREADS)]
     for depth, chunk in itertools.product((False, True), blend_cuda.CHUNKS):  # with a depth term, and without
         passes = blend_cuda.make_backward(TILE, depth, chunk, False)
         own += [(passes.backward, warps), (passes.gather, THREADS)]
