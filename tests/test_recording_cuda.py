@@ -199,6 +199,7 @@ def test_a_device_that_is_not_the_current_one(fresh):
     with torch.cuda.device(1):
         for _ in range(CALLS + 2):
             rasterize(g, cams[0]).rgb.sum().backward()
+            assert torch.cuda.current_device() == 1
     assert replays() == 0
 
 

@@ -141,6 +141,41 @@ def test_memory_that_nobody_wrote_is_not_read(whole, poisoned_memory):
         assert torch.equal(a, b), i
 
 
+@pytest.mark.parametrize("several", [False, True])
+def test_the_device_that_is_current_stays_so(monkeypatch, several):
+    """Warp leaves the one current that it worked on: where there are several, launches and its own work stand in a guard."""
+    events, device = [], torch.device("cuda", 1)
+
+    class Guard:
+        def __init__(self, where):
+            self.where = where
+
+        def __enter__(self):
+            events.append(("enter", self.where))
+
+        def __exit__(self, *_):
+            events.append("exit")
+
+    class Noted:
+        def launch(self, *_):
+            events.append("launch")
+
+        def set_stream(self, stream, sync):
+            events.append(stream)
+
+    Noted.stream = "before"
+    monkeypatch.setattr(bridge, "_several_devices", lambda: several)
+    monkeypatch.setattr(torch.cuda, "device", Guard)
+    monkeypatch.setattr(bridge, "_recorded", lambda *_: Noted())
+    monkeypatch.setattr(bridge, "warp_stream", lambda _: "ours")
+    monkeypatch.setattr(bridge, "warp_device", lambda _: Noted())
+    bridge.launch(None, 1, [], device)
+    with bridge.stream_of(device):
+        events.append("sort")
+    guarded = [[("enter", device), *body, "exit"] if several else body for body in (["launch"], ["ours", "sort", "before"])]
+    assert events == guarded[0] + guarded[1]
+
+
 def test_items_are_numbered_in_31_bits():
     """2^31 - 1 of them can be, one more cannot."""
     bridge._check_size(2**31 - 1)

@@ -107,8 +107,22 @@ def warp_device(device: torch.device) -> wp.Device:
 
 
 @functools.cache
+def _several_devices() -> bool:
+    return torch.cuda.device_count() > 1
+
+
+def _current(device: torch.device):
+    """A block in which a CUDA device is the current one, and after which the caller's is again.
+
+    Warp makes a device current when it works there, and leaves it so; torch takes that for the caller's choice.
+    """
+    return torch.cuda.device(device) if _several_devices() else contextlib.nullcontext()
+
+
+@functools.cache
 def _warp_stream(device: torch.device, pointer: int) -> wp.Stream:
-    return wp.Stream(warp_device(device), cuda_stream=pointer)
+    with _current(device):
+        return wp.Stream(warp_device(device), cuda_stream=pointer)
 
 
 def warp_stream(device: torch.device) -> wp.Stream:
@@ -135,7 +149,7 @@ def stream_of(device: torch.device):
         yield
         return
     wanted, where = warp_stream(device), warp_device(device)
-    with _SORTING:
+    with _SORTING, _current(device):
         before = where.stream
         where.set_stream(wanted, sync=False)
         try:
@@ -263,7 +277,8 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
         return
     _check_size(count)
     if device.type == "cuda":
-        _recorded(kernel, device, block_dim).launch(count, inputs, warp_stream(device))
+        with _current(device):
+            _recorded(kernel, device, block_dim).launch(count, inputs, warp_stream(device))
         return
     inputs = [a.array() if isinstance(a, View) else a for a in inputs]
     with _LOADING:  # launches on a CPU are compiled for blocks of one thread
