@@ -1,5 +1,7 @@
 """Functions that are recorded: when, how often, and what they give where they are not."""
 
+import warnings
+
 import pytest
 import torch
 
@@ -10,9 +12,10 @@ CPU = torch.device("cpu")
 
 
 class Full(Graphs):
-    """Memory is never enough to record in."""
+    """Memory is never enough to record in, as turns out at the end."""
 
     def capture(self, work):
+        work()
         raise torch.OutOfMemoryError
 
 
@@ -86,3 +89,22 @@ def test_what_cannot_be_recorded_for_want_of_memory_is_done_all_the_same():
     for k, ((out,), block) in enumerate(calls):
         assert torch.equal(out, torch.full((4,), 2.0 * k)) and torch.equal(work.kept(block)[0], torch.full((4,), 0.5 * k))
     assert work.replays == 0 and work.recorded == FREE + 1
+
+
+def test_a_driver_that_cannot_record_is_told_once_and_work_goes_on():
+    """Until somebody asks to begin anew."""
+
+    class Refusing(Graphs):
+        def capture(self, work):
+            raise RuntimeError("operation not permitted")
+
+    own = Refusing(CPU)
+    work = Work(doubled, own)
+    with pytest.warns(UserWarning, match="not recorded from here on.*operation not permitted"):
+        (out,), block = work(torch.ones(4))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        work(torch.zeros(4))
+    assert own.failed and work.recorded == 1 and float(out[0]) == 2 and float(work.kept(block)[0][0]) == 0.5
+    own.release()
+    assert not own.failed

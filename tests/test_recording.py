@@ -1,7 +1,9 @@
 """Which calls are planned, when kernels are recorded, and what a plan draws without graphs: all that needs no GPU."""
 
 import dataclasses
+import gc
 import itertools
+import weakref
 
 import pytest
 import torch
@@ -35,9 +37,10 @@ class Counted:
 
 
 class NoGraphs(Graphs):
-    """Memory is never enough to record in."""
+    """Memory is never enough to record in, as turns out at the end."""
 
     def capture(self, work):
+        work()
         raise torch.OutOfMemoryError
 
 
@@ -173,3 +176,59 @@ def test_a_plan_without_room_says_so(surroundings):
     for _ in range(2 * CALLS):
         found = own.render(sources, None, frame)
     assert found is not None and own.plan.capacity > own.plan.instances
+
+
+def test_a_plan_is_gone_when_nobody_holds_it(surroundings):
+    """Without a collection of garbage: graphs hold memory of the device. A backward pass that is still to come holds it."""
+    g, own = leaves(cloud(50)), Recorder(NoGraphs(CPU))
+    cam = camera(70, 50, 1, torch.float32)
+    frame = Frame(70, 50, (0, 0, 70, 50), g.sh_degree, RULES["exact"], 16)
+    for _ in range(CALLS):
+        found = own.render((*g.tensors().values(), cam.viewmat, cam.K), None, frame)
+    gone, loss = weakref.ref(own.plan), found[0][0].sum()
+    gc.disable()
+    try:
+        own.forget()
+        del found
+        assert gone() is not None
+        loss.backward()
+        del loss
+        assert gone() is None and bool(g.means.grad.any())
+    finally:
+        gc.enable()
+
+
+def test_where_recording_failed_calls_run_as_usual(recorder):
+    """For good, or until recordings are forgotten."""
+    own = batch()
+    recorder.graphs.failed = True
+    assert [recorder.render(own, None, FRAME) for _ in range(9)] == [None] * 9
+    recorder.forget()
+    assert [recorder.render(own, None, FRAME) for _ in range(CALLS)][-1] == "pictures"
+
+
+def test_torchs_default_type_is_not_the_plans(surroundings):
+    """The background that nobody gave is of the Gaussians' type."""
+    g, own = leaves(cloud(50)), Recorder(NoGraphs(CPU))
+    cam = camera(70, 50, 1, torch.float32)
+    frame = Frame(70, 50, (0, 0, 70, 50), g.sh_degree, RULES["exact"], 16)
+    usual = torch.get_default_dtype()
+    torch.set_default_dtype(torch.bfloat16)
+    try:
+        for _ in range(CALLS):
+            found = own.render((*g.tensors().values(), cam.viewmat, cam.K), None, frame)
+    finally:
+        torch.set_default_dtype(usual)
+    assert torch.equal(found[0][0], rasterize(g, cam).rgb)
+
+
+def test_gaussians_that_change_in_number_before_the_backward_pass(surroundings):
+    """Swapped where autograd does not see it: an error instead of memory beside the gradients."""
+    g, own = leaves(cloud(50)), Recorder(NoGraphs(CPU))
+    cam = camera(70, 50, 1, torch.float32)
+    frame = Frame(70, 50, (0, 0, 70, 50), g.sh_degree, RULES["exact"], 16)
+    for _ in range(CALLS):
+        found = own.render((*g.tensors().values(), cam.viewmat, cam.K), None, frame)
+    g.means.data = torch.zeros(70, 3)
+    with pytest.raises(RuntimeError, match="50 Gaussians were drawn, and now there are 70"):
+        found[0][0].sum().backward()

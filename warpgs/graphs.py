@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import threading
+import warnings
 from collections.abc import Callable
 
 import torch
@@ -26,16 +28,38 @@ class Graphs:
     def __init__(self, device: torch.device):
         self.device = device
         self.stream = torch.cuda.current_stream(device) if device.type == "cuda" else None
-        self.byte = torch.empty(0, dtype=torch.uint8, device=device)
         self.lock = threading.RLock()
         self.replays = 0
+        self.failed = False
+        """Whether something could not be recorded, for another reason than want of memory."""
         self._aside: torch.cuda.Stream | None = None
         self._keeper: tuple | None = None
 
+    @functools.cached_property
+    def byte(self) -> torch.Tensor:
+        """A tensor of bytes on the device, without any."""
+        return torch.empty(0, dtype=torch.uint8, device=self.device)
+
+    def capturing(self) -> bool:
+        """Whether somebody records a graph of their own on the current stream."""
+        return self.stream is not None and torch._C._cuda_isCurrentStreamCapturing()
+
     def capture(self, work: Callable[[], object]) -> tuple[object, object]:
-        """A graph of ``work``, and what must live as long; `torch.OutOfMemoryError` where it does not fit."""
+        """A graph of ``work``, and what must live as long.
+
+        Raises:
+            RuntimeError: It cannot be recorded; `torch.OutOfMemoryError` where its memory does not fit.
+        """
         if self._aside is None:
             self._aside = torch.cuda.Stream(self.device)
+        here = torch.cuda.current_stream(self.device)
+        self._aside.wait_stream(here)  # recording sets numbers of torch's generator that graphs in flight may still read
+        try:
+            return self._capture_aside(work)
+        finally:
+            here.wait_stream(self._aside)
+
+    def _capture_aside(self, work: Callable[[], object]) -> tuple[object, object]:
         with torch.cuda.stream(self._aside), torch.no_grad():
             if self._keeper is None:  # memory that graphs share, and that torch would lend to nobody once the last is gone
                 self._keeper = bridge.capture(lambda: torch.zeros(1, device=self.device))
@@ -47,8 +71,8 @@ class Graphs:
         return None if self._keeper is None else self._keeper[0].pool()
 
     def release(self) -> None:
-        """Keep no memory for graphs to come."""
-        self._keeper = None
+        """Keep no memory for graphs to come, and try again."""
+        self._keeper, self.failed = None, False
 
 
 class Work:
@@ -81,7 +105,9 @@ class Work:
                     self._scratch = self.graphs.byte.new_empty(measured.scratch_bytes)
             blocks = Blocks(self._measured, self.graphs.byte, self._scratch)
             key = (*[0 if t is None else t.data_ptr() for t in inputs], *blocks.addresses())
-            known = self._known.get(key) or self._record(key, blocks, inputs)
+            known = None
+            if not self.graphs.capturing():
+                known = self._known.get(key) or self._record(key, blocks, inputs)
             if known is None:
                 with torch.no_grad():
                     self._run(blocks, inputs)
@@ -96,16 +122,22 @@ class Work:
         return [part(block, *place) for place in self._places]
 
     def _run(self, blocks: Blocks, inputs: tuple[torch.Tensor | None, ...]) -> None:
+        blocks.begin()  # a recording may have ended half way
         found = self.function(blocks, *inputs)
         self._places = [blocks.place(t) for t in found]
 
     def _record(self, key: tuple[int, ...], blocks: Blocks, inputs: tuple[torch.Tensor | None, ...]) -> tuple | None:
-        if self.recorded - FREE > self.replays // PAID:
-            return None  # addresses change too often
+        if self.graphs.failed or self.recorded - FREE > self.replays // PAID:
+            return None  # the latter where addresses change too often
         self.recorded += 1
         try:
             known = self.graphs.capture(lambda: self._run(blocks, inputs))
         except torch.OutOfMemoryError:
+            return None
+        except RuntimeError as error:  # of the driver, or of an allocator that knows no graphs
+            self.graphs.failed = True
+            said = f"calls of the rasterizer are not recorded from here on, which makes small ones slower: {error}"
+            warnings.warn(said, stacklevel=2)
             return None
         if len(self._known) == VARIANTS:
             del self._known[next(iter(self._known))]

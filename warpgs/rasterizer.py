@@ -49,7 +49,8 @@ class RasterizeOptions:
     gradients: the same picture in less memory and more time. None for all at once. Not with ``capacity``."""
     record: bool = True
     """On CUDA, replay what a loop repeats: the same bits in half the time. Of small calls with gradients, in a fixed order,
-    without opacity_factors, contributions and bounds (docs/decisions/010-recorded-calls.md)."""
+    without opacity_factors, contributions and bounds (docs/decisions/010-recorded-calls.md). False where other threads wait for
+    the whole device, as torch.cuda.synchronize does."""
 
     def repeatable(self) -> bool:
         """Whether calls with these options may be recorded."""

@@ -8,7 +8,10 @@ where it does not. The bits are the same, and so is the memory, but for room for
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import os
+import weakref
 from dataclasses import dataclass
 
 import torch
@@ -70,9 +73,12 @@ class Plan:
         self._counted_by_now = torch.cuda.Event() if on_gpu else None
         self._table = wp.zeros(2, dtype=wp.uint64, device="cpu", pinned=on_gpu)
         self._addresses = self._table.numpy()
-        self._count, self._draw = Work(self._counted, graphs), Work(self._composed, graphs)
-        self._blend_back, self._project_back = Work(self._v_splats, graphs), Work(self._v_sources, graphs)
-        self._none = torch.empty(0, device=self.device)
+        # by proxy, so that a plan is gone, and its graphs with it, as soon as nobody holds it
+        own = [
+            functools.partial(f, weakref.proxy(self)) for f in (Plan._counted, Plan._composed, Plan._v_splats, Plan._v_sources)
+        ]
+        self._count, self._draw, self._blend_back, self._project_back = (Work(f, graphs) for f in own)
+        self._none = torch.empty(0, dtype=torch.float32, device=self.device)
         self._black: torch.Tensor | None = None
 
     def render(self, sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor | None):
@@ -84,7 +90,7 @@ class Plan:
             self._counted_by_now.record(self._stream)
         if backgrounds is None:
             if self._black is None:
-                self._black = torch.zeros(len(sources[5]), 3, device=self.device)
+                self._black = torch.zeros(len(sources[5]), 3, dtype=torch.float32, device=self.device)
             backgrounds = self._black
         backgrounds = backgrounds.contiguous()
         pictures, block = self._draw(*made, backgrounds.detach())
@@ -152,6 +158,10 @@ class Plan:
     def project_back(self, saved: tuple[torch.Tensor, ...], v_splats: torch.Tensor | None, wants_camera: bool):
         """Gradients of the seven tensors that `project` takes."""
         *sources, cameras, splats, counts = saved
+        if len(sources[0]) != splats.shape[1]:  # by way of `.data`, which autograd does not see
+            raise RuntimeError(
+                f"{splats.shape[1]:,} Gaussians were drawn, and now there are {len(sources[0]):,}: draw again first"
+            )
         if v_splats is None or wants_camera:
             return project.gradients(self._seven(sources, cameras), *self._how(), splats, counts, v_splats, wants_camera)
         found, _ = self._project_back(*saved, v_splats.contiguous())
@@ -221,7 +231,7 @@ class Recorder:
 
     def render(self, sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor | None, frame: Frame):
         """What `Plan.render` returns; None where the call is to run as usual."""
-        key = call_key(sources, backgrounds, frame)
+        key = None if self.graphs.failed else call_key(sources, backgrounds, frame)
         if key is None or not self.graphs.lock.acquire(blocking=False):
             return None
         try:
@@ -238,7 +248,10 @@ class Recorder:
             try:
                 found = self.plan.render(sources, backgrounds)
             except BaseException:
-                self._drop()  # the device may still be at it
+                if self.graphs.stream is not None:
+                    with contextlib.suppress(RuntimeError):  # what went wrong is raised below
+                        self.graphs.stream.synchronize()  # the device reads memory of the plan
+                self._drop()
                 raise
             if found is None:
                 self._most = (key, self.plan.instances)
@@ -294,13 +307,17 @@ def call_key(sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor | None
 def _usual_surroundings(device: torch.device) -> bool:
     """Not while a graph is being captured, on no other device than the current one, and without hooks on saved tensors.
 
-    Checkpointing, which has such hooks, wants the same number of saved tensors each time.
+    Checkpointing, which has such hooks, wants the same number of saved tensors each time. Nor where torch or Warp were told to
+    do what no graph can hold: to ask the driver for each tensor, or to look for errors after each kernel.
     """
+    if _UNCACHED or wp.config.verify_cuda:
+        return False
     hooks = torch._C._autograd._top_saved_tensors_default_hooks(True)
     # those of torch.cuda take several times as long
     return hooks is None and device.index == torch._C._cuda_getDevice() and not torch._C._cuda_isCurrentStreamCapturing()
 
 
+_UNCACHED = os.environ.get("PYTORCH_NO_CUDA_MEMORY_CACHING") is not None
 _RECORDERS: dict[tuple[torch.device, int], Recorder] = {}
 
 

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from tests.kernels.test_fences import Fenced
 from tests.reference import burst as reference
 from warpgs.kernels.burst import NOT_FINITE, begin_step, end_step
 
@@ -23,6 +24,18 @@ def test_a_step_finds_its_own(device, size):
         counter = torch.tensor([step], device=device)
         found, wanted = (f(counter, views, *given) for f in (begin_step, reference.begin_step))
         assert all(a.shape == b.shape and torch.equal(a, b) for a, b in zip(found, wanted, strict=True))
+
+
+def test_nothing_is_written_beside_what_a_step_finds(device):
+    """Pictures larger and smaller than a matrix."""
+    for size in ((5, 7), (1, 1)):
+        given, views = rows(device, *size), torch.tensor([2, 0, 1, 0], device=device)
+        counter = torch.tensor([1], device=device)
+        with Fenced(2**30) as fences:
+            begin_step(counter, views, *given)
+            stop, history = torch.zeros(1, dtype=torch.int32, device=device), torch.zeros(4, 2, device=device)
+            end_step(given[0][0, 0], given[0][0, 1], counter, stop, history)
+        assert len(fences.kept) >= 5 and fences.intact()
 
 
 @pytest.mark.parametrize("stopped", [0, 1, NOT_FINITE])

@@ -179,7 +179,7 @@ def capture(work: Callable[[], object], pool: tuple[int, int] | None = None) -> 
 
     Args:
         work: May not look at the device, nor load kernels: run it once before.
-        pool: Memory of another graph that is always replayed before this one, to share.
+        pool: Memory of another graph to share, which is never replayed at the same time and leaves nothing there.
 
     Returns:
         The graph, and what must live as long as it does: what ``work`` returned, and what Warp lent to the graph.
@@ -187,7 +187,7 @@ def capture(work: Callable[[], object], pool: tuple[int, int] | None = None) -> 
     # torch.cuda.graph would collect garbage and empty the cache each time, which takes 80 ms
     graph, here = torch.cuda.CUDAGraph(), warp_stream(torch.device("cuda"))
     with _CAPTURING, _no_collection():
-        # other threads may allocate and wait meanwhile
+        # other threads may allocate meanwhile, and wait for streams and events, but not for the whole device
         graph.capture_begin(pool=pool, capture_error_mode="thread_local")
         try:
             wp.capture_begin(stream=here, external=True)

@@ -81,6 +81,10 @@ class Blocks(Memory):
         self.block = byte.new_empty(measured.kept_bytes) if measured.kept_bytes else None
         """What is kept; None where nothing is."""
         self._scratch = byte.new_empty(measured.scratch_bytes) if scratch is None else scratch
+        self.begin()
+
+    def begin(self) -> None:
+        """Hand out the same again, from the first."""
         self._asked = self._kept_to = self._scratch_to = 0
 
     def addresses(self) -> tuple[int, ...]:

@@ -40,7 +40,8 @@ class LossConfig:
 @functools.cache
 def _weights(share: float, count: int, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
     """Of the sums of 1 - SSIM and of absolute differences over ``count`` numbers; kept for good, as graphs refer to it."""
-    return torch.tensor([share / count, (1 - share) / count], dtype=dtype, device=device)
+    with torch.inference_mode(False):  # whoever asks first: what is made in that mode cannot be trained with
+        return torch.tensor([share / count, (1 - share) / count], dtype=dtype, device=device)
 
 
 def photometric_loss(rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None, config: LossConfig) -> torch.Tensor:
