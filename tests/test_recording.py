@@ -178,13 +178,17 @@ def test_a_plan_without_room_says_so(surroundings):
     assert found is not None and own.plan.capacity > own.plan.instances
 
 
+def planned(own: Recorder, g: Gaussians, cam: Camera):
+    """What the first call gives that is drawn by a plan."""
+    frame = Frame(cam.width, cam.height, (0, 0, cam.width, cam.height), g.sh_degree, RULES["exact"], 16)
+    return [own.render((*g.tensors().values(), cam.viewmat, cam.K), None, frame) for _ in range(CALLS)][-1]
+
+
 def test_a_plan_is_gone_when_nobody_holds_it(surroundings):
     """Without a collection of garbage: graphs hold memory of the device. A backward pass that is still to come holds it."""
     g, own = leaves(cloud(50)), Recorder(NoGraphs(CPU))
     cam = camera(70, 50, 1, torch.float32)
-    frame = Frame(70, 50, (0, 0, 70, 50), g.sh_degree, RULES["exact"], 16)
-    for _ in range(CALLS):
-        found = own.render((*g.tensors().values(), cam.viewmat, cam.K), None, frame)
+    found = planned(own, g, cam)
     gone, loss = weakref.ref(own.plan), found[0][0].sum()
     gc.disable()
     try:
@@ -211,12 +215,10 @@ def test_torchs_default_type_is_not_the_plans(surroundings):
     """The background that nobody gave is of the Gaussians' type."""
     g, own = leaves(cloud(50)), Recorder(NoGraphs(CPU))
     cam = camera(70, 50, 1, torch.float32)
-    frame = Frame(70, 50, (0, 0, 70, 50), g.sh_degree, RULES["exact"], 16)
     usual = torch.get_default_dtype()
     torch.set_default_dtype(torch.bfloat16)
     try:
-        for _ in range(CALLS):
-            found = own.render((*g.tensors().values(), cam.viewmat, cam.K), None, frame)
+        found = planned(own, g, cam)
     finally:
         torch.set_default_dtype(usual)
     assert torch.equal(found[0][0], rasterize(g, cam).rgb)
@@ -226,9 +228,7 @@ def test_gaussians_that_change_in_number_before_the_backward_pass(surroundings):
     """Swapped where autograd does not see it: an error instead of memory beside the gradients."""
     g, own = leaves(cloud(50)), Recorder(NoGraphs(CPU))
     cam = camera(70, 50, 1, torch.float32)
-    frame = Frame(70, 50, (0, 0, 70, 50), g.sh_degree, RULES["exact"], 16)
-    for _ in range(CALLS):
-        found = own.render((*g.tensors().values(), cam.viewmat, cam.K), None, frame)
+    found = planned(own, g, cam)
     g.means.data = torch.zeros(70, 3)
     with pytest.raises(RuntimeError, match="50 Gaussians were drawn, and now there are 70"):
         found[0][0].sum().backward()
