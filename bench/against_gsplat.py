@@ -22,10 +22,10 @@ from bench.harness import recorded
 from warpgs import RasterizeOptions, rasterize
 from warpgs.constants import RULES
 from warpgs.kernels.project import project
-from warpgs.pipeline.graph import BURST, Burst, StepGraph, Views
-from warpgs.pipeline.loss import LossConfig
-from warpgs.pipeline.optimizer import Optimizer, OptimizerConfig
-from warpgs.recording import CALLS, recorder
+from warpgs.pipeline.model.table import Optimizer, OptimizerConfig
+from warpgs.pipeline.train.loss import LossConfig
+from warpgs.pipeline.train.step import BURST, Burst, StepGraph, Views
+from warpgs.render.graphed import CALLS, recorder
 from warpgs.scene import Camera, Gaussians
 
 CONFIGURATIONS = {

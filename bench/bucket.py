@@ -22,9 +22,10 @@ from bench.against_gsplat import CONFIGURATIONS, first_camera, quartiles
 from bench.garden import garden_inputs
 from bench.kernels.bucket import SIZES, VALUES, make_backward
 from warpgs.constants import RULES, Rule
-from warpgs.kernels import blend_cuda, bridge
+from warpgs.kernels import blend_cuda
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import Tiles, bin_tiles
+from warpgs.runtime import interop
 from warpgs.scene import Camera, Gaussians
 
 NAMES = ("112k at 504x378", "2.8M at 1920x1080", "2.8M at 3840x2160")
@@ -46,7 +47,7 @@ class Launch:
     how: dict
 
     def __call__(self) -> None:
-        bridge.launch(self.kernel, self.count, self.inputs, self.device, **self.how)
+        interop.launch(self.kernel, self.count, self.inputs, self.device, **self.how)
 
 
 def put_off(work: Callable, *inputs) -> tuple[object, list[Launch]]:
@@ -56,7 +57,7 @@ def put_off(work: Callable, *inputs) -> tuple[object, list[Launch]]:
     def note(kernel, count, arguments, device, **how):
         launches.append(Launch(kernel, count, arguments, device, how))
 
-    with mock.patch.object(bridge, "launch", note):
+    with mock.patch.object(interop, "launch", note):
         result = work(*inputs)
     return result, launches
 
@@ -102,7 +103,7 @@ class Case:
 
     def _variant(self, kernel, size: int, states: dict) -> Launch:
         inputs = list(self.backward.inputs)
-        inputs[STATES] = bridge.view(states[size], wp.float32)
+        inputs[STATES] = interop.view(states[size], wp.float32)
         count = 32 * -(-self.instances // size)
         return Launch(kernel, count, inputs, self.backward.device, {"block_dim": 32 * blend_cuda.WARPS})
 

@@ -16,10 +16,10 @@ import torch
 from bench.against_gsplat import first_camera, gpu_times, wall_times
 from bench.garden import garden_inputs
 from bench.machine import describe
-from warpgs.pipeline.density import DensityStats
-from warpgs.pipeline.graph import BURST, Burst, StepGraph, Views
-from warpgs.pipeline.loss import LossConfig
-from warpgs.pipeline.optimizer import Optimizer, OptimizerConfig
+from warpgs.pipeline.model.table import Optimizer, OptimizerConfig
+from warpgs.pipeline.train.loss import LossConfig
+from warpgs.pipeline.train.step import BURST, Burst, StepGraph, Views
+from warpgs.pipeline.train.strategies.clone_split import DensityStats
 from warpgs.scene import Camera, Gaussians
 
 CONFIGURATIONS = {"112k at 504x378": (1, 504, 378), "2.8M at 1920x1080": (5, 1920, 1080)}

@@ -16,9 +16,9 @@ import torch
 
 from bench.against_gsplat import first_camera
 from bench.garden import garden_inputs
-from warpgs.pipeline.graph import BURST, Burst, StepGraph, Views
-from warpgs.pipeline.loss import LossConfig
-from warpgs.pipeline.optimizer import Optimizer, OptimizerConfig
+from warpgs.pipeline.model.table import Optimizer, OptimizerConfig
+from warpgs.pipeline.train.loss import LossConfig
+from warpgs.pipeline.train.step import BURST, Burst, StepGraph, Views
 from warpgs.scene import Gaussians
 
 

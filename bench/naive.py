@@ -11,9 +11,9 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from warpgs.constants import RULES, Rule
-from warpgs.kernels import bridge
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import Tiles, bin_tiles, grid
+from warpgs.runtime import interop
 from warpgs.scene import Camera, Gaussians
 
 
@@ -134,29 +134,29 @@ class Naive:
         ends = torch.empty(pixels, dtype=torch.int32, device=splats.device)
         columns, rows = grid(width, height, tiles.size)
         self.inputs = [
-            bridge.view(self.splats.view(-1, 12), wp.float32), bridge.view(tiles.ranges, wp.int32),
-            bridge.view(tiles.splat_ids, wp.int32), bridge.view(backgrounds, wp.float32), width, height, columns,
+            interop.view(self.splats.view(-1, 12), wp.float32), interop.view(tiles.ranges, wp.int32),
+            interop.view(tiles.splat_ids, wp.int32), interop.view(backgrounds, wp.float32), width, height, columns,
             columns * rows, tiles.size, rule.alpha_cut, rule.alpha_max,
         ]  # fmt: skip
         self.stop, self.kept = rule.transmittance_stop, [transmittances, ends]
-        self.state = [bridge.view(transmittances, wp.float32), bridge.view(ends, wp.int32)]
+        self.state = [interop.view(transmittances, wp.float32), interop.view(ends, wp.int32)]
         self.kernels = make_kernels()
 
     def _launch(self, kernel, inputs: list) -> None:
-        inputs = [a.array() if isinstance(a, bridge.View) else a for a in inputs]
-        with bridge.stream_of(self.rgb.device):
+        inputs = [a.array() if isinstance(a, interop.View) else a for a in inputs]
+        with interop.stream_of(self.rgb.device):
             wp.launch(kernel, self.pixels, inputs=inputs, device=self.device, record_tape=False)
 
     def forward(self) -> torch.Tensor:
         """The image, shape [C, H, W, 3]."""
-        outputs = [bridge.view(self.rgb.view(-1, 3), wp.float32), *self.state]
+        outputs = [interop.view(self.rgb.view(-1, 3), wp.float32), *self.state]
         self._launch(self.kernels.forward, [*self.inputs, self.stop, *outputs])
         return self.rgb
 
     def backward(self, v_rgb: torch.Tensor) -> torch.Tensor:
         """Gradient of the records for an upstream gradient, after `forward`; shape [C, N, 12]."""
         self.v_splats.zero_()
-        arrays = [bridge.view(t.view(-1, t.shape[-1]), wp.float32) for t in (v_rgb.contiguous(), self.v_splats)]
+        arrays = [interop.view(t.view(-1, t.shape[-1]), wp.float32) for t in (v_rgb.contiguous(), self.v_splats)]
         self._launch(self.kernels.backward, [*self.inputs, *self.state, *arrays])
         return self.v_splats
 

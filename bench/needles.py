@@ -23,11 +23,11 @@ from pathlib import Path
 import torch
 
 from bench.machine import describe
-from tests.reference.twins import Frame, Inputs, Splats, layers, pixel_centers, splats_of
+from tests.reference.low_precision import Frame, Inputs, Splats, layers, pixel_centers, splats_of
 from warpgs.constants import RULES
 from warpgs.files import write_json
 from warpgs.kernels.project import project
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
 
 LENGTHS = (1, 3, 10, 30, 100, 300, 1000, 3000, 10000)

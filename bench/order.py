@@ -16,11 +16,11 @@ import torch
 from bench.machine import describe
 from warpgs import load_scene
 from warpgs.io.splits import split_views
-from warpgs.pipeline.config import FitConfig
-from warpgs.pipeline.density import DensityConfig
-from warpgs.pipeline.fit import Fit, train_views
-from warpgs.pipeline.init import InitConfig
-from warpgs.pipeline.run import choose_device
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.runs.folder import choose_device
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.trainer import Fit, train_views
 
 REPEATS = 15
 BURST = 100

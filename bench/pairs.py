@@ -10,10 +10,10 @@ import warp as wp
 from bench import inputs
 from bench.points import Point
 from warpgs.constants import RULES, Rule
-from warpgs.kernels import bridge
 from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import Tiles, bin_tiles
+from warpgs.runtime import interop
 
 
 @wp.kernel(enable_backward=False)
@@ -47,13 +47,13 @@ def drawn_pairs(splats: torch.Tensor, tiles: Tiles, width: int, height: int, rul
     ends = next(t for t in rgb.grad_fn.saved_tensors if t.dtype == torch.int32 and t.shape == rgb.shape[:3])
     columns, rows = -(-width // tiles.size), -(-height // tiles.size)
     drawn = torch.empty(ends.numel(), dtype=torch.int32, device=splats.device)
-    with bridge.stream_of(splats.device):
+    with interop.stream_of(splats.device):
         arguments = [
-            bridge.view(splats.reshape(-1, splats.shape[-1]), wp.float32), bridge.view(tiles.ranges, wp.int32),
-            bridge.view(tiles.splat_ids, wp.int32), bridge.view(ends.reshape(-1), wp.int32),
-            width, height, columns, columns * rows, tiles.size, rule.alpha_cut, bridge.view(drawn, wp.int32),
+            interop.view(splats.reshape(-1, splats.shape[-1]), wp.float32), interop.view(tiles.ranges, wp.int32),
+            interop.view(tiles.splat_ids, wp.int32), interop.view(ends.reshape(-1), wp.int32),
+            width, height, columns, columns * rows, tiles.size, rule.alpha_cut, interop.view(drawn, wp.int32),
         ]  # fmt: skip
-        bridge.launch(count_drawn, len(drawn), arguments, splats.device, cost=100)
+        interop.launch(count_drawn, len(drawn), arguments, splats.device, cost=100)
     return int(drawn.sum(dtype=torch.int64))
 
 

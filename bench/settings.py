@@ -11,7 +11,7 @@ from warpgs.constants import RULES, Rule
 from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
 
 EXACT = RULES["exact"]

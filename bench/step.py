@@ -18,11 +18,11 @@ from warpgs.io.splits import split_views
 from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
-from warpgs.pipeline.config import FitConfig
-from warpgs.pipeline.fit import Fit, train_views
-from warpgs.pipeline.init import InitConfig
-from warpgs.pipeline.loss import LossConfig, photometric_loss
-from warpgs.pipeline.run import choose_device
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.runs.folder import choose_device
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loss import LossConfig, photometric_loss
+from warpgs.pipeline.train.trainer import Fit, train_views
 
 
 def stages(fit: Fit) -> dict[str, dict[str, float]]:

@@ -13,8 +13,8 @@ import torch
 from bench.frozen import Frozen
 from bench.harness import measure_in_turn, recorded
 from bench.settings import UNCUT, Setting, settings
-from warpgs.kernels.bridge import set_threads
 from warpgs.kernels.project import project
+from warpgs.runtime.interop import set_threads
 from warpgs.scene import Camera, Gaussians
 
 VISIBLE = 0.5 / 255

@@ -7,7 +7,7 @@ import torch
 
 from warpgs.geometry import look_at
 from warpgs.kernels.sh import C0
-from warpgs.rasterizer import rasterize
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians, PointCloud, Prior, View
 
 

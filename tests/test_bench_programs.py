@@ -8,9 +8,9 @@ import torch
 
 from bench import accuracy, fused, many, needles, step
 from tests.scenes import photographs, seeds
-from warpgs.pipeline.config import FitConfig
-from warpgs.pipeline.fit import Fit
-from warpgs.pipeline.init import InitConfig
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.trainer import Fit
 
 
 def test_stages_of_a_step(device):

@@ -13,8 +13,8 @@ from bench.settings import UNCUT, Setting, settings
 from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference
 from tests.splats import camera, cloud
-from warpgs.prices import RULE_PRICES
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.rule_costs import RULE_PRICES
 
 CPU = torch.device("cpu")
 RESULTS = Path(__file__).parent.parent / "bench/results"

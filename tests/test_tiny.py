@@ -4,12 +4,12 @@ import numpy as np
 import torch
 
 from tests.scenes import photographs, seeds
-from warpgs.pipeline.config import FitConfig
-from warpgs.pipeline.evaluate import render_view, score
-from warpgs.pipeline.fit import Fit
-from warpgs.pipeline.init import InitConfig
-from warpgs.pipeline.optimizer import OptimizerConfig
-from warpgs.rasterizer import RasterizeOptions
+from warpgs.pipeline.metrics.evaluate import render_view, score
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.model.table import OptimizerConfig
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.trainer import Fit
+from warpgs.render.rasterize import RasterizeOptions
 
 
 def test_a_tiny_scene_passes_35_db_in_200_steps():

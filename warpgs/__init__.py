@@ -18,9 +18,9 @@ __all__ = [
 
 if TYPE_CHECKING:
     from warpgs.io.load import load_scene
-    from warpgs.prices import choose_knobs
-    from warpgs.rasterizer import RasterizeOptions, rasterize
-    from warpgs.recording import forget_recordings
+    from warpgs.render.graphed import forget_recordings
+    from warpgs.render.rasterize import RasterizeOptions, rasterize
+    from warpgs.render.rule_costs import choose_knobs
     from warpgs.scene import Camera, Gaussians, Render, Scene
 
 _HOMES = {
@@ -28,10 +28,10 @@ _HOMES = {
     "Gaussians": "warpgs.scene",
     "Render": "warpgs.scene",
     "Scene": "warpgs.scene",
-    "RasterizeOptions": "warpgs.rasterizer",
-    "rasterize": "warpgs.rasterizer",
-    "choose_knobs": "warpgs.prices",
-    "forget_recordings": "warpgs.recording",
+    "RasterizeOptions": "warpgs.render.rasterize",
+    "rasterize": "warpgs.render.rasterize",
+    "choose_knobs": "warpgs.render.rule_costs",
+    "forget_recordings": "warpgs.render.graphed",
     "load_scene": "warpgs.io.load",
 }
 

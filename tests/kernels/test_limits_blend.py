@@ -70,7 +70,7 @@ def test_counted_apart_where_one_sum_might_not_hold_both(monkeypatch, spare_sum,
     monkeypatch.setattr(tiles, "VISIBLE", 60 + spare_sum)
     monkeypatch.setattr(tiles, "MAX_VISIBLE", 10 + spare_count)
     monkeypatch.setattr(tiles, "_check_total", stop("apart"))
-    monkeypatch.setattr(tiles.bridge, "launch", stop("together"))
+    monkeypatch.setattr(tiles.interop, "launch", stop("together"))
     with pytest.raises(InterruptedError, match="apart" if apart else "together"):
         tiles.bin_tiles(splats, counts, width=48, height=30, rule=EXACT)
 

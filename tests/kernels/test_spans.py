@@ -7,7 +7,8 @@ import pytest
 import torch
 import warp as wp
 
-from warpgs.kernels import bridge, falloff, functions
+from warpgs.kernels import falloff, functions
+from warpgs.runtime import interop
 
 COUNT = 4000
 
@@ -46,8 +47,8 @@ def make_probe():
 
 def probe(cases: torch.Tensor, device, whole_tiles=0, origin=16, size=53, tile_size=16) -> torch.Tensor:
     spans = torch.zeros(len(cases), 5, dtype=torch.int32, device=device)
-    inputs = [bridge.view(cases.to(device), wp.float64), whole_tiles, origin, size, tile_size, bridge.view(spans, wp.int32)]
-    bridge.launch(make_probe(), len(cases), inputs, device)
+    inputs = [interop.view(cases.to(device), wp.float64), whole_tiles, origin, size, tile_size, interop.view(spans, wp.int32)]
+    interop.launch(make_probe(), len(cases), inputs, device)
     return spans.cpu()
 
 
@@ -181,9 +182,9 @@ def make_reach():
 
 def reaches(opacities, cut, square_sigma, xs):
     found, falls = torch.zeros_like(opacities), torch.zeros_like(xs)
-    inputs = [bridge.view(opacities, wp.float64), cut, square_sigma, bridge.view(xs, wp.float32)]
-    outputs = [bridge.view(found, wp.float64), bridge.view(falls, wp.float32)]
-    bridge.launch(make_reach(), len(opacities), [*inputs, *outputs], torch.device("cpu"))
+    inputs = [interop.view(opacities, wp.float64), cut, square_sigma, interop.view(xs, wp.float32)]
+    outputs = [interop.view(found, wp.float64), interop.view(falls, wp.float32)]
+    interop.launch(make_reach(), len(opacities), [*inputs, *outputs], torch.device("cpu"))
     return found, falls
 
 

@@ -9,7 +9,7 @@ from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference, rotations
 from tests.splats import SMOOTH, camera, cloud
 from warpgs.constants import FAR, FARTHEST_PIXEL, LARGEST_AXIS, LARGEST_COEFFICIENT, RULES, SHORTEST_QUAT
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
 
 SLOTS = (

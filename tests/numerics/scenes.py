@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from tests.reference.twins import Frame, Inputs
+from tests.reference.low_precision import Frame, Inputs
 from tests.splats import camera, cloud
 from warpgs.scene import Camera, Gaussians
 

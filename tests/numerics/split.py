@@ -12,9 +12,9 @@ import torch
 
 from tests.numerics.scenes import Scene
 from tests.numerics.thresholds import Band, band
-from tests.reference.twins import Inputs, Pictures, p32, r64, r64c
+from tests.reference.low_precision import Inputs, Pictures, p32, r64, r64c
 from warpgs.constants import Rule
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
 
 PICTURES = Pictures._fields

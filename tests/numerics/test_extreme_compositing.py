@@ -13,10 +13,11 @@ from tests.kernels.test_blend import drawn, stack_of
 from tests.reference.blend import blend_reference
 from tests.splats import camera, cloud, leaves
 from warpgs.constants import ALPHA_CUT, RULES
-from warpgs.kernels import blend_cuda, bridge
+from warpgs.kernels import blend_cuda
 from warpgs.kernels.falloff import make_falloff
 from warpgs.kernels.native import source
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.runtime import interop
 from warpgs.scene import Gaussians
 
 EXACT = RULES["exact"]
@@ -305,9 +306,9 @@ def test_exponential_in_ulps(device):
     turn = 2 * math.pi * torch.rand(len(radii), generator=generator)
     e = torch.stack([radii * torch.cos(turn), radii * torch.sin(turn)], 1)
     found = torch.empty(len(e), device=device)
-    inputs = [bridge.view(e.to(device), wp.float32), bridge.view(found, wp.float32)]
-    with bridge.stream_of(device):
-        bridge.launch(exponential(device.type == "cuda"), len(e), inputs, device)
+    inputs = [interop.view(e.to(device), wp.float32), interop.view(found, wp.float32)]
+    with interop.stream_of(device):
+        interop.launch(exponential(device.type == "cuda"), len(e), inputs, device)
     found = found.cpu().double()
     exact = torch.exp(-0.5 * e.double().square().sum(1))
     assert finite(found) and bool((found >= 0).all()) and bool((found <= 1).all())

@@ -18,13 +18,13 @@ from tests.splats import SMOOTH, camera, cloud, hand_placed, leaves
 from warpgs.constants import FAR, FARTHEST_PIXEL, LARGEST_AXIS, LARGEST_COEFFICIENT, RULES, SHORTEST_QUAT
 from warpgs.export.ply import read_ply, write_ply
 from warpgs.io.load import load_scene
-from warpgs.kernels import bridge
 from warpgs.kernels.functions import make_spans
 from warpgs.kernels.project import project
-from warpgs.pipeline.config import FitConfig
-from warpgs.pipeline.fit import Fit
-from warpgs.pipeline.init import InitConfig
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.trainer import Fit
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.runtime import interop
 from warpgs.scene import Camera, Gaussians
 
 EXACT = RULES["exact"]
@@ -315,9 +315,9 @@ def test_tiles_of_impossible_boxes(device):
     found = {}
     for where in {"cpu", str(device)}:
         result = torch.empty(len(table), 4, dtype=torch.int32, device=where)
-        inputs = [bridge.view(boxes.to(where), wp.float32), bridge.view(result, wp.int32)]
-        with bridge.stream_of(torch.device(where)):
-            bridge.launch(spans_kernel(), len(table), inputs, torch.device(where))
+        inputs = [interop.view(boxes.to(where), wp.float32), interop.view(result, wp.int32)]
+        with interop.stream_of(torch.device(where)):
+            interop.launch(spans_kernel(), len(table), inputs, torch.device(where))
         found[where] = result.cpu()
     rows = found[str(device)]
     assert torch.equal(rows, found["cpu"])

@@ -18,21 +18,21 @@ from warpgs.io.normalize import normalization_of, normalize_points, normalize_vi
 from warpgs.kernels.adam import adam_step
 from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.ssim import differences, ssim
-from warpgs.pipeline.checkpoint import TENSORS, load_checkpoint, save_checkpoint
-from warpgs.pipeline.config import FitConfig
-from warpgs.pipeline.density import DensityConfig, DensityStats, Refinement, refine
-from warpgs.pipeline.fit import Fit, run
-from warpgs.pipeline.importance import ImportanceConfig, normalized
-from warpgs.pipeline.init import InitConfig, initial_gaussians, initial_points
-from warpgs.pipeline.judge import JudgeConfig
-from warpgs.pipeline.layers import ProtectConfig
-from warpgs.pipeline.loss import LossConfig, photometric_loss
-from warpgs.pipeline.method import MethodConfig
-from warpgs.pipeline.optimizer import Optimizer, OptimizerConfig
-from warpgs.pipeline.quantiles import quantiles
-from warpgs.pipeline.sampler import SamplerConfig, geometry_gate, sample_pixels
-from warpgs.pipeline.schedule import PhaseConfig
-from warpgs.rasterizer import rasterize
+from warpgs.pipeline.metrics.quantiles import quantiles
+from warpgs.pipeline.model.init import InitConfig, initial_gaussians, initial_points
+from warpgs.pipeline.model.layers import ProtectConfig
+from warpgs.pipeline.model.table import Optimizer, OptimizerConfig
+from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loss import LossConfig, photometric_loss
+from warpgs.pipeline.train.schedule import PhaseConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig, DensityStats, Refinement, refine
+from warpgs.pipeline.train.strategies.holdout_blocks import JudgeConfig
+from warpgs.pipeline.train.strategies.importance import ImportanceConfig, normalized
+from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
+from warpgs.pipeline.train.strategies.sampler import SamplerConfig, geometry_gate, sample_pixels
+from warpgs.pipeline.train.trainer import Fit, run
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Normalization, PointCloud, View
 
 POINTS = InitConfig(source="points", max_sh_degree=0)

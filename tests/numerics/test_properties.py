@@ -20,8 +20,8 @@ from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
 from warpgs.kernels.sh import C0
 from warpgs.kernels.tiles import bin_tiles
-from warpgs.pipeline.checkpoint import load_checkpoint, save_checkpoint
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians, Normalization, Render
 
 few = settings(

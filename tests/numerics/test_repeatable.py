@@ -90,7 +90,7 @@ PROCESS = """
 import hashlib, torch
 from tests.scenes import photographs
 from warpgs.pipeline.config import FitConfig
-from warpgs.pipeline.fit import Fit
+from warpgs.pipeline.train.trainer import Fit
 from warpgs.pipeline.init import InitConfig
 torch.set_num_threads({threads})
 config = FitConfig(steps=12, seed=5, dropout=0.1, init=InitConfig(source="random", random_count=300))

@@ -9,7 +9,7 @@ import dataclasses
 
 import torch
 
-from tests.reference.twins import Frame, Inputs, Splats, layers, parts, splats_of
+from tests.reference.low_precision import Frame, Inputs, Splats, layers, parts, splats_of
 from warpgs.constants import Rule
 
 EPS = 2.0**-23

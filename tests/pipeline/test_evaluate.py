@@ -9,9 +9,9 @@ import torch
 from tests.scenes import photographs, ring
 from warpgs.errors import UsageError
 from warpgs.geometry import back_project, camera_extent, focus_point, in_image, project_points
-from warpgs.pipeline.evaluate import guesses, psnr, score, summarize, to_8_bit, variants
-from warpgs.pipeline.paths import camera_path
-from warpgs.pipeline.region import counted_region
+from warpgs.pipeline.metrics.evaluate import guesses, psnr, score, summarize, to_8_bit, variants
+from warpgs.pipeline.metrics.region import counted_region
+from warpgs.pipeline.runs.camera_paths import camera_path
 from warpgs.scene import View
 
 

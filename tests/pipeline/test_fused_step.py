@@ -8,9 +8,9 @@ from warpgs.constants import RULES
 from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
-from warpgs.pipeline.density import DensityStats
-from warpgs.pipeline.limits import Limits
-from warpgs.pipeline.optimizer import Optimizer, OptimizerConfig
+from warpgs.pipeline.model.parameter_bounds import Limits
+from warpgs.pipeline.model.table import Optimizer, OptimizerConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityStats
 
 STEPS = 12
 RULE = RULES["exact"]

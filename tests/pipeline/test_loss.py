@@ -9,14 +9,14 @@ import torch
 
 from tests.scenes import photographs, priors, seeds
 from warpgs.errors import UsageError
-from warpgs.pipeline.config import PRESETS, FitConfig
-from warpgs.pipeline.density import DensityConfig
-from warpgs.pipeline.fit import Fit
-from warpgs.pipeline.init import InitConfig
-from warpgs.pipeline.loss import FLAT, MIN_ALPHA, LossConfig, depth_disagreement, training_loss
-from warpgs.pipeline.method import TrainingView
-from warpgs.pipeline.resolution import halved
-from warpgs.rasterizer import rasterize
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.train.config import PRESETS, FitConfig
+from warpgs.pipeline.train.half_resolution import halved
+from warpgs.pipeline.train.loss import FLAT, MIN_ALPHA, LossConfig, depth_disagreement, training_loss
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.strategies.importance_sampling import TrainingView
+from warpgs.pipeline.train.trainer import Fit
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Prior
 
 CPU = torch.device("cpu")

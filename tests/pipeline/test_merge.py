@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.splats import cloud
-from warpgs.pipeline.merge import OPAQUE, covariances, merges, quaternions, rotation_matrices
+from warpgs.pipeline.model.merge import OPAQUE, covariances, merges, quaternions, rotation_matrices
 from warpgs.scene import Gaussians
 
 

@@ -8,17 +8,17 @@ import torch
 
 from tests.scenes import ring
 from tests.splats import camera, cloud
-from warpgs.cli import main
-from warpgs.demo import split_spec, write_demo
+from warpgs.app.cli import main
 from warpgs.errors import UsageError
 from warpgs.export.ply import read_ply
-from warpgs.pipeline.checkpoint import load_checkpoint
-from warpgs.pipeline.optimizer import Optimizer, OptimizerConfig
-from warpgs.pipeline.prune import prune
-from warpgs.pipeline.run import open_run
-from warpgs.pipeline.shrink import Looks, keep_last, largest_share, needed_degrees, prune_order, rows_of, stored_degrees
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.pipeline.model.compress import Looks, keep_last, largest_share, needed_degrees, prune_order, rows_of, stored_degrees
+from warpgs.pipeline.model.table import Optimizer, OptimizerConfig
+from warpgs.pipeline.runs.checkpoint import load_checkpoint
+from warpgs.pipeline.runs.folder import open_run
+from warpgs.pipeline.runs.prune import prune
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera
+from warpgs.synthetic.demo import split_spec, write_demo
 
 CPU = torch.device("cpu")
 

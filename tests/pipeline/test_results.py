@@ -4,10 +4,10 @@ import pytest
 
 from tests.scenes import photographs, seeds
 from warpgs.errors import ResourceError
-from warpgs.pipeline import results
-from warpgs.pipeline.evaluate import render_view, score
-from warpgs.pipeline.init import InitConfig, initial_gaussians
-from warpgs.pipeline.results import evaluate_run, options_for
+from warpgs.pipeline.metrics.evaluate import render_view, score
+from warpgs.pipeline.model.init import InitConfig, initial_gaussians
+from warpgs.pipeline.runs import results
+from warpgs.pipeline.runs.results import evaluate_run, options_for
 
 BLACK = (0.0, 0.0, 0.0)
 

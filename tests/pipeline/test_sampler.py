@@ -9,7 +9,7 @@ from tests.scenes import ring
 from warpgs import geometry
 from warpgs.errors import UsageError
 from warpgs.kernels.sh import C0
-from warpgs.pipeline.sampler import (
+from warpgs.pipeline.train.strategies.sampler import (
     SUPPORT,
     SamplerConfig,
     back_project,

@@ -3,7 +3,7 @@
 import numpy as np
 
 from warpgs.report.contact_sheet import GAP, HEAD, MARGIN, PAPER, TITLE_SIZE, Tile, contact_sheet
-from warpgs.report.pictures import colored
+from warpgs.report.images import colored
 
 TOP = MARGIN + TITLE_SIZE + 18
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from warpgs.report.curve import curve
+from warpgs.report.images import png
 from warpgs.report.page import SamplingStory, ViewPictures, write_page
-from warpgs.report.pictures import png
 
 VOID = {"meta", "img", "input", "br", "hr", "link"}
 

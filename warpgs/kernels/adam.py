@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from warpgs.kernels import bridge
 from warpgs.kernels.compiler import ROLLED
+from warpgs.runtime import interop
 
 BETAS = (0.9, 0.999)
 """Decay of the two running means (Kingma and Ba 2015)."""
@@ -170,11 +170,11 @@ def adam_scheduled(
 ) -> None:  # fmt: skip
     """`adam_step` on CUDA in float32, with ``rates`` [3] of `scheduled_rates`; nothing changes where ``skip`` [1] is not 0."""
     inputs = [
-        bridge.view(grad.view(-1), wp.float32), param[0].numel(), head, bridge.view(rates, wp.float32),
-        *betas, 1 - betas[0], 1 - betas[1], eps, bridge.view(skip, wp.int32),
-        *(bridge.view(t.view(-1), wp.float32) for t in (param, exp_avg, exp_avg_sq)),
+        interop.view(grad.view(-1), wp.float32), param[0].numel(), head, interop.view(rates, wp.float32),
+        *betas, 1 - betas[0], 1 - betas[1], eps, interop.view(skip, wp.int32),
+        *(interop.view(t.view(-1), wp.float32) for t in (param, exp_avg, exp_avg_sq)),
     ]  # fmt: skip
-    bridge.launch(make_scheduled_kernel(), -(-param.numel() // 4), inputs, param.device)
+    interop.launch(make_scheduled_kernel(), -(-param.numel() // 4), inputs, param.device)
 
 
 def adam_step(
@@ -209,14 +209,14 @@ def adam_step(
         ValueError: A shape or device disagrees, a tensor to be updated is not contiguous, or ``step`` is below 1.
     """
     pattern = " ".join(str(s) for s in param.shape)
-    bridge.check(param=(param, pattern), grad=(grad, pattern), exp_avg=(exp_avg, pattern), exp_avg_sq=(exp_avg_sq, pattern))
+    interop.check(param=(param, pattern), grad=(grad, pattern), exp_avg=(exp_avg, pattern), exp_avg_sq=(exp_avg_sq, pattern))
     if not (param.is_contiguous() and exp_avg.is_contiguous() and exp_avg_sq.is_contiguous()):
         raise ValueError("param, exp_avg and exp_avg_sq are updated in place and must be contiguous")
     if step < 1:
         raise ValueError(f"step counts from 1, not {step}")
     if param.numel() == 0:
         return
-    real, device = bridge.real_of(param), param.device
+    real, device = interop.real_of(param), param.device
     if device.type == "cuda" and real is wp.float32:
         # one kernel for this and for recorded steps, so that both give the same bits
         rates = torch.tensor(scheduled_rates(lr, step, betas, head_lr), device=device)
@@ -227,13 +227,13 @@ def adam_step(
     correction1, correction2 = 1 - beta1**step, 1 - beta2**step
     row = param[0].numel()
     length, lanes = (SEGMENT, LANES) if device.type == "cpu" else (1, 1)
-    flat = [bridge.view(t.view(-1), real) for t in (param, exp_avg, exp_avg_sq)]
-    with bridge.stream_of(device):
+    flat = [interop.view(t.view(-1), real) for t in (param, exp_avg, exp_avg_sq)]
+    with interop.stream_of(device):
         inputs = [
-            bridge.view(grad.contiguous().view(-1), real), length, row, head,
+            interop.view(grad.contiguous().view(-1), real), length, row, head,
             (lr if head_lr is None else head_lr) / correction1, lr / correction1,
             beta1, beta2, 1 - beta1, 1 - beta2, correction2**0.5, eps, *flat,
         ]  # fmt: skip
-        bridge.launch(
+        interop.launch(
             make_kernel(real, head > 0, lanes), -(-param.numel() // length), inputs, device, cost=max(1, length // 16)
         )

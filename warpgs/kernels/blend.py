@@ -8,9 +8,10 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from warpgs.constants import Rule
-from warpgs.kernels import blend_cpu, blend_cuda, bridge
-from warpgs.kernels.memory import TORCH, Memory
+from warpgs.kernels import blend_cpu, blend_cuda
 from warpgs.kernels.tiles import Tiles, grid
+from warpgs.runtime import interop
+from warpgs.runtime.allocator import TORCH, Memory
 
 VALUES = 10
 """Gradient values of an instance: the record of `project` without its last two entries."""
@@ -60,14 +61,14 @@ def _native(splats: torch.Tensor) -> bool:
 
 def _launch(kernel, tiles: int, inputs: list, device: torch.device) -> None:
     """One task per tile of the generic kernels."""
-    bridge.launch(kernel, tiles, inputs, device, cost=10_000, block_dim=32)
+    interop.launch(kernel, tiles, inputs, device, cost=10_000, block_dim=32)
 
 
-def _tile_inputs(splats: torch.Tensor, tiles: Tiles, real) -> list[bridge.View]:
+def _tile_inputs(splats: torch.Tensor, tiles: Tiles, real) -> list[interop.View]:
     return [
-        bridge.view(splats.view(-1, splats.shape[-1]), real),
-        bridge.view(tiles.ranges, wp.int32),
-        bridge.view(tiles.splat_ids, wp.int32),
+        interop.view(splats.view(-1, splats.shape[-1]), real),
+        interop.view(tiles.ranges, wp.int32),
+        interop.view(tiles.splat_ids, wp.int32),
     ]
 
 
@@ -82,17 +83,17 @@ def composite(
     """Pictures, and what the backward pass needs: rgb, alpha, depth, transmittances, weights, ends, states (CUDA only)."""
     if _native(splats):
         return blend_cuda.forward(splats, tiles, backgrounds, origin, width, height, rule, keep, deterministic, memory)
-    real, device = bridge.real_of(splats), splats.device
+    real, device = interop.real_of(splats), splats.device
     shape = (len(backgrounds), height, width)
     rgb, alpha, depth = (memory.own(s, splats.dtype, device) for s in ((*shape, 3), shape, shape))
     transmittances, weights = (memory.kept(shape, splats.dtype, device) for _ in range(2))
     ends = memory.kept(shape, torch.int32, device)
     inputs = [
-        *_tile_inputs(splats, tiles, real), bridge.view(backgrounds, real), *_frame(origin, width, height, tiles.size),
+        *_tile_inputs(splats, tiles, real), interop.view(backgrounds, real), *_frame(origin, width, height, tiles.size),
         rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), rule.transmittance_stop, int(rule.inclusive_stop),
-        bridge.view(rgb.view(-1, 3), real),
-        *(bridge.view(t.view(-1), real) for t in (alpha, depth, transmittances, weights)),
-        bridge.view(ends.view(-1), wp.int32),
+        interop.view(rgb.view(-1, 3), real),
+        *(interop.view(t.view(-1), real) for t in (alpha, depth, transmittances, weights)),
+        interop.view(ends.view(-1), wp.int32),
     ]  # fmt: skip
     _launch(blend_cpu.make_kernels(real, tiles.size).forward, len(tiles.ranges), inputs, device)
     return rgb, alpha, depth, transmittances, weights, ends, memory.kept((0,), splats.dtype, device)
@@ -101,24 +102,24 @@ def composite(
 def _backward(splats, tiles, backgrounds, origin, width, height, rule, _, saved, v_rgb, v_alpha, v_depth, memory):
     """Gradient of the records by the generic kernels; ``saved`` as in blend_cuda.backward."""
     _, depth, transmittances, weights, ends, _ = saved
-    real, device = bridge.real_of(splats), splats.device
+    real, device = interop.real_of(splats), splats.device
     v_splats = memory.own(splats.shape, splats.dtype, device).zero_()
     v_slots = memory.scratch((len(tiles.slots), VALUES), splats.dtype, device).zero_()
-    upstream = [bridge.view(v_rgb.contiguous().view(-1, 3), real)]
+    upstream = [interop.view(v_rgb.contiguous().view(-1, 3), real)]
     for v in (v_alpha, v_depth):
-        upstream.append(bridge.view((torch.zeros_like(depth) if v is None else v.contiguous()).view(-1), real))
+        upstream.append(interop.view((torch.zeros_like(depth) if v is None else v.contiguous()).view(-1), real))
     inputs = [
-        *_tile_inputs(splats, tiles, real), bridge.view(tiles.slots, wp.int32), bridge.view(backgrounds, real),
+        *_tile_inputs(splats, tiles, real), interop.view(tiles.slots, wp.int32), interop.view(backgrounds, real),
         *_frame(origin, width, height, tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
-        *(bridge.view(t.view(-1), real) for t in (transmittances, weights, depth)), bridge.view(ends.view(-1), wp.int32),
-        *upstream, bridge.view(v_slots, real),
+        *(interop.view(t.view(-1), real) for t in (transmittances, weights, depth)), interop.view(ends.view(-1), wp.int32),
+        *upstream, interop.view(v_slots, real),
     ]  # fmt: skip
     _launch(blend_cpu.make_kernels(real, tiles.size).backward, len(tiles.ranges), inputs, device)
     inputs = [
-        bridge.view(v_slots, real), bridge.view(tiles.starts, wp.int32), bridge.view(tiles.counts, wp.int32),
-        bridge.view(v_splats.view(-1, v_splats.shape[-1]), real),
+        interop.view(v_slots, real), interop.view(tiles.starts, wp.int32), interop.view(tiles.counts, wp.int32),
+        interop.view(v_splats.view(-1, v_splats.shape[-1]), real),
     ]  # fmt: skip
-    bridge.launch(make_segments(real).sum_gradients, len(tiles.counts), inputs, device, cost=5)
+    interop.launch(make_segments(real).sum_gradients, len(tiles.counts), inputs, device, cost=5)
     return v_splats
 
 
@@ -163,7 +164,7 @@ class _Blend(torch.autograd.Function):
 
 
 def _check(splats: torch.Tensor, tiles: Tiles, width: int, height: int, **backgrounds) -> None:
-    sizes = bridge.check(splats=(splats, "C N 12"), **backgrounds)
+    sizes = interop.check(splats=(splats, "C N 12"), **backgrounds)
     columns, rows = grid(width, height, tiles.size)
     if len(tiles.ranges) != sizes["C"] * columns * rows:
         raise ValueError(
@@ -233,22 +234,22 @@ def contributions(
     """
     _check(splats, tiles, width, height)
     splats = splats.detach().contiguous()
-    real, device = bridge.real_of(splats), splats.device
+    real, device = interop.real_of(splats), splats.device
     ends = composite(splats, tiles, splats.new_zeros(len(splats), 3), origin, width, height, rule, keep=False)[5]
     if _native(splats):
         weights = blend_cuda.instance_weights(splats, tiles, origin, width, height, rule, ends)
     else:
         weights = splats.new_zeros(len(tiles.slots), 2)
         inputs = [
-            *_tile_inputs(splats, tiles, real), bridge.view(tiles.slots, wp.int32), *_frame(origin, width, height, tiles.size),
-            rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), bridge.view(ends.view(-1), wp.int32),
-            bridge.view(weights, real),
+            *_tile_inputs(splats, tiles, real), interop.view(tiles.slots, wp.int32), *_frame(origin, width, height, tiles.size),
+            rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), interop.view(ends.view(-1), wp.int32),
+            interop.view(weights, real),
         ]  # fmt: skip
         _launch(blend_cpu.make_kernels(real, tiles.size).contributions, len(tiles.ranges), inputs, device)
     sums, maxima = splats.new_empty(splats.shape[:2]), splats.new_empty(splats.shape[:2])
     inputs = [
-        bridge.view(weights, real), bridge.view(tiles.starts, wp.int32), bridge.view(tiles.counts, wp.int32),
-        bridge.view(sums.view(-1), real), bridge.view(maxima.view(-1), real),
+        interop.view(weights, real), interop.view(tiles.starts, wp.int32), interop.view(tiles.counts, wp.int32),
+        interop.view(sums.view(-1), real), interop.view(maxima.view(-1), real),
     ]  # fmt: skip
-    bridge.launch(make_segments(real).gather_weights, len(tiles.counts), inputs, device)
+    interop.launch(make_segments(real).gather_weights, len(tiles.counts), inputs, device)
     return sums, maxima

@@ -11,10 +11,10 @@ import torch
 import warp as wp
 
 from warpgs.constants import Rule
-from warpgs.kernels import bridge
-from warpgs.kernels.memory import TORCH, Memory
 from warpgs.kernels.native import source
 from warpgs.kernels.tiles import Tiles, grid
+from warpgs.runtime import interop
+from warpgs.runtime.allocator import TORCH, Memory
 
 CHUNKS = (64, 128)
 """Instances that one warp of the backward pass works through: the first in pictures of up to MANY tiles, to have enough
@@ -177,12 +177,12 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
     return SimpleNamespace(backward=backward, gather=gather)
 
 
-def _floats(*tensors: torch.Tensor) -> list[bridge.View]:
-    return [bridge.view(t.view(-1), wp.float32) for t in tensors]
+def _floats(*tensors: torch.Tensor) -> list[interop.View]:
+    return [interop.view(t.view(-1), wp.float32) for t in tensors]
 
 
-def _ints(*tensors: torch.Tensor) -> list[bridge.View]:
-    return [bridge.view(t.view(-1), wp.int32) for t in tensors]
+def _ints(*tensors: torch.Tensor) -> list[interop.View]:
+    return [interop.view(t.view(-1), wp.int32) for t in tensors]
 
 
 def _frame(origin: tuple[int, int], width: int, height: int, tile_size: int) -> list[int]:
@@ -206,18 +206,18 @@ def forward(
     transmittances, weights = memory.kept((2, *shape), torch.float32, device).unbind()
     ends = memory.kept(shape, torch.int32, device)
     pixels = tiles.size * tiles.size
-    chunk = chunk_of(tiles, deterministic) if keep else bridge.MAX_SIZE  # of which no instance is a multiple but the first
+    chunk = chunk_of(tiles, deterministic) if keep else interop.MAX_SIZE  # of which no instance is a multiple but the first
     states = memory.kept((tiles.slots.shape[0] // chunk + 1, STATE * pixels), torch.float32, device)
     k, count = make_kernels(tiles.size), tiles.ranges.shape[0]
     order = memory.scratch((count,), torch.int32, device)
-    bridge.launch(k.order_tiles, THREADS, [*_ints(tiles.ranges), count, *_ints(order)], device, block_dim=THREADS)
+    interop.launch(k.order_tiles, THREADS, [*_ints(tiles.ranges), count, *_ints(order)], device, block_dim=THREADS)
     inputs = [
         *_floats(splats), *_ints(order, tiles.ranges, tiles.splat_ids), *_floats(backgrounds),
         *_frame(origin, width, height, tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
         rule.transmittance_stop, int(rule.inclusive_stop), chunk,
-        *_floats(rgb, alpha, depth, transmittances, weights), *_ints(ends), bridge.view(states, wp.float32),
+        *_floats(rgb, alpha, depth, transmittances, weights), *_ints(ends), interop.view(states, wp.float32),
     ]  # fmt: skip
-    bridge.launch(k.forward, count * pixels, inputs, device, block_dim=32 * WARPS)
+    interop.launch(k.forward, count * pixels, inputs, device, block_dim=32 * WARPS)
     return rgb, alpha, depth, transmittances, weights, ends, states
 
 
@@ -242,14 +242,14 @@ def backward(
         v_slots = v_splats.zero_().view(-1, STRIDE)
     inputs = [
         *_floats(splats), *_ints(tiles.tile_ids, tiles.ranges, tiles.splat_ids, tiles.slots),
-        bridge.view(tiles.total, wp.int64), count, *_floats(backgrounds), *_frame(origin, width, height, tiles.size),
+        interop.view(tiles.total, wp.int64), count, *_floats(backgrounds), *_frame(origin, width, height, tiles.size),
         tiles.ranges.shape[0], rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
-        *_floats(rgb, depth, transmittances, weights), *_ints(ends), bridge.view(states, wp.float32),
-        *_floats(v_rgb.contiguous(), v_alpha, v_depth), bridge.view(v_slots, wp.float32),
+        *_floats(rgb, depth, transmittances, weights), *_ints(ends), interop.view(states, wp.float32),
+        *_floats(v_rgb.contiguous(), v_alpha, v_depth), interop.view(v_slots, wp.float32),
     ]  # fmt: skip
-    bridge.launch(k.backward, 32 * -(-count // chunk), inputs, device, block_dim=32 * WARPS)
-    inputs = [*_floats(splats), *_ints(tiles.starts, tiles.counts), bridge.view(v_slots, wp.float32), *_floats(v_splats)]
-    bridge.launch(k.gather, -(-tiles.counts.shape[0] // 256) * 256, inputs, device)
+    interop.launch(k.backward, 32 * -(-count // chunk), inputs, device, block_dim=32 * WARPS)
+    inputs = [*_floats(splats), *_ints(tiles.starts, tiles.counts), interop.view(v_slots, wp.float32), *_floats(v_splats)]
+    interop.launch(k.gather, -(-tiles.counts.shape[0] // 256) * 256, inputs, device)
     return v_splats
 
 
@@ -261,7 +261,7 @@ def instance_weights(splats, tiles: Tiles, origin: tuple[int, int], width: int, 
         rule.alpha_cut, rule.alpha_max, *_ints(ends), *_floats(weights),
     ]  # fmt: skip
     pixels = tiles.size * tiles.size
-    bridge.launch(
+    interop.launch(
         make_kernels(tiles.size).contributions, tiles.ranges.shape[0] * pixels, inputs, splats.device, block_dim=pixels
     )
     return weights

@@ -8,12 +8,13 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from warpgs.constants import LARGEST_COEFFICIENT, Rule
-from warpgs.kernels import bridge, sh
+from warpgs.kernels import sh
 from warpgs.kernels.functions import make_projection, make_spans
-from warpgs.kernels.memory import TORCH, Memory
 from warpgs.kernels.native import BLOCK
 from warpgs.kernels.native import make_functions as make_native
 from warpgs.kernels.project_backward import make_backward
+from warpgs.runtime import interop
+from warpgs.runtime.allocator import TORCH, Memory
 
 RECORD = 12
 """Floats of a projected Gaussian ("splat"), 16-byte aligned in float32:
@@ -150,10 +151,10 @@ def make_forward(real, native: bool):
 
 
 def _inputs(means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks) -> list[wp.array]:
-    m = make_projection(bridge.real_of(means))
-    types = (m.vec3, m.vec4, m.vec3, bridge.real_of(means), m.vec3, m.mat44, m.mat33)
+    m = make_projection(interop.real_of(means))
+    types = (m.vec3, m.vec4, m.vec3, interop.real_of(means), m.vec3, m.mat44, m.mat33)
     tensors = (means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks)
-    return [bridge.view(t, dtype) for t, dtype in zip(tensors, types)]
+    return [interop.view(t, dtype) for t, dtype in zip(tensors, types)]
 
 
 def _native(tensor: torch.Tensor) -> bool:
@@ -175,16 +176,16 @@ def records(
         tile: Side of a tile [px].
         memory: Where to put the records.
     """
-    means, real = tensors[0], bridge.real_of(tensors[0])
+    means, real = tensors[0], interop.real_of(tensors[0])
     cameras, count = len(tensors[5]), len(means)
     splats = memory.own((cameras, count, RECORD), means.dtype, means.device)
     tile_counts = memory.own((cameras, count), torch.int32, means.device)
     inputs = [
-        *_inputs(*tensors), bridge.view(factors, real), *size, *window, tile, sh_count,
+        *_inputs(*tensors), interop.view(factors, real), *size, *window, tile, sh_count,
         rule.near, rule.low_pass, rule.alpha_cut, rule.square_sigma,
-        bridge.view(splats.view(-1, RECORD), real), bridge.view(tile_counts.view(-1), wp.int32),
+        interop.view(splats.view(-1, RECORD), real), interop.view(tile_counts.view(-1), wp.int32),
     ]  # fmt: skip
-    bridge.launch(make_forward(real, _native(means)), cameras * count, inputs, means.device, cost=5)
+    interop.launch(make_forward(real, _native(means)), cameras * count, inputs, means.device, cost=5)
     return splats, tile_counts
 
 
@@ -226,7 +227,7 @@ def gradients(
         wants_camera: Whether those of viewmats and Ks are wanted; else they are None.
         memory: Where to put the gradients.
     """
-    real, device = bridge.real_of(splats), splats.device
+    real, device = interop.real_of(splats), splats.device
     m = make_projection(real)
     v_splats = torch.zeros_like(splats) if v_splats is None else v_splats.contiguous()
     native = _native(splats)  # writes zeros itself
@@ -237,15 +238,15 @@ def gradients(
     cameras, count = len(tensors[5]), len(tensors[0])
     rows = (cameras, count) if wants_camera else (0, 0)
     v_viewmats, v_Ks = (splats.new_zeros(*rows, n, n) if wants_camera else splats.new_empty(*rows, n, n) for n in (4, 3))
-    outputs = [bridge.view(g, t) for g, t in zip(found, (m.vec3, m.vec4, m.vec3, real, m.vec3))]
+    outputs = [interop.view(g, t) for g, t in zip(found, (m.vec3, m.vec4, m.vec3, real, m.vec3))]
     inputs = [
         *_inputs(*tensors), *size, sh_count, rule.near, rule.low_pass,
-        bridge.view(splats.view(-1, RECORD), real), bridge.view(tile_counts.view(-1), wp.int32),
-        bridge.view(v_splats.view(-1, RECORD), real),
-        int(wants_camera), *outputs, bridge.view(v_viewmats, m.mat44), bridge.view(v_Ks, m.mat33),
+        interop.view(splats.view(-1, RECORD), real), interop.view(tile_counts.view(-1), wp.int32),
+        interop.view(v_splats.view(-1, RECORD), real),
+        int(wants_camera), *outputs, interop.view(v_viewmats, m.mat44), interop.view(v_Ks, m.mat33),
     ]  # fmt: skip
     threads = -(-count // BLOCK) * BLOCK if native else count
-    bridge.launch(make_backward(real, native), threads, inputs, device, cost=10 * cameras, block_dim=BLOCK)
+    interop.launch(make_backward(real, native), threads, inputs, device, cost=10 * cameras, block_dim=BLOCK)
     return [*found, *((v_viewmats.sum(1), v_Ks.sum(1)) if wants_camera else (None, None))]
 
 
@@ -299,7 +300,7 @@ def project(
         ValueError: A shape or device disagrees; the message names argument, wanted and found.
     """
     sh_count = sh.coefficient_count(degree)
-    sizes = bridge.check(
+    sizes = interop.check(
         means=(means, "N 3"), quats=(quats, "N 4"), log_scales=(log_scales, "N 3"),
         logit_opacities=(logit_opacities, "N"), sh=(sh_coefficients, "N K 3"),
         viewmats=(viewmats, "C 4 4"), Ks=(Ks, "C 3 3"),
@@ -311,7 +312,7 @@ def project(
     if opacity_factors is None:
         opacity_factors = means.new_empty(0)
     else:
-        bridge.check(means=(means, "N 3"), opacity_factors=(opacity_factors, "N"))
+        interop.check(means=(means, "N 3"), opacity_factors=(opacity_factors, "N"))
     factors = opacity_factors.detach().contiguous()
     size, window = (width, height), window or (0, 0, width, height)
     return _Project.apply(

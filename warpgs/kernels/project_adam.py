@@ -10,11 +10,12 @@ import torch
 import warp as wp
 
 from warpgs.constants import Rule
-from warpgs.kernels import adam, bridge, sh
+from warpgs.kernels import adam, sh
 from warpgs.kernels.functions import make_projection
 from warpgs.kernels.native import BLOCK, source
 from warpgs.kernels.native import make_functions as make_native
 from warpgs.kernels.project_backward import make_functions
+from warpgs.runtime import interop
 
 PATTERNS = {"means": "N 3", "quats": "N 4", "log_scales": "N 3", "logit_opacities": "N", "sh": "N K 3"}
 """The five tensors in the order of their rates."""
@@ -195,7 +196,7 @@ def project_adam(
     groups = {"params": params, "exp_avgs": exp_avgs, "exp_avg_sqs": exp_avg_sqs}
     named = {f"{name} of {group}": (tensors[name], p) for name, p in PATTERNS.items() for group, tensors in groups.items()}
     shared = {} if share is None else {"share": (share, "N")}
-    sizes = bridge.check(
+    sizes = interop.check(
         **named, viewmats=(viewmats, "1 4 4"), Ks=(Ks, "1 3 3"), splats=(splats, "1 N 12"), v_splats=(v_splats, "1 N 12"),
         rates=(rates, "15"), **shared,
     )  # fmt: skip
@@ -209,17 +210,17 @@ def project_adam(
             raise ValueError(f"{name} is updated in place and must be contiguous")
     if count == 0:
         return
-    real, device = bridge.real_of(splats), splats.device
+    real, device = interop.real_of(splats), splats.device
     native = device.type == "cuda" and real is wp.float32
     m = make_projection(real)
     record = splats.shape[-1]
     inputs = [
-        bridge.view(viewmats.contiguous(), m.mat44), bridge.view(Ks.contiguous(), m.mat33), width, height, sh_count,
-        rule.near, rule.low_pass, bridge.view(splats.detach().contiguous().view(-1, record), real),
-        bridge.view(tile_counts.contiguous().view(-1), wp.int32), bridge.view(v_splats.contiguous().view(-1, record), real),
-        bridge.view(splats.new_empty(0) if share is None else share.contiguous(), real), bridge.view(rates.contiguous(), real),
-        bridge.view(skip, wp.int32), *betas, 1 - betas[0], 1 - betas[1], eps,
-        *(bridge.view(t.detach().view(count, -1), real) for t, _ in named.values()),
+        interop.view(viewmats.contiguous(), m.mat44), interop.view(Ks.contiguous(), m.mat33), width, height, sh_count,
+        rule.near, rule.low_pass, interop.view(splats.detach().contiguous().view(-1, record), real),
+        interop.view(tile_counts.contiguous().view(-1), wp.int32), interop.view(v_splats.contiguous().view(-1, record), real),
+        interop.view(splats.new_empty(0) if share is None else share.contiguous(), real), interop.view(rates.contiguous(), real),
+        interop.view(skip, wp.int32), *betas, 1 - betas[0], 1 - betas[1], eps,
+        *(interop.view(t.detach().view(count, -1), real) for t, _ in named.values()),
     ]  # fmt: skip
     threads = -(-count // BLOCK) * BLOCK if native else count
-    bridge.launch(make_kernel(real, native), threads, inputs, device, cost=100, block_dim=BLOCK)
+    interop.launch(make_kernel(real, native), threads, inputs, device, cost=100, block_dim=BLOCK)

@@ -5,7 +5,7 @@ import functools
 import torch
 import warp as wp
 
-from warpgs.kernels import bridge
+from warpgs.runtime import interop
 
 BLOCK = 32
 """Threads of a block: there are some hundred lines, which more blocks spread over more multiprocessors."""
@@ -88,15 +88,15 @@ def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor
                 f"not {tensor.dtype} of shape {list(tensor.shape)} on {tensor.device}"
             )
     total = torch.zeros_like(costs, memory_format=torch.contiguous_format)
-    flat = [bridge.view(t.contiguous().view(-1, planes), wp.int16) for t in (costs, total)]
+    flat = [interop.view(t.contiguous().view(-1, planes), wp.int16) for t in (costs, total)]
     for lines, length, steps, limits, edges in (
         (width, height, (1, width), down, (1, width)),
         (height, width, (width, 1), across, (width - 1, 1)),
     ):
         path = torch.empty(lines, planes + 1, dtype=torch.int32, device=costs.device)
         inputs = [
-            flat[0], bridge.view(limits.contiguous().view(-1), wp.int32), small, planes, *steps, length, *edges,
-            bridge.view(path, wp.int32), flat[1],
+            flat[0], interop.view(limits.contiguous().view(-1), wp.int32), small, planes, *steps, length, *edges,
+            interop.view(path, wp.int32), flat[1],
         ]  # fmt: skip
-        bridge.launch(make_kernel(), lines, inputs, costs.device, cost=max(1, length * planes // 2), block_dim=BLOCK)
+        interop.launch(make_kernel(), lines, inputs, costs.device, cost=max(1, length * planes // 2), block_dim=BLOCK)
     return total

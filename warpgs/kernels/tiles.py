@@ -10,10 +10,10 @@ import warp as wp
 
 from warpgs.constants import Rule
 from warpgs.errors import ResourceError
-from warpgs.kernels import bridge
 from warpgs.kernels.functions import make_spans
-from warpgs.kernels.memory import TORCH, Memory
 from warpgs.kernels.native import make_functions as make_native
+from warpgs.runtime import interop
+from warpgs.runtime.allocator import TORCH, Memory
 
 LIST_BYTES = 20
 """Of an instance while the lists are made: two sort buffers of (key, slot), and the owner."""
@@ -29,7 +29,7 @@ MAX_VISIBLE = 2**63 // VISIBLE - 1
 SMALL = 32
 """Tiles of a Gaussian that one CUDA thread lists alone."""
 
-MAX_INSTANCES = bridge.MAX_SIZE // 2
+MAX_INSTANCES = interop.MAX_SIZE // 2
 """A radix sort wants one array of twice that size."""
 
 
@@ -334,17 +334,17 @@ def bin_tiles(
         TypeError: A scalar type is neither float32 nor float64.
         ValueError: A shape disagrees.
     """
-    sizes = bridge.check(splats=(splats, "C N 12"))
+    sizes = interop.check(splats=(splats, "C N 12"))
     if tuple(tile_counts.shape) != (sizes["C"], sizes["N"]) or tile_counts.dtype != torch.int32:
         raise ValueError(f"tile_counts must be int32 of shape {[sizes['C'], sizes['N']]}, not {list(tile_counts.shape)}")
-    device, real, native = splats.device, bridge.real_of(splats), splats.is_cuda
+    device, real, native = splats.device, interop.real_of(splats), splats.is_cuda
     k = make_kernels(real, native)
     (columns, rows), count = grid(width, height, tile_size), sizes["C"] * sizes["N"]
     tiles, no_tile = columns * rows, sizes["C"] * columns * rows
-    if no_tile > bridge.MAX_SIZE:
+    if no_tile > interop.MAX_SIZE:
         raise ResourceError(
             f"{sizes['C']:,} images of {width} x {height} px have {no_tile:,} tiles of {tile_size} px, beyond the "
-            f"{bridge.MAX_SIZE:,} that can be numbered; draw fewer cameras at once, or a window of each"
+            f"{interop.MAX_SIZE:,} that can be numbered; draw fewer cameras at once, or a window of each"
         )
     counts = tile_counts.contiguous().view(-1)
     ranges = memory.kept((no_tile, 2), torch.int32, device).zero_()
@@ -352,8 +352,8 @@ def bin_tiles(
         return Tiles(tile_size, ranges, counts, counts, counts, counts, counts, counts.new_zeros(1, dtype=torch.int64))
 
     splats = splats.detach().contiguous().view(count, -1)
-    splats_view, counts_view, fixed = bridge.view(splats, real), bridge.view(counts, wp.int32), capacity is not None
-    with bridge.stream_of(device):
+    splats_view, counts_view, fixed = interop.view(splats, real), interop.view(counts, wp.int32), capacity is not None
+    with interop.stream_of(device):
         if fixed:
             visible, total = count, capacity
         else:
@@ -363,38 +363,46 @@ def bin_tiles(
             # One look at the device, before the sorts, tells how many are visible and how many tiles they touch.
             sums, threads = (-(-count // 32), -(-count // 256) * 256) if native else (count, count)
             packed = memory.scratch((sums,), torch.int64, device)
-            bridge.launch(k.pack_counts, threads, [counts_view, bridge.view(packed, wp.int64)], device)
+            interop.launch(k.pack_counts, threads, [counts_view, interop.view(packed, wp.int64)], device)
             torch.cumsum(packed, 0, out=packed)
             visible, total = divmod(int(packed[-1]), VISIBLE)
             _check_total(total, visible, device, tiles, budget_bytes)
         depths, order = (memory.scratch((2 * visible,), t, device) for t in (splats.dtype, torch.int32))
-        depths_view, order_view = bridge.view(depths, real), bridge.view(order, wp.int32)
+        depths_view, order_view = interop.view(depths, real), interop.view(order, wp.int32)
         if fixed:
-            bridge.launch(k.depth_keys, count, [splats_view, counts_view, depths_view, order_view], device)
+            interop.launch(k.depth_keys, count, [splats_view, counts_view, depths_view, order_view], device)
         else:
-            inputs = [splats_view, counts_view, bridge.view(packed, wp.int64), depths_view, order_view]
-            bridge.launch(k.visible_keys, threads, inputs, device)
+            inputs = [splats_view, counts_view, interop.view(packed, wp.int64), depths_view, order_view]
+            interop.launch(k.visible_keys, threads, inputs, device)
         wp.utils.radix_sort_pairs(depths_view.array(), order_view.array(), visible)
         ends = memory.kept((max(visible, 1),), torch.int64, device)
-        ends_view = bridge.view(ends, wp.int64)
-        bridge.launch(k.ordered_counts, visible, [order_view, counts_view, ends_view], device)
+        ends_view = interop.view(ends, wp.int64)
+        interop.launch(k.ordered_counts, visible, [order_view, counts_view, ends_view], device)
         ends = torch.cumsum(ends, 0, out=ends) if visible > 0 else ends.zero_()
         starts, keys, slots = (memory.kept((n,), torch.int32, device) for n in (count, 2 * total, 2 * total))
         owners = memory.scratch((total,), torch.int32, device)
         if fixed:
             keys[:total].fill_(no_tile)
-        keys_view, slots_view, owners_view = (bridge.view(t, wp.int32) for t in (keys, slots, owners))
+        keys_view, slots_view, owners_view = (interop.view(t, wp.int32) for t in (keys, slots, owners))
         inputs = [
             splats_view, order_view, counts_view, ends_view, visible, sizes["N"],
             *origin, width, height, tile_size, rule.alpha_cut, rule.square_sigma, columns, tiles, no_tile, total,
-            bridge.view(starts, wp.int32), keys_view, slots_view, owners_view,
-            bridge.view(overflow if fixed else starts, wp.int32),
+            interop.view(starts, wp.int32), keys_view, slots_view, owners_view,
+            interop.view(overflow if fixed else starts, wp.int32),
         ]  # fmt: skip
         threads = -(-visible // 256) * 256 if native else visible
-        bridge.launch(make_emit(real, native), threads, inputs, device, cost=10)
+        interop.launch(make_emit(real, native), threads, inputs, device, cost=10)
         wp.utils.radix_sort_pairs(keys_view.array(), slots_view.array(), total, end_bit=no_tile.bit_length())
         # the second half of the sorted buffers is free again
         ids = slots[total:]
-        inputs = [keys_view, slots_view, owners_view, total, no_tile, bridge.view(ids, wp.int32), bridge.view(ranges, wp.int32)]
-        bridge.launch(k.find_ranges, total, inputs, device)
+        inputs = [
+            keys_view,
+            slots_view,
+            owners_view,
+            total,
+            no_tile,
+            interop.view(ids, wp.int32),
+            interop.view(ranges, wp.int32),
+        ]
+        interop.launch(k.find_ranges, total, inputs, device)
     return Tiles(tile_size, ranges, ids, slots[:total], starts, counts, keys[:total], ends[-1:])

@@ -18,8 +18,8 @@ import torch
 from warpgs.errors import UsageError
 from warpgs.kernels.tiles import installed_bytes
 from warpgs.priors.epipolar import nearest_views, pixel_grid
+from warpgs.runtime.byte_units import format_bytes
 from warpgs.scene import Camera, View, ViewDepth
-from warpgs.sizes import format_bytes
 
 CPU = torch.device("cpu")
 NOISE = (2 / 255) ** 2

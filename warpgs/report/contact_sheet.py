@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warpgs.report.pictures import colored, resized
+from warpgs.report.images import colored, resized
 
 PAPER, INK, SOFT, LINE = (251, 251, 249), (27, 29, 33), (102, 108, 118), (223, 226, 231)
 LABEL_SIZE, TEXT_SIZE, TITLE_SIZE = 15, 13, 22  # [px]
