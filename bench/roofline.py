@@ -114,7 +114,7 @@ def dropout(count: int) -> Cost:
     return Cost(REAL * count, 20 * count)
 
 
-def burst(pixels: int) -> Cost:
+def buffers(pixels: int) -> Cost:
     """A photograph in and out."""
     return Cost(6 * REAL * pixels, 0)
 

@@ -13,7 +13,7 @@ HALF = 0.7, 0.5
 """Half width and height of the card [u]; it stands in the plane z = 0."""
 
 
-def photographs(
+def photos(
     colour: Callable[[np.ndarray, np.ndarray, float], np.ndarray], count: int = 4, width: int = 96, height: int = 72,
     half: tuple[float, float] = HALF, cameras=None,
 ) -> list[View]:  # fmt: skip

@@ -12,15 +12,22 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 __version__ = "0.1.0"
 
 __all__ = [
-    "Camera", "Gaussians", "RasterizeOptions", "Render", "Scene", "choose_knobs", "forget_recordings", "load_scene",
+    "Camera",
+    "Gaussians",
+    "RasterizeOptions",
+    "Render",
+    "Scene",
+    "clear_graph_cache",
+    "load_scene",
     "rasterize",
+    "select_rule",
 ]  # fmt: skip
 
 if TYPE_CHECKING:
     from warpgs.io.load import load_scene
-    from warpgs.render.graphed import forget_recordings
+    from warpgs.render.graphed import clear_graph_cache
     from warpgs.render.rasterize import RasterizeOptions, rasterize
-    from warpgs.render.rule_costs import choose_knobs
+    from warpgs.render.rule_costs import select_rule
     from warpgs.scene import Camera, Gaussians, Render, Scene
 
 _HOMES = {
@@ -30,8 +37,8 @@ _HOMES = {
     "Scene": "warpgs.scene",
     "RasterizeOptions": "warpgs.render.rasterize",
     "rasterize": "warpgs.render.rasterize",
-    "choose_knobs": "warpgs.render.rule_costs",
-    "forget_recordings": "warpgs.render.graphed",
+    "select_rule": "warpgs.render.rule_costs",
+    "clear_graph_cache": "warpgs.render.graphed",
     "load_scene": "warpgs.io.load",
 }
 

@@ -22,4 +22,4 @@ def tasks(point, device, wanted):
         end_step(value, value, numbers[0], stop, history)
         return found
 
-    yield Task(OURS, "forward", forward, roofline.burst(point.pixels))
+    yield Task(OURS, "forward", forward, roofline.buffers(point.pixels))

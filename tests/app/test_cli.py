@@ -35,7 +35,8 @@ def run(scene):
 def test_help_is_fast_and_imports_nothing_heavy():
     """`warpgs --help` lists the commands without loading torch or Warp."""
     code = (
-        "import sys; from warpgs.app.cli import main; main(['--help']); print(sorted({'torch', 'warp', 'cv2'} & set(sys.modules)))"
+        "import sys; from warpgs.app.cli import main; main(['--help']); "
+        "print(sorted({'torch', 'warp', 'cv2'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip().endswith("[]")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.scenes import photographs, priors, seeds
+from tests.scenes import photos, priors, seeds
 from warpgs.app.precompile import fit_kernels
 from warpgs.pipeline.metrics.evaluate import render_view, score
 from warpgs.pipeline.model.init import InitConfig
@@ -34,9 +34,11 @@ def test_a_fit_launches_nothing_else(device, recorded, monkeypatch):
         launch(kernel, count, inputs, where, block_dim=block_dim, **more)
 
     monkeypatch.setattr(interop, "launch", note)
-    views = photographs(3)
+    views = photos(3)
     views[0] = dataclasses.replace(views[0], mask=np.ones(views[0].image.shape[:2], bool))
-    method = MethodConfig(events=True, hier=True, pm=False, sampler=SamplerConfig(share=0.01, min_alpha=0.05, max_share=0.05))
+    method = MethodConfig(
+        events=True, hier=True, pm=False, sampler=SamplerConfig(fraction=0.01, min_alpha=0.05, max_fraction=0.05)
+    )
     config = FitConfig(
         steps=20, dropout=0.2, cuda_graph=recorded, init=InitConfig(source="points"), method=method,
         loss=LossConfig(depth_weight=0.1, depth_until=0.5),
@@ -45,7 +47,7 @@ def test_a_fit_launches_nothing_else(device, recorded, monkeypatch):
     fit = Fit(views, seeds(), config, device, priors=priors(views))
     while fit.step < 20:
         fit.burst(100)
-    assert any(event["freed"] for event in fit.events)
+    assert any(event["evicted"] for event in fit.events)
     score(views[1], render_view(fit.gaussians, views[1], RasterizeOptions())[0])
     warmed = {(kind, k.module, block) for kind in ("cpu", "cuda") for k, block in fit_kernels(kind == "cuda")}
     assert len(launched) > 8 and launched <= warmed

@@ -4,8 +4,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from tests.kernels.test_project_adam import State
-from tests.splats import camera, cloud, leaves
+from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.kernels.adam import adam_step
 from warpgs.kernels.blend import blend, contributions
@@ -13,11 +12,11 @@ from warpgs.kernels.project import project
 from warpgs.kernels.ssim import differences, ssim
 from warpgs.kernels.tiles import bin_tiles
 
-FENCE = 64
+GUARD = 64
 """Entries before and behind each tensor; a multiple of 16 bytes."""
 
 
-class Fenced(TorchDispatchMode):
+class Guarded(TorchDispatchMode):
     """While entered, new tensors lie between fences of NaN or of one whole number, and so does what they begin with."""
 
     def __init__(self, whole: int):
@@ -30,8 +29,8 @@ class Fenced(TorchDispatchMode):
         if not fresh or not result.is_contiguous() or result.dtype == torch.bool:
             return result
         mark = torch.nan if result.is_floating_point() else self.whole
-        memory = torch.full((result.numel() + 2 * FENCE,), mark, dtype=result.dtype, device=result.device)
-        inner = memory[FENCE : FENCE + result.numel()].view(result.shape)
+        memory = torch.full((result.numel() + 2 * GUARD,), mark, dtype=result.dtype, device=result.device)
+        inner = memory[GUARD : GUARD + result.numel()].view(result.shape)
         if "empty" not in function.__name__:
             inner.copy_(result)
         self.kept.append(memory)
@@ -39,7 +38,7 @@ class Fenced(TorchDispatchMode):
 
     def intact(self) -> bool:
         """Whether all fences are as they were."""
-        ends = [end for memory in self.kept for end in (memory[:FENCE], memory[-FENCE:])]
+        ends = [end for memory in self.kept for end in (memory[:GUARD], memory[-GUARD:])]
         return all(bool((end.isnan() if end.is_floating_point() else end == self.whole).all()) for end in ends)
 
 
@@ -51,17 +50,17 @@ def rendering(device, cameras, deterministic=True):
     with torch.no_grad():
         g.log_scales[::4] += 2.0  # more tiles than a thread lists or sums alone
     views, Ks = cam.viewmat.clone().requires_grad_(), cam.K.clone().requires_grad_()
-    splats, counts = project(*g.tensors().values(), views, Ks, degree=1, **size, **side)
-    made = bin_tiles(splats, counts, **size, **side)
+    projected, counts = project(*g.tensors().values(), views, Ks, degree=1, **size, **side)
+    made = bin_tiles(projected, counts, **size, **side)
     room = {"capacity": len(made.slots) + 5, "overflow": torch.zeros(1, dtype=torch.int32, device=device)}
-    spare = bin_tiles(splats, counts, **size, **side, **room)
-    pictures = blend(splats, made, torch.ones(cameras, 3, device=device), **size, deterministic=deterministic)
-    inputs = [splats, *g.tensors().values(), views, Ks]
-    of_all = torch.autograd.grad(sum((t * t).sum() for t in pictures), inputs, retain_graph=True)
-    of_rgb = torch.autograd.grad(pictures[0].sum(), inputs)
+    spare = bin_tiles(projected, counts, **size, **side, **room)
+    images = blend(projected, made, torch.ones(cameras, 3, device=device), **size, deterministic=deterministic)
+    inputs = [projected, *g.tensors().values(), views, Ks]
+    of_all = torch.autograd.grad(sum((t * t).sum() for t in images), inputs, retain_graph=True)
+    of_rgb = torch.autograd.grad(images[0].sum(), inputs)
     count = len(made.slots)
-    lists = [made.ranges, made.splat_ids, made.slots, spare.ranges, spare.splat_ids[:count]]
-    return [splats, counts, *lists, *pictures, *contributions(splats, made, **size), *of_all, *of_rgb]
+    lists = [made.ranges, made.gaussian_ids, made.slots, spare.ranges, spare.gaussian_ids[:count]]
+    return [projected, counts, *lists, *images, *contributions(projected, made, **size), *of_all, *of_rgb]
 
 
 def similarity(device, cameras):
@@ -80,12 +79,8 @@ def steps(device, number):
     """Adam alone and behind projection, in sets that fill neither a block nor a piece of four."""
     found = []
     for count, degree in ((129, 2), (2, 0), (128, 1), (63, 3)):
-        state = State(cloud(count, device=device, degree=degree), camera(40, 32, 1, torch.float32, device), degree)
-        own = {kind: {n: t.clone() for n, t in getattr(state, kind).items()} for kind in ("params", "means", "squares")}
-        state.params, state.means, state.squares = own["params"], own["means"], own["squares"]
-        state.fused(number)
-        found += state.all().values()
-        tensors = [t.clone() for t in (state.params["sh"], state.params["sh"] + 1, state.means["sh"], state.squares["sh"])]
+        sh = torch.rand(count, (degree + 1) ** 2, 3, generator=torch.Generator().manual_seed(degree)).to(device)
+        tensors = [sh.clone(), sh + 1, sh * 0.1, sh * 0.01]
         adam_step(*tensors, lr=0.1, step=1, head=3, head_lr=0.2)
         found += tensors
     return found
@@ -97,9 +92,9 @@ def steps(device, number):
 def test_nothing_beside_a_tensor_is_written_or_used(device, work, number, whole):
     """The same bits as without fences, whatever stands in them, and the fences are as they were."""
     wanted = work(device, number)
-    with Fenced(whole) as fences:
+    with Guarded(whole) as guards:
         found = work(device, number)
-    assert len(fences.kept) > 20 and fences.intact()
+    assert len(guards.kept) > 20 and guards.intact()
     for i, (a, b) in enumerate(zip(found, wanted, strict=True)):
         assert torch.equal(a, b), i
 
@@ -110,8 +105,8 @@ def test_sums_in_no_order_keep_to_their_rows(whole):
     """The same of the backward pass without slots, but for the order of sums."""
     device = torch.device("cuda", 0)
     wanted = rendering(device, 2, deterministic=False)
-    with Fenced(whole) as fences:
+    with Guarded(whole) as guards:
         found = rendering(device, 2, deterministic=False)
-    assert fences.intact()
+    assert guards.intact()
     for a, b in zip(found, wanted, strict=True):
         assert float((a.double() - b).norm()) <= 1e-4 * float(b.double().norm())

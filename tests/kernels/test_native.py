@@ -54,14 +54,14 @@ def small_kernels() -> SimpleNamespace:
         return s.touches(corners.data[2 * i], corners.data[2 * i + 1], limit_of(s.b.y, cut));
         """
     )
-    def touches(splats: wp.array(dtype=float), corners: wp.array(dtype=float), cut: float, i: int) -> int: ...
+    def touches(projected: wp.array(dtype=float), corners: wp.array(dtype=float), cut: float, i: int) -> int: ...
 
     @wp.kernel(enable_backward=False, module="unique")
     def block(
-        begin: int, splats: wp.array(dtype=float), corners: wp.array(dtype=float), cut: float, found: wp.array(dtype=int)
+        begin: int, projected: wp.array(dtype=float), corners: wp.array(dtype=float), cut: float, found: wp.array(dtype=int)
     ):
         i = begin + wp.tid()
-        found[i] = touches(splats, corners, cut, i)
+        found[i] = touches(projected, corners, cut, i)
 
     @wp.kernel(enable_backward=False, module="unique")
     def deal(begin: int, wanted: wp.array(dtype=int), found: wp.array(dtype=int)):
@@ -71,12 +71,12 @@ def small_kernels() -> SimpleNamespace:
     return SimpleNamespace(block=block, deal=deal)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.97, 1.0])
-def test_wanted_items_go_to_the_first_threads(share):
+@pytest.mark.parametrize("fraction", [0.0, 0.3, 0.97, 1.0])
+def test_wanted_items_go_to_the_first_threads(fraction):
     """In order within their block, whatever number says that they are wanted; -1 for the threads that are left over."""
     blocks = 50
     draw = torch.rand(blocks * native.BLOCK, generator=torch.Generator().manual_seed(0))
-    wanted = torch.where(draw < share, (draw * 1000).int() % 3 + 1, 0).int()
+    wanted = torch.where(draw < fraction, (draw * 1000).int() % 3 + 1, 0).int()
     found = torch.full_like(wanted, -7).to(CUDA)
     interop.launch(small_kernels().deal, len(wanted), [ints(wanted.to(CUDA)), ints(found)], CUDA, block_dim=native.BLOCK)
     for i, dealt in enumerate(found.cpu().view(blocks, -1).tolist()):

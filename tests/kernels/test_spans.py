@@ -104,10 +104,10 @@ def test_strips_are_those_of_the_ellipse(device, far):
     cases = ellipses(far=far)
     mx, my, u11, u12, u22, _, half_width, half_height, _ = (t[:, None] for t in cases.unbind(-1))
     if far > 1:  # beside the ellipse, at a height of it
-        share = torch.linspace(-1, 1, COUNT, dtype=torch.float64)[:, None]
-        my[:] = 16.5 - share * half_height
-        mx[:] = 20.0 + u12 / u11 * share * half_height
-        mx[::2] += (u22 * half_height / u11 * (1 - share**2).sqrt())[::2] + 8 * share[::2].flip(0)
+        fraction = torch.linspace(-1, 1, COUNT, dtype=torch.float64)[:, None]
+        my[:] = 16.5 - fraction * half_height
+        mx[:] = 20.0 + u12 / u11 * fraction * half_height
+        mx[::2] += (u22 * half_height / u11 * (1 - fraction**2).sqrt())[::2] + 8 * fraction[::2].flip(0)
     radius, dy = u22 * (half_height + margin_of(my, half_height)), 16.5 - my
     side = 3.5 + margin_of(mx, half_width)
     dx = 20.0 - mx + side * torch.linspace(-1, 1, 4001, dtype=torch.float64)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from tests.kernels.test_guard_bytes import Fenced
+from tests.kernels.test_guard_bytes import Guarded
 from tests.reference import step_buffers as reference
 from warpgs.kernels.step_buffers import NOT_FINITE, begin_step, end_step
 
@@ -31,11 +31,11 @@ def test_nothing_is_written_beside_what_a_step_finds(device):
     for size in ((5, 7), (1, 1)):
         given, views = rows(device, *size), torch.tensor([2, 0, 1, 0], device=device)
         counter = torch.tensor([1], device=device)
-        with Fenced(2**30) as fences:
+        with Guarded(2**30) as guards:
             begin_step(counter, views, *given)
             stop, history = torch.zeros(1, dtype=torch.int32, device=device), torch.zeros(4, 2, device=device)
             end_step(given[0][0, 0], given[0][0, 1], counter, stop, history)
-        assert len(fences.kept) >= 5 and fences.intact()
+        assert len(guards.kept) >= 5 and guards.intact()
 
 
 @pytest.mark.parametrize("stopped", [0, 1, NOT_FINITE])

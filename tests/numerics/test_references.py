@@ -5,12 +5,12 @@ import dataclasses
 import pytest
 import torch
 
+from tests.gaussians import SMOOTH, cloud
 from tests.numerics.scenes import SCENES
 from tests.numerics.thresholds import band
 from tests.reference.blend import blend_reference
 from tests.reference.low_precision import Frame, model, p32, r64, r64c
 from tests.reference.project import project_reference
-from tests.splats import SMOOTH, cloud
 from warpgs.constants import RULES
 
 
@@ -41,8 +41,8 @@ def test_dense_twin_equals_plain_loop(rule, tile_size):
     found = r64c(exact, frame, rule, tile_size)
     upstream = [torch.randn(p.shape, generator=torch.Generator().manual_seed(0), dtype=p.dtype) for p in wanted]
     gradients = [
-        torch.autograd.grad(sum((p * u).sum() for p, u in zip(pictures, upstream)), list(exact), retain_graph=True)
-        for pictures in (found, wanted)
+        torch.autograd.grad(sum((p * u).sum() for p, u in zip(images, upstream)), list(exact), retain_graph=True)
+        for images in (found, wanted)
     ]
     for a, b in zip((*found, *gradients[0]), (*wanted, *gradients[1])):
         assert float((a - b).detach().norm()) <= 1e-12 * float(b.detach().norm())

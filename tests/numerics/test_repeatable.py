@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from bench.determinism import atomic_spread, gradients_of, scene
-from tests.splats import camera, cloud
+from tests.gaussians import camera, cloud
 from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.ssim import differences
 

@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
-from tests.splats import cloud
+from tests.gaussians import cloud
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.table import Optimizer, OptimizerConfig
-from warpgs.pipeline.train.strategies.clone_split import DensityConfig, DensityStats, Refinement, refine
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig, DensityStats, DensityUpdate, refine
 from warpgs.scene import Gaussians
 
 
@@ -95,7 +95,7 @@ def test_optimizer_rows_follow():
     before = {k: v.clone() for k, v in optimizer.state().items()}
     keep = torch.tensor([0, 3, 4])
     added = {n: t[:2] + 1 for n, t in cloud(5).tensors().items()}
-    optimizer.apply(Refinement(keep, added, torch.full((2,), -1)))
+    optimizer.apply(DensityUpdate(keep, added, torch.full((2,), -1)))
     after = optimizer.state()
     for name in added:
         assert torch.equal(after[f"param.{name}"][:3], before[f"param.{name}"][keep])
@@ -117,7 +117,7 @@ def test_opacity_reset_caps_and_forgets():
     assert not bool(optimizer.means["logit_opacities"].any()) and not bool(optimizer.squares["logit_opacities"].any())
 
 
-@pytest.mark.parametrize("bad", [{"every": 0}, {"start": -1}, {"stop_share": 1.5}, {"max_gaussians": 0}])
+@pytest.mark.parametrize("bad", [{"every": 0}, {"start": -1}, {"stop_fraction": 1.5}, {"max_gaussians": 0}])
 def test_bad_settings_are_refused(bad):
     """A setting that cannot work is an error at once."""
     with pytest.raises(UsageError):
@@ -140,7 +140,7 @@ def test_statistics_follow_rows():
     """What is known of a row that stays stays with it; of new rows nothing is known."""
     stats = DensityStats(3, torch.device("cpu"))
     stats.gradient[:], stats.seen[:] = torch.tensor([1.0, 2, 3]), torch.tensor([4.0, 5, 6])
-    stats.apply(Refinement(torch.tensor([2, 0]), {}, torch.tensor([-1])))
+    stats.apply(DensityUpdate(torch.tensor([2, 0]), {}, torch.tensor([-1])))
     assert stats.gradient.tolist() == [3, 1, 0] and stats.seen.tolist() == [6, 4, 0]
 
 
@@ -148,7 +148,7 @@ def test_rates_of_scales_may_fall():
     """Log-linear to the share that is left at the last step, from where the set settles; level where nothing is asked for."""
     gaussians = cloud(3)
     falling = Optimizer(gaussians, OptimizerConfig(scales_lr=0.1, scales_decay=0.01), 1.0)
-    assert [falling.rates(p)["log_scales"] for p in (0.0, 0.5, 1.0)] == pytest.approx([0.1, 0.01, 0.001])
-    late = Optimizer(gaussians, OptimizerConfig(scales_lr=0.1, scales_decay=0.01), 1.0, settle=0.5)
-    assert [late.rates(p)["log_scales"] for p in (0.0, 0.5, 0.75, 1.0)] == pytest.approx([0.1, 0.1, 0.01, 0.001])
-    assert Optimizer(gaussians, OptimizerConfig(scales_lr=0.1), 1.0).rates(1.0)["log_scales"] == pytest.approx(0.1)
+    assert [falling.lrs(p)["log_scales"] for p in (0.0, 0.5, 1.0)] == pytest.approx([0.1, 0.01, 0.001])
+    late = Optimizer(gaussians, OptimizerConfig(scales_lr=0.1, scales_decay=0.01), 1.0, stable_start=0.5)
+    assert [late.lrs(p)["log_scales"] for p in (0.0, 0.5, 0.75, 1.0)] == pytest.approx([0.1, 0.1, 0.01, 0.001])
+    assert Optimizer(gaussians, OptimizerConfig(scales_lr=0.1), 1.0).lrs(1.0)["log_scales"] == pytest.approx(0.1)

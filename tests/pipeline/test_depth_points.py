@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.priors.rigs import still_life
-from tests.scenes import photographs, ring
+from tests.scenes import photos, ring
 from warpgs.errors import UsageError
 from warpgs.geometry import in_image, project_points
 from warpgs.pipeline.model.depth_points import coarse_points, depth_bounds, in_free_space, merge, merge_cells
@@ -13,13 +13,13 @@ from warpgs.priors.flow import write_flo
 from warpgs.scene import Camera, View, ViewDepth
 
 
-def known(valid_share: float = 1.0, cut: int = 0) -> tuple[list[View], list[ViewDepth]]:
+def known(valid_fraction: float = 1.0, cut: int = 0) -> tuple[list[View], list[ViewDepth]]:
     """Views with their exact depth, valid at random pixels; ``cut`` columns on the left are not."""
     views, depths = still_life()
     generator = np.random.default_rng(0)
     out = []
     for d in depths:
-        valid = generator.uniform(size=d.shape) < valid_share
+        valid = generator.uniform(size=d.shape) < valid_fraction
         valid[:, :cut] = False
         out.append(ViewDepth(np.where(valid, d, 0).astype(np.float32), valid, np.where(valid, 1, np.inf).astype(np.float32)))
     return views, out
@@ -140,7 +140,7 @@ def test_fallbacks_are_said(tmp_path):
     config = InitConfig(source="flow", flow=str(tmp_path), random_count=300)
     cloud, how, _ = initial_points(views, None, config, np.random.default_rng(0))
     assert len(cloud) == 300 and "only 0 points survived" in how and "no flow to 002.png" in how and "overlap?" in how
-    away = [photographs(2)[0]]
+    away = [photos(2)[0]]
     turned = np.diag([-1.0, 1, -1, 1]) @ away[0].camera.viewmat
     noise = np.random.default_rng(0).uniform(size=(32, 40, 3)).astype(np.float32)
     away.append(View("back.png", Camera(turned, away[0].camera.K, 40, 32), noise))

@@ -8,8 +8,8 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.allocations import Allocations
-from tests.scenes import photographs, priors, seeds
-from tests.splats import camera, cloud, leaves
+from tests.gaussians import camera, cloud, leaves
+from tests.scenes import photos, priors, seeds
 from warpgs.app.cli import main
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.train.config import FitConfig
@@ -55,16 +55,14 @@ def measured(fit: Fit, steps: int) -> int:
     """Bytes that the tensors of a fit take at the heaviest moment of some steps."""
     o = fit.optimizer
     views = (t for v in fit.views for t in vars(v).values() if isinstance(t, torch.Tensor))
-    stats = (fit.stats.gradient, fit.stats.seen, fit.layers.level, fit.layers.birth)
+    stats = (fit.stats.gradient, fit.stats.seen, fit.layers.level, fit.layers.created_step)
     with Allocations([*views, *stats, *o.params.values(), *o.means.values(), *o.squares.values()]) as allocations:
         for _ in range(steps):
             fit.advance()
     return allocations.peak
 
 
-@pytest.mark.parametrize(
-    "views", [photographs(2), masked(photographs(2)), photographs(2, 400, 300), masked(photographs(2, 400, 300))]
-)
+@pytest.mark.parametrize("views", [photos(2), masked(photos(2)), photos(2, 400, 300), masked(photos(2, 400, 300))])
 @pytest.mark.parametrize("count", [60, 5000])
 def test_plan_covers_a_step_and_not_much_more(views, count):
     """From few Gaussians on many pixels to many on few, with and without masks."""
@@ -75,7 +73,7 @@ def test_plan_covers_a_step_and_not_much_more(views, count):
     assert fit.memory.planned >= 0.95 * planned and found <= planned <= 1.25 * found + 20_000
 
 
-@pytest.mark.parametrize("views", [photographs(2, 400, 300), masked(photographs(2, 400, 300))], ids=["all", "masked"])
+@pytest.mark.parametrize("views", [photos(2, 400, 300), masked(photos(2, 400, 300))], ids=["all", "masked"])
 def test_plan_covers_the_depth_term(views):
     """A disparity a pixel that stays, and what a correlation and its gradient take."""
     config = dataclasses.replace(STEADY, loss=LossConfig(depth_weight=0.1))
@@ -83,12 +81,12 @@ def test_plan_covers_the_depth_term(views):
     fit.advance()
     found = measured(fit, 2)
     planned = fit.layout.step(60, instances(fit))
-    assert fit.layout.guided and found <= planned <= 1.25 * found + 20_000
+    assert fit.layout.depth_supervised and found <= planned <= 1.25 * found + 20_000
 
 
 def test_plan_covers_density_events():
     """A set that doubles within a step: the heaviest moment is then the growing itself."""
-    fit = Fit(photographs(2), seeds(4000), GROWING, CPU)
+    fit = Fit(photos(2), seeds(4000), GROWING, CPU)
     fit.advance()
     found = measured(fit, 1)
     layout, after = fit.layout, len(fit.gaussians)
@@ -98,15 +96,17 @@ def test_plan_covers_density_events():
 
 def test_plan_covers_sampling_events():
     """Scores, renderings and contributions of all views, and the fine Gaussians that they lead to."""
-    views = photographs(3, 200, 150)
-    method = MethodConfig(events=True, hier=True, pm=False, sampler=SamplerConfig(share=0.01, min_alpha=0.05, max_share=0.2))
+    views = photos(3, 200, 150)
+    method = MethodConfig(
+        events=True, hier=True, pm=False, sampler=SamplerConfig(fraction=0.01, min_alpha=0.05, max_fraction=0.2)
+    )
     config = dataclasses.replace(STEADY, steps=40, method=method, phases=PhaseConfig(4, 6, every=2))
     fit = Fit(views, seeds(1500), config, CPU, priors=priors(views))
     for _ in range(6):
         fit.advance()
     before = len(fit.gaussians)
     found, after = measured(fit, 4), len(fit.gaussians)
-    assert len(fit.events) > 2 and any(e["freed"] for e in fit.events) and before <= after
+    assert len(fit.events) > 2 and any(e["evicted"] for e in fit.events) and before <= after
     planned = max(fit.layout.step(after, instances(fit)), fit.layout.held(after) + fit.layout.event(before, after))
     assert found <= planned <= 1.35 * found
 
@@ -114,7 +114,7 @@ def test_plan_covers_sampling_events():
 @pytest.mark.parametrize("most", [400, 3000])
 def test_plan_covers_bands(most):
     """The same for steps that draw in bands."""
-    views = photographs(2, 200, 150)
+    views = photos(2, 200, 150)
     fit = Fit(views, seeds(800), STEADY, CPU)
     fit.advance()
     assert instances(fit) > most
@@ -133,7 +133,7 @@ def test_planned_instance_bytes_are_those_of_the_tensors(device):
         lists = sum(n for n in sizes.found if n in (4 * total, 8 * total))
         states = sum(n for n in sizes.found if n > 50 * total)
         sizes.found.clear()
-        torch.autograd.grad(render.rgb.sum(), render.splats)
+        torch.autograd.grad(render.rgb.sum(), render.projected)
         slots = sum(n for n in sizes.found if 30 * total < n < 60 * total)
     listing, backward = instance_bytes(cuda, 30)
     assert lists == listing * total
@@ -143,7 +143,7 @@ def test_planned_instance_bytes_are_those_of_the_tensors(device):
 
 def test_fit_keeps_to_its_limit(tmp_path):
     """A limit that forces bands and fewer Gaussians: it is said, kept, and costs no quality."""
-    views = photographs(4, 160, 120)
+    views = photos(4, 160, 120)
     config = dataclasses.replace(
         STEADY, steps=50, sh_every=25, density=DensityConfig(start=10, every=10, gradient=2e-5, max_gaussians=4000)
     )
@@ -181,16 +181,13 @@ def test_recorded_steps_are_given_up_where_they_need_more():
     """On CUDA a recording has room to spare and views twice; a limit between the two ways is kept by the smaller one."""
     layout = Layout(16, 504, 378, 3 * 504 * 378, cuda=True, recordings=1)
     single = dataclasses.replace(layout, recordings=0)
-    ways = [dataclasses.replace(way, fused=True).moments(20_000, 200_000, False)["projection"] for way in (layout, single)]
-    assert ways[1] - ways[0] == 20_000 * layout.row  # fused steps have no gradients of the parameters
-    assert layout.moments(20_000, 200_000, False)["projection"] == ways[1]
     many = {"count": 20_000, "instances": 200_000, "most": 20_000, "available": 2**40}
-    wide, _ = plan(layout, **many, limit=2**33, room=1.3)
+    wide, _ = plan(layout, **many, limit=2**33, capacity_factor=1.3)
     assert not wide.graph_refused and not wide.banded
     needed = single.step(20_000, 200_000)
-    tight, chosen = plan(layout, **many, limit=needed, room=1.3)
+    tight, chosen = plan(layout, **many, limit=needed, capacity_factor=1.3)
     assert tight.graph_refused and chosen == single and not tight.banded and "one by one" in tight.sentence()
-    assert plan(layout, **many, limit=needed - 2**20, room=1.3)[0].banded
+    assert plan(layout, **many, limit=needed - 2**20, capacity_factor=1.3)[0].banded
     open_end, _ = plan(layout, **{**many, "most": 10**6, "available": 2**29}, limit=None)
     assert "--memory-limit helps" in open_end.sentence() and open_end.lowered_from is None
 
@@ -200,7 +197,7 @@ def test_recorded_steps_are_given_up_where_they_need_more():
 def test_limit_holds_on_cuda(recorded):
     """What torch's allocator counted at its peak lies below the limit, in bands and in recorded steps."""
     device = torch.device("cuda", 0)
-    views = photographs(4, 160, 120)
+    views = photos(4, 160, 120)
     config = dataclasses.replace(STEADY, steps=60, density=DensityConfig(start=10, every=10, gradient=2e-5, max_gaussians=4000))
     free = Fit(views, seeds(1200), dataclasses.replace(config, cuda_graph=recorded), device)
     most = 4 * free.memory.planned_at_cap if recorded else free.layout.smallest(1500)

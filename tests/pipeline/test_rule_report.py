@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from tests.scenes import photographs, seeds, three_gaussians
-from tests.splats import cloud
+from tests.gaussians import cloud
+from tests.scenes import photos, seeds, three_gaussians
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.rule_report import TILE, trade_on
+from warpgs.pipeline.runs.rule_report import TILE, rule_report_of
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.half_resolution import halved
 from warpgs.pipeline.train.step import stack_views
@@ -26,7 +26,7 @@ BACKGROUND = (0.2, 0.4, 0.6)
 
 
 def views(count: int = 5, width: int = 150, height: int = 100) -> list[View]:
-    return photographs(count, width, height)
+    return photos(count, width, height)
 
 
 def crowd(device) -> Gaussians:
@@ -42,7 +42,7 @@ def test_error_is_the_difference_of_the_pictures(device):
     """For a coarse rule the figures are those of its pictures and exact's, whole pictures in float32, within float32."""
     g, seen = crowd(device), views(2, 60, 48)  # smaller than a part: the parts are the pictures
     for rule in ("fast", "gsplat"):
-        found = trade_on(g, seen, rule, BACKGROUND, seed=0)
+        found = rule_report_of(g, seen, rule, BACKGROUND, seed=0)
         options = RasterizeOptions(background=torch.tensor(BACKGROUND))
         pairs = [
             [rasterize(g, v.camera, dataclasses.replace(options, rule=r)).rgb.flatten() for r in (rule, "exact")] for v in seen
@@ -57,7 +57,7 @@ def test_error_is_the_difference_of_the_pictures(device):
 
 def test_nothing_traded_is_said_and_is_as_small_as_float32(device):
     """Rule exact: the arithmetic alone, and no second time."""
-    found = trade_on(crowd(device), views(), "exact", BACKGROUND, seed=3)
+    found = rule_report_of(crowd(device), views(), "exact", BACKGROUND, seed=3)
     assert 0 < found["mean"] < 2e-6 and "exact_ms" not in found and found["psnr"] > 90
     assert "nothing in a picture was traded" in found["sentence"] and "random training views" in found["sentence"]
 
@@ -65,7 +65,7 @@ def test_nothing_traded_is_said_and_is_as_small_as_float32(device):
 def test_the_seed_draws_views_and_parts():
     """Three views, parts of 64 px on tile edges or the picture's, others for another seed."""
     g, seen = crowd(CPU), views(6)
-    first, again, other = (trade_on(g, seen, "exact", BACKGROUND, seed=s) for s in (0, 0, 1))
+    first, again, other = (rule_report_of(g, seen, "exact", BACKGROUND, seed=s) for s in (0, 0, 1))
     assert first["views"] == again["views"] and first["mean"] == again["mean"] and first["views"] != other["views"]
     assert len(first["views"]) == 3
     for x, y, w, h in first["views"].values():
@@ -78,7 +78,7 @@ def test_a_gaussian_that_is_no_number_changes_nothing():
     g = crowd(CPU)
     bad = g.means.clone()
     bad[5] = float("nan")
-    found = trade_on(dataclasses.replace(g, means=bad), views(1), "exact", BACKGROUND, seed=0)
+    found = rule_report_of(dataclasses.replace(g, means=bad), views(1), "exact", BACKGROUND, seed=0)
     assert found["mean"] < 2e-6
 
 
@@ -92,9 +92,9 @@ def test_halved_views(size):
     view = TrainingView.of(View("a", views(1, width, height)[0].camera, image, mask), CPU)
     half = halved(view)
     h, w = max(1, height // 2), max(1, width // 2)
-    assert half.photo.shape == (h, w, 3) and half.mask.shape == (h, w) and (half.camera.width, half.camera.height) == (w, h)
+    assert half.image.shape == (h, w, 3) and half.mask.shape == (h, w) and (half.camera.width, half.camera.height) == (w, h)
     if size == (40, 32):
-        assert torch.allclose(half.photo[3, 5], view.photo[6:8, 10:12].mean((0, 1)))
+        assert torch.allclose(half.image[3, 5], view.image[6:8, 10:12].mean((0, 1)))
         assert half.mask.sum() == w * h - 1 and half.mask[0, -1] == 0
     corner = torch.tensor([float(width), float(height), 1.0])
     ray = torch.linalg.solve(view.camera.K, corner)
@@ -104,7 +104,7 @@ def test_halved_views(size):
 def test_a_fit_starts_at_half_size_and_ends_whole(device):
     """The first steps see halved views; the share decides when; without it everything is as before."""
     config = FitConfig(steps=8, init=InitConfig(source="points"), half_resolution=0.5)
-    fit = Fit(photographs(3), seeds(), config, device)
+    fit = Fit(photos(3), seeds(), config, device)
     assert [fit._phase(s).halved for s in range(1, 9)] == [True] * 4 + [False] * 4
     sizes = []
     for _ in range(8):
@@ -116,7 +116,7 @@ def test_a_fit_starts_at_half_size_and_ends_whole(device):
         assert math.isfinite(report.loss)
     assert sizes == [20] * 4 + [40] * 4
     assert len(stack_views(fit.shown)[0]) == 2
-    plain = Fit(photographs(3), seeds(), dataclasses.replace(config, half_resolution=0.0), device)
+    plain = Fit(photos(3), seeds(), dataclasses.replace(config, half_resolution=0.0), device)
     assert plain.shown == plain.views
     with pytest.raises(UsageError, match="half-resolution"):
         dataclasses.replace(config, half_resolution=float("nan"))

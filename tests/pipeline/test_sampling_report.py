@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from tests.pipeline.test_importance_sampling import CONFIG, METHOD, fitted
-from tests.scenes import photographs, priors, seeds
+from tests.scenes import photos, priors, seeds
 from warpgs.errors import ResourceError
 from warpgs.pipeline.runs import sampling_report
 from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
-from warpgs.pipeline.runs.sampling_report import event_figures, pictured, pictures_kept, sampling_story, view_sheet
+from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, pictured, sampling_report_of, view_sheet
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
 from warpgs.pipeline.train.trainer import Fit
 from warpgs.report.contact_sheet import DOT, GAP, HEAD, MARGIN, TITLE_SIZE
@@ -26,9 +26,9 @@ NAMES = ["00.png", "01.png", "02.png"]
 def run(tmp_path_factory):
     """A finished fit with its folder, and the first event."""
     out, seen = tmp_path_factory.mktemp("run"), []
-    views = photographs(3)
+    views = photos(3)
     fit = Fit(views, seeds(), CONFIG, CPU, priors=priors(views))
-    with pictures_kept(fit, NAMES, out):
+    with images_kept(fit, NAMES, out):
         draw = fit.on_event
         fit.on_event = lambda step, event: (draw(step, event), seen.append((step, event)))
         while fit.step < CONFIG.steps:
@@ -73,7 +73,7 @@ def test_tiles_show_what_the_event_saw(run):
     rows, columns = (((np.arange(n) + 0.5) * big[0].shape[i] / n).astype(int) for i, n in ((0, H), (1, W)))
     small = {i: t[rows][:, columns] for i, t in big.items()}
     np.testing.assert_allclose(small[0], drawn.rendered.numpy().clip(0, 1), atol=0.02)
-    np.testing.assert_allclose(small[1], view.photo.numpy(), atol=0.02)
+    np.testing.assert_allclose(small[1], view.image.numpy(), atol=0.02)
     for i, score in zip((5, 6, 7, 8), (*drawn.scores, drawn.score)):
         assert np.abs(small[i] - colored(score.numpy(), "INFERNO")).mean() < 0.02, i
     assert np.abs(small[2] - colored(fit.disparities[1], "TURBO")).mean() < 0.03
@@ -90,7 +90,7 @@ def test_figures_add_up(run):
     fit, _, seen = run
     figures = event_figures(fit)
     assert figures["events"] == {
-        "count": len(seen), "added": sum(len(e.change.parents) for _, e in seen), "freed": sum(e.freed for _, e in seen),
+        "count": len(seen), "added": sum(len(e.change.parents) for _, e in seen), "evicted": sum(e.evicted for _, e in seen),
         "draws": 3 * len(seen), "widened": sum(v.quantile < 0.6 for _, e in seen for v in e.views),
     }  # fmt: skip
     assert figures["events"]["added"] > 0 and sum(figures["layers"].values()) == len(fit.gaussians)
@@ -100,31 +100,31 @@ def test_figures_add_up(run):
 def test_story_follows_the_switches(run, tmp_path):
     """What is said of gate, draw and depth is what was asked for, and a widened gate is told; no events, no story."""
     fit, out, _ = run
-    story = sampling_story(fit, out)
+    story = sampling_report_of(fit, out)
     assert "drawn at random" in story.words and "above its 0.6 quantile" in story.words and "rendered depth" in story.words
-    assert [c for c, _ in story.pictures] == [f"sampling after step {s}" for s in sorted(pictured(fit.phases))]
-    assert story.pictures[0][1] == next(iter(sorted((out / "sampling").iterdir()))).read_bytes()
+    assert [c for c, _ in story.images] == [f"sampling after step {s}" for s in sorted(pictured(fit.phases))]
+    assert story.images[0][1] == next(iter(sorted((out / "sampling").iterdir()))).read_bytes()
     assert dict(zip(*story.table))["sampling events"] == str(len(fit.events))
-    sampler = dataclasses.replace(METHOD.sampler, share=0.2, depth="confirmed")
+    sampler = dataclasses.replace(METHOD.sampler, fraction=0.2, depth="consistent")
     method = dataclasses.replace(METHOD, agp=False, sampler=sampler)
     other = fitted(dataclasses.replace(CONFIG, method=method), steps=8)
-    words = sampling_story(other, tmp_path).words
+    words = sampling_report_of(other, tmp_path).words
     assert "the highest in S_importance" in words and "other views confirm and whose S_geometry" in words
     assert "In 3 of 3 draws the gate was widened" in words and "widened" not in story.words
     free = fitted(dataclasses.replace(CONFIG, method=dataclasses.replace(method, ra=False)), steps=8)
-    assert "all pixels where something is drawn" in sampling_story(free, tmp_path).words
-    assert sampling_story(fitted(dataclasses.replace(CONFIG, method=type(METHOD)()), steps=1), tmp_path) is None
+    assert "all pixels where something is drawn" in sampling_report_of(free, tmp_path).words
+    assert sampling_report_of(fitted(dataclasses.replace(CONFIG, method=type(METHOD)()), steps=1), tmp_path) is None
 
 
 def test_first_picture_outlives_a_continuation(run, tmp_path):
     """Stopped after the first event and continued: the same pictures, byte for byte, as of the fit that never stopped."""
-    views = photographs(3)
+    views = photos(3)
 
     def go_on(until: int, begin=None) -> Fit:
         fit = Fit(views, seeds(), CONFIG, CPU, priors=priors(views))
         if begin is not None:
             fit.load(*begin)
-        with pictures_kept(fit, NAMES, tmp_path):
+        with images_kept(fit, NAMES, tmp_path):
             while fit.step < until:
                 fit.advance()
         return fit
@@ -138,10 +138,10 @@ def test_first_picture_outlives_a_continuation(run, tmp_path):
 
 def test_a_folder_that_cannot_be_made_is_said_before_the_first_step(tmp_path):
     """A file stands where it should be."""
-    views = photographs(3)
+    views = photos(3)
     fit = Fit(views, seeds(), CONFIG, CPU, priors=priors(views))
     (tmp_path / "sampling").write_text("in the way")
-    with pytest.raises(ResourceError, match="sampling: cannot be made"), pictures_kept(fit, NAMES, tmp_path):
+    with pytest.raises(ResourceError, match="sampling: cannot be made"), images_kept(fit, NAMES, tmp_path):
         pytest.fail("begun")
 
 
@@ -153,9 +153,9 @@ def test_a_picture_that_cannot_be_written_is_said(tmp_path, monkeypatch, until):
         raise ResourceError(f"{path.name}: no space left")
 
     monkeypatch.setattr(sampling_report, "write_bytes", full)
-    views = photographs(3)
+    views = photos(3)
     fit = Fit(views, seeds(), CONFIG, CPU, priors=priors(views))
-    with pytest.raises(ResourceError, match="no space left"), pictures_kept(fit, NAMES, tmp_path):
+    with pytest.raises(ResourceError, match="no space left"), images_kept(fit, NAMES, tmp_path):
         while fit.step < until:
             fit.advance()
     assert fit.on_event is None and (fit.step == 10) == (until == 10)

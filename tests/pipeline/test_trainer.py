@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.scenes import photographs, seeds
+from tests.scenes import photos, seeds
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import look_at
 from warpgs.kernels.knn import morton_codes
@@ -35,7 +35,7 @@ BUSY = FitConfig(
 
 
 def fitted(config: FitConfig, steps: int, background=(0.0, 0.0, 0.0)) -> Fit:
-    fit = Fit(photographs(4), seeds(), config, CPU, background)
+    fit = Fit(photos(4), seeds(), config, CPU, background)
     for _ in range(steps):
         fit.advance()
     return fit
@@ -86,7 +86,7 @@ def test_continued_fit_equals_uninterrupted_one(tmp_path):
     straight = fitted(BUSY, 60)
     broken = fitted(BUSY, 27)
     save_checkpoint(tmp_path, *broken.state())
-    resumed = Fit(photographs(4), seeds(), BUSY, CPU)
+    resumed = Fit(photos(4), seeds(), BUSY, CPU)
     resumed.load(*load_checkpoint(tmp_path))
     for _ in range(33):
         resumed.advance()
@@ -110,10 +110,10 @@ def test_order_of_the_gaussians_changes_nothing_but_their_order():
 def test_all_that_goes_by_row_is_sorted_together():
     """Parameters, moments and layers of a Gaussian stay together."""
     fit = fitted(FitConfig(steps=9, init=InitConfig(source="points")), 3)
-    fit.layers.birth = torch.arange(len(fit.gaussians), dtype=torch.int32)
+    fit.layers.created_step = torch.arange(len(fit.gaussians), dtype=torch.int32)
     before = {name: t.clone() for name, t in fit.optimizer.state().items()}
     fit.layers.reorder(fit.optimizer.sort_along_curve())
-    rows = fit.layers.birth.long()
+    rows = fit.layers.created_step.long()
     assert not bool((rows.diff() > 0).all()) and bool((rows.sort().values.diff() == 1).all())
     assert all(torch.equal(t, before[name][rows]) for name, t in fit.optimizer.state().items())
     assert all(t.requires_grad for t in fit.optimizer.params.values())
@@ -121,7 +121,7 @@ def test_all_that_goes_by_row_is_sorted_together():
 
 def test_masked_pixels_do_not_count():
     """What a mask hides may hold anything, even NaN-free nonsense, without changing the fit."""
-    views = photographs(2)
+    views = photos(2)
     mask = np.ones(views[0].image.shape[:2], bool)
     mask[:, :8] = False
     results = []
@@ -154,7 +154,7 @@ def test_loss_of_known_images():
 
 def test_loss_that_is_no_number_stops_the_fit():
     """A NaN in a photograph is named, not trained on."""
-    views = photographs(2)
+    views = photos(2)
     bad = [View(v.name, v.camera, np.full_like(v.image, np.nan)) for v in views]
     fit = Fit(bad, seeds(), FitConfig(steps=3, init=InitConfig(source="points")), CPU)
     before = fit.gaussians.means.clone()
@@ -192,7 +192,7 @@ def test_first_gaussians():
 
 def test_start_falls_back_to_random_and_says_so():
     """Too few points: a random start inside what the cameras see, named; asked for points: an error with a way out."""
-    views = photographs(4)
+    views = photos(4)
     few = PointCloud(np.zeros((3, 3)), np.zeros((3, 3), np.float32))
     cloud, how, _ = initial_points(views, few, InitConfig(random_count=500), np.random.default_rng(0))
     assert len(cloud) == 500 and "500 random points" in how and "only 3 points" in how

@@ -46,7 +46,7 @@ class Inputs(NamedTuple):
         return Inputs(*(t.detach().cpu().to(dtype).requires_grad_() for t in self))
 
 
-class Pictures(NamedTuple):
+class Images(NamedTuple):
     """rgb [H, W, 3], alpha [H, W], depth [H, W] of the window."""
 
     rgb: torch.Tensor
@@ -54,7 +54,7 @@ class Pictures(NamedTuple):
     depth: torch.Tensor
 
 
-class Splats(NamedTuple):
+class ProjectedGaussians(NamedTuple):
     """Gaussians in the image, front to back: means [N, 2], conics xx, xy, yy [N, 3], opacities, colours [N, 3], depths.
 
     ``ids`` are their places among the inputs, ``sigmas`` [N, 2] the axes in pixels, shortest first, without a gradient.
@@ -88,7 +88,7 @@ def model(rule: Rule) -> Rule:
     )
 
 
-def splats_of(inputs: Inputs, frame: Frame, rule: Rule) -> Splats:
+def projected_of(inputs: Inputs, frame: Frame, rule: Rule) -> ProjectedGaussians:
     """Project, leave out what lies before the near plane or has no inverse covariance, and sort by depth, ties by number."""
     means, covs, colors, depths, opacities = project_reference(
         *inputs[:5], inputs.viewmat[None], inputs.K[None],
@@ -101,15 +101,15 @@ def splats_of(inputs: Inputs, frame: Frame, rule: Rule) -> Splats:
     ids = ids[sound[ids]]
     conics = torch.stack([c, -b, a], -1)[ids] / det[ids, None]
     sigmas = torch.linalg.eigvalsh(covs[0].detach()[ids].double()).clamp_min(0).sqrt().to(means.dtype)
-    return Splats(means[0][ids], conics, opacities[ids], colors[0][ids], depths[0][ids], ids, sigmas)
+    return ProjectedGaussians(means[0][ids], conics, opacities[ids], colors[0][ids], depths[0][ids], ids, sigmas)
 
 
-def squares(splats: Splats, frame: Frame, rule: Rule, tile_size: int) -> tuple[torch.Tensor, torch.Tensor]:
+def squares(projected: ProjectedGaussians, frame: Frame, rule: Rule, tile_size: int) -> tuple[torch.Tensor, torch.Tensor]:
     """By Gaussian, columns [N, W] and rows [N, H] of the tiles that its square touches: all that tiles ever decide."""
     flags = []
-    half = torch.ceil(rule.square_sigma * splats.sigmas[:, 1]).double()
+    half = torch.ceil(rule.square_sigma * projected.sigmas[:, 1]).double()
     for axis, size in enumerate((frame.width, frame.height)):
-        mean = splats.means[:, axis].detach().double()
+        mean = projected.means[:, axis].detach().double()
         margin = 0.01 + 2e-6 * (mean.abs() + half)
         inside = ((torch.arange(size) + 0.5)[None] - mean[:, None]).abs() <= (half + margin)[:, None]
         padded = torch.nn.functional.pad(inside, (0, -size % tile_size)).view(len(mean), -1, tile_size)
@@ -128,13 +128,13 @@ def pixel_centers(frame: Frame, dtype: torch.dtype) -> torch.Tensor:
     return torch.stack([xs, ys], -1).view(-1, 2)
 
 
-def layers(pixels: torch.Tensor, reach: torch.Tensor | None, splats: Splats, rule: Rule) -> Layers:
+def layers(pixels: torch.Tensor, reach: torch.Tensor | None, projected: ProjectedGaussians, rule: Rule) -> Layers:
     """Kerbl et al. 2023, equation 3, with the cut-offs of a rule; ``reach`` [N, P] is where tiles let a Gaussian draw."""
-    dx = pixels[None, :, 0] - splats.means[:, 0, None]
-    dy = pixels[None, :, 1] - splats.means[:, 1, None]
-    xx, xy, yy = (splats.conics[:, k, None] for k in range(3))
+    dx = pixels[None, :, 0] - projected.means[:, 0, None]
+    dy = pixels[None, :, 1] - projected.means[:, 1, None]
+    xx, xy, yy = (projected.conics[:, k, None] for k in range(3))
     power = xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy
-    raw = splats.opacities[:, None] * torch.exp(-0.5 * power)
+    raw = projected.opacities[:, None] * torch.exp(-0.5 * power)
     alpha = torch.where(raw > rule.alpha_max, torch.full_like(raw, rule.alpha_max), raw)
     drawn = (power >= 0) & (alpha >= rule.alpha_cut)  # a negative power is the conic's rounding, and skipped everywhere
     if reach is not None:
@@ -150,11 +150,11 @@ def layers(pixels: torch.Tensor, reach: torch.Tensor | None, splats: Splats, rul
     return Layers(power, raw, alpha, drawn, before, blended)
 
 
-def composite(found: Layers, splats: Splats, background: torch.Tensor) -> torch.Tensor:
+def composite(found: Layers, projected: ProjectedGaussians, background: torch.Tensor) -> torch.Tensor:
     """Colour, alpha and depth [P, 5], front to back, every sum in the scalar type of the inputs."""
     T = torch.ones_like(found.power[0])
     sums = T.new_zeros(len(T), 5)
-    values = torch.cat([splats.colors, splats.depths[:, None], torch.ones_like(splats.depths[:, None])], 1)
+    values = torch.cat([projected.colors, projected.depths[:, None], torch.ones_like(projected.depths[:, None])], 1)
     for alpha, value in zip(torch.where(found.blended, found.alpha, 0), values):
         sums = sums + (alpha * T)[:, None] * value
         T = T * (1 - alpha)
@@ -163,13 +163,13 @@ def composite(found: Layers, splats: Splats, background: torch.Tensor) -> torch.
     return torch.cat([sums[:, :3] + T[:, None] * background, 1 - T[:, None], depth], 1)
 
 
-def parts(splats: Splats, frame: Frame, rule: Rule, tile_size: int):
+def parts(projected: ProjectedGaussians, frame: Frame, rule: Rule, tile_size: int):
     """Pixels part by part, with what tiles let each Gaussian reach there (None: everything)."""
-    pixels = pixel_centers(frame, splats.means.dtype)
-    count = max(1, PAIRS // max(1, len(splats.means)))
+    pixels = pixel_centers(frame, projected.means.dtype)
+    count = max(1, PAIRS // max(1, len(projected.means)))
     columns = rows = None
     if rule.square_sigma > 0:
-        columns, rows = squares(splats, frame, rule, tile_size)
+        columns, rows = squares(projected, frame, rule, tile_size)
     for begin in range(0, len(pixels), count):
         numbers = torch.arange(begin, min(begin + count, len(pixels)))
         width = frame.window[2]
@@ -177,37 +177,37 @@ def parts(splats: Splats, frame: Frame, rule: Rule, tile_size: int):
         yield pixels[begin : begin + count], reach
 
 
-def draw(inputs: Inputs, frame: Frame, rule: Rule, tile_size: int = 16) -> Pictures:
+def draw(inputs: Inputs, frame: Frame, rule: Rule, tile_size: int = 16) -> Images:
     """The pictures in the scalar type of the inputs, differentiable in all of them."""
-    splats = splats_of(inputs, frame, rule)
+    projected = projected_of(inputs, frame, rule)
     width, height = frame.window[2:]
-    if len(splats.ids) == 0:
+    if len(projected.ids) == 0:
         empty = inputs.means.new_zeros(height, width)
-        return Pictures(inputs.background.expand(height, width, 3), empty, empty)
+        return Images(inputs.background.expand(height, width, 3), empty, empty)
 
     def part(pixels, reach, background, *fields):
-        those = Splats(*fields)
+        those = ProjectedGaussians(*fields)
         return composite(layers(pixels, reach, those, rule), those, background)
 
     made = [
-        checkpoint(part, pixels, reach, inputs.background, *splats, use_reentrant=False)
-        for pixels, reach in parts(splats, frame, rule, tile_size)
+        checkpoint(part, pixels, reach, inputs.background, *projected, use_reentrant=False)
+        for pixels, reach in parts(projected, frame, rule, tile_size)
     ]
     picture = torch.cat(made).view(height, width, 5)
-    return Pictures(picture[..., :3], picture[..., 3], picture[..., 4])
+    return Images(picture[..., :3], picture[..., 3], picture[..., 4])
 
 
-def r64(inputs: Inputs, frame: Frame, rule: Rule) -> Pictures:
+def r64(inputs: Inputs, frame: Frame, rule: Rule) -> Images:
     """The truth of the model that a rule approximates."""
     return draw(_checked(inputs, torch.float64), frame, model(rule))
 
 
-def r64c(inputs: Inputs, frame: Frame, rule: Rule, tile_size: int = 16) -> Pictures:
+def r64c(inputs: Inputs, frame: Frame, rule: Rule, tile_size: int = 16) -> Images:
     """The truth of the algorithm."""
     return draw(_checked(inputs, torch.float64), frame, rule, tile_size)
 
 
-def p32(inputs: Inputs, frame: Frame, rule: Rule, tile_size: int = 16) -> Pictures:
+def p32(inputs: Inputs, frame: Frame, rule: Rule, tile_size: int = 16) -> Images:
     """The plain program in float32."""
     return draw(_checked(inputs, torch.float32), frame, rule, tile_size)
 

@@ -3,11 +3,11 @@
 import torch
 
 
-def begin_step(counter, view_rows, rate_rows, setting_rows, viewmats, Ks, targets):
+def begin_step(counter, view_rows, lr_rows, setting_rows, viewmats, Ks, targets):
     """As `warpgs.kernels.step_buffers.begin_step`."""
     view = view_rows.index_select(0, counter)
-    rates, settings = (t.index_select(0, counter)[0] for t in (rate_rows, setting_rows))
-    return rates, settings, viewmats.index_select(0, view), Ks.index_select(0, view), targets.index_select(0, view)[0]
+    lrs, settings = (t.index_select(0, counter)[0] for t in (lr_rows, setting_rows))
+    return lrs, settings, viewmats.index_select(0, view), Ks.index_select(0, view), targets.index_select(0, view)[0]
 
 
 def end_step(loss, mse, counter, stop, history):

@@ -8,12 +8,12 @@ import weakref
 import pytest
 import torch
 
-from tests.splats import camera, cloud, leaves
+from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.render import graphed
-from warpgs.render.graphed import CALLS, Frame, Recorder, call_key
+from warpgs.render.graphed import MIN_CALLS, Frame, Recorder, call_key
 from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.runtime.cuda_graph import PAID, Graphs
+from warpgs.runtime.cuda_graph import PAID, GraphPool
 from warpgs.scene import Camera, Gaussians
 
 CPU = torch.device("cpu")
@@ -36,7 +36,7 @@ class Counted:
         return "pictures" if fits else None
 
 
-class NoGraphs(Graphs):
+class NoGraphPool(GraphPool):
     """Memory is never enough to record in, as turns out at the end."""
 
     def capture(self, work):
@@ -56,7 +56,7 @@ def recorder(monkeypatch, surroundings) -> Recorder:
     Counted.made, Counted.seen = 0, 100
     monkeypatch.setattr(graphed, "Plan", Counted)
     monkeypatch.setattr(graphed.project, "project", lambda *_, **__: (None, torch.tensor([Counted.seen])))
-    return Recorder(Graphs(CPU))
+    return Recorder(GraphPool(CPU))
 
 
 def sources_of(gaussians: Gaussians, cam: Camera) -> tuple[torch.Tensor, ...]:
@@ -72,7 +72,7 @@ def test_the_third_of_equal_calls_is_planned(recorder):
     own, other = batch(), batch()
     moved = (*own[:5], own[5] + 1, own[6] * 2)
     background = torch.zeros(1, 3)
-    assert [recorder.render(s, None, FRAME) for s in (own, moved, own, own)] == [None] * (CALLS - 1) + ["pictures"] * 2
+    assert [recorder.render(s, None, FRAME) for s in (own, moved, own, own)] == [None] * (MIN_CALLS - 1) + ["pictures"] * 2
     assert Counted.made == 1
     assert recorder.render(other, None, FRAME) is None and recorder.plan is None
     assert recorder.render(own, background, FRAME) is None
@@ -98,7 +98,7 @@ def test_plans_that_do_not_pay_are_made_less_and_less(recorder):
     assert 1 <= Counted.made <= 3
     recorder.forget()
     for tensors in (own, other, own):
-        assert [recorder.render(tensors, None, FRAME) for _ in range(PAID + CALLS)].count(None) == CALLS - 1
+        assert [recorder.render(tensors, None, FRAME) for _ in range(PAID + MIN_CALLS)].count(None) == MIN_CALLS - 1
 
 
 def test_what_cannot_be_recorded_is_not(recorder, monkeypatch):
@@ -136,44 +136,44 @@ def drawn(gaussians, cam, background, recorder=None):
     background = background.clone().requires_grad_()
     if recorder is None:
         r = rasterize(gaussians, cam, RasterizeOptions(background=background))
-        rgb, alpha, depth, splats, counts = r.rgb, r.alpha, r.depth, r.splats, r.tile_counts
+        rgb, alpha, depth, projected, counts = r.rgb, r.alpha, r.depth, r.projected, r.tile_counts
     else:
         frame = Frame(cam.width, cam.height, (0, 0, cam.width, cam.height), gaussians.sh_degree, RULES["exact"], 16)
         found = recorder.render((*params, cam.viewmat, cam.K), background, frame)
         if found is None:
             return None
-        (rgb, alpha, depth), splats, counts = found
+        (rgb, alpha, depth), projected, counts = found
     loss = (rgb**2).sum() + alpha.sum() + 0.1 * depth.sum()
-    gradients = torch.autograd.grad(loss, [*params, splats, cam.viewmat, cam.K, background], retain_graph=True)
+    gradients = torch.autograd.grad(loss, [*params, projected, cam.viewmat, cam.K, background], retain_graph=True)
     only_alpha = torch.autograd.grad(alpha.sum(), [*params, background], retain_graph=True)
-    (v_unused,) = torch.autograd.grad(splats[..., :2].sum(), params[0])
-    return [t.detach() for t in (rgb, alpha, depth, splats, counts, *gradients, *only_alpha, v_unused)]
+    (v_unused,) = torch.autograd.grad(projected[..., :2].sum(), params[0])
+    return [t.detach() for t in (rgb, alpha, depth, projected, counts, *gradients, *only_alpha, v_unused)]
 
 
 def test_a_plan_draws_what_the_rasterizer_draws(surroundings):
     """To the bit, batches and backgrounds and gradients of cameras included; where nothing can be recorded."""
-    g, own = leaves(cloud(300)), Recorder(NoGraphs(CPU))
+    g, own = leaves(cloud(300)), Recorder(NoGraphPool(CPU))
     cams = camera(70, 50, 3, torch.float32)
     backgrounds = torch.rand(3, 3, generator=torch.Generator().manual_seed(3))
-    found = [drawn(g, cams, backgrounds, own) for _ in range(CALLS + 1)]
-    assert found[: CALLS - 1] == [None] * (CALLS - 1)
+    found = [drawn(g, cams, backgrounds, own) for _ in range(MIN_CALLS + 1)]
+    assert found[: MIN_CALLS - 1] == [None] * (MIN_CALLS - 1)
     wanted = drawn(g, cams, backgrounds)
-    for each in found[CALLS - 1 :]:
+    for each in found[MIN_CALLS - 1 :]:
         assert all(torch.equal(a, b) for a, b in itertools.zip_longest(each, wanted))
 
 
 def test_a_plan_without_room_says_so(surroundings):
     """The call runs as usual, and the next plan has room for it."""
-    g, own = leaves(cloud(300)), Recorder(NoGraphs(CPU))
+    g, own = leaves(cloud(300)), Recorder(NoGraphPool(CPU))
     cam = camera(70, 50, 1, torch.float32)
     sources = (*g.tensors().values(), cam.viewmat, cam.K)
     frame = Frame(70, 50, (0, 0, 70, 50), g.sh_degree, RULES["exact"], 16)
-    for _ in range(CALLS):
+    for _ in range(MIN_CALLS):
         found = own.render(sources, None, frame)
     assert found is not None
     own.plan.capacity = own.plan.instances - 1
     assert own.render(sources, None, frame) is None and own.plan is None
-    for _ in range(2 * CALLS):
+    for _ in range(2 * MIN_CALLS):
         found = own.render(sources, None, frame)
     assert found is not None and own.plan.capacity > own.plan.instances
 
@@ -181,12 +181,12 @@ def test_a_plan_without_room_says_so(surroundings):
 def planned(own: Recorder, g: Gaussians, cam: Camera):
     """What the first call gives that is drawn by a plan."""
     frame = Frame(cam.width, cam.height, (0, 0, cam.width, cam.height), g.sh_degree, RULES["exact"], 16)
-    return [own.render((*g.tensors().values(), cam.viewmat, cam.K), None, frame) for _ in range(CALLS)][-1]
+    return [own.render((*g.tensors().values(), cam.viewmat, cam.K), None, frame) for _ in range(MIN_CALLS)][-1]
 
 
 def test_a_plan_is_gone_when_nobody_holds_it(surroundings):
     """Without a collection of garbage: graphs hold memory of the device. A backward pass that is still to come holds it."""
-    g, own = leaves(cloud(50)), Recorder(NoGraphs(CPU))
+    g, own = leaves(cloud(50)), Recorder(NoGraphPool(CPU))
     cam = camera(70, 50, 1, torch.float32)
     found = planned(own, g, cam)
     gone, loss = weakref.ref(own.plan), found[0][0].sum()
@@ -208,12 +208,12 @@ def test_where_recording_failed_calls_run_as_usual(recorder):
     recorder.graphs.failed = True
     assert [recorder.render(own, None, FRAME) for _ in range(9)] == [None] * 9
     recorder.forget()
-    assert [recorder.render(own, None, FRAME) for _ in range(CALLS)][-1] == "pictures"
+    assert [recorder.render(own, None, FRAME) for _ in range(MIN_CALLS)][-1] == "pictures"
 
 
 def test_torchs_default_type_is_not_the_plans(surroundings):
     """The background that nobody gave is of the Gaussians' type."""
-    g, own = leaves(cloud(50)), Recorder(NoGraphs(CPU))
+    g, own = leaves(cloud(50)), Recorder(NoGraphPool(CPU))
     cam = camera(70, 50, 1, torch.float32)
     usual = torch.get_default_dtype()
     torch.set_default_dtype(torch.bfloat16)
@@ -226,7 +226,7 @@ def test_torchs_default_type_is_not_the_plans(surroundings):
 
 def test_gaussians_that_change_in_number_before_the_backward_pass(surroundings):
     """Swapped where autograd does not see it: an error instead of memory beside the gradients."""
-    g, own = leaves(cloud(50)), Recorder(NoGraphs(CPU))
+    g, own = leaves(cloud(50)), Recorder(NoGraphPool(CPU))
     cam = camera(70, 50, 1, torch.float32)
     found = planned(own, g, cam)
     g.means.data = torch.zeros(70, 3)

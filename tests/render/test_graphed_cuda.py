@@ -8,9 +8,9 @@ import pytest
 import torch
 import torch.utils.checkpoint
 
-from tests.splats import camera, cloud, leaves
+from tests.gaussians import camera, cloud, leaves
 from warpgs.render import graphed
-from warpgs.render.graphed import CALLS
+from warpgs.render.graphed import MIN_CALLS
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
 
@@ -54,8 +54,8 @@ def loop(record: bool, steps: int = 9, change: float = 0.01, keep: bool = True, 
         if step % 3 == 0:  # another backward kernel
             loss = loss + r.alpha.sum() + 0.1 * r.depth.sum()
         gradients = torch.autograd.grad(loss, params, retain_graph=True)
-        (own,) = torch.autograd.grad(loss, r.splats)
-        found = [t.detach() for t in (r.rgb, r.alpha, r.depth, r.splats, r.tile_counts, *gradients, own)]
+        (own,) = torch.autograd.grad(loss, r.projected)
+        found = [t.detach() for t in (r.rgb, r.alpha, r.depth, r.projected, r.tile_counts, *gradients, own)]
         seen.append(found if keep else [t.cpu() for t in found])
         del r, loss, gradients, own, found
         with torch.no_grad():
@@ -87,8 +87,8 @@ def test_a_training_loop_is_replayed(fresh):
     target = torch.rand(50, 70, 3, device=CUDA)
     for step in range(60):
         optimizer.zero_grad()
-        picture = rasterize(g, cams[step % 4]).rgb
-        loss = (picture - target).abs().mean() + 0.2 * ((picture - target) ** 2).mean()
+        image = rasterize(g, cams[step % 4]).rgb
+        loss = (image - target).abs().mean() + 0.2 * ((image - target) ** 2).mean()
         loss.backward()
         optimizer.step()
         if step == 19:
@@ -100,13 +100,13 @@ def test_more_instances_than_room_are_drawn_as_usual(fresh):
     """Gaussians that grow twice: the same bits, and recorded anew."""
     g, cams = scene(3000)
 
-    def picture(record):
+    def image(record):
         r = rasterize(g, cams[0], RasterizeOptions(record=record))
         return [r.rgb.detach(), *torch.autograd.grad(r.rgb.sum(), list(g.tensors().values()))]
 
     capacities = []
     for step in range(14):
-        assert equal([picture(True)], [picture(False)])
+        assert equal([image(True)], [image(False)])
         capacities.append(0 if fresh.plan is None else fresh.plan.capacity)
         if step in (5, 6):
             with torch.no_grad():
@@ -123,10 +123,10 @@ def test_open_backward_passes_keep_what_they_need(fresh):
     def draw(i, record=True):
         return rasterize(g, cams[i], RasterizeOptions(record=record)).rgb
 
-    def gradients(*pictures, **how):
-        return torch.autograd.grad(sum((k + 1) * p.sum() for k, p in enumerate(pictures)), params, **how)
+    def gradients(*images, **how):
+        return torch.autograd.grad(sum((k + 1) * p.sum() for k, p in enumerate(images)), params, **how)
 
-    for _ in range(CALLS):
+    for _ in range(MIN_CALLS):
         gradients(draw(0))
     assert fresh.plan is not None
     wanted = gradients(draw(1, False), draw(2, False))
@@ -147,13 +147,13 @@ def test_batches_and_gradients_of_records(fresh):
     cams = dataclasses.replace(cams, viewmat=cams.viewmat.mT.contiguous().mT)
     backgrounds, seen = torch.rand(4, 3, device=CUDA), {}
     for record in (True, False):
-        for _ in range(CALLS + 1):
+        for _ in range(MIN_CALLS + 1):
             for t in g.tensors().values():
                 t.grad = None
             r = rasterize(g, cams, RasterizeOptions(record=record, background=backgrounds))
-            r.splats.retain_grad()
+            r.projected.retain_grad()
             (r.rgb * r.rgb).sum().backward()
-        seen[record] = [r.rgb.detach(), r.splats.grad, *(t.grad for t in g.tensors().values())]
+        seen[record] = [r.rgb.detach(), r.projected.grad, *(t.grad for t in g.tensors().values())]
     assert replays() > 0 and equal([seen[True]], [seen[False]])
 
 
@@ -166,11 +166,11 @@ def test_hooks_and_checkpoints_are_drawn_as_usual(fresh):
         return torch.autograd.grad(draw(g, cams[0]).rgb.sum(), params)
 
     wanted = gradient(lambda *of: rasterize(*of, PLAIN))
-    for _ in range(2 * CALLS):
+    for _ in range(2 * MIN_CALLS):
         with torch.autograd.graph.save_on_cpu(pin_memory=True):
             assert equal([gradient(rasterize)], [wanted])
     assert replays() == 0
-    for _ in range(2 * CALLS):
+    for _ in range(2 * MIN_CALLS):
         again = torch.utils.checkpoint.checkpoint(lambda: rasterize(g, cams[0]).rgb, use_reentrant=False)
         assert equal([torch.autograd.grad(again.sum(), params)], [wanted])
 
@@ -197,7 +197,7 @@ def test_a_device_that_is_not_the_current_one(fresh):
         pytest.skip("needs a second CUDA device to be the current one")
     g, cams = scene()
     with torch.cuda.device(1):
-        for _ in range(CALLS + 2):
+        for _ in range(MIN_CALLS + 2):
             rasterize(g, cams[0]).rgb.sum().backward()
             assert torch.cuda.current_device() == 1
     assert replays() == 0
@@ -224,7 +224,7 @@ def test_a_recording_holds_no_memory(fresh):
     g, cams = scene(30_000, 400, 300)
     peaks, held = {}, {}
     for record in (False, True):
-        for _ in range(CALLS + 3):
+        for _ in range(MIN_CALLS + 3):
             torch.cuda.reset_peak_memory_stats()
             before = torch.cuda.memory_allocated()
             torch.autograd.grad(rasterize(g, cams[0], RasterizeOptions(record=record)).rgb.sum(), list(g.tensors().values()))
@@ -247,7 +247,7 @@ def test_streams_do_not_share(fresh):
         for stream in (torch.cuda.current_stream(), torch.cuda.Stream()):
             stream.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(stream):
-                for _ in range(2 * CALLS):
+                for _ in range(2 * MIN_CALLS):
                     r = rasterize(g, cams[0], RasterizeOptions(record=record))
                     (step,) = torch.autograd.grad(r.rgb.sum(), g.means)
                     with torch.no_grad():

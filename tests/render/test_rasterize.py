@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import warpgs
+from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.scenes import ring, three_gaussians
-from tests.splats import SMOOTH, camera, cloud, hand_placed, leaves
 from warpgs.errors import ResourceError, UsageError
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
@@ -40,12 +40,12 @@ def test_gradcheck_end_to_end(device):
     inputs = [*gaussians.tensors().values(), cam.viewmat.clone(), cam.K.clone(), background]
     inputs = [t.detach().requires_grad_() for t in inputs]
 
-    def pictures(means, quats, scales, opacities, sh, viewmat, K, behind):
+    def images(means, quats, scales, opacities, sh, viewmat, K, behind):
         g = warpgs.Gaussians(means, quats, scales, opacities, sh)
         r = rasterize(g, Camera(viewmat, K, 12, 11), RasterizeOptions(rule=SMOOTH, background=behind))
         return r.rgb, r.alpha, r.depth
 
-    assert torch.autograd.gradcheck(pictures, inputs, eps=1e-6, atol=1e-7, rtol=1e-5, nondet_tol=0.0)
+    assert torch.autograd.gradcheck(images, inputs, eps=1e-6, atol=1e-7, rtol=1e-5, nondet_tol=0.0)
 
 
 def test_moving_scene_and_camera_together_changes_nothing(device):
@@ -63,9 +63,9 @@ def test_gradients_of_projected_means_on_request(device):
     """`splats.retain_grad()` gives what densification needs."""
     gaussians, cam = leaves(cloud(50, device=device)), camera(20, 12, dtype=torch.float32, device=device)
     r = rasterize(gaussians, cam)
-    r.splats.retain_grad()
+    r.projected.retain_grad()
     r.rgb.sum().backward()
-    assert bool(r.splats.grad[..., :2].any()) and not bool(r.splats.grad[..., 10:].any())
+    assert bool(r.projected.grad[..., :2].any()) and not bool(r.projected.grad[..., 10:].any())
 
 
 def test_contributions_only_on_request(device):
@@ -124,8 +124,8 @@ def test_native_kernels_agree_with_generic_ones(size):
         tensors = {n: t.detach().to(dtype).requires_grad_() for n, t in gaussians.tensors().items()}
         view = Camera(cam.viewmat.to(dtype), cam.K.to(dtype), *size)
         r = rasterize(warpgs.Gaussians(**tensors), view, RasterizeOptions(rule=SMOOTH))
-        pictures = torch.cat([r.rgb, r.alpha[..., None], r.depth[..., None]], -1)
-        results.append((pictures.detach(), *torch.autograd.grad((pictures * weights).sum(), list(tensors.values()))))
+        images = torch.cat([r.rgb, r.alpha[..., None], r.depth[..., None]], -1)
+        results.append((images.detach(), *torch.autograd.grad((images * weights).sum(), list(tensors.values()))))
     for a, b in zip(*results):
         assert float((a.double() - b).norm()) <= 1e-5 * float(b.norm())
 

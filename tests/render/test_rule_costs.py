@@ -8,15 +8,15 @@ import re
 import pytest
 import torch
 
-from tests.scenes import photographs
-from warpgs import choose_knobs
+from tests.scenes import photos
+from warpgs import select_rule
 from warpgs.app.cli import main
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.pipeline.train import time_budget
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.time_budget import FEWEST, MOST, within_budget
-from warpgs.render.rule_costs import RULE_PRICES
+from warpgs.pipeline.train.time_budget import MAX_STEPS, MIN_STEPS, within_budget
+from warpgs.render.rule_costs import RULE_COSTS
 from warpgs.synthetic.demo import split_spec, write_demo
 
 CPU = torch.device("cpu")
@@ -31,40 +31,40 @@ def scene(tmp_path_factory):
 
 def test_the_fastest_rule_within_the_error():
     """At each price's own error its rule, just below it the next one; every rule named exists."""
-    assert [p.rule for p in RULE_PRICES][-1] == "exact"
-    errors, times = [p.mean_error for p in RULE_PRICES], [p.time for p in RULE_PRICES]
+    assert [p.rule for p in RULE_COSTS][-1] == "exact"
+    errors, times = [p.mean_error for p in RULE_COSTS], [p.time for p in RULE_COSTS]
     assert errors == sorted(errors, reverse=True) and times == sorted(times)
-    for price, slower in zip(RULE_PRICES, [*RULE_PRICES[1:], None]):
-        assert price.rule in RULES
-        rule, why = choose_knobs(max_error=price.mean_error)
-        assert rule == price.rule and price.rule in why and "exact" in why
+    for cost, slower in zip(RULE_COSTS, [*RULE_COSTS[1:], None]):
+        assert cost.rule in RULES
+        rule, why = select_rule(max_error=cost.mean_error)
+        assert rule == cost.rule and cost.rule in why and "exact" in why
         if slower:
-            assert choose_knobs(max_error=0.99 * price.mean_error)[0] == slower.rule
+            assert select_rule(max_error=0.99 * cost.mean_error)[0] == slower.rule
 
 
 @pytest.mark.parametrize("error", [0.0, -1.0, float("nan"), float("inf")])
 def test_an_error_that_is_none(error):
     with pytest.raises(UsageError, match="positive number"):
-        choose_knobs(max_error=error)
+        select_rule(max_error=error)
 
 
 def test_an_error_below_float32():
     with pytest.raises(UsageError, match="float32 itself"):
-        choose_knobs(max_error=1e-9)
+        select_rule(max_error=1e-9)
 
 
 def test_more_time_more_steps(monkeypatch):
     """By the prices of a probe of 10 ms: what is foretold keeps the budget, and one step more would not."""
     monkeypatch.setattr(time_budget, "probe_seconds", lambda *_: 0.01)
-    views, config = photographs(3), FitConfig(seed=7, rule="fast")
+    views, config = photos(3), FitConfig(seed=7, rule="fast")
     setup, step = 0.01 * time_budget.SETUP * 3, 0.01 * time_budget.STEP
     for seconds in (setup + 150 * step, setup + 777.5 * step):
         chosen, why = within_budget(config, seconds, views, CPU)
         assert setup + chosen.steps * step <= seconds < setup + (chosen.steps + 1) * step + 1e-9
         assert f"--steps {chosen.steps}" in why and dataclasses.replace(chosen, steps=config.steps) == config
-    assert within_budget(config, 1e9, views, CPU)[0].steps == MOST
-    with pytest.raises(UsageError, match=f"too short: {FEWEST} steps"):
-        within_budget(config, setup + (FEWEST - 1) * step, views, CPU)
+    assert within_budget(config, 1e9, views, CPU)[0].steps == MAX_STEPS
+    with pytest.raises(UsageError, match=f"too short: {MIN_STEPS} steps"):
+        within_budget(config, setup + (MIN_STEPS - 1) * step, views, CPU)
 
 
 def test_the_probe_measures(device):
@@ -97,7 +97,7 @@ def test_what_was_chosen_is_said_and_stored(scene, tmp_path, capsys):
     assert main(["fit", str(scene), "--split", split_spec(9), *flags]) == 0
     printed = capsys.readouterr().out
     config, metrics = json.loads((out / "config.json").read_text()), json.loads((out / "metrics.json").read_text())
-    assert config["config"]["rule"] == metrics["trade"]["rule"] == RULE_PRICES[0].rule
-    assert f"chose rule {RULE_PRICES[0].rule}" in printed and metrics["trade"]["sentence"] in printed
+    assert config["config"]["rule"] == metrics["trade"]["rule"] == RULE_COSTS[0].rule
+    assert f"chose rule {RULE_COSTS[0].rule}" in printed and metrics["trade"]["sentence"] in printed
     assert metrics["trade"]["sentence"] in (out / "report.html").read_text("utf-8")
     assert re.search(r"a view took [\d.]+ ms instead of", metrics["trade"]["sentence"])

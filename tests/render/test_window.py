@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from tests.splats import camera, cloud, leaves
+from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.render.chunked import Frame, parts
@@ -43,8 +43,8 @@ def gradients(gaussians, cam, background, upstream, **options) -> list[torch.Ten
     g, background = leaves(gaussians), background.clone().requires_grad_()
     r = rasterize(g, cam, RasterizeOptions(background=background, **options))
     x, y, width, height = options.get("window") or (0, 0, *SIZE)
-    pictures = torch.cat([r.rgb, r.alpha[..., None], r.depth[..., None]], -1)
-    loss = (pictures * upstream[:, y : y + height, x : x + width]).sum()
+    images = torch.cat([r.rgb, r.alpha[..., None], r.depth[..., None]], -1)
+    loss = (images * upstream[:, y : y + height, x : x + width]).sum()
     inputs = [*g.tensors().values(), cam.viewmat, cam.K, background]
     return list(torch.autograd.grad(loss, inputs, allow_unused=False))
 
@@ -70,7 +70,7 @@ def test_bands_make_the_same_picture(device, dtype, most):
     weights = rasterize(gaussians, cam, RasterizeOptions(contributions=True))
     assert torch.equal(weights.weight_maxima, banded.weight_maxima)
     assert torch.allclose(weights.weight_sums, banded.weight_sums, rtol=1e-5, atol=1e-6)
-    assert int(whole.tile_counts.sum()) > 2 * most and torch.equal(whole.splats, banded.splats)
+    assert int(whole.tile_counts.sum()) > 2 * most and torch.equal(whole.projected, banded.projected)
     for name in ("rgb", "alpha", "depth"):
         assert torch.equal(getattr(whole, name), getattr(banded, name)), name
     upstream = torch.rand(2, SIZE[1], SIZE[0], 5, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 0.4

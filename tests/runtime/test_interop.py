@@ -6,7 +6,7 @@ import pytest
 import torch
 import warp as wp
 
-from tests.splats import camera, cloud, leaves
+from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
 from warpgs.kernels.adam import adam_step
@@ -72,10 +72,10 @@ def everything():
     g, cam = leaves(cloud(61)), camera(37, 30, cameras=2, dtype=torch.float32)
     size, rule = {"width": 37, "height": 30}, RULES["exact"]
     views, Ks = cam.viewmat.clone().requires_grad_(), cam.K.clone().requires_grad_()
-    splats, counts = project(*g.tensors().values(), views, Ks, **size, degree=1, rule=rule)
-    tiles = bin_tiles(splats, counts, **size, rule=rule)
-    capped = bin_tiles(splats, counts, **size, rule=rule, capacity=2000, overflow=torch.zeros(1, dtype=torch.int32))
-    pictures = blend(splats, tiles, torch.ones(2, 3), **size, rule=rule)
+    projected, counts = project(*g.tensors().values(), views, Ks, **size, degree=1, rule=rule)
+    tiles = bin_tiles(projected, counts, **size, rule=rule)
+    capped = bin_tiles(projected, counts, **size, rule=rule, capacity=2000, overflow=torch.zeros(1, dtype=torch.int32))
+    pictures = blend(projected, tiles, torch.ones(2, 3), **size, rule=rule)
     target = torch.rand(pictures[0].shape, generator=torch.Generator().manual_seed(0))
     maps, sums = ssim(pictures[0], target), differences(pictures[0], target)
     colors = evaluate_sh(g.sh, torch.nn.functional.normalize(g.means, dim=1), 1)
@@ -85,10 +85,10 @@ def everything():
     state = [moved, moved.flip(0).contiguous(), moved * 0, moved * 0]
     adam_step(*state, lr=0.1, step=1)
     drawn = opacity_dropout(53, torch.tensor([0.3, 1.0]), 5)
-    lists = [t for tiled in (tiles, capped) for t in (tiled.ranges, tiled.counts, tiled.splat_ids[: len(tiles.slots)])]
-    weights = contributions(splats, tiles, **size, rule=rule)
+    lists = [t for tiled in (tiles, capped) for t in (tiled.ranges, tiled.counts, tiled.gaussian_ids[: len(tiles.slots)])]
+    weights = contributions(projected, tiles, **size, rule=rule)
     near = mean_square_distances(moved[:91])
-    return [t.detach() for t in (splats, counts, *lists, *pictures, *gradients, *weights, *state, near, drawn, maps, sums)]
+    return [t.detach() for t in (projected, counts, *lists, *pictures, *gradients, *weights, *state, near, drawn, maps, sums)]
 
 
 @pytest.fixture

@@ -12,11 +12,11 @@ from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESETS, FitConfig
 from warpgs.pipeline.train.loss import LossConfig
 from warpgs.pipeline.train.schedule import PhaseConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.holdout_blocks import JudgeConfig
+from warpgs.pipeline.train.strategies.holdout_blocks import HoldoutConfig
 from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 from warpgs.pipeline.train.time_budget import check_budget
 from warpgs.priors.view_prior import PriorConfig
-from warpgs.render.rule_costs import choose_knobs
+from warpgs.render.rule_costs import select_rule
 from warpgs.runtime.byte_units import parse_bytes
 from warpgs.runtime.interop import set_threads
 
@@ -88,13 +88,11 @@ def _flags(base: FitConfig) -> type:
         """Most memory that the fit's tensors may take on its device while it takes steps, such as 2GiB or 800MB."""
         cuda_graph: bool = base.cuda_graph
         """On CUDA, record a step once and replay it: the same bytes in less time."""
-        fused_adam: bool = base.fused_adam
-        """In recorded steps, update Gaussians in the kernel that finds their gradients: less memory, other last digits."""
         adaptive: bool = base.adaptive
         """Held-out blocks of the training views decide how many Gaussians there are and of which degree."""
         max_gaussians: int = base.density.max_gaussians
         """No more Gaussians than this, from the start on; the same as --density.max-gaussians."""
-        judge: JudgeConfig = field(default_factory=lambda: base.judge)
+        holdout: HoldoutConfig = field(default_factory=lambda: base.holdout)
         init: InitConfig = field(default_factory=lambda: base.init)
         loss: LossConfig = field(default_factory=lambda: base.loss)
         optimizer: OptimizerConfig = field(default_factory=lambda: base.optimizer)
@@ -121,7 +119,7 @@ def _choose(a, arguments: list[str], rooms: dict) -> tuple[str, ...]:
         return ()
     if _word(arguments, "--rule"):
         raise UsageError("--max-error chooses the rule: leave out --rule")
-    rooms["rule"], note = choose_knobs(max_error=a.max_error)
+    rooms["rule"], note = select_rule(max_error=a.max_error)
     return (note,)
 
 

@@ -71,7 +71,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
 
 
 @dataclass(frozen=True)
-class Warmed:
+class Precompiled:
     """One module on one device."""
 
     device: str
@@ -86,13 +86,13 @@ class Warmed:
     """Time to compile and load it [s]."""
 
 
-def _load(device: torch.device, kernel: wp.Kernel, block: int) -> Warmed:
+def _load(device: torch.device, kernel: wp.Kernel, block: int) -> Precompiled:
     began, name = time.time(), f"{kernel.func.__module__.rpartition('.')[2]}.{kernel.func.__name__}"
     path = Path(kernel.module.load(interop.warp_device(device), block_dim=block).binary_path)
-    return Warmed(str(device), name, block, path.stat().st_mtime >= began, time.time() - began)
+    return Precompiled(str(device), name, block, path.stat().st_mtime >= began, time.time() - began)
 
 
-def warm_kernels(devices: list[torch.device] | None = None) -> Iterator[Warmed]:
+def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[Precompiled]:
     """Compile what is not in the cache yet, and yield each module as it is done.
 
     Args:
@@ -116,7 +116,7 @@ def warm_kernels(devices: list[torch.device] | None = None) -> Iterator[Warmed]:
 def print_warming(devices: list[torch.device] | None = None) -> None:
     """Warm the cache, with a line for each module that was compiled and a sum at the end."""
     began, results = time.perf_counter(), []
-    for w in warm_kernels(devices):
+    for w in precompile_kernels(devices):
         results.append(w)
         if w.compiled:
             blocks = "" if w.device == "cpu" else f" in blocks of {w.block}"

@@ -22,10 +22,10 @@ def make_kernels():
     @wp.kernel(enable_backward=False, module="warpgs.kernels.step_buffers")
     def begin_step(
         begin: int, counter: wp.array(dtype=wp.int64), view_rows: wp.array(dtype=wp.int64),
-        rate_rows: wp.array2d(dtype=float), setting_rows: wp.array2d(dtype=float),
+        lr_rows: wp.array2d(dtype=float), setting_rows: wp.array2d(dtype=float),
         viewmats: wp.array2d(dtype=float), Ks: wp.array2d(dtype=float), targets: wp.array2d(dtype=float),
         # outputs
-        rates: wp.array(dtype=float), settings: wp.array(dtype=float),
+        lrs: wp.array(dtype=float), settings: wp.array(dtype=float),
         viewmat: wp.array(dtype=float), K: wp.array(dtype=float), target: wp.array(dtype=float),
     ):  # fmt: skip
         i = begin + wp.tid()
@@ -33,8 +33,8 @@ def make_kernels():
         view = int(view_rows[step])
         if i < target.shape[0]:
             target[i] = targets[view, i]
-        if i < rates.shape[0]:
-            rates[i] = rate_rows[step, i]
+        if i < lrs.shape[0]:
+            lrs[i] = lr_rows[step, i]
         if i < settings.shape[0]:
             settings[i] = setting_rows[step, i]
         if i < 16:
@@ -62,7 +62,7 @@ def make_kernels():
 
 
 def begin_step(
-    counter: torch.Tensor, view_rows: torch.Tensor, rate_rows: torch.Tensor, setting_rows: torch.Tensor,
+    counter: torch.Tensor, view_rows: torch.Tensor, lr_rows: torch.Tensor, setting_rows: torch.Tensor,
     viewmats: torch.Tensor, Ks: torch.Tensor, targets: torch.Tensor,
 ) -> tuple[torch.Tensor, ...]:  # fmt: skip
     """What the step takes whose number the device knows. Float32 where nothing else is said.
@@ -70,20 +70,20 @@ def begin_step(
     Args:
         counter: The step's number in its burst, int64, shape [1].
         view_rows: Number of each step's view, int64, shape [B].
-        rate_rows: Rates of each step, shape [B, R].
+        lr_rows: Rates of each step, shape [B, R].
         setting_rows: Settings of each step, shape [B, S].
         viewmats: camera_from_world of each view, shape [V, 4, 4].
         Ks: Intrinsics [px], shape [V, 3, 3].
         targets: Photographs, shape [V, H, W, 3].
 
     Returns:
-        ``rates`` [R], ``settings`` [S], ``viewmat`` [1, 4, 4], ``K`` [1, 3, 3] and ``target`` [H, W, 3].
+        ``lrs`` [R], ``settings`` [S], ``viewmat`` [1, 4, 4], ``K`` [1, 3, 3] and ``target`` [H, W, 3].
     """
     found = (
-        rate_rows.new_empty(rate_rows.shape[1]), setting_rows.new_empty(setting_rows.shape[1]),
+        lr_rows.new_empty(lr_rows.shape[1]), setting_rows.new_empty(setting_rows.shape[1]),
         viewmats.new_empty(1, 4, 4), Ks.new_empty(1, 3, 3), targets.new_empty(targets.shape[1:]),
     )  # fmt: skip
-    rows = [interop.view(t.view(len(t), -1), wp.float32) for t in (rate_rows, setting_rows, viewmats, Ks, targets)]
+    rows = [interop.view(t.view(len(t), -1), wp.float32) for t in (lr_rows, setting_rows, viewmats, Ks, targets)]
     numbers = [interop.view(t, wp.int64) for t in (counter, view_rows)]
     outputs = [interop.view(t.view(-1), wp.float32) for t in found]
     count = max(16, *(t.numel() for t in found))

@@ -70,66 +70,66 @@ def parts(frame: Frame, sources: tuple[torch.Tensor, ...]) -> Iterator[tuple[Win
             left += reversed(smaller)
 
 
-def _draw(splats: torch.Tensor, backgrounds: torch.Tensor, frame: Frame, window: Window, counts: torch.Tensor):
+def _draw(projected: torch.Tensor, backgrounds: torch.Tensor, frame: Frame, window: Window, counts: torch.Tensor):
     x, y, width, height = window
     how = {"width": width, "height": height, "rule": frame.rule, "origin": (x, y)}
-    tiles = bin_tiles(splats, counts, tile_size=frame.tile_size, **how)
-    return blend(splats, tiles, backgrounds, deterministic=frame.deterministic, **how)
+    tiles = bin_tiles(projected, counts, tile_size=frame.tile_size, **how)
+    return blend(projected, tiles, backgrounds, deterministic=frame.deterministic, **how)
 
 
 class _Banded(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, splats, backgrounds, frame, *sources):
+    def forward(ctx, projected, backgrounds, frame, *sources):
         x0, y0, width, height = frame.window
-        pictures = [splats.new_empty(len(splats), height, width, *rest) for rest in ((3,), (), ())]
+        images = [projected.new_empty(len(projected), height, width, *rest) for rest in ((3,), (), ())]
         ctx.windows = []
         for window, counts in parts(frame, sources):
             x, y, w, h = window
             rows, columns = slice(y - y0, y - y0 + h), slice(x - x0, x - x0 + w)
-            for picture, part in zip(pictures, _draw(splats.detach(), backgrounds.detach(), frame, window, counts)):
-                picture[:, rows, columns] = part
+            for image, part in zip(images, _draw(projected.detach(), backgrounds.detach(), frame, window, counts)):
+                image[:, rows, columns] = part
             ctx.windows.append((window, rows, columns))
         # the sources too, so that torch notices where they are changed before the gradient is taken
-        ctx.save_for_backward(splats, backgrounds, *sources)
+        ctx.save_for_backward(projected, backgrounds, *sources)
         ctx.frame = frame
         ctx.set_materialize_grads(False)
-        return tuple(pictures)
+        return tuple(images)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *upstream):
-        splats, backgrounds, *sources = ctx.saved_tensors
+        projected, backgrounds, *sources = ctx.saved_tensors
         sources = tuple(t.detach() for t in sources)
-        v_splats, v_backgrounds = torch.zeros_like(splats), torch.zeros_like(backgrounds)
+        v_projected, v_backgrounds = torch.zeros_like(projected), torch.zeros_like(backgrounds)
         for window, rows, columns in ctx.windows:
             counts = _counts(ctx.frame, window, sources)
             with torch.enable_grad():
-                inputs = [splats.detach().requires_grad_(), backgrounds.detach().requires_grad_()]
+                inputs = [projected.detach().requires_grad_(), backgrounds.detach().requires_grad_()]
                 drawn = _draw(*inputs, ctx.frame, window, counts)
             wanted = [(p, v[:, rows, columns]) for p, v in zip(drawn, upstream) if v is not None]
-            pictures, gradients = zip(*wanted)
-            part, part_background = torch.autograd.grad(pictures, inputs, gradients)
-            v_splats += part
+            images, gradients = zip(*wanted)
+            part, part_background = torch.autograd.grad(images, inputs, gradients)
+            v_projected += part
             v_backgrounds += part_background
-        return v_splats, v_backgrounds, *(None for _ in range(1 + len(sources)))
+        return v_projected, v_backgrounds, *(None for _ in range(1 + len(sources)))
 
 
 def contributions_in_bands(
-    splats: torch.Tensor, frame: Frame, sources: tuple[torch.Tensor, ...]
+    projected: torch.Tensor, frame: Frame, sources: tuple[torch.Tensor, ...]
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Sum and maximum of each record's weights, as `contributions` returns them, part by part."""
-    sums, maxima = torch.zeros_like(splats[..., 0]), torch.zeros_like(splats[..., 0])
+    sums, maxima = torch.zeros_like(projected[..., 0]), torch.zeros_like(projected[..., 0])
     for (x, y, width, height), counts in parts(frame, tuple(t.detach() for t in sources)):
         how = {"width": width, "height": height, "rule": frame.rule, "origin": (x, y)}
-        tiles = bin_tiles(splats, counts, tile_size=frame.tile_size, **how)
-        part, part_maxima = contributions(splats, tiles, **how)
+        tiles = bin_tiles(projected, counts, tile_size=frame.tile_size, **how)
+        part, part_maxima = contributions(projected, tiles, **how)
         sums += part
         maxima = torch.maximum(maxima, part_maxima)
     return sums, maxima
 
 
 def blend_in_bands(
-    splats: torch.Tensor, backgrounds: torch.Tensor, frame: Frame, sources: tuple[torch.Tensor, ...]
+    projected: torch.Tensor, backgrounds: torch.Tensor, frame: Frame, sources: tuple[torch.Tensor, ...]
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Composite the records of `project` part by part: the same pictures as at once, to the bit.
 
@@ -137,12 +137,12 @@ def blend_in_bands(
     half as long again as drawing at once, and memory for the instances of one part only.
 
     Args:
-        splats: Records of `project` for the frame's window, shape [C, N, 12]; differentiable.
+        projected: Records of `project` for the frame's window, shape [C, N, 12]; differentiable.
         backgrounds: Colour behind everything, shape [C, 3]; differentiable.
         frame: What to draw.
-        sources: The seven tensors that ``splats`` were projected from, and the opacity factors if there were any.
+        sources: The seven tensors that ``projected`` were projected from, and the opacity factors if there were any.
 
     Returns:
         ``rgb``, ``alpha`` and ``depth`` as `blend` returns them.
     """
-    return _Banded.apply(splats, backgrounds, frame, *(t.detach() for t in sources))
+    return _Banded.apply(projected, backgrounds, frame, *(t.detach() for t in sources))

@@ -22,16 +22,16 @@ from warpgs.constants import Rule
 from warpgs.kernels import blend, project, sh
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, Tiles, available_bytes, bin_tiles
 from warpgs.runtime import interop
-from warpgs.runtime.allocator import Memory, fetch
-from warpgs.runtime.cuda_graph import PAID, Graphs, Work
+from warpgs.runtime.allocator import Allocator, fetch
+from warpgs.runtime.cuda_graph import PAID, GraphedFunction, GraphPool
 
-CALLS = 3
+MIN_CALLS = 3
 """The call from which on kernels are recorded, of equal ones in a row. Where that did not pay, twice as many the next time."""
-ROOM = 1.05
+CAPACITY_FACTOR = 1.05
 """Instances that there is room for, as a multiple of the most that such calls were seen to have."""
-MOST = 2**19
+MAX_PROJECTED = 2**19
 """Records beyond which the GPU takes longer than the host, so that a recording would gain nothing."""
-SHARE = 0.05
+FRACTION = 0.05
 """Part of the free memory that lists and states may take; beyond it calls are not recorded."""
 
 
@@ -50,10 +50,10 @@ class Frame:
     tile_size: int
 
 
-class Plan:
+class GraphedRasterizer:
     """Rendering of one set of tensors for any camera, and its gradients, as four works."""
 
-    def __init__(self, frame: Frame, cameras: int, capacity: int, graphs: Graphs):
+    def __init__(self, frame: Frame, cameras: int, capacity: int, graphs: GraphPool):
         """Nothing is drawn yet.
 
         Args:
@@ -76,9 +76,15 @@ class Plan:
         self._addresses = self._table.numpy()
         # by proxy, so that a plan is gone, and its graphs with it, as soon as nobody holds it
         own = [
-            functools.partial(f, weakref.proxy(self)) for f in (Plan._counted, Plan._composed, Plan._v_splats, Plan._v_sources)
+            functools.partial(f, weakref.proxy(self))
+            for f in (
+                GraphedRasterizer._counted,
+                GraphedRasterizer._composed,
+                GraphedRasterizer._v_projected,
+                GraphedRasterizer._v_sources,
+            )
         ]
-        self._count, self._draw, self._blend_back, self._project_back = (Work(f, graphs) for f in own)
+        self._count, self._draw, self._blend_back, self._project_back = (GraphedFunction(f, graphs) for f in own)
         self._none = torch.empty(0, dtype=torch.float32, device=self.device)
         self._black: torch.Tensor | None = None
 
@@ -94,16 +100,16 @@ class Plan:
                 self._black = torch.zeros(len(sources[5]), 3, dtype=torch.float32, device=self.device)
             backgrounds = self._black
         backgrounds = backgrounds.contiguous()
-        pictures, block = self._draw(*made, backgrounds.detach())
-        splats = _projected(*sources, self, cameras, made)
-        pictures = _drawn(splats, backgrounds, self, made[1], pictures, block)
+        images, block = self._draw(*made, backgrounds.detach())
+        projected = _projected(*sources, self, cameras, made)
+        images = _drawn(projected, backgrounds, self, made[1], images, block)
         if self._counted_by_now is not None:
             self._counted_by_now.synchronize()  # not before: the device goes on meanwhile
         self.instances = int(self._seen[0])
         if self.instances > self.capacity:
             return None
         self.drawn += 1
-        return pictures, splats, made[1]
+        return images, projected, made[1]
 
     def _seven(self, sources, cameras: torch.Tensor) -> list[torch.Tensor]:
         """What `project` takes, of which the last two were put into one."""
@@ -113,59 +119,61 @@ class Plan:
     def _how(self) -> tuple[tuple[int, int], int, Rule]:
         return (self.frame.width, self.frame.height), sh.coefficient_count(self.frame.degree), self.frame.rule
 
-    def _counted(self, memory: Memory, *sources: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def _counted(self, allocator: Allocator, *sources: torch.Tensor) -> tuple[torch.Tensor, ...]:
         # a copy, since gradients are still to come when the next call's cameras are at the same addresses
-        cameras = memory.own((25 * self.cameras,), torch.float32, self.device)
+        cameras = allocator.output((25 * self.cameras,), torch.float32, self.device)
         fetch(self._table.ptr, 16 * self.cameras, cameras)
         size, sh_count, rule = self._how()
         how = (self._none, size, self.frame.window, sh_count, rule, self.frame.tile_size)
-        _, counts = project.records(self._seven(sources, cameras), *how, memory)
-        total = memory.scratch((1,), torch.int64, self.device)
+        _, counts = project.records(self._seven(sources, cameras), *how, allocator)
+        total = allocator.workspace((1,), torch.int64, self.device)
         torch.sum(counts.view(-1), 0, keepdim=True, dtype=torch.int64, out=total)
         with interop.stream_of(self.device):
             wp.copy(self._on_host, interop.view(total, wp.int64).array())
         return ()
 
-    def _composed(self, memory: Memory, splats, counts, backgrounds) -> tuple[torch.Tensor, ...]:
+    def _composed(self, allocator: Allocator, projected, counts, backgrounds) -> tuple[torch.Tensor, ...]:
         origin, width, height, rule = self.part
-        overflow = memory.scratch((1,), torch.int32, self.device).zero_()  # nobody looks: the count tells before
+        overflow = allocator.workspace((1,), torch.int32, self.device).zero_()  # nobody looks: the count tells before
         tiles = bin_tiles(
-            splats, counts, width=width, height=height, tile_size=self.frame.tile_size, rule=rule, origin=origin,
-            capacity=self.capacity, overflow=overflow, memory=memory,
+            projected, counts, width=width, height=height, tile_size=self.frame.tile_size, rule=rule, origin=origin,
+            capacity=self.capacity, overflow=overflow, allocator=allocator,
         )  # fmt: skip
-        _, _, _, *rest = blend.composite(splats, tiles, backgrounds, *self.part, keep=True, deterministic=True, memory=memory)
+        _, _, _, *rest = blend.composite(
+            projected, tiles, backgrounds, *self.part, keep=True, deterministic=True, allocator=allocator
+        )
         return *(t for t in tiles.tensors() if t is not tiles.counts), *rest
 
-    def _v_splats(self, memory: Memory, splats, counts, backgrounds, rgb, depth, block, *v_pictures) -> tuple[()]:
+    def _v_projected(self, allocator: Allocator, projected, counts, backgrounds, rgb, depth, block, *v_images) -> tuple[()]:
         ranges, ids, slots, starts, tile_ids, total, *rest = self._draw.kept(block)
         tiles = Tiles(self.frame.tile_size, ranges, ids, slots, starts, counts.view(-1), tile_ids, total)
-        blend.gradients(splats, tiles, backgrounds, (*self.part, True), (rgb, depth, *rest), *v_pictures, memory)
+        blend.gradients(projected, tiles, backgrounds, (*self.part, True), (rgb, depth, *rest), *v_images, allocator)
         return ()
 
-    def _v_sources(self, memory: Memory, *of: torch.Tensor) -> tuple[()]:
-        *sources, cameras, splats, counts, v_splats = of
-        project.gradients(self._seven(sources, cameras), *self._how(), splats, counts, v_splats, False, memory)
+    def _v_sources(self, allocator: Allocator, *of: torch.Tensor) -> tuple[()]:
+        *sources, cameras, projected, counts, v_projected = of
+        project.gradients(self._seven(sources, cameras), *self._how(), projected, counts, v_projected, False, allocator)
         return ()
 
-    def blend_back(self, saved: tuple[torch.Tensor, ...], v_pictures: tuple[torch.Tensor | None, ...], wants_backgrounds: bool):
+    def blend_back(self, saved: tuple[torch.Tensor, ...], v_images: tuple[torch.Tensor | None, ...], wants_backgrounds: bool):
         """Gradients of records and backgrounds."""
-        v_pictures = [None if v is None else v.contiguous() for v in v_pictures]
-        (v_splats,), _ = self._blend_back(*saved, *v_pictures)
+        v_images = [None if v is None else v.contiguous() for v in v_images]
+        (v_projected,), _ = self._blend_back(*saved, *v_images)
         if not wants_backgrounds:
-            return v_splats, None
+            return v_projected, None
         transmittances = self._draw.kept(saved[5])[6]
-        return v_splats, blend.background_gradient(transmittances, v_pictures[0])
+        return v_projected, blend.background_gradient(transmittances, v_images[0])
 
-    def project_back(self, saved: tuple[torch.Tensor, ...], v_splats: torch.Tensor | None, wants_camera: bool):
+    def project_back(self, saved: tuple[torch.Tensor, ...], v_projected: torch.Tensor | None, wants_camera: bool):
         """Gradients of the seven tensors that `project` takes."""
-        *sources, cameras, splats, counts = saved
-        if len(sources[0]) != splats.shape[1]:  # by way of `.data`, which autograd does not see
+        *sources, cameras, projected, counts = saved
+        if len(sources[0]) != projected.shape[1]:  # by way of `.data`, which autograd does not see
             raise RuntimeError(
-                f"{splats.shape[1]:,} Gaussians were drawn, and now there are {len(sources[0]):,}: draw again first"
+                f"{projected.shape[1]:,} Gaussians were drawn, and now there are {len(sources[0]):,}: draw again first"
             )
-        if v_splats is None or wants_camera:
-            return project.gradients(self._seven(sources, cameras), *self._how(), splats, counts, v_splats, wants_camera)
-        found, _ = self._project_back(*saved, v_splats.contiguous())
+        if v_projected is None or wants_camera:
+            return project.gradients(self._seven(sources, cameras), *self._how(), projected, counts, v_projected, wants_camera)
+        found, _ = self._project_back(*saved, v_projected.contiguous())
         return *found, None, None
 
 
@@ -192,26 +200,26 @@ class _Projected(torch.autograd.Function):
 
     @staticmethod
     @_once
-    def backward(ctx, v_splats):
+    def backward(ctx, v_projected):
         wants_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
-        return *ctx.plan.project_back(ctx.saved_tensors, v_splats, wants_camera), None, None, None
+        return *ctx.plan.project_back(ctx.saved_tensors, v_projected, wants_camera), None, None, None
 
 
 class _Drawn(torch.autograd.Function):
     """Pictures, as what follows from records and backgrounds."""
 
     @staticmethod
-    def forward(ctx, splats, backgrounds, plan, counts, pictures, block):
-        rgb, _, depth = pictures
-        ctx.save_for_backward(splats, counts, backgrounds, rgb, depth, block)
+    def forward(ctx, projected, backgrounds, plan, counts, images, block):
+        rgb, _, depth = images
+        ctx.save_for_backward(projected, counts, backgrounds, rgb, depth, block)
         ctx.plan = plan
         ctx.set_materialize_grads(False)
-        return tuple(pictures)
+        return tuple(images)
 
     @staticmethod
     @_once
-    def backward(ctx, *v_pictures):
-        return *ctx.plan.blend_back(ctx.saved_tensors, v_pictures, ctx.needs_input_grad[1]), None, None, None, None
+    def backward(ctx, *v_images):
+        return *ctx.plan.blend_back(ctx.saved_tensors, v_images, ctx.needs_input_grad[1]), None, None, None, None
 
 
 # Function.apply itself, which looks for functorch's wrappers first, takes as long again as what it calls
@@ -221,10 +229,10 @@ _projected, _drawn = (super(torch.autograd.Function, node).apply for node in (_P
 class Recorder:
     """What the calls on one stream were, and the plan of those that came often enough."""
 
-    def __init__(self, graphs: Graphs):
+    def __init__(self, graphs: GraphPool):
         self.graphs = graphs
-        self.plan: Plan | None = None
-        self.wanted = CALLS
+        self.plan: GraphedRasterizer | None = None
+        self.wanted = MIN_CALLS
         """Equal calls in a row that it takes."""
         self._key, self._times, self._too_large = None, 0, False
         self._most: tuple[tuple | None, int] = (None, 0)
@@ -268,13 +276,13 @@ class Recorder:
             instances = int(project.project(*sources, **size, **how)[1].sum())
         if self._most[0] == self._key:
             instances = max(instances, self._most[1])
-        self._too_large = ROOM * instances * BYTES_PER_INSTANCE > SHARE * available_bytes(self.graphs.device)
+        self._too_large = CAPACITY_FACTOR * instances * BYTES_PER_INSTANCE > FRACTION * available_bytes(self.graphs.device)
         if not self._too_large:
-            self.plan = Plan(frame, len(sources[5]), int(ROOM * instances) + 1024, self.graphs)
+            self.plan = GraphedRasterizer(frame, len(sources[5]), int(CAPACITY_FACTOR * instances) + 1024, self.graphs)
 
     def _drop(self) -> None:
         if self.plan is not None:
-            self.wanted = CALLS if self.plan.drawn >= PAID else 2 * self.wanted
+            self.wanted = MIN_CALLS if self.plan.drawn >= PAID else 2 * self.wanted
         self.plan, self._key, self._times, self._too_large = None, None, 0, False
 
     def forget(self) -> None:
@@ -282,7 +290,7 @@ class Recorder:
         with self.graphs.lock:
             self._drop()
             self.graphs.release()
-            self.wanted, self._most = CALLS, (None, 0)
+            self.wanted, self._most = MIN_CALLS, (None, 0)
 
 
 def call_key(sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor | None, frame: Frame) -> tuple | None:
@@ -291,7 +299,7 @@ def call_key(sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor | None
     None for what cannot be recorded, and for what need not be: large calls, and those without gradients.
     """
     means, viewmats = sources[0], sources[5]
-    small = 0 < len(means) * len(viewmats) <= MOST
+    small = 0 < len(means) * len(viewmats) <= MAX_PROJECTED
     fit = means.dtype == torch.float32 and torch.is_grad_enabled() and any(t.requires_grad for t in sources)
     if not (small and fit) or torch.is_inference_mode_enabled() or not _usual_surroundings(means.device):
         return None
@@ -326,10 +334,10 @@ def recorder(device: torch.device) -> Recorder:
     """That of torch's current stream of a CUDA device."""
     key = (device, interop.warp_stream(device).cuda_stream)
     own = _RECORDERS.get(key)
-    return own or _RECORDERS.setdefault(key, Recorder(Graphs(device)))
+    return own or _RECORDERS.setdefault(key, Recorder(GraphPool(device)))
 
 
-def forget_recordings() -> None:
+def clear_graph_cache() -> None:
     """Give back the memory of what was recorded; loops that go on are recorded anew."""
     for own in list(_RECORDERS.values()):
         own.forget()

@@ -99,7 +99,7 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
 
     Returns:
         The pictures; without a leading axis for a single camera. To get gradients of the projected means, call
-        ``render.splats.retain_grad()`` before the backward pass: they are ``render.splats.grad[..., :2]``.
+        ``render.projected.retain_grad()`` before the backward pass: they are ``render.projected.grad[..., :2]``.
 
     Raises:
         ResourceError: The Gaussians touch more tiles than memory allows.
@@ -129,7 +129,7 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
             return _render(camera, *found)
     backgrounds = _backgrounds(means.new_zeros(3), viewmats) if backgrounds is None else backgrounds
 
-    splats, tile_counts = project(
+    projected, tile_counts = project(
         *sources, width=camera.width, height=camera.height, degree=degree, rule=rule,
         tile_size=options.tile_size, window=window, opacity_factors=options.opacity_factors,
     )  # fmt: skip
@@ -137,20 +137,20 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
         frame = Frame(camera.width, camera.height, window, degree, rule, options.tile_size, most, options.deterministic)
         factors = () if options.opacity_factors is None else (options.opacity_factors,)
         sources = (*sources, *factors)
-        pictures = blend_in_bands(splats, backgrounds, frame, sources)
-        weights = contributions_in_bands(splats, frame, sources) if options.contributions else (None, None)
-        return _render(camera, pictures, splats, tile_counts, *weights)
+        images = blend_in_bands(projected, backgrounds, frame, sources)
+        weights = contributions_in_bands(projected, frame, sources) if options.contributions else (None, None)
+        return _render(camera, images, projected, tile_counts, *weights)
     overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=means.device)
     tiles = bin_tiles(
-        splats, tile_counts, **size, tile_size=options.tile_size, rule=rule,
+        projected, tile_counts, **size, tile_size=options.tile_size, rule=rule,
         budget_bytes=options.memory_budget, capacity=options.capacity, overflow=overflow, origin=(x, y),
     )  # fmt: skip
     how = {**size, "rule": rule, "origin": (x, y)}
-    pictures = blend(splats, tiles, backgrounds, **how, deterministic=options.deterministic)
-    weights = contributions(splats, tiles, **how) if options.contributions else (None, None)
-    return _render(camera, pictures, splats, tile_counts, *weights, overflow)
+    images = blend(projected, tiles, backgrounds, **how, deterministic=options.deterministic)
+    weights = contributions(projected, tiles, **how) if options.contributions else (None, None)
+    return _render(camera, images, projected, tile_counts, *weights, overflow)
 
 
-def _render(camera: Camera, pictures: tuple[torch.Tensor, ...], *rest) -> Render:
+def _render(camera: Camera, images: tuple[torch.Tensor, ...], *rest) -> Render:
     # not p[0], whose gradient would be a copy among zeros
-    return Render(*(p.squeeze(0) if len(camera.viewmat.shape) == 2 else p for p in pictures), *rest)
+    return Render(*(p.squeeze(0) if len(camera.viewmat.shape) == 2 else p for p in images), *rest)

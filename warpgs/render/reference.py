@@ -42,7 +42,7 @@ def _colors(coefficients: torch.Tensor, directions: torch.Tensor, degree: int) -
 
 
 @torch.no_grad()
-def exact_picture(
+def reference_image(
     gaussians: Gaussians, camera: Camera, window: tuple[int, int, int, int], background: torch.Tensor, degree: int
 ) -> torch.Tensor:
     """Colours in a window of one camera's picture under rule ``exact``, in float64.
@@ -84,7 +84,7 @@ def exact_picture(
     half = reach * torch.sqrt(torch.diagonal(covariances, dim1=-2, dim2=-1))
 
     left, top, width, height = window
-    picture = torch.empty(height, width, 3, dtype=torch.float64, device=means.device)
+    image = torch.empty(height, width, 3, dtype=torch.float64, device=means.device)
     steps = torch.arange(BLOCK, dtype=torch.float64, device=means.device) + 0.5
     for v in range(0, height, BLOCK):
         for u in range(0, width, BLOCK):
@@ -100,8 +100,8 @@ def exact_picture(
             before = torch.cat([torch.ones_like(alpha[:1]), after[:-1]])
             weights = torch.where(before >= rule.transmittance_stop, alpha * before, 0.0)
             color = weights.T @ colors[near] + (1 - weights.sum(0))[:, None] * background.double()
-            picture[v : v + h, u : u + w] = color.view(h, w, 3)
-    return picture
+            image[v : v + h, u : u + w] = color.view(h, w, 3)
+    return image
 
 
 def psnr_of(mean_square: float) -> float:

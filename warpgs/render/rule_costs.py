@@ -11,7 +11,7 @@ SOURCE = "bench/results/tradeoff_kernel_cpu2.json, scene trained"
 
 
 @dataclass(frozen=True)
-class RulePrice:
+class RuleCost:
     """One rule against `exact`, on a trained scene."""
 
     rule: str
@@ -23,16 +23,16 @@ class RulePrice:
     """Time of a picture with its gradients as a share of `exact`'s."""
 
 
-RULE_PRICES = (
-    RulePrice("fast", 6.6e-3, 0.11, 0.87),
-    RulePrice("balanced", 2.4e-3, 3.8e-2, 0.93),
-    RulePrice("exact", 6e-7, 2e-3, 1.0),
+RULE_COSTS = (
+    RuleCost("fast", 6.6e-3, 0.11, 0.87),
+    RuleCost("balanced", 2.4e-3, 3.8e-2, 0.93),
+    RuleCost("exact", 6e-7, 2e-3, 1.0),
 )
 """From fast to slow. Of `exact` the error is that of float32 against float64, the largest found on parts of fits of fern: a
 Gaussian whose alpha is within rounding of the cut is drawn by the one and not by the other."""
 
 
-def choose_knobs(*, max_error: float) -> tuple[str, str]:
+def select_rule(*, max_error: float) -> tuple[str, str]:
     """The fastest rule whose error keeps a limit.
 
     Args:
@@ -46,11 +46,11 @@ def choose_knobs(*, max_error: float) -> tuple[str, str]:
     """
     if not 0 < max_error < float("inf"):
         raise UsageError(f"max-error must be a positive number, such as 0.002, not {max_error}")
-    for price in RULE_PRICES:
-        if price.mean_error <= max_error:
-            return price.rule, (
-                f"max-error {max_error:g}: chose rule {price.rule}, off exact by {price.mean_error:.1e} on average and "
-                f"{price.max_error:.1e} at most on a trained scene ({SOURCE}), {price.time:.0%} of exact's time"
+    for cost in RULE_COSTS:
+        if cost.mean_error <= max_error:
+            return cost.rule, (
+                f"max-error {max_error:g}: chose rule {cost.rule}, off exact by {cost.mean_error:.1e} on average and "
+                f"{cost.max_error:.1e} at most on a trained scene ({SOURCE}), {cost.time:.0%} of exact's time"
             )
-    least = min(p.mean_error for p in RULE_PRICES)
+    least = min(p.mean_error for p in RULE_COSTS)
     raise UsageError(f"max-error {max_error:g} is below what float32 itself errs by, {least:.1e} on average; ask for more")

@@ -17,101 +17,101 @@ ALIGNMENT = 256
 """Bytes that parts of a block begin at multiples of: what sorts and 16-byte loads need, and whole cache lines."""
 
 
-class Memory:
+class Allocator:
     """Asks torch for each tensor."""
 
-    def own(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    def output(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
         """A tensor that the caller may keep."""
         return torch.empty(shape, dtype=dtype, device=device)
 
-    def kept(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    def saved(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
         """One that the backward pass needs."""
         return torch.empty(shape, dtype=dtype, device=device)
 
-    def scratch(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    def workspace(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
         """One that nobody needs when the function is done."""
         return torch.empty(shape, dtype=dtype, device=device)
 
 
-TORCH = Memory()
+TORCH = Allocator()
 
 
 def _bytes(shape: tuple[int, ...], dtype: torch.dtype) -> int:
     return -(-math.prod(shape) * dtype.itemsize // ALIGNMENT) * ALIGNMENT
 
 
-class Measured(Memory):
+class SizingAllocator(Allocator):
     """Asks torch, and takes down what a function asks for."""
 
     def __init__(self):
-        self.owned: list[tuple[torch.Tensor, tuple[int, ...]]] = []
+        self.outputs: list[tuple[torch.Tensor, tuple[int, ...]]] = []
         """Of the caller's tensors: an empty one of its kind, and the shape."""
-        self.kept_bytes = self.scratch_bytes = 0
+        self.saved_bytes = self.workspace_bytes = 0
 
-    def own(self, shape, dtype, device):
+    def output(self, shape, dtype, device):
         """See `Memory`."""
-        tensor = super().own(shape, dtype, device)
-        self.owned.append((tensor.new_empty(0), tuple(shape)))
+        tensor = super().output(shape, dtype, device)
+        self.outputs.append((tensor.new_empty(0), tuple(shape)))
         return tensor
 
-    def kept(self, shape, dtype, device):
+    def saved(self, shape, dtype, device):
         """See `Memory`."""
-        self.kept_bytes += _bytes(shape, dtype)
-        return super().kept(shape, dtype, device)
+        self.saved_bytes += _bytes(shape, dtype)
+        return super().saved(shape, dtype, device)
 
-    def scratch(self, shape, dtype, device):
+    def workspace(self, shape, dtype, device):
         """See `Memory`."""
-        self.scratch_bytes += _bytes(shape, dtype)
-        return super().scratch(shape, dtype, device)
+        self.workspace_bytes += _bytes(shape, dtype)
+        return super().workspace(shape, dtype, device)
 
 
-class Blocks(Memory):
+class Arena(Allocator):
     """What a measured function asks for the next time: tensors for the caller, and parts of two blocks."""
 
-    def __init__(self, measured: Measured, byte: torch.Tensor, scratch: torch.Tensor | None = None):
+    def __init__(self, measured: SizingAllocator, byte: torch.Tensor, workspace: torch.Tensor | None = None):
         """Ask torch for all of it.
 
         Args:
             measured: What the function asked for.
             byte: Any tensor of bytes on the device. (`new_empty` takes half the time of `torch.empty`.)
-            scratch: A block that nobody else uses now; None for one of its own.
+            workspace: A block that nobody else uses now; None for one of its own.
         """
-        self.owned = [kind.new_empty(shape) for kind, shape in measured.owned]
+        self.outputs = [kind.new_empty(shape) for kind, shape in measured.outputs]
         """The caller's tensors, in the order in which the function asks for them."""
-        self.block = byte.new_empty(measured.kept_bytes) if measured.kept_bytes else None
+        self.block = byte.new_empty(measured.saved_bytes) if measured.saved_bytes else None
         """What is kept; None where nothing is."""
-        self._scratch = byte.new_empty(measured.scratch_bytes) if scratch is None else scratch
+        self._workspace = byte.new_empty(measured.workspace_bytes) if workspace is None else workspace
         self.begin()
 
     def begin(self) -> None:
         """Hand out the same again, from the first."""
-        self._asked = self._kept_to = self._scratch_to = 0
+        self._asked = self._saved_to = self._workspace_to = 0
 
     def addresses(self) -> tuple[int, ...]:
         """Of all memory that is handed out."""
         block = 0 if self.block is None else self.block.data_ptr()
-        return *[t.data_ptr() for t in self.owned], block, self._scratch.data_ptr()
+        return *[t.data_ptr() for t in self.outputs], block, self._workspace.data_ptr()
 
     def place(self, tensor: torch.Tensor) -> tuple[int, tuple[int, ...], torch.dtype]:
         """Where a kept tensor is: what `part` takes after the block."""
         begin = tensor.data_ptr() - self.block.data_ptr() if tensor.numel() else 0  # without entries it has no address
         return begin, tuple(tensor.shape), tensor.dtype
 
-    def own(self, shape, dtype, device):
+    def output(self, shape, dtype, device):
         """See `Memory`."""
-        tensor = self.owned[self._asked]
+        tensor = self.outputs[self._asked]
         self._asked += 1
         return tensor
 
-    def kept(self, shape, dtype, device):
+    def saved(self, shape, dtype, device):
         """See `Memory`."""
-        begin, self._kept_to = self._kept_to, self._kept_to + _bytes(shape, dtype)
+        begin, self._saved_to = self._saved_to, self._saved_to + _bytes(shape, dtype)
         return part(self.block, begin, shape, dtype)
 
-    def scratch(self, shape, dtype, device):
+    def workspace(self, shape, dtype, device):
         """See `Memory`."""
-        begin, self._scratch_to = self._scratch_to, self._scratch_to + _bytes(shape, dtype)
-        return part(self._scratch, begin, shape, dtype)
+        begin, self._workspace_to = self._workspace_to, self._workspace_to + _bytes(shape, dtype)
+        return part(self._workspace, begin, shape, dtype)
 
 
 def part(block: torch.Tensor, begin: int, shape: tuple[int, ...], dtype: torch.dtype) -> torch.Tensor:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import torch
 
 from warpgs.runtime import interop
-from warpgs.runtime.allocator import Blocks, Measured, part
+from warpgs.runtime.allocator import Arena, SizingAllocator, part
 
 VARIANTS = 8
 """Sets of addresses that graphs are kept for: a loop that holds on to some result alternates between two."""
@@ -22,7 +22,7 @@ SMALL = 2**16
 """Bytes that are not worth asking for at each call."""
 
 
-class Graphs:
+class GraphPool:
     """Records on one stream of a device, and replays one graph at a time."""
 
     def __init__(self, device: torch.device):
@@ -75,21 +75,21 @@ class Graphs:
         self._keeper, self.failed = None, False
 
 
-class Work:
+class GraphedFunction:
     """A function of tensors whose kernels are recorded for each set of addresses that it meets, up to VARIANTS."""
 
-    def __init__(self, function: Callable[..., tuple[torch.Tensor, ...]], graphs: Graphs):
+    def __init__(self, function: Callable[..., tuple[torch.Tensor, ...]], graphs: GraphPool):
         """Nothing is recorded yet.
 
         Args:
-            function: Takes a `Memory` and tensors or Nones, always of the same shapes; asks the memory for what it makes, does
-                not look at the device, and returns those of the kept tensors that `kept` is to find.
+            function: Takes an `Allocator` and tensors or Nones, always of the same shapes; asks the allocator for what it
+                makes, does not read from the device, and returns those saved tensors that `kept` is to find.
             graphs: Where to record.
         """
         self.function, self.graphs = function, graphs
         self.replays = self.recorded = 0
-        self._measured: Measured | None = None
-        self._scratch: torch.Tensor | None = None
+        self._measured: SizingAllocator | None = None
+        self._workspace: torch.Tensor | None = None
         self._known: dict[tuple[int, ...], tuple] = {}
         self._places: list[tuple] = []
 
@@ -97,13 +97,13 @@ class Work:
         """The caller's tensors, and the block of those that are kept."""
         with self.graphs.lock:
             if self._measured is None:  # a first run, which also loads what may not be loaded while recording
-                measured = Measured()
+                measured = SizingAllocator()
                 with torch.no_grad():
                     self.function(measured, *inputs)
                 self._measured = measured
-                if measured.scratch_bytes <= SMALL:
-                    self._scratch = self.graphs.byte.new_empty(measured.scratch_bytes)
-            blocks = Blocks(self._measured, self.graphs.byte, self._scratch)
+                if measured.workspace_bytes <= SMALL:
+                    self._workspace = self.graphs.byte.new_empty(measured.workspace_bytes)
+            blocks = Arena(self._measured, self.graphs.byte, self._workspace)
             key = (*[0 if t is None else t.data_ptr() for t in inputs], *blocks.addresses())
             known = None
             if not self.graphs.capturing():
@@ -115,18 +115,18 @@ class Work:
                 known[0].replay()
                 self.replays += 1
                 self.graphs.replays += 1
-        return blocks.owned, blocks.block
+        return blocks.outputs, blocks.block
 
-    def kept(self, block: torch.Tensor) -> list[torch.Tensor]:
+    def saved(self, block: torch.Tensor) -> list[torch.Tensor]:
         """What the function returned when it made this block."""
         return [part(block, *place) for place in self._places]
 
-    def _run(self, blocks: Blocks, inputs: tuple[torch.Tensor | None, ...]) -> None:
+    def _run(self, blocks: Arena, inputs: tuple[torch.Tensor | None, ...]) -> None:
         blocks.begin()  # a recording may have ended half way
         found = self.function(blocks, *inputs)
         self._places = [blocks.place(t) for t in found]
 
-    def _record(self, key: tuple[int, ...], blocks: Blocks, inputs: tuple[torch.Tensor | None, ...]) -> tuple | None:
+    def _record(self, key: tuple[int, ...], blocks: Arena, inputs: tuple[torch.Tensor | None, ...]) -> tuple | None:
         if self.graphs.failed or self.recorded - FREE > self.replays // PAID:
             return None  # the latter where addresses change too often
         self.recorded += 1

@@ -174,8 +174,8 @@ def surface_points(
     width, height = cameras[0].width, cameras[0].height
     count = int(np.clip(CANDIDATES * width * height / (320 * 240), 600, CANDIDATES))
     xs, indices = [], []
-    for camera, share in zip(cameras, np.array_split(np.arange(count), len(cameras))):
-        xy = rng.uniform(2, np.array([width, height]) - 2.0, size=(len(share), 2))
+    for camera, fraction in zip(cameras, np.array_split(np.arange(count), len(cameras))):
+        xy = rng.uniform(2, np.array([width, height]) - 2.0, size=(len(fraction), 2))
         d = raycast.pixel_rays(camera.K, camera.viewmat, xy)
         t, index = raycast.cast(shapes, camera.center, d)
         xs.append((camera.center + t[:, None] * d)[index >= 0])

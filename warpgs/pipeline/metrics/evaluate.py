@@ -95,7 +95,7 @@ def render_view(gaussians: Gaussians, view: View, options: RasterizeOptions) -> 
     return r.rgb.cpu().numpy(), r.depth.cpu().numpy(), r.alpha.cpu().numpy()
 
 
-def guesses(train: list[View], test: list[View]) -> dict[str, float]:
+def baselines(train: list[View], test: list[View]) -> dict[str, float]:
     """Mean PSNR [dB] over the test views of two predictions that need no 3D: a fit that is worth anything beats both.
 
     ``mean_photo``: the mean of the training photos; ``nearest_photo``: the training photo taken from nearest by. Photos of

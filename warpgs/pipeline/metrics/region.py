@@ -8,7 +8,7 @@ from warpgs.scene import View
 
 DARK = 16 / 255
 """A pixel whose brightest channel is below this belongs to a black background."""
-DARK_SHARE = 0.3
+DARK_FRACTION = 0.3
 """A photograph with at least this share of such pixels, and a dark border, shows an object on black."""
 
 
@@ -32,6 +32,6 @@ def counted_region(view: View) -> tuple[np.ndarray | None, str]:
         return view.mask, "mask"
     dark = view.image.max(-1) < DARK
     border = np.concatenate([dark[0], dark[-1], dark[:, 0], dark[:, -1]])
-    if dark.mean() >= DARK_SHARE and border.mean() >= 0.5 and not dark.all():
+    if dark.mean() >= DARK_FRACTION and border.mean() >= 0.5 and not dark.all():
         return ~dark, "foreground"
     return None, "all"

@@ -10,7 +10,7 @@ import torch
 from warpgs.pipeline.model.coverage import Coverage, coverage, fisher
 from warpgs.pipeline.model.merge import Merges, merges
 from warpgs.pipeline.model.parameter_bounds import truncated
-from warpgs.pipeline.train.strategies.clone_split import Refinement
+from warpgs.pipeline.train.strategies.clone_split import DensityUpdate
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.scene import Camera, Gaussians
 
@@ -18,7 +18,7 @@ ROUNDS = 5
 """Halvings of the interval in which the largest share is looked for."""
 PASSES = 8
 """Most rounds of merging: 2^8 neighbours become one."""
-DEGREES_SHARE, MERGE_SHARE = 1 / 3, 2 / 3
+DEGREES_FRACTION, MERGE_FRACTION = 1 / 3, 2 / 3
 """Parts of the allowed loss of a finished model that may be spent after lower degrees, and after merging; removing takes it
 whole."""
 RAMP = 3
@@ -27,7 +27,7 @@ WORTHWHILE = 0.02
 """A round of merging that takes a smaller part of the Gaussians than this is the last."""
 
 
-def largest_share(accepted: Callable[[float], bool], rounds: int = ROUNDS) -> float:
+def largest_fraction(accepted: Callable[[float], bool], rounds: int = ROUNDS) -> float:
     """The largest share in [0, 1] that is accepted, by bisection; 1 is tried first, 0 is taken without asking.
 
     What is returned was itself asked for and accepted, or is 0: no promise rests on acceptance being monotone.
@@ -57,9 +57,9 @@ def prune_order(maxima: torch.Tensor, sensitivity: torch.Tensor) -> torch.Tensor
     return torch.argsort(torch.maximum(_ranks(maxima), _ranks(sensitivity)), stable=True)
 
 
-def keep_last(order: torch.Tensor, share: float) -> torch.Tensor:
-    """Numbers in ascending order of what stays when the first ``share`` of an order goes; at least one stays."""
-    return order[min(len(order) - 1, int(share * len(order))) :].sort().values
+def keep_last(order: torch.Tensor, fraction: float) -> torch.Tensor:
+    """Numbers in ascending order of what stays when the first ``fraction`` of an order goes; at least one stays."""
+    return order[min(len(order) - 1, int(fraction * len(order))) :].sort().values
 
 
 def rows_of(gaussians: Gaussians, keep: torch.Tensor) -> Gaussians:
@@ -67,7 +67,7 @@ def rows_of(gaussians: Gaussians, keep: torch.Tensor) -> Gaussians:
     return Gaussians(**{n: t[keep] for n, t in gaussians.tensors().items()})
 
 
-def changed(gaussians: Gaussians, change: Refinement) -> Gaussians:
+def changed(gaussians: Gaussians, change: DensityUpdate) -> Gaussians:
     """The set after a change."""
     return Gaussians(**{n: torch.cat([t[change.keep], change.added[n]]) for n, t in gaussians.tensors().items()})
 
@@ -92,7 +92,7 @@ def stored_degrees(sh: torch.Tensor) -> torch.Tensor:
     return torch.where((sh != 0).any(2), bands, 0).amax(1)
 
 
-def trimmed(gaussians: Gaussians) -> Gaussians:
+def drop_unused_sh(gaussians: Gaussians) -> Gaussians:
     """The same Gaussians without the bands that none of them uses; a file has one number of coefficients for all."""
     degrees = stored_degrees(gaussians.sh)
     highest = int(degrees.max()) if len(degrees) else 0
@@ -100,7 +100,7 @@ def trimmed(gaussians: Gaussians) -> Gaussians:
 
 
 @dataclass(frozen=True)
-class Looks:
+class ViewSet:
     """How the training views look at a model."""
 
     cameras: list[Camera]
@@ -119,18 +119,18 @@ class Looks:
 def cheapest(gaussians: Gaussians, pairs: Merges, accepted: Callable[[Gaussians], bool]) -> int:
     """How many of the pairs, the cheapest first, may become one."""
     count, total = len(gaussians), len(pairs.first)
-    return int(total * largest_share(lambda s: accepted(changed(gaussians, pairs.change(count, int(s * total))))))
+    return int(total * largest_fraction(lambda s: accepted(changed(gaussians, pairs.change(count, int(s * total))))))
 
 
 def merge_neighbours(
-    gaussians: Gaussians, kinds: torch.Tensor, looks: Looks, accepted: Callable[[Gaussians, float], bool]
+    gaussians: Gaussians, kinds: torch.Tensor, view_set: ViewSet, accepted: Callable[[Gaussians, float], bool]
 ) -> tuple[Gaussians, torch.Tensor]:
     """Merge pairs, cheapest first, in rounds: again and again while it is worthwhile.
 
     Args:
         gaussians: The set.
         kinds: Only Gaussians of the same number are paired, int, shape [N].
-        looks: Training views.
+        view_set: Training views.
         accepted: Whether a model is good enough when that part [0, 1] of the allowed loss may be spent. It grows over the first
             `RAMP` rounds, for the cheapest pairs of the second are cheaper than the dearest of the first.
 
@@ -140,7 +140,7 @@ def merge_neighbours(
     idle, into = 0, torch.arange(len(gaussians), device=gaussians.means.device)
     for number in range(PASSES):
         part = min(1.0, (number + 1) / RAMP)
-        pairs = merges(gaussians, looks.coverage(gaussians).maxima, kinds, odd=bool(number % 2), shift=number / PASSES)
+        pairs = merges(gaussians, view_set.coverage(gaussians).maxima, kinds, odd=bool(number % 2), shift=number / PASSES)
         taken = cheapest(gaussians, pairs, lambda g, part=part: accepted(g, part))
         if taken:
             change = pairs.change(len(gaussians), taken)
@@ -156,25 +156,25 @@ def merge_neighbours(
     return gaussians, into
 
 
-def dispensable(gaussians: Gaussians, looks: Looks, accepted: Callable[[Gaussians], bool]) -> torch.Tensor:
+def dispensable(gaussians: Gaussians, view_set: ViewSet, accepted: Callable[[Gaussians], bool]) -> torch.Tensor:
     """Numbers of the Gaussians that stay, ascending, when as many of the others go as the judge accepts."""
-    order = prune_order(looks.coverage(gaussians).maxima, looks.fisher(gaussians))
-    return keep_last(order, largest_share(lambda s: accepted(rows_of(gaussians, keep_last(order, s)))))
+    order = prune_order(view_set.coverage(gaussians).maxima, view_set.fisher(gaussians))
+    return keep_last(order, largest_fraction(lambda s: accepted(rows_of(gaussians, keep_last(order, s)))))
 
 
 def needed_degrees(
-    gaussians: Gaussians, highest: torch.Tensor, looks: Looks, accepted: Callable[[Gaussians], bool]
+    gaussians: Gaussians, highest: torch.Tensor, view_set: ViewSet, accepted: Callable[[Gaussians], bool]
 ) -> torch.Tensor:
     """Degree of each Gaussian, int32 [N]: 0 for as many as the judge accepts, the others keep up to ``highest`` [N]."""
-    order = degree_order(gaussians, looks.coverage(gaussians))
+    order = degree_order(gaussians, view_set.coverage(gaussians))
     degrees = torch.minimum(stored_degrees(gaussians.sh), highest.to(torch.int32))
 
-    def lowered(share: float) -> torch.Tensor:
+    def lowered(fraction: float) -> torch.Tensor:
         result = degrees.clone()
-        result[order[: int(share * len(order))]] = 0
+        result[order[: int(fraction * len(order))]] = 0
         return result
 
-    return lowered(largest_share(lambda s: accepted(with_degrees(gaussians, lowered(s)))))
+    return lowered(largest_fraction(lambda s: accepted(with_degrees(gaussians, lowered(s)))))
 
 
 @dataclass(frozen=True)
@@ -190,14 +190,14 @@ class Pruned:
 
 
 def prune_model(
-    gaussians: Gaussians, kinds: torch.Tensor, looks: Looks, accepted: Callable[[Gaussians, float], bool]
+    gaussians: Gaussians, kinds: torch.Tensor, view_set: ViewSet, accepted: Callable[[Gaussians, float], bool]
 ) -> Pruned:
     """Lower degrees, merge neighbours, then remove Gaussians, as far as is accepted.
 
     Args:
         gaussians: N Gaussians.
         kinds: Only Gaussians of the same number are merged, int, shape [N].
-        looks: The training views.
+        view_set: The training views.
         accepted: Whether a model is good enough when that share [0, 1] of the allowed loss may be spent.
 
     Returns:
@@ -205,11 +205,11 @@ def prune_model(
     """
     degrees, model = stored_degrees(gaussians.sh), gaussians
     if bool((degrees > 0).any()):
-        model = with_degrees(model, needed_degrees(model, degrees, looks, lambda g: accepted(g, DEGREES_SHARE)))
+        model = with_degrees(model, needed_degrees(model, degrees, view_set, lambda g: accepted(g, DEGREES_FRACTION)))
 
-    begin = DEGREES_SHARE
-    model, into = merge_neighbours(model, kinds, looks, lambda g, part: accepted(g, begin + part * (MERGE_SHARE - begin)))
-    keep = dispensable(model, looks, lambda g: accepted(g, 1.0))
+    begin = DEGREES_FRACTION
+    model, into = merge_neighbours(model, kinds, view_set, lambda g, part: accepted(g, begin + part * (MERGE_FRACTION - begin)))
+    keep = dispensable(model, view_set, lambda g: accepted(g, 1.0))
     degrees = stored_degrees(model.sh[keep])
     order = torch.argsort(degrees, stable=True)
     keep, degrees = keep[order], degrees[order]

@@ -18,7 +18,7 @@ from warpgs.scene import Camera, PointCloud, View, ViewDepth
 
 FREE_SPACE = 0.95
 """A filled point nearer to another view than this share of the depth found there would hide what that view sees."""
-NEAR_SHARE, FAR_SHARE = 1 / 1.3, 3.0
+NEAR_FRACTION, FAR_FRACTION = 1 / 1.3, 3.0
 """Planes reach from this much of the 2nd to this much of the 98th percentile of the depths of known points: what is far takes
 few planes, what is near many."""
 MIN_KNOWN = 10
@@ -32,7 +32,7 @@ def depth_bounds(view: View, known: np.ndarray, default: tuple[float, float]) ->
     if len(z) < MIN_KNOWN:
         return default
     low, high = np.percentile(z, [2, 98])
-    return NEAR_SHARE * float(low), FAR_SHARE * float(high)
+    return NEAR_FRACTION * float(low), FAR_FRACTION * float(high)
 
 
 def merge_cells(points: np.ndarray, widths: np.ndarray) -> np.ndarray:
@@ -111,13 +111,13 @@ def coarse_points(
     for i, (view, depth, sure, (region, name)) in enumerate(zip(views, depths, sures, regions)):
         found.append(_lift(view, depth.depth, sure))
         total = sure.size if region is None else region.sum()
-        text = f"{view.name}: {_share(sure.sum(), total)} of {'pixels' if region is None else f'the {name}'} by {source}"
+        text = f"{view.name}: {_fraction(sure.sum(), total)} of {'pixels' if region is None else f'the {name}'} by {source}"
         if fill_px > 0:
             free = ~sure & (completed[i] > 0) if region is None else ~sure & region & (completed[i] > 0)
             points, colors, widths = _lift(view, completed[i], free)
             keep = ~in_free_space(points, views, completed, i)
             guessed.append((points[keep], colors[keep], widths[keep]))
-            text += f", {_share(keep.sum(), total)} filled"
+            text += f", {_fraction(keep.sum(), total)} filled"
         notes.append("; ".join((text, *depth.notes)))
     points, colors, widths = (np.concatenate(a) for a in zip(*found))
     cloud = merge(points, colors, merge_cells(points, merge_px * widths) if merge_px > 0 else np.arange(len(points)))
@@ -131,5 +131,5 @@ def coarse_points(
     return PointCloud(np.concatenate([cloud.points, filled.points]), np.concatenate([cloud.colors, filled.colors])), notes
 
 
-def _share(part: int, whole: int) -> str:
+def _fraction(part: int, whole: int) -> str:
     return f"{100 * part / max(1, whole):.0f} %"

@@ -125,12 +125,12 @@ class _Depths:
         seen = geometry.in_image(view.camera, matched.points)
         pixels, self.known = geometry.project_points(view.camera, matched.points)
         self.pixels, self.known, self.bounds = pixels[seen], self.known[seen], bounds
-        self.guided = len(self.known) >= MIN_MATCHES
+        self.depth_supervised = len(self.known) >= MIN_MATCHES
 
     def draw(self, pixels: np.ndarray, wanted: int, generator: np.random.Generator) -> np.ndarray:
         """Depths [u] of the first ``wanted`` pixels. Random numbers are drawn for all, so one does not depend on how many."""
         count = len(pixels)
-        if not self.guided:
+        if not self.depth_supervised:
             near, far = self.bounds
             return 1 / generator.uniform(1 / far, 1 / near, size=count)[:wanted]
         which, spread = generator.integers(NEIGHBORS, size=count), generator.normal(0, DEPTH_SPREAD, count)
@@ -174,7 +174,7 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
         chosen = generator.integers(len(rows), size=8 * wanted)
         rows, columns = rows[chosen], columns[chosen]
         pixels = np.stack([columns, rows], 1) + 0.5
-        elsewhere = not source.guided and len(views) > 1
+        elsewhere = not source.depth_supervised and len(views) > 1
         # where none is better than another, the first are taken, and the others need no depth
         useful = len(pixels) if elsewhere or any(name == "foreground" for _, name in regions) else wanted
         candidates = geometry.back_project(view.camera, pixels[:useful], source.draw(pixels, useful, generator))
@@ -187,15 +187,15 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
         colors.append(view.image[rows[:wanted], columns[:wanted]])
     if not points:
         raise DataError("no random start: every pixel of the training views is masked out; check the masks' polarity")
-    guided = sum(s.guided for s in sources)
-    how = f"{count:,} random points, {guided} of {len(views)} views guided by {len(matched):,} matched points"
+    depth_supervised = sum(s.depth_supervised for s in sources)
+    how = f"{count:,} random points, {depth_supervised} of {len(views)} views guided by {len(matched):,} matched points"
     objects = sum(name == "foreground" for _, name in regions)
     if objects:
         how += f", on the object that {objects} views show on black"
     return PointCloud(np.concatenate(points), np.concatenate(colors)), how
 
 
-def confirmed_depths(
+def consistent_depths(
     views: list[View], known: PointCloud, config: InitConfig, device: Callable[[], torch.device] = lambda: CPU
 ) -> list[ViewDepth]:
     """Depth of each of at least two views that the others confirm, by flow or by sweeping planes between ``known`` points.
@@ -210,7 +210,7 @@ def confirmed_depths(
     return sweep_depths(views, bounds, SweepConfig(near_count=config.near_views), device())
 
 
-def confirmed_points(
+def consistent_points(
     views: list[View], points: PointCloud, config: InitConfig, generator: np.random.Generator,
     device: Callable[[], torch.device],
 ) -> Start:  # fmt: skip
@@ -220,7 +220,7 @@ def confirmed_points(
     """
     reason, depths = "a single view has no other to compare with", None
     if len(views) > 1:
-        depths = confirmed_depths(views, points, config, device)
+        depths = consistent_depths(views, points, config, device)
         cloud, notes = coarse_points(views, depths, merge_px=config.merge_px, fill_px=config.fill_px, source=config.source)
         if len(cloud) >= MIN_POINTS:
             return Start(cloud, "\n    ".join((notes[-1], *notes[:-1])), depths)
@@ -261,9 +261,9 @@ def initial_points(
     check_points(views, points, config)
     usable = seen_points(views, points)
     if config.source == "auto" and sweeps(config, len(views)):
-        return confirmed_points(views, usable, dataclasses.replace(config, source="sweep"), generator, device)
+        return consistent_points(views, usable, dataclasses.replace(config, source="sweep"), generator, device)
     if config.source in ("sweep", "flow"):
-        return confirmed_points(views, usable, config, generator, device)
+        return consistent_points(views, usable, config, generator, device)
     if config.source == "points" or (config.source == "auto" and len(usable) >= MIN_POINTS):
         return Start(usable, f"{len(usable):,} points of the reconstruction that the training views saw")
     cloud, how = random_points(views, config.random_count, generator)
@@ -272,7 +272,7 @@ def initial_points(
     return Start(cloud, how)
 
 
-def at_most(start: Start, most: int, generator: np.random.Generator) -> Start:
+def subsample(start: Start, most: int, generator: np.random.Generator) -> Start:
     """The start with no more points than that, drawn at random; their Gaussians are wider as they lie farther apart."""
     count = len(start.cloud)
     if count <= most:

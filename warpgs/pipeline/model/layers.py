@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import torch
 
 from warpgs.errors import UsageError
-from warpgs.pipeline.train.strategies.clone_split import Refinement
+from warpgs.pipeline.train.strategies.clone_split import DensityUpdate
 
 COARSE, FINE = 0, 1
-LONG_AGO = -(2**30)
+NOT_SAMPLED = -(2**30)
 """Step of birth of what was never new: the coarse layer."""
 
 
@@ -43,7 +43,7 @@ class Layers:
     def __init__(self, count: int, device: torch.device):
         self.level = torch.zeros(count, dtype=torch.int32, device=device)
         """COARSE or FINE, shape [N]."""
-        self.birth = torch.full((count,), LONG_AGO, dtype=torch.int32, device=device)
+        self.created_step = torch.full((count,), NOT_SAMPLED, dtype=torch.int32, device=device)
         """Step after which a sampled Gaussian was added; what grew from it has the same. Shape [N]."""
 
     @property
@@ -51,22 +51,22 @@ class Layers:
         """True for fine Gaussians, shape [N]."""
         return self.level == FINE
 
-    def young(self, step: int | torch.Tensor, config: ProtectConfig) -> torch.Tensor:
+    def is_protected(self, step: int | torch.Tensor, config: ProtectConfig) -> torch.Tensor:
         """True for Gaussians that are protected at a step, shape [N]."""
-        return step - self.birth <= config.steps
+        return step - self.created_step <= config.steps
 
-    def hold_up(
+    def clamp_min_opacity(
         self, logits: torch.Tensor, step: int | torch.Tensor, config: ProtectConfig, going: torch.Tensor | bool = True
     ) -> None:
         """Raise the opacity logits [N] of the young to the least value, in place: alpha = max(alpha, alpha_minimum).
 
         Nothing changes where ``going`` (bool, shape [1]) is False.
         """
-        logits.copy_(torch.where(self.young(step, config) & going, logits.clamp_min(config.logit), logits))
+        logits.copy_(torch.where(self.is_protected(step, config) & going, logits.clamp_min(config.logit), logits))
 
-    def apply(self, change: Refinement, *, level: int = COARSE, birth: int = LONG_AGO) -> None:
+    def apply(self, change: DensityUpdate, *, level: int = COARSE, created_step: int = NOT_SAMPLED) -> None:
         """Follow a change of the set: rows that grew from another are as it is, others as named."""
-        for name, fresh in (("level", level), ("birth", birth)):
+        for name, fresh in (("level", level), ("created_step", created_step)):
             old = getattr(self, name)
             grown = (
                 torch.where(change.parents >= 0, old[change.parents.clamp_min(0)], fresh) if len(change.parents) else old[:0]
@@ -75,13 +75,13 @@ class Layers:
 
     def reorder(self, order: torch.Tensor) -> None:
         """Row i becomes what row ``order[i]`` was."""
-        self.level, self.birth = self.level[order], self.birth[order]
+        self.level, self.created_step = self.level[order], self.created_step[order]
 
     def state(self) -> dict[str, torch.Tensor]:
         """Both by name, for the checkpoint."""
-        return {"layers.level": self.level, "layers.birth": self.birth}
+        return {"layers.level": self.level, "layers.created_step": self.created_step}
 
     def load(self, state: dict[str, torch.Tensor]) -> None:
         """Take over what `state` gave."""
         self.level = state["layers.level"].to(self.level.device)
-        self.birth = state["layers.birth"].to(self.birth.device)
+        self.created_step = state["layers.created_step"].to(self.created_step.device)

@@ -8,7 +8,7 @@ import torch
 
 from warpgs.kernels.knn import morton_codes
 from warpgs.kernels.sh import C0
-from warpgs.pipeline.train.strategies.clone_split import Refinement
+from warpgs.pipeline.train.strategies.clone_split import DensityUpdate
 from warpgs.scene import Gaussians
 
 OPAQUE = 0.99
@@ -79,13 +79,13 @@ class Merges:
     merged: dict[str, torch.Tensor]
     """What each pair would become: rows of the five tensors, shape [P, ...]."""
 
-    def change(self, count: int, taken: int) -> Refinement:
+    def change(self, count: int, taken: int) -> DensityUpdate:
         """The change of a set of ``count`` Gaussians that merges the first ``taken`` pairs."""
         stays = torch.ones(count, dtype=torch.bool, device=self.first.device)
         stays[self.first[:taken]] = False
         stays[self.second[:taken]] = False
         added = {n: t[:taken] for n, t in self.merged.items()}
-        return Refinement(torch.nonzero(stays).squeeze(1), added, self.first[:taken])
+        return DensityUpdate(torch.nonzero(stays).squeeze(1), added, self.first[:taken])
 
 
 def _curve(means: torch.Tensor, shift: float) -> torch.Tensor:
@@ -119,11 +119,11 @@ def merges(gaussians: Gaussians, maxima: torch.Tensor, kinds: torch.Tensor, odd:
     opacity = g["logit_opacities"].sigmoid()
     area = torch.stack([_area(g["log_scales"][:, i]) for i in range(2)], 1)
     mass = opacity * area
-    share = mass / mass.sum(1, keepdim=True)
-    means = (share[..., None] * g["means"]).sum(1)
+    fraction = mass / mass.sum(1, keepdim=True)
+    means = (fraction[..., None] * g["means"]).sum(1)
     apart = g["means"] - means[:, None]
     own = torch.stack([covariances(g["quats"][:, i], g["log_scales"][:, i]) for i in range(2)], 1)
-    both = (share[..., None, None] * (own + apart[..., :, None] * apart[..., None, :])).sum(1)
+    both = (fraction[..., None, None] * (own + apart[..., :, None] * apart[..., None, :])).sum(1)
     squares, axes = torch.linalg.eigh(both)  # in float64 on the CPU: the same on every device
     axes = axes * torch.linalg.det(axes)[:, None, None].sign()
     log_scales = 0.5 * squares.clamp_min(1e-30).log()
@@ -132,7 +132,7 @@ def merges(gaussians: Gaussians, maxima: torch.Tensor, kinds: torch.Tensor, odd:
     log_scales[:, 1:] += 0.5 * grown[:, None]  # eigenvalues ascend
     merged = {
         "means": means, "quats": quaternions(axes), "log_scales": log_scales,
-        "logit_opacities": wanted.clamp(1e-6, OPAQUE).logit(), "sh": (share[..., None, None] * g["sh"]).sum(1),
+        "logit_opacities": wanted.clamp(1e-6, OPAQUE).logit(), "sh": (fraction[..., None, None] * g["sh"]).sum(1),
     }  # fmt: skip
     colour = (C0 * (g["sh"][:, 0, 0] - g["sh"][:, 1, 0])).abs().amax(1)
     bulge = (_area(log_scales) / area.sum(1)).log().clamp_min(0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from warpgs.pipeline.train.strategies.clone_split import Refinement
+from warpgs.pipeline.train.strategies.clone_split import DensityUpdate
 
 FINEST = 12**-0.5
 """Least standard deviation of an axis, in pixels of the nearest view that sees the Gaussian: that of one pixel's box filter."""
@@ -49,7 +49,7 @@ def unpack(packed: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
     return sh
 
 
-class Limits:
+class ParameterBounds:
     """Limits of every Gaussian, row by row in step with the optimizer."""
 
     def __init__(self, count: int, degree: int, device: torch.device):
@@ -79,7 +79,7 @@ class Limits:
         """Take the least scales from the width of a pixel [N] [u]; where that is 0, there is none."""
         self.floor = torch.log(FINEST * footprint).clamp_min(NONE)
 
-    def apply(self, change: Refinement) -> None:
+    def apply(self, change: DensityUpdate) -> None:
         """Follow a change of the set: what grew from another has its limits, but the level of now."""
         for name, fresh in (("degree", self.highest), ("floor", NONE), ("level", self.growing)):
             old = getattr(self, name)

@@ -8,15 +8,14 @@ from dataclasses import dataclass
 import torch
 
 from warpgs.errors import UsageError
-from warpgs.kernels.adam import adam_scheduled, adam_step, scheduled_rates
+from warpgs.kernels.adam import adam_scheduled, adam_step, scheduled_lrs
 from warpgs.kernels.knn import morton_codes
-from warpgs.kernels.project_adam import project_adam
-from warpgs.pipeline.model.parameter_bounds import Limits
+from warpgs.pipeline.model.parameter_bounds import ParameterBounds
 from warpgs.pipeline.train.schedule import log_linear
-from warpgs.pipeline.train.strategies.clone_split import Refinement
+from warpgs.pipeline.train.strategies.clone_split import DensityUpdate
 from warpgs.scene import Gaussians
 
-HIGHEST_RATE = 1e6
+MAX_LR = 1e6
 """No rate is higher: far above what trains, far below what overflows within a fit."""
 
 
@@ -44,21 +43,21 @@ class OptimizerConfig:
 
     def __post_init__(self):
         for name, value in vars(self).items():
-            if not 0 < value <= HIGHEST_RATE:
-                raise UsageError(f"optimizer {name} must be positive and at most {HIGHEST_RATE:g}, not {value}")
+            if not 0 < value <= MAX_LR:
+                raise UsageError(f"optimizer {name} must be positive and at most {MAX_LR:g}, not {value}")
 
 
 class Optimizer:
     """Adam over the five tensors of a set of Gaussians."""
 
-    def __init__(self, gaussians: Gaussians, config: OptimizerConfig, extent: float, settle: float = 0.0):
-        """Begin with zero moments; ``settle`` in [0, 1) is the share of the fit after which the rate of scales falls."""
-        self.config, self.extent, self.settle = config, extent, settle
+    def __init__(self, gaussians: Gaussians, config: OptimizerConfig, extent: float, stable_start: float = 0.0):
+        """Begin with zero moments; ``stable_start`` in [0, 1) is the share of the fit after which the rate of scales falls."""
+        self.config, self.extent, self.stable_start = config, extent, stable_start
         self.params = {n: t.detach().clone().contiguous().requires_grad_() for n, t in gaussians.tensors().items()}
         self.means = {n: torch.zeros_like(t) for n, t in self.params.items()}
         self.squares = {n: torch.zeros_like(t) for n, t in self.params.items()}
         self.step_count = 0
-        self.limits: Limits | None = None
+        self.bounds: ParameterBounds | None = None
         """What parameters are held to after every step; None for nothing."""
 
     @property
@@ -66,10 +65,10 @@ class Optimizer:
         """The current parameters; they require gradients."""
         return Gaussians(**self.params)
 
-    def rates(self, progress: float) -> dict[str, float]:
+    def lrs(self, progress: float) -> dict[str, float]:
         """Learning rate of each tensor at a share [0, 1] of the fit."""
         c = self.config
-        settled = (progress - self.settle) / (1 - self.settle)
+        settled = (progress - self.stable_start) / (1 - self.stable_start)
         return {
             "means": self.extent * log_linear(c.means_lr, c.means_lr_final, progress),
             "quats": c.quats_lr,
@@ -78,74 +77,57 @@ class Optimizer:
             "sh": c.sh_lr * c.sh_rest_factor,
         }
 
-    def step(self, progress: float, share: torch.Tensor | None = None) -> None:
+    def step(self, progress: float, fraction: torch.Tensor | None = None) -> None:
         """Update all parameters from their gradients, which are then cleared.
 
-        ``share`` [N]: the part of its step that each mean takes; None for all of it.
+        ``fraction`` [N]: the part of its step that each mean takes; None for all of it.
         """
         self.step_count += 1
-        before = None if share is None else self.params["means"].detach().clone()
-        for name, rate in self.rates(progress).items():
+        before = None if fraction is None else self.params["means"].detach().clone()
+        for name, lr in self.lrs(progress).items():
             param = self.params[name]
             if param.grad is None:
                 continue
             head = {"head": 3, "head_lr": self.config.sh_lr} if name == "sh" else {}
             state = (param.detach(), param.grad, self.means[name], self.squares[name])
-            adam_step(*state, lr=rate, step=self.step_count, **head)
+            adam_step(*state, lr=lr, step=self.step_count, **head)
             param.grad = None
-        self._hold_back(before, share)
+        self._hold_back(before, fraction)
 
-    def _hold_back(self, before: torch.Tensor | None, share: torch.Tensor | None) -> None:
+    def _hold_back(self, before: torch.Tensor | None, fraction: torch.Tensor | None) -> None:
         """Take back a part of the last step of the means, whose size Adam makes independent of the gradient's; keep limits."""
-        if share is not None:
+        if fraction is not None:
             means = self.params["means"].detach()
-            means.copy_(torch.where(share[:, None] == 1, means, before + share[:, None] * (means - before)))
-        if self.limits is not None:
-            self.limits.enforce(self.params)
+            means.copy_(torch.where(fraction[:, None] == 1, means, before + fraction[:, None] * (means - before)))
+        if self.bounds is not None:
+            self.bounds.enforce(self.params)
 
     def schedule(self, progress: float, step: int) -> list[float]:
         """Numbers that `step_scheduled` reads from memory: three for each tensor, in order."""
         row = []
-        for name, rate in self.rates(progress).items():
-            row += scheduled_rates(rate, step, head_lr=self.config.sh_lr if name == "sh" else None)
+        for name, lr in self.lrs(progress).items():
+            row += scheduled_lrs(lr, step, head_lr=self.config.sh_lr if name == "sh" else None)
         return row
 
     def step_scheduled(
-        self, gradients: dict[str, torch.Tensor], rates: torch.Tensor, skip: torch.Tensor, share: torch.Tensor | None = None
+        self, gradients: dict[str, torch.Tensor], lrs: torch.Tensor, skip: torch.Tensor, fraction: torch.Tensor | None = None
     ) -> None:
         """`step` on CUDA with a row [15] of `schedule` in memory; nothing changes where ``skip`` [1] is not 0."""
-        before = None if share is None else self.params["means"].detach().clone()
+        before = None if fraction is None else self.params["means"].detach().clone()
         for i, (name, gradient) in enumerate(gradients.items()):
             state = (self.params[name].detach(), gradient, self.means[name], self.squares[name])
-            adam_scheduled(*state, rates[3 * i : 3 * i + 3], skip, head=3 if name == "sh" else 0)
-        self._hold_back(before, share)
+            adam_scheduled(*state, lrs[3 * i : 3 * i + 3], skip, head=3 if name == "sh" else 0)
+        self._hold_back(before, fraction)
 
-    def step_projected(
-        self, viewmats: torch.Tensor, Ks: torch.Tensor, splats: torch.Tensor, counts: torch.Tensor, v_splats: torch.Tensor,
-        rates: torch.Tensor, skip: torch.Tensor, share: torch.Tensor | None = None, **size,
-    ) -> None:  # fmt: skip
-        """`step_scheduled` from the gradient of the records: projection's backward pass and Adam in one kernel.
-
-        ``viewmats``, ``Ks`` and ``size`` (width, height, degree, rule) are what one camera's `project` took; ``splats`` and
-        ``counts`` what it gave; ``v_splats`` the gradient of the records [1, N, 12].
-        """
-        params = {n: t.detach() for n, t in self.params.items()}
-        project_adam(
-            params, self.means, self.squares, viewmats, Ks, splats, counts, v_splats,
-            rates=rates, skip=skip, share=share, **size,
-        )  # fmt: skip
-        if self.limits is not None:
-            self.limits.enforce(self.params)
-
-    def apply(self, change: Refinement) -> None:
+    def apply(self, change: DensityUpdate) -> None:
         """Keep the named rows with their moments and append new rows with zero moments."""
         for name in self.params:  # each old tensor is given up before the next is made
             added = change.added[name].to(self.params[name].dtype)
             self.params[name] = torch.cat([self.params[name].detach()[change.keep], added]).requires_grad_()
             for moments in (self.means, self.squares):
                 moments[name] = torch.cat([moments[name][change.keep], torch.zeros_like(added)])
-        if self.limits is not None:
-            self.limits.apply(change)
+        if self.bounds is not None:
+            self.bounds.apply(change)
 
     @torch.no_grad()
     def regroup(self, rows: Gaussians, into: torch.Tensor) -> None:
@@ -186,8 +168,8 @@ class Optimizer:
                 group[name] = group[name].detach()[order]
         for param in self.params.values():
             param.requires_grad_()
-        if self.limits is not None:
-            self.limits.reorder(order)
+        if self.bounds is not None:
+            self.bounds.reorder(order)
 
     def cap_opacity(self, opacity: float) -> None:
         """Lower every opacity to at most this and forget the moments of all opacities (the classic reset)."""
@@ -200,7 +182,7 @@ class Optimizer:
         """Everything that a continued fit needs, by flat names."""
         groups = (("param", self.params), ("mean", self.means), ("square", self.squares))
         tensors = {f"{kind}.{n}": t.detach() for kind, group in groups for n, t in group.items()}
-        return tensors if self.limits is None else tensors | self.limits.state()
+        return tensors if self.bounds is None else tensors | self.bounds.state()
 
     def load(self, state: dict[str, torch.Tensor], step_count: int) -> None:
         """Take over what `state` gave."""
@@ -211,5 +193,5 @@ class Optimizer:
         for name, t in self.params.items():
             self.params[name] = t.requires_grad_()
         self.step_count = step_count
-        if self.limits is not None:
-            self.limits.load(state)
+        if self.bounds is not None:
+            self.bounds.load(state)

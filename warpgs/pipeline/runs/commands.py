@@ -11,7 +11,7 @@ from warpgs.errors import DataError, UsageError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_bytes, write_json
 from warpgs.pipeline.metrics.lpips import load_lpips
-from warpgs.pipeline.model.compress import trimmed
+from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.runs.camera_paths import PATHS, camera_path
 from warpgs.pipeline.runs.folder import SceneRequest, choose_device, open_run, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, file_stem, options_for, protocol_of, score_line
@@ -91,7 +91,7 @@ def render(folder: Path, kind: str, out: Path | None, frames: int, fps: int, dev
     options = options_for(stored.record["config"]["rule"], tuple(stored.record["background"]), stored.gaussians)
     one_size = len({(c.width, c.height) for _, c in cameras}) == 1
 
-    def pictures():
+    def images():
         for name, camera in cameras:
             with torch.no_grad():
                 image = rasterize(stored.gaussians, camera, options).rgb.cpu().numpy()
@@ -99,9 +99,9 @@ def render(folder: Path, kind: str, out: Path | None, frames: int, fps: int, dev
             yield image
 
     if one_size:
-        write_mp4(out / "film.mp4", pictures(), fps)
+        write_mp4(out / "film.mp4", images(), fps)
         return f"{len(cameras)} pictures and film.mp4 in {out}"
-    count = sum(1 for _ in pictures())
+    count = sum(1 for _ in images())
     return f"{count} pictures in {out}; no film, since the views differ in size"
 
 
@@ -115,5 +115,5 @@ def export(folder: Path, target: Path) -> str:
     if target.suffix.lower() != ".ply":
         raise UsageError(f"{target}: format {target.suffix or '(none)'} is not supported; use .ply")
     stored = open_run(folder, torch.device("cpu"))
-    write_ply(target, trimmed(stored.gaussians), stored.normalization)
+    write_ply(target, drop_unused_sh(stored.gaussians), stored.normalization)
     return f"{len(stored.gaussians):,} Gaussians in {target}"

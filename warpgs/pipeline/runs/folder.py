@@ -20,16 +20,16 @@ from warpgs.errors import DataError, ResourceError, UsageError, WarpgsError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.load import load_scene
-from warpgs.io.splits import Split, default_split, split_views, twins
+from warpgs.io.splits import Split, coincident_views, default_split, split_views
 from warpgs.pipeline.metrics.lpips import load_lpips
-from warpgs.pipeline.model.compress import trimmed
+from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.model.parameter_bounds import unpack
 from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line, write_report
-from warpgs.pipeline.runs.rule_report import trade_on
-from warpgs.pipeline.runs.sampling_report import event_figures, pictures_kept, sampling_story
+from warpgs.pipeline.runs.rule_report import rule_report_of
+from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, sampling_report_of
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.strategies.holdout import complexity_figures, complexity_sentence, fit_class
+from warpgs.pipeline.train.strategies.holdout import complexity_figures, complexity_summary, fit_class
 from warpgs.pipeline.train.time_budget import within_budget
 from warpgs.pipeline.train.trainer import Fit, StepReport, run, train_views
 from warpgs.pipeline.train.warmup import rehearsal
@@ -115,7 +115,7 @@ def read_scene(request: SceneRequest) -> tuple[Scene, Split, list[str]]:
             "masks hide pixels from the fit, which the published DTU protocol does not do: object masks that only scores "
             "should see belong into a folder idrmasks, or behind --score-masks"
         )
-    for test, train in twins(scene, split):
+    for test, train in coincident_views(scene, split):
         notes.append(f"{test} is held out, but {train} was taken from the same place: its score says nothing of new views")
     return scene, split, notes
 
@@ -220,14 +220,14 @@ def fit_scene(request: FitRequest) -> dict:
         print(f"  {note}")
 
     setup = time.perf_counter() - began
-    with pictures_kept(fit, [v.name for v in train], out):
+    with images_kept(fit, [v.name for v in train], out):
         _train(fit, out, notes)
     trained = time.perf_counter() - began - setup
     peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(device)} if device.type == "cuda" else {}
-    write_ply(out / "point_cloud.ply", trimmed(fit.gaussians), scene.normalization)
+    write_ply(out / "point_cloud.ply", drop_unused_sh(fit.gaussians), scene.normalization)
     metrics = evaluate_run(out, fit.gaussians, train, test, request.config.rule, scene.background, lpips, fit.most)
     c = request.config
-    trade = trade_on(
+    trade = rule_report_of(
         fit.gaussians, train, c.rule, scene.background, seed=c.seed, half_resolution=c.half_resolution, max_instances=fit.most
     )
     notes.append(trade["sentence"])
@@ -241,7 +241,7 @@ def fit_scene(request: FitRequest) -> dict:
     }  # fmt: skip
     write_json(out / "metrics.json", metrics)
     record["notes"] = notes
-    write_report(out, scene, split, fit.gaussians, metrics, record, sampling_story(fit, out))
+    write_report(out, scene, split, fit.gaussians, metrics, record, sampling_report_of(fit, out))
     _print_result(out, metrics)
     return metrics
 
@@ -282,8 +282,8 @@ def _train(fit: Fit, out: Path, notes: list[str]) -> None:
         def on_step(r: StepReport) -> None:
             progress.update(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count)
             log.write(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=round(r.seconds, 6))
-            while fit.news:
-                notes.append(fit.news.pop(0))
+            while fit.messages:
+                notes.append(fit.messages.pop(0))
                 print(f"  {notes[-1]}")
 
         try:
@@ -297,9 +297,9 @@ def _print_result(out: Path, metrics: dict) -> None:
     if metrics["test"]:
         scores = metrics["test"]
         print(f"held-out {score_line(scores)} over {len(metrics['views'])} views")
-        for name, value in metrics["guesses"].items():
+        for name, value in metrics["baselines"].items():
             print(f"  without a fit, the {name.replace('_', ' ')} scores {value:.2f} dB")
-    print(complexity_sentence(metrics))
+    print(complexity_summary(metrics))
     print(f"{metrics['gaussians']:,} Gaussians; report: {out / 'report.html'}  pictures: {out / 'renders'}")
 
 

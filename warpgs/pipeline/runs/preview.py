@@ -10,7 +10,7 @@ import torch
 from warpgs.errors import ResourceError, UsageError
 from warpgs.files import write_bytes
 from warpgs.pipeline.metrics.region import counted_region
-from warpgs.pipeline.model.init import InitConfig, confirmed_depths, seen_points
+from warpgs.pipeline.model.init import InitConfig, consistent_depths, seen_points
 from warpgs.pipeline.runs.folder import SceneRequest, read_scene
 from warpgs.pipeline.runs.results import file_stem
 from warpgs.pipeline.train.strategies.importance import ImportanceConfig, geometry_score, semantic_score
@@ -69,7 +69,7 @@ def show_priors(request: SceneRequest, config: PriorConfig, source: str, out: Pa
     regions = [counted_region(v)[0] for v in views]
     depths = None
     if config.depth_model is None and len(views) > 1:
-        depths = confirmed_depths(views, seen_points(views, scene.points), InitConfig(source=source))
+        depths = consistent_depths(views, seen_points(views, scene.points), InitConfig(source=source))
     priors, said = view_priors(views, config, depths=lambda: depths, regions=regions, threads=threads, cache=cache_folder())
     for view, prior in zip(views, priors):
         write_bytes(out / f"{file_stem(view.name)}.png", png(prior_sheet(view, prior)))

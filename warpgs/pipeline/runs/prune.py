@@ -104,11 +104,11 @@ def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str) ->
             f"{folder}: its PSNR on the training views is {whole} dB, so no loss of it can be kept small; fit again"
         )
     kinds = torch.zeros(len(before), dtype=torch.int64, device=device)
-    looks = compress.Looks([TrainingView.of(v, device).camera for v in train], options, stored.record["config"]["seed"])
+    view_set = compress.ViewSet([TrainingView.of(v, device).camera for v in train], options, stored.record["config"]["seed"])
     made = compress.prune_model(
-        before, kinds, looks, lambda g, share: mean_psnr(g, train, options) >= whole - share * keep_psnr
+        before, kinds, view_set, lambda g, fraction: mean_psnr(g, train, options) >= whole - fraction * keep_psnr
     )
-    made = dataclasses.replace(made, gaussians=compress.trimmed(made.gaussians))
+    made = dataclasses.replace(made, gaussians=compress.drop_unused_sh(made.gaussians))
 
     degrees = compress.stored_degrees(before.sh)
     sizes = [model_bytes(d) for d in (degrees, made.degrees)]

@@ -9,14 +9,14 @@ import numpy as np
 
 from warpgs.files import write_bytes
 from warpgs.io.splits import Split
-from warpgs.pipeline.metrics.evaluate import ViewMetrics, guesses, render_view, score, summarize, variants
+from warpgs.pipeline.metrics.evaluate import ViewMetrics, baselines, render_view, score, summarize, variants
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.report.curve import curve
 from warpgs.report.events import read_events
 from warpgs.report.images import depth_map, error_map, png, side_by_side
 from warpgs.report.overview import render_overview
-from warpgs.report.page import SamplingStory, ViewPictures, write_page
+from warpgs.report.page import SamplingReport, ViewImages, write_page
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.scene import Gaussians, Scene, View
 
@@ -41,7 +41,7 @@ def score_line(scores: dict[str, float]) -> str:
 
 SHOWN_VIEWS = 6
 """Held-out views with pictures in the report; all have files in the run folder."""
-PAINTERS = 4
+RENDER_WORKERS = 4
 """Threads that score and encode pictures while others are drawn."""
 
 
@@ -100,37 +100,37 @@ def evaluate_run(
         return score(view, image)
 
     tasks, jobs = [(finish, v) for v in test or train] + [(compare, v) for v in train if test], []
-    with ThreadPoolExecutor(PAINTERS if lpips is None else 1) as painters:  # LPIPS takes much memory a view
+    with ThreadPoolExecutor(RENDER_WORKERS if lpips is None else 1) as render_workers:  # LPIPS takes much memory a view
         for work, view in tasks:
-            jobs.append(painters.submit(work, view, *render_view(gaussians, view, options)))
-            if len(jobs) > PAINTERS:
-                jobs[-PAINTERS].result()  # not all pictures at once
+            jobs.append(render_workers.submit(work, view, *render_view(gaussians, view, options)))
+            if len(jobs) > RENDER_WORKERS:
+                jobs[-RENDER_WORKERS].result()  # not all pictures at once
         found = [j.result() for j in jobs]
     rows, train_rows = found[: len(test)], found[-len(train) :]
     return {
         "test": summarize(rows), "train": summarize(train_rows),
         "views": [r.row() for r in rows],
-        "guesses": guesses(train, test) if test else {},
+        "baselines": baselines(train, test) if test else {},
         "variants": variants(lpips),
     }  # fmt: skip
 
 
-def _pictures(views: list[View], gaussians: Gaussians, options: RasterizeOptions, rows: dict[str, dict]) -> list[ViewPictures]:
+def _images(views: list[View], gaussians: Gaussians, options: RasterizeOptions, rows: dict[str, dict]) -> list[ViewImages]:
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(SHOWN_VIEWS, len(views))).round().astype(int))]
     result = []
-    with ThreadPoolExecutor(PAINTERS) as painters:
+    with ThreadPoolExecutor(RENDER_WORKERS) as render_workers:
         for view in chosen:
             image, depth, alpha = render_view(gaussians, view, options)
             row = rows.get(view.name)
             region = f", over {row['region']}" if row and row["region"] != "all" else ""
             caption = f"PSNR {row['psnr']:.2f} dB{region}, SSIM {row['ssim']:.3f}" if row else "training view"
             parts = (image, view.image, error_map(image, view.image), depth_map(depth, alpha))
-            result.append((view.name, caption, painters.map(png, parts)))
-    return [ViewPictures(name, caption, *parts) for name, caption, parts in result]
+            result.append((view.name, caption, render_workers.map(png, parts)))
+    return [ViewImages(name, caption, *parts) for name, caption, parts in result]
 
 
 def write_report(
-    out: Path, scene: Scene, split: Split, gaussians: Gaussians, metrics: dict, record: dict, sampling: SamplingStory | None
+    out: Path, scene: Scene, split: Split, gaussians: Gaussians, metrics: dict, record: dict, sampling: SamplingReport | None
 ) -> None:
     """Write report.html for a run whose scores are known; ``sampling`` is what it says of sampling events, if any."""
     train, test = [scene.view(n) for n in split.train], [scene.view(n) for n in split.test]
@@ -152,7 +152,7 @@ def write_report(
     ]
     figures = []
     if metrics["test"]:
-        best = max(metrics["guesses"].values(), default=float("nan"))
+        best = max(metrics["baselines"].values(), default=float("nan"))
         figures = [
             ("held-out PSNR", f"{metrics['test']['psnr']:.2f} dB"), ("held-out SSIM", f"{metrics['test']['ssim']:.3f}"),
             ("best guess without a fit", f"{best:.2f} dB"),
@@ -169,7 +169,7 @@ def write_report(
         [r["name"], *(f"{r[k]:.{2 if k == 'psnr' else 4}f}" for k in keys), r["region"]] for r in metrics["views"]
     ]
     options = options_for(record["config"]["rule"], tuple(record["background"]), gaussians)
-    pictures = _pictures(test or train, gaussians, options, {r["name"]: r for r in metrics["views"]})
+    images = _images(test or train, gaussians, options, {r["name"]: r for r in metrics["views"]})
     camera = train[0].camera
     details = {k: v for k, v in record.items() if k != "cameras"}
     protocol = {k.replace("_", " "): ", ".join(v) if isinstance(v, list) else str(v) for k, v in metrics["protocol"].items()}
@@ -179,7 +179,7 @@ def write_report(
         title=Path(scene.path).resolve().name,
         subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
         f"{camera.width} x {camera.height} px, {metrics['device']}",
-        figures=figures, notes=notes, table=table, views=pictures, curves=curves, sampling=sampling, overview=overview,
+        figures=figures, notes=notes, table=table, views=images, curves=curves, sampling=sampling, overview=overview,
         details=details,
         protocol=protocol | {LABELS.get(k, k): v for k, v in metrics["variants"].items()},
     )  # fmt: skip

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.render.reference import exact_picture, psnr_of
+from warpgs.render.reference import psnr_of, reference_image
 from warpgs.scene import Camera, Gaussians, View
 
 VIEWS = 3
@@ -55,7 +55,7 @@ def _seconds(draw: Callable[[], object], device: torch.device) -> float:
 
 
 @torch.no_grad()
-def trade_on(
+def rule_report_of(
     gaussians: Gaussians, views: list[View], rule: str, background: tuple[float, float, float], *, seed: int,
     half_resolution: float = 0.0, max_instances: int | None = None,
 ) -> dict:  # fmt: skip
@@ -92,7 +92,7 @@ def trade_on(
         near = rasterize(gaussians, view.camera, dataclasses.replace(exact, window=window)).visible[0]
         part = Gaussians(**{n: t[near] for n, t in gaussians.tensors().items()})
         with _one_thread():
-            wanted = exact_picture(part, view.camera, window, behind, gaussians.sh_degree)
+            wanted = reference_image(part, view.camera, window, behind, gaussians.sh_degree)
         errors.append((found.double() - wanted).abs().flatten())
     error = torch.cat(errors)
     whole = chosen[0].camera

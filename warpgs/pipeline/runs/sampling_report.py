@@ -13,12 +13,12 @@ import numpy as np
 from warpgs.errors import ResourceError
 from warpgs.files import write_bytes
 from warpgs.pipeline.train.schedule import Phases
-from warpgs.pipeline.train.strategies.importance_sampling import Drawn, Event, MethodConfig, TrainingView
+from warpgs.pipeline.train.strategies.importance_sampling import Event, MethodConfig, SampledView, TrainingView
 from warpgs.pipeline.train.strategies.sampler import SUPPORT
 from warpgs.pipeline.train.trainer import Fit
 from warpgs.report.contact_sheet import Tile, contact_sheet
 from warpgs.report.images import png
-from warpgs.report.page import SamplingStory
+from warpgs.report.page import SamplingReport
 
 FOLDER = "sampling"
 """Subfolder of a run with the pictures, ``STEP.png``."""
@@ -32,14 +32,14 @@ FADED = 0.45
 
 def pictured(phases: Phases) -> set[int]:
     """Steps of the events that get a picture: the first, and the first of the second half of phase 2."""
-    middle = 0.5 * (phases.refine + phases.settle)
+    middle = 0.5 * (phases.refine + phases.stable_start)
     late = [e for e in phases.events if e >= middle]
     return {*phases.events[:1], *late[:1]}
 
 
-def _open_pixels(confirmed: bool, quantile: float) -> str:
+def _open_pixels(consistent: bool, quantile: float) -> str:
     """The pixels that a gate leaves open, in words."""
-    parts = ["whose depth other views confirm"] * confirmed
+    parts = ["whose depth other views confirm"] * consistent
     parts += [f"whose S_geometry is above its {quantile:g} quantile"] * (quantile > 0)
     return f"pixels {' and '.join(parts)}" if parts else "all pixels where something is drawn"
 
@@ -50,7 +50,7 @@ def _asked(method: MethodConfig) -> float:
 
 
 def view_sheet(
-    name: str, step: int, view: TrainingView, disparity: np.ndarray, drawn: Drawn, config: MethodConfig
+    name: str, step: int, view: TrainingView, disparity: np.ndarray, drawn: SampledView, config: MethodConfig
 ) -> np.ndarray:
     """One view at one event, colours [rows, columns, 3] in [0, 1]: what there was, its scores, the gate, the drawn pixels.
 
@@ -62,45 +62,45 @@ def view_sheet(
         drawn: What the event saw and did there.
         config: Switches and settings of the fit.
     """
-    photo, rendered, score = (t.cpu().numpy() for t in (view.photo, drawn.rendered, drawn.score))
+    image, rendered, score = (t.cpu().numpy() for t in (view.image, drawn.rendered, drawn.score))
     render, semantic, geometry = (t.cpu().numpy() for t in drawn.scores)
     at, gate = drawn.at.cpu().numpy(), drawn.gate.cpu().numpy()
     weights = config.weights(view.semantic is not None)
     # each score stands below what it comes from
     tiles = [
         Tile("rendering before", rendered),
-        Tile("photograph", photo),
+        Tile("photograph", image),
         Tile("disparity, near is 1", disparity, "TURBO"),
         Tile("gate", np.where(gate[..., None], OPEN, CLOSED).astype(np.float32)),
-        Tile("drawn pixels", 1 - FADED * (1 - photo.mean(-1, keepdims=True).repeat(3, -1)), dots=at),
+        Tile("drawn pixels", 1 - FADED * (1 - image.mean(-1, keepdims=True).repeat(3, -1)), dots=at),
         Tile(f"{weights[0]:.2f} S_render", render),
         Tile(f"{weights[1]:.2f} S_semantic", semantic),
         Tile(f"{weights[2]:.2f} S_geometry", geometry),
         Tile("S_importance", score),
     ]
-    confirmed = config.ra and config.sampler.depth == "confirmed" and view.confirmed is not None
+    consistent = config.ra and config.sampler.depth == "consistent" and view.consistent is not None
     widened = f"; too few passed at the {_asked(config):g} quantile" if drawn.quantile < _asked(config) else ""
     lines = [
         f"{len(at):,} pixels drawn of the {gate.sum():,} that the gate leaves open, {gate.mean():.0%} of the view.",
-        f"Gate: {_open_pixels(confirmed, drawn.quantile)}{widened}.",
+        f"Gate: {_open_pixels(consistent, drawn.quantile)}{widened}.",
         f"Their mean importance is {score[at[:, 0], at[:, 1]].mean() if len(at) else 0:.2f}, the view's {score.mean():.2f}.",
     ]
     return contact_sheet(f"{name}, step {step:,}", lines, tiles, columns=5, tile_width=320, text=1.25)
 
 
-def _shown(event: Event) -> list[Drawn]:
+def _shown(event: Event) -> list[SampledView]:
     """Up to three of an event's views."""
     count = len(event.views)
     return [event.views[i] for i in np.unique(np.linspace(0, count - 1, min(SHOWN, count)).round().astype(int))]
 
 
-def _on_host(drawn: Drawn) -> Drawn:
+def _on_host(drawn: SampledView) -> SampledView:
     maps = {n: getattr(drawn, n).cpu() for n in ("rendered", "score", "gate", "at")}
     return dataclasses.replace(drawn, scores=tuple(s.cpu() for s in drawn.scores), **maps)
 
 
 @contextlib.contextmanager
-def pictures_kept(fit: Fit, names: list[str], out: Path) -> Iterator[None]:
+def images_kept(fit: Fit, names: list[str], out: Path) -> Iterator[None]:
     """Have a fit write pictures of some of its events into its run folder, ``sampling/STEP.png``, while it goes on.
 
     They are drawn by a thread of their own, which the end of the block waits for.
@@ -121,7 +121,7 @@ def pictures_kept(fit: Fit, names: list[str], out: Path) -> Iterator[None]:
         except OSError as e:
             raise ResourceError(f"{out / FOLDER}: cannot be made ({e.strerror}); make room there") from e
 
-    def draw(step: int, views: list[TrainingView], kept: list[Drawn]) -> None:
+    def draw(step: int, views: list[TrainingView], kept: list[SampledView]) -> None:
         sheets = [view_sheet(names[d.view], step, v, fit.disparities[d.view], d, config) for v, d in zip(views, kept)]
         write_bytes(out / FOLDER / f"{step:06d}.png", png(np.concatenate(sheets)))
 
@@ -135,7 +135,7 @@ def pictures_kept(fit: Fit, names: list[str], out: Path) -> Iterator[None]:
             if step in steps:
                 # the thread must not ask the device for anything: steps may be being recorded then
                 kept = [_on_host(d) for d in _shown(event)]
-                views = [dataclasses.replace(fit.views[d.view], photo=fit.views[d.view].photo.cpu()) for d in kept]
+                views = [dataclasses.replace(fit.views[d.view], image=fit.views[d.view].image.cpu()) for d in kept]
                 drawing.append(thread.submit(draw, step, views, kept))
 
         fit.on_event = on_event
@@ -159,24 +159,24 @@ def event_figures(fit: Fit) -> dict:
     fine = int(fit.layers.fine.sum())
     return {
         "events": {
-            "count": len(fit.events), **{k: sum(e[k] for e in fit.events) for k in ("added", "freed")},
+            "count": len(fit.events), **{k: sum(e[k] for e in fit.events) for k in ("added", "evicted")},
             "draws": len(quantiles), "widened": sum(q < asked for q in quantiles),
         },
         "layers": {"coarse": len(fit.gaussians) - fine, "fine": fine},
     }  # fmt: skip
 
 
-def sampling_story(fit: Fit, out: Path) -> SamplingStory | None:
+def sampling_report_of(fit: Fit, out: Path) -> SamplingReport | None:
     """What the report of a finished fit says of its sampling events; None where there were none."""
     method, figures = fit.config.method, event_figures(fit)
     events, layers = figures["events"], figures["layers"]
     if not events["count"]:
         return None
     how = "drawn at random, the likelier the higher their S_importance," if method.agp else "the highest in S_importance"
-    confirmed = method.sampler.depth == "confirmed"
+    consistent = method.sampler.depth == "consistent"
     words = (
         f"Each dot is a pixel behind which a fine Gaussian was put at the {method.sampler.depth} depth, as far as the layer "
-        f"had room. These pixels are {how} among {_open_pixels(confirmed and method.ra, _asked(method))} (the gate); "
+        f"had room. These pixels are {how} among {_open_pixels(consistent and method.ra, _asked(method))} (the gate); "
         "S_importance is the weighted sum of the three scores, and each score stands below what it comes from."
     )
     if events["widened"]:
@@ -186,7 +186,7 @@ def sampling_story(fit: Fit, out: Path) -> SamplingStory | None:
         )
     table = [
         ["sampling events", "Gaussians added", "removed to make room", "coarse at the end", "fine at the end"],
-        [f"{n:,}" for n in (events["count"], events["added"], events["freed"], layers["coarse"], layers["fine"])],
+        [f"{n:,}" for n in (events["count"], events["added"], events["evicted"], layers["coarse"], layers["fine"])],
     ]
-    pictures = [(f"sampling after step {int(p.stem):,}", p.read_bytes()) for p in sorted((out / FOLDER).glob("*.png"))]
-    return SamplingStory(words, pictures, table)
+    images = [(f"sampling after step {int(p.stem):,}", p.read_bytes()) for p in sorted((out / FOLDER).glob("*.png"))]
+    return SamplingReport(words, images, table)

@@ -15,7 +15,7 @@ from warpgs.report.sheet import Cell, Strip
 from warpgs.scene import View
 
 CROPS = 2
-SHARE = 0.22
+FRACTION = 0.22
 """Width and height of a crop as a share of the picture's."""
 
 
@@ -46,22 +46,22 @@ def strips(
     Returns:
         Rows with a cell per variant and the photograph as the last.
     """
-    pictures = {name: _rendered(folder, views, device) for name, folder in folders.items()}
+    images = {name: _rendered(folder, views, device) for name, folder in folders.items()}
     maps = []
     for i, view in enumerate(views):
-        values = disagreement([p[i] for p in pictures.values()], view.image)
+        values = disagreement([p[i] for p in images.values()], view.image)
         maps.append(values if view.score_mask is None else values * view.score_mask)
     chosen = sorted(sorted(range(len(views)), key=lambda i: -float(maps[i].mean()))[:count])
     rows = []
     for i in chosen:
         view = views[i]
         H, W = view.image.shape[:2]
-        w, h = max(8, round(SHARE * W)), max(8, round(SHARE * H))
+        w, h = max(8, round(FRACTION * W)), max(8, round(FRACTION * H))
         corners = crops(maps[i], w, h, CROPS)
         cells = []
-        for name, images in pictures.items():
+        for name, rendered in images.items():
             value = scores.get(name, {}).get(view.name)
-            cells.append(Cell(images[i], f"{value:.2f} dB" if value is not None else ""))
+            cells.append(Cell(rendered[i], f"{value:.2f} dB" if value is not None else ""))
         truth = view.image if view.score_mask is None else over_white(view.image, view.score_mask) * 0.5 + view.image * 0.5
         words = "held-out photograph" if view.score_mask is None else "photograph, bleached where not scored"
         rows.append(Strip(f"{scene}, {view.name}", (*cells, Cell(truth, words)), tuple((x, y, w, h) for x, y in corners)))

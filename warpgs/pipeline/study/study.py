@@ -225,7 +225,7 @@ def write_study(request: StudyRequest, runs: Runs, places: list[Place], device: 
     title = "Ablation" if request.marks else "Comparison"
     what = scenes[0] if len(scenes) == 1 else f"the mean over {len(scenes)} scenes"
     table = _table(request, runs, scenes, metrics, f"{title} on {what}, {request.seeds} seeds")
-    picture, about = _figure(request, runs, places, device)
+    image, about = _figure(request, runs, places, device)
     notes = [*_notes(request, runs, metrics), about]
     parts = [f"# {table.caption}", markdown(table)]
     if len(scenes) > 1:
@@ -236,8 +236,8 @@ def write_study(request: StudyRequest, runs: Runs, places: list[Place], device: 
     write_text(request.out / "table.tex", latex(table))
     write_text(request.out / "runs.csv", _runs_csv(request, runs))
     write_text(request.out / "plot.svg", _plot(request, runs, scenes, table))
-    if picture is not None:
-        write_bytes(request.out / "figure.png", picture)
+    if image is not None:
+        write_bytes(request.out / "figure.png", image)
     hashes = {n: dataclasses.replace(c, seed=0).fingerprint() for n, c in request.variants.items()}
     write_json(request.out / "study.json", {
         "variants": {n: {"config_hash_of_seed_0": hashes[n], "config": c.to_json()} for n, c in request.variants.items()},

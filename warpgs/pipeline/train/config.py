@@ -15,7 +15,7 @@ from warpgs.pipeline.model.table import OptimizerConfig
 from warpgs.pipeline.train.loss import LossConfig
 from warpgs.pipeline.train.schedule import PhaseConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.holdout_blocks import JudgeConfig
+from warpgs.pipeline.train.strategies.holdout_blocks import HoldoutConfig
 from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig
 from warpgs.priors.view_prior import PriorConfig
@@ -51,12 +51,9 @@ class FitConfig:
     stops where a step would not fit, and pictures are drawn in bands where a whole one would not."""
     cuda_graph: bool = True
     """On CUDA, record a step once and replay it; the same kernels and the same bytes as without, in less time."""
-    fused_adam: bool = False
-    """In recorded steps, update Gaussians in the kernel that finds their gradients: a step takes less memory and, with millions
-    of them, a tenth more time; results differ in their last digits (docs/decisions/006-recorded-steps.md)."""
     adaptive: bool = False
     """Held-out blocks of the training views decide how many Gaussians there are and of which degree (docs/complexity.md)."""
-    judge: JudgeConfig = field(default_factory=JudgeConfig)
+    holdout: HoldoutConfig = field(default_factory=HoldoutConfig)
     init: InitConfig = field(default_factory=InitConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
@@ -114,13 +111,13 @@ _PAPER = dataclasses.replace(
     _SPARSE, preset="paper",
     method=MethodConfig(
         events=True, hier=True,
-        sampler=SamplerConfig(depth="confirmed", share=0.02, footprint=3.0, gate_quantile=0.0, max_share=2.0),
+        sampler=SamplerConfig(depth="consistent", fraction=0.02, footprint=3.0, gate_quantile=0.0, max_fraction=2.0),
     ),
 )  # fmt: skip
 _NEXUS = FitConfig(
     preset="nexusgs", steps=10_000, sh_every=500, init=InitConfig(source="flow", merge_px=0, fill_px=0),
     optimizer=OptimizerConfig(scales_lr=0.03),
-    density=DensityConfig(gradient=5e-4, stop_share=1.0, reset_every=3000, reset_opacity=0.05, prune_size=0),
+    density=DensityConfig(gradient=5e-4, stop_fraction=1.0, reset_every=3000, reset_opacity=0.05, prune_size=0),
 )  # fmt: skip
 
 PRESETS: dict[str, FitConfig] = {
@@ -136,12 +133,12 @@ PRESETS: dict[str, FitConfig] = {
     "nexusgs": _NEXUS,
     "dropgaussian": FitConfig(
         preset="dropgaussian", steps=10_000, dropout=0.2, optimizer=OptimizerConfig(scales_lr=0.005),
-        density=DensityConfig(gradient=5e-4, stop_share=1.0, prune_size=0),
+        density=DensityConfig(gradient=5e-4, stop_fraction=1.0, prune_size=0),
     ),
     "fsgs": FitConfig(
         preset="fsgs", steps=10_000, sh_every=500, init=InitConfig(sweep_up_to=30), loss=LossConfig(depth_weight=0.05),
         optimizer=OptimizerConfig(scales_lr=0.005),
-        density=DensityConfig(gradient=5e-4, stop_share=1.0, reset_every=3000, reset_opacity=0.05, prune_size=0),
+        density=DensityConfig(gradient=5e-4, stop_fraction=1.0, reset_every=3000, reset_opacity=0.05, prune_size=0),
     ),
     "paper-literal": dataclasses.replace(
         _NEXUS, preset="paper-literal", steps=30_000, phases=PhaseConfig(coarse=2000, stable=3000),

@@ -21,8 +21,8 @@ def halved(view: TrainingView) -> TrainingView:
     def mean(maps: torch.Tensor) -> torch.Tensor:
         return interpolate(maps[None], (height, width), mode="area")[0]
 
-    photo = mean(view.photo.permute(2, 0, 1)).permute(1, 2, 0).contiguous()
+    image = mean(view.image.permute(2, 0, 1)).permute(1, 2, 0).contiguous()
     mask = None if view.mask is None else (mean(view.mask[None])[0] > 1 - 1e-4).to(view.mask.dtype)
     disparity = None if view.disparity is None else mean(view.disparity[None])[0]
     camera = Camera(c.viewmat, scale[:, None] * c.K, width, height)
-    return TrainingView(camera, photo, mask, disparity=disparity)
+    return TrainingView(camera, image, mask, disparity=disparity)

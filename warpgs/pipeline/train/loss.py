@@ -38,10 +38,10 @@ class LossConfig:
 
 
 @functools.cache
-def _weights(share: float, count: int, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+def _weights(fraction: float, count: int, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
     """Of the sums of 1 - SSIM and of absolute differences over ``count`` numbers; kept for good, as graphs refer to it."""
     with torch.inference_mode(False):  # whoever asks first: what is made in that mode cannot be trained with
-        return torch.tensor([share / count, (1 - share) / count], dtype=dtype, device=device)
+        return torch.tensor([fraction / count, (1 - fraction) / count], dtype=dtype, device=device)
 
 
 def photometric_loss(rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None, config: LossConfig) -> torch.Tensor:
@@ -56,19 +56,19 @@ def photometric_loss(rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor
     Returns:
         The loss, shape []; 0 where no pixel counts.
     """
-    share = config.ssim_weight
-    if mask is None and share > 0:
+    fraction = config.ssim_weight
+    if mask is None and fraction > 0:
         sums = differences(rgb, target)
         # a product and a sum, where terms one by one would be a dozen kernels on a GPU
-        return (sums * _weights(share, target.numel(), sums.dtype, sums.device)).sum()
+        return (sums * _weights(fraction, target.numel(), sums.dtype, sums.device)).sum()
     if mask is not None:
         rgb, target = rgb * mask[..., None], target * mask[..., None]
     pixels = target.shape[0] * target.shape[1] if mask is None else mask.sum().clamp_min(1)
     l1 = (rgb - target).abs().sum() / (3 * pixels)
-    if share == 0:
+    if fraction == 0:
         return l1
     structural = ((1 - ssim(rgb, target)) * mask[..., None]).sum() / (3 * pixels)
-    return (1 - share) * l1 + share * structural
+    return (1 - fraction) * l1 + fraction * structural
 
 
 def depth_disagreement(
@@ -91,11 +91,11 @@ def depth_disagreement(
     """
     counts = ~(alpha <= MIN_ALPHA)  # of a NaN too: it must not vanish
     counts = counts if mask is None else counts & (mask > 0)
-    share = counts.to(depth.dtype)
-    pixels = share.sum().clamp_min(1)
+    fraction = counts.to(depth.dtype)
+    pixels = fraction.sum().clamp_min(1)
     depth = torch.where(counts, depth, 1)
-    mean = (depth.detach() * share).sum() / pixels
-    a, b = ((m - (m * share).sum() / pixels) * share for m in (mean / depth, disparity))
+    mean = (depth.detach() * fraction).sum() / pixels
+    a, b = ((m - (m * fraction).sum() / pixels) * fraction for m in (mean / depth, disparity))
     of_a, of_b = (a * a).sum() / pixels, (b * b).sum() / pixels
     flat = (of_a <= FLAT**2) | (of_b <= FLAT**2)
     spread = torch.where(flat, 1, of_a).sqrt() * torch.where(flat, 1, of_b).sqrt()
@@ -103,7 +103,7 @@ def depth_disagreement(
 
 
 def training_loss(
-    pictures: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+    images: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
     target: torch.Tensor,
     mask: torch.Tensor | None,
     disparity: torch.Tensor | None,
@@ -111,9 +111,9 @@ def training_loss(
 ) -> torch.Tensor:
     """What a step minimises, shape []: `photometric_loss` and, where a disparity is given, the weighted depth term.
 
-    ``pictures`` are colour, alpha and depth; the rest is as in `photometric_loss` and `depth_disagreement`.
+    ``images`` are colour, alpha and depth; the rest is as in `photometric_loss` and `depth_disagreement`.
     """
-    rgb, alpha, depth = pictures
+    rgb, alpha, depth = images
     loss = photometric_loss(rgb, target, mask, config)
     if disparity is None:
         return loss

@@ -57,10 +57,8 @@ class Layout:
     """Whether a view has a mask."""
     scored: bool = False
     """Whether views have scores, by which fine Gaussians are sampled."""
-    guided: bool = False
+    depth_supervised: bool = False
     """Whether the loss has its depth term."""
-    fused: bool = False
-    """Whether recorded steps update Gaussians in the kernel that finds their gradients."""
     cuda: bool = False
     recordings: int = 0
     """CUDA graphs that exist at a time, one for each size of view; 0 where steps are taken one by one."""
@@ -73,7 +71,7 @@ class Layout:
     def held(self, count: int) -> int:
         """Bytes that last from step to step: parameters, two moments, density statistics, layers and births, views."""
         copies = 2 if self.recordings else 1  # recorded steps take views from one tensor
-        views = FLOAT * (copies * (3 + self.masked + self.guided) + 3 * self.scored) * self.view_pixels
+        views = FLOAT * (copies * (3 + self.masked + self.depth_supervised) + 3 * self.scored) * self.view_pixels
         return (3 * self.row + 4 * FLOAT) * count + views
 
     def moments(self, count: int, instances: int, banded: bool) -> dict[str, int]:
@@ -89,39 +87,36 @@ class Layout:
         records = record + FLOAT * count  # with the tile counts
         ranges = 8 * columns * rows + 2 * FLOAT * count
         sorting = count * (FLOAT * 4 + 2 * 8)  # depths and order twice, two running sums
-        pictures = 5 * FLOAT * pixels  # colour, alpha, depth
+        images = 5 * FLOAT * pixels  # colour, alpha, depth
         kept = 3 * FLOAT * pixels  # transmittance, weight, end: what blending leaves for its gradient
-        upstream = FLOAT * pixels * (3 if self.cuda and not self.guided else 5)
+        upstream = FLOAT * pixels * (3 if self.cuda and not self.depth_supervised else 5)
         # three partials for each colour and the gradient; masked copies; the two maps that are correlated, with gradients
-        loss = FLOAT * pixels * ((36 if self.masked else 12) + 4 * self.guided)
+        loss = FLOAT * pixels * ((36 if self.masked else 12) + 4 * self.depth_supervised)
         if not self.cuda:
             loss += 5 * FLOAT * (3 * self.width + 30) * -(-self.height // 8)
         # what an event sees of each view stays until its end: the picture, scores, the gate
         seen = 7 * FLOAT * pixels * min(self.views, SAMPLED) if self.scored else 0
-        sampling = {"sampling": records + ranges + listing + seen + 3 * pictures} if self.scored else {}
+        sampling = {"sampling": records + ranges + listing + seen + 3 * images} if self.scored else {}
         if banded:  # nothing of a band waits for the loss; in the backward pass its pictures stand beside the whole ones
-            apart = records + 2 * record + pictures + upstream
+            apart = records + 2 * record + images + upstream
             return {
                 "binning": apart + ranges + sorting + listing,
-                "loss": records + pictures + loss,
-                "blending": apart + ranges + pictures + kept + backward,
-                "projection": self._projection(count) + pictures + upstream,
+                "loss": records + images + loss,
+                "blending": apart + ranges + images + kept + backward,
+                "projection": self._projection(count) + images + upstream,
                 **sampling,
             }
         return {
             "binning": records + ranges + sorting + listing,
-            "loss": records + ranges + pictures + kept + waiting + loss,
-            "blending": records + record + ranges + pictures + kept + upstream + backward,
-            "projection": self._projection(count) + pictures + upstream,
+            "loss": records + ranges + images + kept + waiting + loss,
+            "blending": records + record + ranges + images + kept + upstream + backward,
+            "projection": self._projection(count) + images + upstream,
             **sampling,
         }
 
     def _projection(self, count: int) -> int:
-        """Records, their gradient and its copy for the density statistics, and the gradients of the parameters.
-
-        Fused steps have no gradients of the parameters (graph.StepGraph).
-        """
-        return (FLOAT * (3 * RECORD + 1) + (0 if self.fused and self.recordings else self.row)) * count
+        """Records, their gradient and its copy for the density statistics, and the gradients of the parameters."""
+        return (FLOAT * (3 * RECORD + 1) + self.row) * count
 
     def event(self, before: int, after: int) -> int:
         """Bytes on top of ``held(after)`` while Gaussians are added: new rows, and one tensor before, cut and grown."""
@@ -201,8 +196,8 @@ class MemoryPlan:
                 text += ", then in bands"
         if self.limit is None:
             if self.planned_at_cap > self.available:
-                share = (self.available - self.planned) / max(1, self.planned_at_cap - self.planned)
-                reached = int(self.gaussians + max(0.0, share) * (self.cap - self.gaussians))
+                fraction = (self.available - self.planned) / max(1, self.planned_at_cap - self.planned)
+                reached = int(self.gaussians + max(0.0, fraction) * (self.cap - self.gaussians))
                 text += (
                     f"; the {format_bytes(self.available)} that are free are reached at about {reached:,}, --memory-limit helps"
                 )
@@ -222,15 +217,14 @@ def layout_of(
     *,
     scored: bool,
     recorded: bool,
-    guided: bool = False,
-    fused: bool = False,
+    depth_supervised: bool = False,
 ) -> Layout:
     """The layout of a fit to views with these cameras, recorded where the device can and ``recorded`` says so."""
     largest = max(cameras, key=lambda c: c.width * c.height)
     cuda, kinds = gaussians.means.is_cuda, {(c.width, c.height, m) for c, m in zip(cameras, masked)}
     return Layout(
         gaussians.sh.shape[1], largest.width, largest.height, sum(c.width * c.height for c in cameras), len(cameras),
-        any(masked), scored, guided, fused, cuda, len(kinds) if cuda and recorded else 0,
+        any(masked), scored, depth_supervised, cuda, len(kinds) if cuda and recorded else 0,
     )  # fmt: skip
 
 
@@ -245,7 +239,7 @@ def most_instances(gaussians: Gaussians, cameras: list[Camera], rule: str) -> in
 
 
 def plan(
-    layout: Layout, *, count: int, instances: int, most: int, limit: int | None, available: int, room: float = 1.0
+    layout: Layout, *, count: int, instances: int, most: int, limit: int | None, available: int, capacity_factor: float = 1.0
 ) -> tuple[MemoryPlan, Layout]:
     """Plan a fit that starts with ``count`` Gaussians, whose heaviest view has ``instances``, and may reach ``most``.
 
@@ -256,7 +250,7 @@ def plan(
         most: Number of Gaussians that densification may reach.
         limit: Bytes, or None.
         available: Bytes that the device has free.
-        room: Instances that a recording makes room for, as a multiple of what there are.
+        capacity_factor: Instances that a recording makes room for, as a multiple of what there are.
 
     Returns:
         The plan, and the layout of the steps to be taken: without recordings where those would not keep to the limit.
@@ -274,12 +268,12 @@ def plan(
                 "with fewer points (--max-gaussians N), or --downscale the views"
             )
         cap = single.largest_count(limit, count, cap)
-        graphs = layout.step(cap, int(room * instances / count * cap))
+        graphs = layout.step(cap, int(capacity_factor * instances / count * cap))
         if layout.recordings and max(graphs, layout.held(cap) + layout.event(cap // 2, cap)) > limit:
             layout, refused = single, True
 
     def needed(at: int) -> tuple[int, bool]:
-        there = int(instances / count * at * (room if layout.recordings else 1))
+        there = int(instances / count * at * (capacity_factor if layout.recordings else 1))
         whole = layout.step(at, there)
         if limit is None or whole <= limit:
             return whole, False

@@ -42,11 +42,11 @@ class PhaseConfig:
 
 @dataclass(frozen=True)
 class Phases:
-    """The phases of one fit: of ``steps`` steps, the first ``refine`` are phase 1 and those from ``settle`` on phase 3."""
+    """Phases of one fit: the first ``refine`` steps are phase 1, those from ``stable_start`` on phase 3."""
 
     refine: int
     """Steps done when phase 2 begins."""
-    settle: int
+    stable_start: int
     """Steps done when phase 3 begins."""
     events: tuple[int, ...]
     """Steps done when fine Gaussians are sampled, ascending; the first is ``refine``, or 1 where that is 0."""
@@ -64,7 +64,7 @@ class Phase:
     """The coarse layer is kept stable."""
     halved: bool
     """Views are half their size."""
-    guided: bool
+    depth_supervised: bool
     """The loss has its depth term."""
 
 
@@ -75,9 +75,9 @@ def plan_phases(config: PhaseConfig, steps: int) -> Phases:
     """
     outer = config.coarse + config.stable
     shrink = min(1.0, 0.5 * steps / outer) if outer else 1.0
-    refine, settle = round(shrink * config.coarse), steps - round(shrink * config.stable)
-    length, at, events = settle - refine, 0.0, []
+    refine, stable_start = round(shrink * config.coarse), steps - round(shrink * config.stable)
+    length, at, events = stable_start - refine, 0.0, []
     while at < length:
         events.append(max(1, refine + int(at)))
         at += max(1.0, shrink * config.every) * (1 + config.growth * at / length)
-    return Phases(refine, settle, tuple(events))
+    return Phases(refine, stable_start, tuple(events))

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from warpgs.pipeline.metrics.region import counted_region
-from warpgs.pipeline.model.init import Start, at_most, check_points, initial_points
+from warpgs.pipeline.model.init import Start, check_points, initial_points, subsample
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.priors.cache import cache_folder
 from warpgs.priors.view_prior import view_priors
@@ -57,7 +57,7 @@ def prepare(
     @functools.cache
     def start() -> Start:
         found = initial_points(train, points, config.init, generator, usable)
-        return at_most(found, config.density.max_gaussians, generator)
+        return subsample(found, config.density.max_gaussians, generator)
 
     notes = []
     if priors is None and (config.method.events or config.loss.depth_weight > 0):

@@ -23,7 +23,7 @@ STEP, SETUP = 1.6, 11.0
 """Mean time of a step of a fit, and time before the first step for each training view, in probes (`probe_seconds`). Measured on
 a CPU on fern with preset `quick`: 1.54 and 11.2 at 126 x 94 px, 1.56 and 10.8 at 168 x 126 px (docs/trade.md). On CUDA, where
 steps are recorded and probes are not, a step takes less: what is foretold there is an upper limit."""
-FEWEST, MOST = 100, 3000
+MIN_STEPS, MAX_STEPS = 100, 3000
 """Steps that a budget may lead to: with fewer nothing is seen, with more held-out views gain nothing (docs/results.md)."""
 
 
@@ -76,17 +76,17 @@ def within_budget(config: FitConfig, seconds: float, views: list[View], device: 
     largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
     probe = probe_seconds(largest.width, largest.height, device)
     setup, step = probe * SETUP * len(views), probe * STEP
-    steps = min(int((seconds - setup) / step), MOST)
-    if steps < FEWEST:
+    steps = min(int((seconds - setup) / step), MAX_STEPS)
+    if steps < MIN_STEPS:
         raise UsageError(
-            f"time-budget {seconds:g} s is too short: {FEWEST} steps are foretold to take {setup + FEWEST * step:.0f} s here, "
+            f"time-budget {seconds:g} s is too short: {MIN_STEPS} steps would take {setup + MIN_STEPS * step:.0f} s here, "
             f"where a picture with gradients takes {1000 * probe:.0f} ms; give more time, or smaller images with --downscale"
         )
     needed = setup + steps * step
     return dataclasses.replace(config, steps=steps), (
         f"time-budget {seconds:g} s: chose --steps {steps} of preset {config.preset}, foretold to take {needed:.0f} s "
         f"here, where a picture with gradients takes {1000 * probe:.0f} ms"
-        + (f"; more than {MOST} steps gain nothing" if steps == MOST else "")
+        + (f"; more than {MAX_STEPS} steps gain nothing" if steps == MAX_STEPS else "")
         + "; scores and report come on top"
     )
 

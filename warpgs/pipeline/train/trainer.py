@@ -15,7 +15,7 @@ from warpgs.errors import DataError, NotFiniteError
 from warpgs.kernels.dropout import opacity_dropout
 from warpgs.kernels.tiles import available_bytes
 from warpgs.pipeline.model.init import initial_gaussians, scene_extent
-from warpgs.pipeline.model.layers import COARSE, FINE, LONG_AGO, Layers
+from warpgs.pipeline.model.layers import COARSE, FINE, NOT_SAMPLED, Layers
 from warpgs.pipeline.model.table import Optimizer
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.half_resolution import halved
@@ -23,9 +23,17 @@ from warpgs.pipeline.train.loss import masked_mse, training_loss
 from warpgs.pipeline.train.memory_plan import layout_of, most_instances, plan
 from warpgs.pipeline.train.schedule import Phase, plan_phases, sh_degree
 from warpgs.pipeline.train.setup import prepare
-from warpgs.pipeline.train.step import BURST, NOT_FINITE, ROOM, Burst, OverLimitError, StepGraph, stack_views
-from warpgs.pipeline.train.strategies.clone_split import DensityStats, Refinement, refine
-from warpgs.pipeline.train.strategies.importance_sampling import Event, TrainingView, guided_views, sampling_event
+from warpgs.pipeline.train.step import (
+    CAPACITY_FACTOR,
+    NOT_FINITE,
+    STEPS_PER_BATCH,
+    OverLimitError,
+    StepBuffers,
+    StepGraph,
+    stack_views,
+)
+from warpgs.pipeline.train.strategies.clone_split import DensityStats, DensityUpdate, refine
+from warpgs.pipeline.train.strategies.importance_sampling import Event, TrainingView, depth_supervised_views, sampling_event
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Gaussians, PointCloud, Prior, Scene, View
 
@@ -79,9 +87,9 @@ class Fit:
         self.extent = scene_extent([v.camera for v in train], cloud)
         self.background = torch.tensor(background, dtype=torch.float32, device=device)
         self.phases = plan_phases(config.phases, config.steps)
-        settle = self.phases.settle / config.steps if self.phases.settle < config.steps else 0.0
+        stable_start = self.phases.stable_start / config.steps if self.phases.stable_start < config.steps else 0.0
         gaussians = initial_gaussians(cloud, config.init, self.extent, device)
-        self.optimizer = Optimizer(gaussians, config.optimizer, self.extent, settle)
+        self.optimizer = Optimizer(gaussians, config.optimizer, self.extent, stable_start)
         self.stats, self.layers = DensityStats(len(cloud), device), Layers(len(cloud), device)
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
         self.events: list[dict] = []
@@ -95,9 +103,9 @@ class Fit:
             depths = made.start.depths or [None] * len(train)
             self.views = [v.scored(p, d, config.method) for v, p, d in zip(self.views, made.priors, depths, strict=True)]
         if config.loss.depth_weight > 0:
-            self.views, note = guided_views(self.views, made.priors)
+            self.views, note = depth_supervised_views(self.views, made.priors)
             self.notes.append(note)
-        self.news: list[str] = []
+        self.messages: list[str] = []
         """What the user must know of and was not told yet."""
         self._plan()
 
@@ -135,9 +143,9 @@ class Fit:
             record=False,  # it would make room for more than was planned
         )
         render = rasterize(self.optimizer.gaussians, view.camera, options)
-        render.splats.retain_grad()
-        disparity = view.disparity if phase.guided else None
-        loss = training_loss((render.rgb, render.alpha, render.depth), view.photo, view.mask, disparity, c.loss)
+        render.projected.retain_grad()
+        disparity = view.disparity if phase.depth_supervised else None
+        loss = training_loss((render.rgb, render.alpha, render.depth), view.image, view.mask, disparity, c.loss)
         loss.backward()
         value = loss.item()
         if not math.isfinite(value):
@@ -145,16 +153,16 @@ class Fit:
 
         if phase.densifying:
             self.stats.add(render)
-        self.optimizer.step(self._progress(self.step), self._share(phase))
+        self.optimizer.step(self._progress(self.step), self._fraction(phase))
         if self._protects:
-            self.layers.hold_up(self.optimizer.params["logit_opacities"].detach(), self.step, c.method.protect)
+            self.layers.clamp_min_opacity(self.optimizer.params["logit_opacities"].detach(), self.step, c.method.protect)
         with torch.no_grad():
-            psnr = -10 * math.log10(max(masked_mse(render.rgb, view.photo, view.mask).item(), 1e-12))
+            psnr = -10 * math.log10(max(masked_mse(render.rgb, view.image, view.mask).item(), 1e-12))
         del render, loss  # their graph holds the parameters, which are about to be replaced
         self._change_set(phase)
         return StepReport(self.step, value, psnr, len(self.optimizer.gaussians), time.perf_counter() - begin)
 
-    def burst(self, limit: int) -> list[StepReport]:
+    def buffers(self, limit: int) -> list[StepReport]:
         """Take several steps: on CUDA as recorded graphs, which read nothing back in between; elsewhere one as `advance` does.
 
         Ends before anything that needs the host: a change of the set of Gaussians or of the degree, or ``limit`` steps.
@@ -169,7 +177,7 @@ class Fit:
         c, first = self.config, self.step + 1
         phase, count = self._phase(first), 1
         while (
-            count < min(limit, BURST, c.steps - self.step)
+            count < min(limit, STEPS_PER_BATCH, c.steps - self.step)
             and self._phase(first + count) == phase
             and not self._changes_after(first + count - 1)
         ):
@@ -183,11 +191,11 @@ class Fit:
             self.graphs.clear()
             self.layout = dataclasses.replace(self.layout, recordings=0)
             self._count_changed()
-            self.news.append(f"memory: steps are taken one by one from here on, because {e}")
+            self.messages.append(f"memory: steps are taken one by one from here on, because {e}")
             return [self.advance()]
         steps = range(first, first + count)
-        rates = [self.optimizer.schedule(self._progress(s), s) for s in steps]
-        self.work.load([row for _, row in places], rates, [self._settings(s) for s in steps])
+        lrs = [self.optimizer.schedule(self._progress(s), s) for s in steps]
+        self.work.load([row for _, row in places], lrs, [self._settings(s) for s in steps])
         for graph in graphs:
             graph.replay()
         done, stop, history = self.work.result()
@@ -221,13 +229,15 @@ class Fit:
         c = self.config
         layered = c.method.hier and c.method.events and step > self.phases.refine
         half = step <= c.half_resolution * c.steps
-        guided = c.loss.depth_weight > 0 and step <= c.loss.depth_until * c.steps
-        return Phase(sh_degree(step, c.sh_every, c.init.max_sh_degree), step <= self._densify_until, layered, half, guided)
+        depth_supervised = c.loss.depth_weight > 0 and step <= c.loss.depth_until * c.steps
+        return Phase(
+            sh_degree(step, c.sh_every, c.init.max_sh_degree), step <= self._densify_until, layered, half, depth_supervised
+        )
 
     @property
     def _densify_until(self) -> int:
         c = self.config
-        return self.phases.settle if c.phases.coarse + c.phases.stable > 0 else c.density.times(c.steps)[2]
+        return self.phases.stable_start if c.phases.coarse + c.phases.stable > 0 else c.density.times(c.steps)[2]
 
     @property
     def _room_for(self) -> int:
@@ -238,24 +248,23 @@ class Fit:
     def _protects(self) -> bool:
         return self.config.method.events and self.config.method.pm
 
-    def _share(self, phase: Phase) -> torch.Tensor | None:
+    def _fraction(self, phase: Phase) -> torch.Tensor | None:
         """Part of its step that each mean takes."""
         if not phase.layered:
             return None
-        return torch.where(self.layers.fine, 1.0, self.config.method.coarse_rate)
+        return torch.where(self.layers.fine, 1.0, self.config.method.coarse_lr_factor)
 
     def _graph(self, kind: tuple[int, int, bool], phase: Phase) -> StepGraph:
         key = (kind, phase)
         if key not in self.graphs:
             c, views = self.config, self.stacks[kind]
-            views = views if phase.guided else dataclasses.replace(views, disparities=None)
+            views = views if phase.depth_supervised else dataclasses.replace(views, disparities=None)
             self.graphs = {k: g for k, g in self.graphs.items() if k[1:] == key[1:]}
             self.graphs[key] = StepGraph(
                 views, self.optimizer, self.stats if phase.densifying else None, self.work,
                 degree=phase.degree, rule=c.rule, loss=c.loss, background=self.background,
-                dropout_seed=c.seed if self.dropout > 0 else None, share=self._share(phase),
+                dropout_seed=c.seed if self.dropout > 0 else None, fraction=self._fraction(phase),
                 protected=(self.layers, c.method.protect) if self._protects else None, most=self.most,
-                fused=c.fused_adam,
             )  # fmt: skip
         return self.graphs[key]
 
@@ -266,15 +275,16 @@ class Fit:
         cameras, masked = [v.camera for v in self.shown], [v.mask is not None for v in self.shown]
         layout = layout_of(
             self.gaussians, cameras, masked, scored=c.method.events, recorded=c.cuda_graph,
-            guided=c.loss.depth_weight > 0, fused=c.fused_adam,
+            depth_supervised=c.loss.depth_weight > 0,
         )  # fmt: skip
         self.memory, self.layout = plan(
             layout, count=len(self.optimizer.gaussians), instances=most_instances(self.gaussians, cameras, c.rule),
-            most=c.density.max_gaussians, limit=c.memory_limit, available=available_bytes(self.device), room=ROOM,
+            most=c.density.max_gaussians, limit=c.memory_limit, available=available_bytes(self.device),
+            capacity_factor=CAPACITY_FACTOR,
         )  # fmt: skip
         self._count_changed()
         if self.layout.recordings:
-            self.work, (self.stacks, self.places) = Burst(self.device), stack_views(self.shown)
+            self.work, (self.stacks, self.places) = StepBuffers(self.device), stack_views(self.shown)
 
     def _count_changed(self) -> None:
         """Set how many instances a step may have at a time: None where there is no limit."""
@@ -305,9 +315,9 @@ class Fit:
         change = refine(
             self.gaussians, self.stats, density, extent=self.extent, after_reset=self.reset_done, generator=self.generator,
             growing=self.layers.fine if phase.layered else None,
-            protected=self.layers.young(self.step, c.method.protect) if self._protects else None,
+            protected=self.layers.is_protected(self.step, c.method.protect) if self._protects else None,
         )  # fmt: skip
-        self._apply(change, COARSE, LONG_AGO)
+        self._apply(change, COARSE, NOT_SAMPLED)
         if c.density.morton_order:
             self.layers.reorder(self.optimizer.sort_along_curve())
         self.stats = DensityStats(len(self.optimizer.gaussians), self.device)
@@ -317,21 +327,21 @@ class Fit:
         c = self.config
         event = sampling_event(
             self.gaussians, self.layers, self.views, c.method, step=self.step, rule=c.rule, background=self.background,
-            room=self._room_for - len(self.optimizer.gaussians), generator=self.generator, max_instances=self.most,
+            capacity=self._room_for - len(self.optimizer.gaussians), generator=self.generator, max_instances=self.most,
         )  # fmt: skip
         self._apply(event.change, FINE, self.step)
         self.events.append({
-            "step": self.step, "added": len(event.change.parents), "freed": event.freed,
+            "step": self.step, "added": len(event.change.parents), "evicted": event.evicted,
             "quantiles": [v.quantile for v in event.views],
         })  # fmt: skip
         if self.on_event is not None:
             self.on_event(self.step, event)
 
-    def _apply(self, change: Refinement, level: int, birth: int) -> None:
+    def _apply(self, change: DensityUpdate, level: int, created_step: int) -> None:
         """Follow a change of the set with all that goes by row."""
         self.graphs.clear()
         self.optimizer.apply(change)
-        self.layers.apply(change, level=level, birth=birth)
+        self.layers.apply(change, level=level, created_step=created_step)
         self.stats.apply(change)
         self._count_changed()
 
@@ -378,7 +388,7 @@ def run(fit: Fit, on_step: Callable[[StepReport], None], save: Callable[[Fit], N
     """
     every, saved = fit.config.checkpoint_every, time.monotonic()
     while fit.step < fit.config.steps:
-        for report in fit.burst(every - fit.step % every):
+        for report in fit.buffers(every - fit.step % every):
             on_step(report)
         stop = stopped()
         due = fit.step % every == 0 and time.monotonic() - saved >= fit.config.checkpoint_seconds

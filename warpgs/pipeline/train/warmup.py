@@ -39,7 +39,7 @@ def _views(generator: np.random.Generator) -> list[View]:
     return [View(f"{i}", c, generator.random((SIDE, SIDE, 3), np.float32)) for i, c in enumerate(cameras)]
 
 
-def rehearse(config: FitConfig, device: torch.device, stopped: Callable[[], bool] = lambda: False) -> Fit:
+def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool] = lambda: False) -> Fit:
     """Fit noise in two small views with the same settings, refinement and sampling included, and score one.
 
     Args:
@@ -86,7 +86,7 @@ def rehearsal(config: FitConfig, device: torch.device) -> Iterator[Callable[[], 
 
     def on_device() -> None:
         with torch.cuda.device(device):
-            rehearse(config, device, stop.is_set)
+            warm_up(config, device, stop.is_set)
 
     with ThreadPoolExecutor(1, thread_name_prefix="rehearsal") as thread:
         done = thread.submit(on_device)

@@ -9,7 +9,7 @@ import torch
 from warpgs.errors import UsageError
 from warpgs.scene import Gaussians, Render
 
-REST = 500
+RESET_FREE_STEPS = 500
 """Steps before the set is left alone in which no opacity is reset any more: what is transparent then stays so."""
 
 
@@ -21,7 +21,7 @@ class DensityConfig:
     """First step after which Gaussians are added and removed."""
     every: int = 100
     """Steps between two such events."""
-    stop_share: float = 0.5
+    stop_fraction: float = 0.5
     """Share of the fit after which the set is left alone."""
     gradient: float = 2e-4
     """Mean gradient of the projected mean, in half image widths and heights, above which a Gaussian is densified."""
@@ -56,17 +56,17 @@ class DensityConfig:
 
     def times(self, steps: int) -> tuple[int, int, int]:
         """First event, interval and last event [steps] in a fit of that length; a short fit starts after a quarter of it."""
-        return min(self.start, steps // 4), self.every, int(self.stop_share * steps)
+        return min(self.start, steps // 4), self.every, int(self.stop_fraction * steps)
 
     def due(self, step: int, steps: int, until: int) -> tuple[bool, bool]:
         """Whether the set is refined, and opacities reset, after a step of a fit in which ``until`` is the last such step."""
         start, every, _ = self.times(steps)
         refines = start < step <= until and step % every == 0
-        return refines, self.reset_every > 0 and step <= until - REST and step % self.reset_every == 0
+        return refines, self.reset_every > 0 and step <= until - RESET_FREE_STEPS and step % self.reset_every == 0
 
 
 @dataclass(frozen=True)
-class Refinement:
+class DensityUpdate:
     """Which rows stay, and what is appended after them."""
 
     keep: torch.Tensor
@@ -89,16 +89,16 @@ class DensityStats:
     def add(self, render: Render) -> None:
         """Take in one backward pass; ``render.splats`` must have retained its gradient."""
         height, width = render.alpha.shape[-2:]
-        self.add_gradient(render.splats.grad, render.visible, width, height)
+        self.add_gradient(render.projected.grad, render.visible, width, height)
 
-    def add_gradient(self, v_splats: torch.Tensor, visible: torch.Tensor, width: int, height: int, weight=1) -> None:
+    def add_gradient(self, v_projected: torch.Tensor, visible: torch.Tensor, width: int, height: int, weight=1) -> None:
         """The same from the gradient of the records [C, N, 12] and visibility [C, N]; ``weight`` 0 takes in nothing."""
         # a product with a tensor of the two sizes would copy them to the device, which a recorded step must not
-        norms = torch.hypot(v_splats[..., 0] * (0.5 * width), v_splats[..., 1] * (0.5 * height))
+        norms = torch.hypot(v_projected[..., 0] * (0.5 * width), v_projected[..., 1] * (0.5 * height))
         self.gradient += torch.where(visible, norms, 0).sum(0) * weight
         self.seen += visible.sum(0) * weight
 
-    def apply(self, change: Refinement) -> None:
+    def apply(self, change: DensityUpdate) -> None:
         """Keep what is known of the rows that stay; nothing is known of new ones."""
         fresh = torch.zeros(len(change.parents), device=self.seen.device)
         self.gradient = torch.cat([self.gradient[change.keep], fresh])
@@ -137,7 +137,7 @@ def refine(
     generator: torch.Generator,
     growing: torch.Tensor | None = None,
     protected: torch.Tensor | None = None,
-) -> Refinement:
+) -> DensityUpdate:
     """Clone small Gaussians and split large ones where the image pulls at them; prune the transparent and the huge.
 
     Args:
@@ -182,4 +182,4 @@ def refine(
         remove[split] = True
         children = _split(tensors, split, generator)
         added = {n: torch.cat([t[cloned], children[n]]) for n, t in tensors.items()}
-        return Refinement(torch.nonzero(~remove).squeeze(1), added, torch.cat([cloned, split.repeat(2)]))
+        return DensityUpdate(torch.nonzero(~remove).squeeze(1), added, torch.cat([cloned, split.repeat(2)]))

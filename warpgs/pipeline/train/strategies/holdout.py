@@ -12,22 +12,22 @@ from dataclasses import asdict, dataclass
 import torch
 
 from warpgs.pipeline.model import compress
-from warpgs.pipeline.model.layers import COARSE, FINE, LONG_AGO
-from warpgs.pipeline.model.parameter_bounds import Limits, model_bytes
+from warpgs.pipeline.model.layers import COARSE, FINE, NOT_SAMPLED
+from warpgs.pipeline.model.parameter_bounds import ParameterBounds, model_bytes
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import masked_mse
 from warpgs.pipeline.train.schedule import sh_degree
-from warpgs.pipeline.train.strategies.clone_split import Refinement
+from warpgs.pipeline.train.strategies.clone_split import DensityUpdate
 from warpgs.pipeline.train.strategies.holdout_blocks import (
-    FEWEST,
     FLOOR,
+    MIN_BLOCKS,
     Gain,
     block_errors,
     decibels,
-    draw_blocks,
     gain,
     hide,
     only,
+    sample_blocks,
 )
 from warpgs.pipeline.train.strategies.importance_sampling import MAX_VIEWS, sampling_event
 from warpgs.pipeline.train.trainer import Fit, Phase
@@ -81,15 +81,17 @@ class AdaptiveFit(Fit):
         c = self.config
         begins = self.phases.refine if c.method.events else c.density.times(c.steps)[0]
         ends = self._growth_ends
-        self.marks = sorted({max(1, begins + round(k * (ends - begins) / c.judge.levels)) for k in range(c.judge.levels + 1)})
+        self.marks = sorted(
+            {max(1, begins + round(k * (ends - begins) / c.holdout.levels)) for k in range(c.holdout.levels + 1)}
+        )
         """Steps done when the judge looks: before growth, and after each level."""
-        self.optimizer.limits = Limits(len(self.gaussians), c.init.max_sh_degree, self.device)
+        self.optimizer.bounds = ParameterBounds(len(self.gaussians), c.init.max_sh_degree, self.device)
         self.whole = self.views
-        self.blocks = draw_blocks(self.views, c.judge.share, c.seed)
+        self.blocks = sample_blocks(self.views, c.holdout.fraction, c.seed)
         self.before: torch.Tensor | None = None
         """Errors of the blocks when the judge looked last, shape [B]."""
         held = sum(map(len, self.blocks))
-        self.judging = held >= FEWEST and ends < c.steps
+        self.judging = held >= MIN_BLOCKS and ends < c.steps
         if self.judging:
             self._hide_blocks()
             pixels = sum(len(b) * b.side**2 for b in self.blocks) / sum(v.camera.width * v.camera.height for v in self.views)
@@ -97,7 +99,7 @@ class AdaptiveFit(Fit):
                 f"adaptive: {held} blocks, {pixels:.1%} of the pixels, are held out until growth ends, by step {ends}"
             )
         else:
-            few = f"the pictures hold only {held} blocks" if held < FEWEST else "growth lasts to the end of the fit"
+            few = f"the pictures hold only {held} blocks" if held < MIN_BLOCKS else "growth lasts to the end of the fit"
             self.notes.append(f"adaptive: no judge, since {few}; the fit is as with --no-adaptive")
 
     def _hide_blocks(self) -> None:
@@ -134,22 +136,22 @@ class AdaptiveFit(Fit):
         kept = math.prod(t["after"] / t["before"] for t in self.trims)
         return max(0.0, 1 - (1 - probability) / kept), number
 
-    def _judges_after(self, step: int) -> bool:
+    def _holds_out_after(self, step: int) -> bool:
         return self.judging and self.closed is None and step in self.marks
 
     def _trims_after(self, step: int) -> bool:
-        c = self.config.judge
+        c = self.config.holdout
         if self.closed is None or not c.trim_db > 0:
             return False
         rest = self.config.steps - self.closed
         return step in {self.closed + round(k * rest / c.trims) for k in range(1, c.trims + 1)}
 
     def _changes_after(self, step: int) -> bool:
-        return super()._changes_after(step) or self._judges_after(step) or self._trims_after(step)
+        return super()._changes_after(step) or self._holds_out_after(step) or self._trims_after(step)
 
     def _change_set(self, phase: Phase) -> None:
-        if self._judges_after(self.step):
-            self._judge()
+        if self._holds_out_after(self.step):
+            self._hold_out()
         super()._change_set(phase)
         if self._trims_after(self.step):
             self._trim()
@@ -161,8 +163,8 @@ class AdaptiveFit(Fit):
         super()._refine(phase)
 
     @property
-    def _looks(self) -> compress.Looks:
-        return compress.Looks([v.camera for v in self.whole], self._options(), self.config.seed)
+    def _view_set(self) -> compress.ViewSet:
+        return compress.ViewSet([v.camera for v in self.whole], self._options(), self.config.seed)
 
     def _options(self) -> RasterizeOptions:
         degree = self._phase(self.step).degree
@@ -173,19 +175,19 @@ class AdaptiveFit(Fit):
 
     def _observe(self) -> None:
         """Limit every Gaussian to what the views can tell of it, and take growth from what one view alone sees."""
-        limits, seen = self.optimizer.limits, self._looks.coverage(self.gaussians)
-        limits.set_footprint(seen.footprint)
-        limits.degree = torch.minimum(limits.degree, seen.supported_degree().to(torch.int32))
-        limits.enforce(self.optimizer.params)
+        bounds, seen = self.optimizer.bounds, self._view_set.coverage(self.gaussians)
+        bounds.set_footprint(seen.footprint)
+        bounds.degree = torch.minimum(bounds.degree, seen.supported_degree().to(torch.int32))
+        bounds.enforce(self.optimizer.params)
         if len(self.views) > 1:
             self.stats.gradient = torch.where(seen.views > 1, self.stats.gradient, 0)
-        finest = self.gaussians.log_scales.amax(1) <= limits.floor
+        finest = self.gaussians.log_scales.amax(1) <= bounds.floor
         self.stats.gradient = torch.where(finest, 0, self.stats.gradient)
         self.graphs.clear()
 
-    def _judge(self) -> None:
+    def _hold_out(self) -> None:
         """Look at the held-out blocks; end growth where the last level bought less than its noise, or where its time is up."""
-        c, limits = self.config.judge, self.optimizer.limits
+        c, bounds = self.config.holdout, self.optimizer.bounds
         last = max((m for m in self.marks if m < self.step), default=self.step)
         if last < self.step < self.marks[-1] and not any(
             super(AdaptiveFit, self)._changes_after(s) for s in range(last, self.step)
@@ -193,13 +195,13 @@ class AdaptiveFit(Fit):
             return  # nothing could have grown
         errors = self._errors(self.gaussians)
         if self.before is not None:
-            old = limits.level < limits.growing
+            old = bounds.level < bounds.growing
             hidden = self._errors(compress.rows_of(self.gaussians, old)) if bool(old.any()) and not bool(old.all()) else errors
             fall, own = gain(self.before, errors), gain(hidden, errors)
             least: Gain = min(fall, own, key=lambda g: g.mean)
             count = len(self.gaussians)
             self.levels.append(Level(self.step, count, decibels(errors), fall.mean, own.mean, least.mean, least.noise))
-            if least.surely_below(c.least_db, c.noise):
+            if least.upper_bound_below(c.least_db, c.noise):
                 self.why = (
                     f"level {len(self.levels)} bought {least.mean:+.3f} dB on the held-out blocks, which with {c.noise:g} x "
                     f"its noise of {least.noise:.3f} dB is less than {c.least_db:g} dB"
@@ -213,26 +215,26 @@ class AdaptiveFit(Fit):
                 self._close()
                 return
         self.before = errors
-        limits.growing += 1
+        bounds.growing += 1
 
     def _close(self) -> None:
         """End growth: no harmonics but those that held-out evidence asks for, and all pixels are trained on from here on."""
-        c, limits = self.config.judge, self.optimizer.limits
+        c, bounds = self.config.holdout, self.optimizer.bounds
         self.closed = self.step
         self._catch_up()
         self._observe()
         if c.degrees:
             base = self._errors(self.gaussians)
-            limits.degree = compress.needed_degrees(
-                self.gaussians, limits.degree, self._looks,
-                lambda model: gain(base, self._errors(model)).cost_at_most(c.keep_db, c.noise),
+            bounds.degree = compress.needed_degrees(
+                self.gaussians, bounds.degree, self._view_set,
+                lambda model: gain(base, self._errors(model)).cost_below(c.keep_db, c.noise),
             )  # fmt: skip
-        limits.enforce(self.optimizer.params)
+        bounds.enforce(self.optimizer.params)
         self.stats = type(self.stats)(len(self.gaussians), self.device)
         self.graphs.clear()
         self.views = self.whole
         self._plan()
-        self.news.append(
+        self.messages.append(
             f"adaptive: growth ended at step {self.step} with {len(self.gaussians):,} Gaussians, because {self.why}; all "
             f"pixels are trained on from here"
         )
@@ -241,33 +243,36 @@ class AdaptiveFit(Fit):
     def _view_psnr(self, gaussians: Gaussians) -> float:
         """Mean over the training views of the PSNR over the pixels that count, the judge's floor included [dB]."""
         options = self._options()
-        errors = [masked_mse(rasterize(gaussians, v.camera, options).rgb, v.photo, v.mask).double() for v in self.whole]
+        errors = [masked_mse(rasterize(gaussians, v.camera, options).rgb, v.image, v.mask).double() for v in self.whole]
         return float((-10 * torch.log10(torch.stack(errors) + FLOOR)).mean())
 
-    def _spare(self, psnr: float) -> float:
+    def _psnr_budget(self, psnr: float) -> float:
         """What a trim may take now of that PSNR on the training views [dB]; 0 before the last step of a fit far from enough.
 
-        That is `judge.trim_db`, less below enough; what the fit has beyond enough; and before the last step what training is
+        That is `holdout.trim_db`, less below enough; what the fit has beyond enough; and before the last step what training is
         expected to mend.
         """
-        c, last = self.config.judge, self.step == self.config.steps
+        c, last = self.config.holdout, self.step == self.config.steps
         over = psnr - c.enough_db
         if last:
             return c.trim_db + max(over, 0.0)
-        share = 1 + over / NEAR
-        if not share > 0:
+        fraction = 1 + over / NEAR
+        if not fraction > 0:
             return 0.0
         mended = psnr - self.trims[-1]["psnr"][1] if self.trims else 0.0
-        return min(share, 1.0) * c.trim_db + max(over, 0.0) + MENDED_AGAIN * max(mended, 0.0)
+        return min(fraction, 1.0) * c.trim_db + max(over, 0.0) + MENDED_AGAIN * max(mended, 0.0)
 
     def _trim(self) -> None:
         """Make the model smaller, within what the fit can spare on its training views."""
-        limits, whole, before = self.optimizer.limits, self._view_psnr(self.gaussians), len(self.gaussians)
-        spare = self._spare(whole)
+        bounds, whole, before = self.optimizer.bounds, self._view_psnr(self.gaussians), len(self.gaussians)
+        spare = self._psnr_budget(whole)
         if spare == 0:
             return
         made = compress.prune_model(
-            self.gaussians, self.layers.level, self._looks, lambda g, share: self._view_psnr(g) >= whole - share * spare
+            self.gaussians,
+            self.layers.level,
+            self._view_set,
+            lambda g, fraction: self._view_psnr(g) >= whole - fraction * spare,
         )
         old = torch.arange(before, device=self.device)
         first = old.new_full((len(made.degrees),), before)
@@ -275,32 +280,32 @@ class AdaptiveFit(Fit):
         first = first.scatter_reduce(0, made.into[went], old[went], "amin")  # age and layer of what was merged: its first's
         nothing = {n: t[:0] for n, t in self.gaussians.tensors().items()}
         moments = self.optimizer.means | {}, self.optimizer.squares | {}
-        self._apply(Refinement(first, nothing, first[:0]), COARSE, LONG_AGO)
+        self._apply(DensityUpdate(first, nothing, first[:0]), COARSE, NOT_SAMPLED)
         self.optimizer.means, self.optimizer.squares = moments
         self.optimizer.regroup(made.gaussians, made.into)
-        limits.degree = made.degrees
+        bounds.degree = made.degrees
         self._observe()
         after = self._view_psnr(self.gaussians)
         self.trims.append({"step": self.step, "before": before, "after": len(made.degrees), "psnr": [whole, after]})
-        self.news.append(
+        self.messages.append(
             f"adaptive: trimmed at step {self.step} from {before:,} to {len(made.degrees):,} Gaussians for "
             f"{whole - after:.3f} dB on the training views"
         )
 
     def _catch_up(self) -> None:
         """Give the blocks, where nothing was sampled so far, as many fine Gaussians a pixel as there are elsewhere."""
-        c, pixels = self.config, sum(v.photo[..., 0].numel() for v in self.whole)
+        c, pixels = self.config, sum(v.image[..., 0].numel() for v in self.whole)
         held = sum(len(b) * b.side**2 for b in self.blocks)
-        share = int(self.layers.fine.sum()) / (pixels - held) * held / pixels
-        if not c.method.events or not share * pixels >= 1:
+        fraction = int(self.layers.fine.sum()) / (pixels - held) * held / pixels
+        if not c.method.events or not fraction * pixels >= 1:
             return
-        sampler = dataclasses.replace(c.method.sampler, share=min(1.0, share), max_share=1e6)
+        sampler = dataclasses.replace(c.method.sampler, fraction=min(1.0, fraction), max_fraction=1e6)
         blocks = [only(v, b) for v, b in zip(self.whole, self.blocks)]
         for first in range(0, len(blocks), MAX_VIEWS):
             event = sampling_event(
                 self.gaussians, self.layers, blocks[first : first + MAX_VIEWS], dataclasses.replace(c.method, sampler=sampler),
-                step=self.step, room=self._room_for - len(self.optimizer.gaussians), rule=c.rule, background=self.background,
-                generator=self.generator, max_instances=self.most,
+                step=self.step, capacity=self._room_for - len(self.optimizer.gaussians), rule=c.rule,
+                background=self.background, generator=self.generator, max_instances=self.most,
             )  # fmt: skip
             self._apply(event.change, FINE, self.step)
 
@@ -308,20 +313,20 @@ class AdaptiveFit(Fit):
         """As the fit's, with what the judge knows."""
         tensors, plain = super().state()
         if self.before is not None:
-            tensors["judge.before"] = self.before
-        judge = {
+            tensors["holdout.before"] = self.before
+        holdout = {
             "closed": self.closed, "why": self.why, "levels": [asdict(x) for x in self.levels], "trims": self.trims,
-            "growing": self.optimizer.limits.growing,
+            "growing": self.optimizer.bounds.growing,
         }  # fmt: skip
-        return tensors, plain | {"judge": judge}
+        return tensors, plain | {"holdout": holdout}
 
     def load(self, tensors: dict[str, torch.Tensor], plain: dict) -> None:
         """Take over what `state` gave."""
-        judge = plain["judge"]
-        self.closed, self.why, self.trims = judge["closed"], judge["why"], judge["trims"]
-        self.levels = [Level(**x) for x in judge["levels"]]
-        self.before = tensors.get("judge.before")
-        self.optimizer.limits.growing = judge["growing"]
+        holdout = plain["holdout"]
+        self.closed, self.why, self.trims = holdout["closed"], holdout["why"], holdout["trims"]
+        self.levels = [Level(**x) for x in holdout["levels"]]
+        self.before = tensors.get("holdout.before")
+        self.optimizer.bounds.growing = holdout["growing"]
         if self.closed is not None:
             self.views = self.whole
         super().load(tensors, plain)
@@ -334,8 +339,8 @@ def fit_class(config: FitConfig) -> type[Fit]:
 
 def complexity_figures(fit: Fit) -> dict:
     """What metrics.json says of the size of a model: ``complexity`` with Gaussians, mean degree, bytes, levels of growth."""
-    limits = fit.optimizer.limits
-    degrees = compress.stored_degrees(fit.gaussians.sh) if limits is None else limits.degree
+    bounds = fit.optimizer.bounds
+    degrees = compress.stored_degrees(fit.gaussians.sh) if bounds is None else bounds.degree
     figures = {
         "count": len(degrees), "mean_degree": float(degrees.double().mean()), "bytes": model_bytes(degrees),
         "cap": fit.config.density.max_gaussians, "adaptive": isinstance(fit, AdaptiveFit) and fit.judging,
@@ -349,7 +354,7 @@ def complexity_figures(fit: Fit) -> dict:
     }}  # fmt: skip
 
 
-def complexity_sentence(figures: dict) -> str:
+def complexity_summary(figures: dict) -> str:
     """One line for people from the figures of `complexity_figures`."""
     from warpgs.runtime.byte_units import format_bytes
 

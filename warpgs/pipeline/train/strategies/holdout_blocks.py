@@ -22,17 +22,17 @@ SIDES = 16, 32
 eighth is less than the least, it is that eighth."""
 AT_MOST = 3
 """What is lost within the noise may be this many times what is allowed."""
-FEWEST = 12
+MIN_BLOCKS = 12
 """With fewer blocks over all views there is no telling a gain from noise."""
-MOST_SHARE = 0.1
+MAX_FRACTION = 0.1
 """Small pictures hold out more than was asked for, up to this share, where it takes that to have `FEWEST` blocks."""
 
 
 @dataclass(frozen=True)
-class JudgeConfig:
+class HoldoutConfig:
     """How an adaptive fit finds its size."""
 
-    share: float = 0.03
+    fraction: float = 0.03
     """Part of the pixels that is held out until growth ends."""
     levels: int = 4
     """Parts of equal length that growth is judged after."""
@@ -57,8 +57,8 @@ class JudgeConfig:
     photograph; 42.1 is no error at all, so with more every fit keeps what it has."""
 
     def __post_init__(self):
-        if not 0 < self.share <= 0.5:
-            raise UsageError(f"judge share {self.share} must lie above 0 and be at most 0.5")
+        if not 0 < self.fraction <= 0.5:
+            raise UsageError(f"judge share {self.fraction} must lie above 0 and be at most 0.5")
         if self.levels < 1 or self.trims < 1:
             raise UsageError(f"judge: levels {self.levels} and trims {self.trims} must be at least 1")
         for name in ("noise", "least_db", "keep_db", "trim_db", "enough_db"):
@@ -86,15 +86,15 @@ class Blocks:
         return rows[:, :, None].to(device), columns[:, None, :].to(device)
 
 
-def draw_blocks(views: list[TrainingView], share: float, seed: int) -> list[Blocks]:
-    """Squares of a random grid in every view, about ``share`` of its pixels; more than half of each counts by the mask.
+def sample_blocks(views: list[TrainingView], fraction: float, seed: int) -> list[Blocks]:
+    """Squares of a random grid in every view, about ``fraction`` of its pixels; more than half of each counts by the mask.
 
     In small pictures it is more: see `MOST_SHARE`.
     """
     found = []
     for number, view in enumerate(views):
         generator = torch.Generator().manual_seed((seed << 16) + number)
-        height, width = view.photo.shape[:2]
+        height, width = view.image.shape[:2]
         short = min(height, width)
         side = max(1, min(max(SIDES[0], min(SIDES[1], round(short / 16))), short // 8))
         first = torch.stack([torch.randint(n % side + 1, (), generator=generator) for n in (height, width)])
@@ -102,8 +102,8 @@ def draw_blocks(views: list[TrainingView], share: float, seed: int) -> list[Bloc
         if view.mask is not None:
             rows, columns = Blocks(side, cells).pixels(view.mask.device)
             cells = cells[(view.mask[rows, columns].mean((1, 2)) > 0.5).cpu()]
-        least = min(math.ceil(FEWEST / len(views)), int(MOST_SHARE * len(cells)))
-        wanted = min(len(cells), max(1, least, round(share * len(cells))))
+        least = min(math.ceil(MIN_BLOCKS / len(views)), int(MAX_FRACTION * len(cells)))
+        wanted = min(len(cells), max(1, least, round(fraction * len(cells))))
         chosen = torch.randperm(len(cells), generator=generator)[:wanted].sort().values
         found.append(Blocks(side, cells[chosen]))
     return found
@@ -111,14 +111,14 @@ def draw_blocks(views: list[TrainingView], share: float, seed: int) -> list[Bloc
 
 def hide(view: TrainingView, blocks: Blocks) -> TrainingView:
     """The view whose mask leaves out the blocks."""
-    mask = torch.ones_like(view.photo[..., 0]) if view.mask is None else view.mask.clone()
+    mask = torch.ones_like(view.image[..., 0]) if view.mask is None else view.mask.clone()
     mask[blocks.pixels(mask.device)] = 0
     return replace(view, mask=mask)
 
 
 def only(view: TrainingView, blocks: Blocks) -> TrainingView:
     """The view whose mask leaves out all but the blocks."""
-    mask = torch.zeros_like(view.photo[..., 0])
+    mask = torch.zeros_like(view.image[..., 0])
     mask[blocks.pixels(mask.device)] = 1
     return replace(view, mask=mask if view.mask is None else mask * view.mask)
 
@@ -139,7 +139,7 @@ def block_errors(
     for view, held in zip(views, blocks, strict=True):
         if len(held) == 0:
             continue
-        difference = (rasterize(gaussians, view.camera, options).rgb.clamp(0, 1) - view.photo).square().mean(2)
+        difference = (rasterize(gaussians, view.camera, options).rgb.clamp(0, 1) - view.image).square().mean(2)
         where = held.pixels(difference.device)
         weights = torch.ones_like(difference) if view.mask is None else view.mask
         errors.append(((difference * weights)[where].sum((1, 2)) / weights[where].sum((1, 2))).double().cpu())
@@ -161,14 +161,14 @@ class Gain:
     """Standard error of that mean; infinite with fewer than two blocks [dB]. Blocks of a view are not independent, so it is
     rather too small than too large."""
 
-    def surely_below(self, least: float, noises: float) -> bool:
+    def upper_bound_below(self, least: float, noises: float) -> bool:
         """Whether the mean and so many standard errors are together below ``least`` [dB]; a gain that is no number is.
 
         Few blocks are a weak judge: it may end growth that bought nothing, never growth of which it cannot tell.
         """
         return not self.mean + noises * self.noise >= least
 
-    def cost_at_most(self, allowed: float, noises: float) -> bool:
+    def cost_below(self, allowed: float, noises: float) -> bool:
         """Whether no more was lost than ``allowed`` [dB], or than the noise of the difference up to `AT_MOST` times that.
 
         Without the bound few blocks would excuse anything: a large loss differs much from block to block.

@@ -95,9 +95,9 @@ def semantic_score(confidence: torch.Tensor, boundary: torch.Tensor, foreground:
     return normalized(confidence * (boundary + foreground))
 
 
-def render_score(rendered: torch.Tensor, photo: torch.Tensor, valid: torch.Tensor | None = None) -> torch.Tensor:
+def render_score(rendered: torch.Tensor, image: torch.Tensor, valid: torch.Tensor | None = None) -> torch.Tensor:
     """S_render: length of the colour difference of two images [H, W, 3], blurred; normalised to [0, 1], shape [H, W]."""
-    return normalized(blur((rendered - photo).norm(dim=-1)), valid)
+    return normalized(blur((rendered - image).norm(dim=-1)), valid)
 
 
 def weights(config: ImportanceConfig, *, render: bool, semantic: bool, geometry: bool) -> tuple[float, float, float]:

@@ -11,7 +11,7 @@ import torch
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.layers import Layers, ProtectConfig
 from warpgs.pipeline.train.strategies import importance as scoring
-from warpgs.pipeline.train.strategies.clone_split import Refinement
+from warpgs.pipeline.train.strategies.clone_split import DensityUpdate
 from warpgs.pipeline.train.strategies.importance import ImportanceConfig
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig, fine_gaussians, geometry_gate, sample_pixels, valid_pixels
 from warpgs.render.rasterize import RasterizeOptions, rasterize
@@ -42,15 +42,15 @@ class MethodConfig:
     """Adaptive Gaussian placement: pixels are drawn at random by importance, not the highest ones."""
     pm: bool = True
     """Protection mechanism: young fine Gaussians keep a least opacity and are not pruned."""
-    coarse_rate: float = 0.1
+    coarse_lr_factor: float = 0.1
     """Share of the position rate that the coarse layer moves with from phase 2 on."""
     importance: ImportanceConfig = field(default_factory=ImportanceConfig)
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
     protect: ProtectConfig = field(default_factory=ProtectConfig)
 
     def __post_init__(self):
-        if not 0 <= self.coarse_rate <= 1:
-            raise UsageError(f"method coarse rate {self.coarse_rate} must lie between 0 and 1")
+        if not 0 <= self.coarse_lr_factor <= 1:
+            raise UsageError(f"method coarse rate {self.coarse_lr_factor} must lie between 0 and 1")
 
     def weights(self, semantics: bool = True) -> tuple[float, float, float]:
         """Weights of the render, semantic and geometric score that are switched on, summing to 1.
@@ -66,7 +66,7 @@ class TrainingView:
     """A view on the device, with the scores that do not change."""
 
     camera: Camera
-    photo: torch.Tensor
+    image: torch.Tensor
     """Colours in [0, 1], shape [H, W, 3]."""
     mask: torch.Tensor | None
     """1 where a pixel counts, else 0, shape [H, W]; None where all count."""
@@ -74,7 +74,7 @@ class TrainingView:
     """S_semantic in [0, 1], shape [H, W]; None where nothing is known of it."""
     geometry: torch.Tensor | None = None
     """S_geometry in [0, 1], shape [H, W]; None before `scored`."""
-    confirmed: torch.Tensor | None = None
+    consistent: torch.Tensor | None = None
     """z-depth [u] that other views confirm, 0 where none does, shape [H, W]; None where nothing is confirmed."""
     disparity: torch.Tensor | None = None
     """Relative inverse depth in [0, 1] for the loss, shape [H, W]; None where the loss does not look at depth."""
@@ -92,33 +92,33 @@ class TrainingView:
 
     def scored(self, prior: Prior, depth: ViewDepth | None, config: MethodConfig) -> TrainingView:
         """The same view with the scores of its prior and the depth that other views confirm."""
-        maps = {n: torch.as_tensor(getattr(prior, n), dtype=torch.float32, device=self.photo.device)
+        maps = {n: torch.as_tensor(getattr(prior, n), dtype=torch.float32, device=self.image.device)
                 for n in ("disparity", "confidence", "boundary", "foreground")}  # fmt: skip
         valid = None if self.mask is None else self.mask > 0
         geometry = scoring.geometry_score(maps.pop("disparity"), config.importance.curvature, valid)
         semantic = scoring.semantic_score(**maps)
-        confirmed = None
+        consistent = None
         if depth is not None and depth.valid.any():
-            confirmed = torch.as_tensor(np.where(depth.valid, depth.depth, 0), dtype=torch.float32, device=self.photo.device)
+            consistent = torch.as_tensor(np.where(depth.valid, depth.depth, 0), dtype=torch.float32, device=self.image.device)
         known = semantic if bool(semantic.any()) else None
-        return dataclasses.replace(self, semantic=known, geometry=geometry, confirmed=confirmed)
+        return dataclasses.replace(self, semantic=known, geometry=geometry, consistent=consistent)
 
-    def guided(self, prior: Prior) -> TrainingView:
+    def depth_supervised(self, prior: Prior) -> TrainingView:
         """The same view with the disparity of its prior, for the depth term of the loss."""
-        disparity = torch.as_tensor(prior.disparity, dtype=torch.float32, device=self.photo.device)
+        disparity = torch.as_tensor(prior.disparity, dtype=torch.float32, device=self.image.device)
         return dataclasses.replace(self, disparity=disparity)
 
 
-def guided_views(views: list[TrainingView], priors: list[Prior]) -> tuple[list[TrainingView], str]:
+def depth_supervised_views(views: list[TrainingView], priors: list[Prior]) -> tuple[list[TrainingView], str]:
     """The views with what the depth term compares their depth with, and a sentence on where there is anything."""
     known = sum(bool(p.disparity.any()) for p in priors)
     more = "" if known else "; --depth-model, or a start by --init.source sweep or flow, makes priors"
     note = f"depth term: in {known} of {len(views)} views, those whose prior knows a depth{more}"
-    return [v.guided(p) for v, p in zip(views, priors, strict=True)], note
+    return [v.depth_supervised(p) for v, p in zip(views, priors, strict=True)], note
 
 
 @dataclass(frozen=True)
-class Drawn:
+class SampledView:
     """What an event saw and did in one view; maps on the device of the fit."""
 
     view: int
@@ -141,36 +141,36 @@ class Drawn:
 class Event:
     """One sampling event."""
 
-    change: Refinement
+    change: DensityUpdate
     """Rows that stay and rows that are new."""
-    freed: int
+    evicted: int
     """Fine Gaussians removed to make room."""
-    views: tuple[Drawn, ...]
+    views: tuple[SampledView, ...]
     """What happened in each view."""
 
 
-def draw_from_view(
+def sample_view(
     gaussians: Gaussians, view: TrainingView, number: int, config: MethodConfig, options: RasterizeOptions,
     generator: torch.Generator,
-) -> tuple[Drawn, dict[str, torch.Tensor]]:  # fmt: skip
+) -> tuple[SampledView, dict[str, torch.Tensor]]:  # fmt: skip
     """Score one view, draw its pixels, and make the fine Gaussians behind them."""
     c = config.sampler
     render = rasterize(gaussians, view.camera, options)
     depth, alpha = render.depth, render.alpha
-    if c.depth == "confirmed" and view.confirmed is not None:
-        known = view.confirmed > 0
-        depth = torch.where(known, view.confirmed, depth)
+    if c.depth == "consistent" and view.consistent is not None:
+        known = view.consistent > 0
+        depth = torch.where(known, view.consistent, depth)
         alpha = torch.where(known, 1.0, 0.0 if config.ra else alpha)
     valid = valid_pixels(alpha, depth, view.mask, c)
     known = view.semantic is not None
     semantic = view.semantic if known else torch.zeros_like(view.geometry)
-    scores = (scoring.render_score(render.rgb, view.photo, valid), semantic, view.geometry)
+    scores = (scoring.render_score(render.rgb, view.image, valid), semantic, view.geometry)
     score = scoring.importance(scores, config.weights(known))
-    wanted = max(1, round(c.share * valid.numel()))
+    wanted = max(1, round(c.fraction * valid.numel()))
     gate, quantile = geometry_gate(view.geometry, valid, c.gate_quantile if config.ra else 0.0, wanted)
     at = sample_pixels(score, gate, wanted, generator, random=config.agp)
-    rows = fine_gaussians(view.camera, view.photo, depth, at, c, gaussians.sh.shape[1])
-    return Drawn(number, render.rgb, scores, score, gate, quantile, at), rows
+    rows = fine_gaussians(view.camera, view.image, depth, at, c, gaussians.sh.shape[1])
+    return SampledView(number, render.rgb, scores, score, gate, quantile, at), rows
 
 
 def least_contributing(
@@ -192,7 +192,7 @@ def sampling_event(
     config: MethodConfig,
     *,
     step: int,
-    room: int,
+    capacity: int,
     rule: str,
     background: torch.Tensor,
     generator: torch.Generator,
@@ -209,7 +209,7 @@ def sampling_event(
         views: Training views with their scores.
         config: Switches and settings.
         step: Steps done.
-        room: Gaussians that may be added before the whole set is full.
+        capacity: Gaussians that may be added before the whole set is full.
         rule: Cut-offs of the rasterizer.
         background: Colour behind the scene, shape [3].
         generator: CPU generator; the same numbers on every device.
@@ -222,24 +222,24 @@ def sampling_event(
     numbers = list(range(len(views)))
     if len(views) > MAX_VIEWS:
         numbers = sorted(torch.randperm(len(views), generator=generator)[:MAX_VIEWS].tolist())
-    drawn, rows = zip(*(draw_from_view(gaussians, views[i], i, config, options, generator) for i in numbers))
+    drawn, rows = zip(*(sample_view(gaussians, views[i], i, config, options, generator) for i in numbers))
     added = {name: torch.cat([r[name] for r in rows]) for name in rows[0]}
     count = len(added["means"])
 
     fine = layers.fine
     coarse_count, fine_count = int((~fine).sum()), int(fine.sum())
-    over = max(fine_count + count - int(config.sampler.max_share * coarse_count), count - room)
+    over = max(fine_count + count - int(config.sampler.max_fraction * coarse_count), count - capacity)
     keep = torch.ones(len(gaussians), dtype=torch.bool, device=fine.device)
-    freed = 0
+    evicted = 0
     if over > 0:
-        free = fine & ~layers.young(step, config.protect) if config.pm else fine
+        free = fine & ~layers.is_protected(step, config.protect) if config.pm else fine
         weigh = dataclasses.replace(options, contributions=True)
         ids = least_contributing(gaussians, free, over, views, weigh)
         keep[ids] = False
-        freed = len(ids)
-        if over > freed:  # spread over the views, as they were drawn
-            left = torch.randperm(count, generator=generator)[: max(0, count - (over - freed))].sort().values.to(fine.device)
+        evicted = len(ids)
+        if over > evicted:  # spread over the views, as they were drawn
+            left = torch.randperm(count, generator=generator)[: max(0, count - (over - evicted))].sort().values.to(fine.device)
             added = {name: t[left] for name, t in added.items()}
             count = len(left)
     parents = torch.full((count,), -1, dtype=torch.int64, device=fine.device)
-    return Event(Refinement(torch.nonzero(keep).squeeze(1), added, parents), freed, drawn)
+    return Event(DensityUpdate(torch.nonzero(keep).squeeze(1), added, parents), evicted, drawn)

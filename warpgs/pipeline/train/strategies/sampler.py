@@ -23,7 +23,7 @@ class SamplerConfig:
     depth: str = "rendered"
     """Depth that Gaussians are placed at: rendered (the paper), or confirmed: that of the start where other views confirm it.
     With it, a pixel is reliable only where its depth is confirmed, if any of its view's is."""
-    share: float = 0.005
+    fraction: float = 0.005
     """Gaussians per event and view, as a share of the view's pixels."""
     gate_quantile: float = 0.6
     """A pixel is reliable where its geometric score is above this quantile of its view's (tau_geometry)."""
@@ -35,19 +35,19 @@ class SamplerConfig:
     """First opacity of a fine Gaussian, in (0, 1)."""
     footprint: float = 1.0
     """First standard deviation of a fine Gaussian [px], in the view that placed it."""
-    max_share: float = 0.5
+    max_fraction: float = 0.5
     """Most fine Gaussians, as a share of the coarse ones."""
 
     def __post_init__(self):
-        if self.depth not in ("rendered", "confirmed"):
+        if self.depth not in ("rendered", "consistent"):
             raise UsageError(f"sampler depth {self.depth!r} is not one of rendered, confirmed")
-        if not 0 < self.share <= 1 or not 0 <= self.gate_quantile < 1 or not 0 <= self.min_alpha < 1:
+        if not 0 < self.fraction <= 1 or not 0 <= self.gate_quantile < 1 or not 0 <= self.min_alpha < 1:
             raise UsageError("sampler: share must lie in (0, 1], gate quantile and min alpha in [0, 1)")
         if (
             not 0 < self.opacity < 1
             or not 0 < self.footprint < math.inf
             or self.border < 0
-            or not 0 <= self.max_share < math.inf
+            or not 0 <= self.max_fraction < math.inf
         ):
             raise UsageError("sampler: opacity must lie in (0, 1), footprint above 0, border and max share at 0 or above")
 
@@ -127,13 +127,13 @@ def back_project(camera: Camera, pixels: torch.Tensor, depths: torch.Tensor) -> 
 
 
 def fine_gaussians(
-    camera: Camera, photo: torch.Tensor, depth: torch.Tensor, at: torch.Tensor, config: SamplerConfig, coefficients: int
+    camera: Camera, image: torch.Tensor, depth: torch.Tensor, at: torch.Tensor, config: SamplerConfig, coefficients: int
 ) -> dict[str, torch.Tensor]:
     """Isotropic Gaussians behind pixels, as wide as a pixel there, in the photo's colours.
 
     Args:
         camera: Of the view, tensors.
-        photo: Its photograph, shape [H, W, 3].
+        image: Its photograph, shape [H, W, 3].
         depth: Rendered z-depth [u], shape [H, W].
         at: Rows and columns, shape [S, 2].
         config: Opacity and footprint.
@@ -148,7 +148,7 @@ def fine_gaussians(
     count = len(means)
     focal = 0.5 * (camera.K[0, 0] + camera.K[1, 1])
     sh = means.new_zeros(count, coefficients, 3)
-    sh[:, 0] = (photo[rows, columns] - 0.5) / C0
+    sh[:, 0] = (image[rows, columns] - 0.5) / C0
     quats = means.new_zeros(count, 4)
     quats[:, 0] = 1
     return {
