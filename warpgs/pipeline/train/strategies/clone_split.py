@@ -45,7 +45,7 @@ class DensityConfig:
     def __post_init__(self):
         if self.every < 1 or self.start < 0 or self.reset_every < 0 or self.max_gaussians < 1:
             raise UsageError("density: every and max gaussians must be at least 1, start and reset every at least 0")
-        for name in ("stop_share", "prune_opacity"):
+        for name in ("stop_fraction", "prune_opacity"):
             if not 0 <= getattr(self, name) <= 1:
                 raise UsageError(f"density {name.replace('_', ' ')} {getattr(self, name)} must lie between 0 and 1")
         for name in ("gradient", "clone_size", "prune_size"):
