@@ -143,7 +143,7 @@ def write_csv(path: Path, rows: list[dict]) -> None:
 
 def study(a: argparse.Namespace) -> list[tuple[str, Path]]:
     """Fit, write the tables, and name the runs whose curves are drawn."""
-    from warpgs.pipeline.runs.folder import SceneRequest
+    from warpgs.pipeline.runs.request import SceneRequest
     from warpgs.pipeline.study.compare import preset_variants, run_study
     from warpgs.pipeline.study.study import StudyRequest, scene_name
 

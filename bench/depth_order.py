@@ -88,7 +88,7 @@ def run_order(run: Path, scene: Path, device: torch.device) -> list[Order]:
     missing = [n for n in names if n not in known]
     if missing:
         raise DataError(f"{scene}: lacks {missing[0]}, which {run} holds out; give the reconstruction of the same photographs")
-    return [_of_view(n, stored.gaussians, stored.cameras[n], source, stored.record) for n in names]
+    return [_of_view(n, stored.gaussians(), stored.cameras()[n], source, stored.record) for n in names]
 
 
 def _of_view(name: str, gaussians: Gaussians, camera: Camera, source, record: dict) -> Order:

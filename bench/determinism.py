@@ -16,7 +16,7 @@ import torch
 from bench.harness import Task, measure_in_turn, peak_bytes
 from bench.inputs import camera, gaussians
 from bench.machine import describe
-from warpgs.pipeline.runs.folder import choose_device
+from warpgs.pipeline.runs.request import choose_device
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
 

@@ -116,9 +116,9 @@ def scenes(
         if run is None:
             return Frozen("trained", f"{count:,} Gaussians like those of a fit", generated(count, seed), camera)
         stored = open_run(run, torch.device("cpu"))
-        name, place = next(iter(stored.cameras.items()))
-        words = f"{Path(stored.record['scene']['path']).name}, {len(stored.gaussians):,} Gaussians after {stored.step} steps"
-        return Frozen("trained", f"{words}, view {name}", stored.gaussians, place)
+        name, place = next(iter(stored.cameras().items()))
+        words = f"{Path(stored.record['scene']['path']).name}, {len(stored.gaussians()):,} Gaussians after {stored.step} steps"
+        return Frozen("trained", f"{words}, view {name}", stored.gaussians(), place)
 
     def far() -> Frozen:
         base, offset = generated(count, seed), torch.tensor([FAR, -FAR, FAR], dtype=torch.float64)

@@ -17,7 +17,7 @@ from bench.machine import describe
 from warpgs import load_scene
 from warpgs.io.splits import split_views
 from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.folder import choose_device
+from warpgs.pipeline.runs.request import choose_device
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.trainer import Fit, train_views

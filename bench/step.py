@@ -19,7 +19,7 @@ from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
 from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.folder import choose_device
+from warpgs.pipeline.runs.request import choose_device
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LossConfig, photometric_loss
 from warpgs.pipeline.train.trainer import Fit, train_views

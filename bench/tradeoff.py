@@ -27,7 +27,7 @@ from bench.tradeoff_outcome import summary, trials
 from warpgs import load_scene
 from warpgs.app.precompile import fit_kernels
 from warpgs.files import write_json, write_text
-from warpgs.pipeline.runs.folder import choose_device
+from warpgs.pipeline.runs.request import choose_device
 from warpgs.runtime.interop import set_threads
 
 

@@ -6,7 +6,7 @@ import torch
 from bench.leave_one_out import folds, table, trial_config
 from bench.tradeoff_outcome import fit_once
 from warpgs.errors import UsageError
-from warpgs.pipeline.runs.folder import SceneRequest, read_scene
+from warpgs.pipeline.runs.request import SceneRequest, read_scene
 from warpgs.pipeline.train.config import PRESETS
 from warpgs.synthetic.demo import write_demo
 

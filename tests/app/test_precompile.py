@@ -46,7 +46,7 @@ def test_a_fit_launches_nothing_else(device, recorded, monkeypatch):
     )  # fmt: skip
     fit = Fit(views, seeds(), config, device, priors=priors(views))
     while fit.step < 20:
-        fit.burst(100)
+        fit.buffers(100)
     assert any(event["evicted"] for event in fit.events)
     score(views[1], render_view(fit.gaussians, views[1], RasterizeOptions())[0])
     warmed = {(kind, k.module, block) for kind in ("cpu", "cuda") for k, block in fit_kernels(kind == "cuda")}

@@ -83,7 +83,7 @@ def test_prune_keeps_its_promise(run, tmp_path, capsys):
     assert "Gaussians, mean SH degree" in words and "times smaller" in words and "held-out PSNR" in words
     assert before == {p: p.read_bytes() for p in run.rglob("*") if p.is_file()}
     record = json.loads((tmp_path / "small" / "config.json").read_text())["pruned"]
-    whole, small = (open_run(f, CPU).gaussians for f in (run, tmp_path / "small"))
+    whole, small = (open_run(f, CPU).gaussians() for f in (run, tmp_path / "small"))
     assert record["count"] == [len(whole), len(small)] and record["bytes"][1] < 0.6 * record["bytes"][0]
     assert record["train_psnr"][1] >= record["train_psnr"][0] - 0.2
     assert json.loads((run / "metrics.json").read_text())["train"]["psnr"] == pytest.approx(record["train_psnr"][0])

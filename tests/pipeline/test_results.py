@@ -4,10 +4,10 @@ import pytest
 
 from tests.scenes import photos, seeds
 from warpgs.errors import ResourceError
-from warpgs.pipeline.metrics.evaluate import render_view, score
+from warpgs.pipeline.metrics.evaluate import options_for, render_view, score
 from warpgs.pipeline.model.init import InitConfig, initial_gaussians
 from warpgs.pipeline.runs import results
-from warpgs.pipeline.runs.results import evaluate_run, options_for
+from warpgs.pipeline.runs.results import evaluate_run
 
 BLACK = (0.0, 0.0, 0.0)
 

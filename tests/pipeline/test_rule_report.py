@@ -51,7 +51,7 @@ def test_error_is_the_difference_of_the_pictures(device):
         assert found["mean"] == pytest.approx(float(off.mean()), rel=1e-2, abs=2e-6)
         assert found["max"] == pytest.approx(float(off.max()), rel=1e-2, abs=2e-5)
         assert found["psnr"] == pytest.approx(-10 * math.log10(float((off**2).mean())), abs=0.2)
-        assert found["render_ms"] > 0 and found["exact_ms"] > 0 and f"rule {rule} is off exact" in found["sentence"]
+        assert found["render_ms"] > 0 and found["exact_ms"] > 0 and f"rule {rule} is off exact" in found["summary"]
     assert float(off.max()) > 0
 
 
@@ -59,7 +59,7 @@ def test_nothing_traded_is_said_and_is_as_small_as_float32(device):
     """Rule exact: the arithmetic alone, and no second time."""
     found = rule_report_of(crowd(device), views(), "exact", BACKGROUND, seed=3)
     assert 0 < found["mean"] < 2e-6 and "exact_ms" not in found and found["psnr"] > 90
-    assert "nothing in a picture was traded" in found["sentence"] and "random training views" in found["sentence"]
+    assert "no cut-off changes the images" in found["summary"] and "random training views" in found["summary"]
 
 
 def test_the_seed_draws_views_and_parts():

@@ -12,7 +12,7 @@ from tests.scenes import photos, priors, seeds
 from warpgs.errors import ResourceError
 from warpgs.pipeline.runs import sampling_report
 from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
-from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, pictured, sampling_report_of, view_sheet
+from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, sampling_report_of, shown_steps, view_sheet
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
 from warpgs.pipeline.train.trainer import Fit
 from warpgs.report.contact_sheet import DOT, GAP, HEAD, MARGIN, TITLE_SIZE
@@ -44,20 +44,20 @@ def tile(sheet: np.ndarray, index: int, view, text: float = 1.25, width: int = 3
     return sheet[y : y + height, x : x + width]
 
 
-def test_two_events_are_pictured():
+def test_two_events_are_shown_steps():
     """The first, and the first of the second half of phase 2; the same one where there is but one; none without events."""
     phases = plan_phases(PhaseConfig(2000, 3000), 10_000)
-    first, middle = sorted(pictured(phases))
+    first, middle = sorted(shown_steps(phases))
     assert first == 2000 and 4500 <= middle < 4800 and middle in phases.events
-    assert pictured(dataclasses.replace(phases, events=(2000,))) == {2000}
-    assert pictured(dataclasses.replace(phases, events=())) == set()
+    assert shown_steps(dataclasses.replace(phases, events=(2000,))) == {2000}
+    assert shown_steps(dataclasses.replace(phases, events=())) == set()
 
 
 def test_pictures_lie_in_the_run_folder(run):
     """A picture per pictured event with a sheet for each of the three views, and no other file."""
     fit, out, _ = run
     files = sorted((out / "sampling").iterdir())
-    assert [int(f.stem) for f in files] == sorted(pictured(fit.phases)) and len(files) == 2
+    assert [int(f.stem) for f in files] == sorted(shown_steps(fit.phases)) and len(files) == 2
     first = cv2.imread(str(files[0]))
     assert first.shape[0] % 3 == 0 and first.shape[1] == 2 * MARGIN + 5 * 320 + 4 * GAP
 
@@ -91,7 +91,7 @@ def test_figures_add_up(run):
     figures = event_figures(fit)
     assert figures["events"] == {
         "count": len(seen), "added": sum(len(e.change.parents) for _, e in seen), "evicted": sum(e.evicted for _, e in seen),
-        "draws": 3 * len(seen), "widened": sum(v.quantile < 0.6 for _, e in seen for v in e.views),
+        "samplings": 3 * len(seen), "widened": sum(v.quantile < 0.6 for _, e in seen for v in e.views),
     }  # fmt: skip
     assert figures["events"]["added"] > 0 and sum(figures["layers"].values()) == len(fit.gaussians)
     assert figures["layers"]["fine"] == int(fit.layers.fine.sum()) > 0
@@ -101,8 +101,8 @@ def test_story_follows_the_switches(run, tmp_path):
     """What is said of gate, draw and depth is what was asked for, and a widened gate is told; no events, no story."""
     fit, out, _ = run
     story = sampling_report_of(fit, out)
-    assert "drawn at random" in story.words and "above its 0.6 quantile" in story.words and "rendered depth" in story.words
-    assert [c for c, _ in story.images] == [f"sampling after step {s}" for s in sorted(pictured(fit.phases))]
+    assert "sampled at random" in story.words and "above its 0.6 quantile" in story.words and "rendered depth" in story.words
+    assert [c for c, _ in story.images] == [f"sampling after step {s}" for s in sorted(shown_steps(fit.phases))]
     assert story.images[0][1] == next(iter(sorted((out / "sampling").iterdir()))).read_bytes()
     assert dict(zip(*story.table))["sampling events"] == str(len(fit.events))
     sampler = dataclasses.replace(METHOD.sampler, fraction=0.2, depth="consistent")
@@ -110,9 +110,9 @@ def test_story_follows_the_switches(run, tmp_path):
     other = fitted(dataclasses.replace(CONFIG, method=method), steps=8)
     words = sampling_report_of(other, tmp_path).words
     assert "the highest in S_importance" in words and "other views confirm and whose S_geometry" in words
-    assert "In 3 of 3 draws the gate was widened" in words and "widened" not in story.words
+    assert "In 3 of 3 samplings the gate was widened" in words and "widened" not in story.words
     free = fitted(dataclasses.replace(CONFIG, method=dataclasses.replace(method, ra=False)), steps=8)
-    assert "all pixels where something is drawn" in sampling_report_of(free, tmp_path).words
+    assert "all pixels that Gaussians cover" in sampling_report_of(free, tmp_path).words
     assert sampling_report_of(fitted(dataclasses.replace(CONFIG, method=type(METHOD)()), steps=1), tmp_path) is None
 
 

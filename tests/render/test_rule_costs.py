@@ -97,7 +97,7 @@ def test_what_was_chosen_is_said_and_stored(scene, tmp_path, capsys):
     assert main(["fit", str(scene), "--split", split_spec(9), *flags]) == 0
     printed = capsys.readouterr().out
     config, metrics = json.loads((out / "config.json").read_text()), json.loads((out / "metrics.json").read_text())
-    assert config["config"]["rule"] == metrics["trade"]["rule"] == RULE_COSTS[0].rule
-    assert f"chose rule {RULE_COSTS[0].rule}" in printed and metrics["trade"]["sentence"] in printed
-    assert metrics["trade"]["sentence"] in (out / "report.html").read_text("utf-8")
-    assert re.search(r"a view took [\d.]+ ms instead of", metrics["trade"]["sentence"])
+    assert config["config"]["rule"] == metrics["rule"]["rule"] == RULE_COSTS[0].rule
+    assert f"chose rule {RULE_COSTS[0].rule}" in printed and metrics["rule"]["summary"] in printed
+    assert metrics["rule"]["summary"] in (out / "report.html").read_text("utf-8")
+    assert re.search(r"a view took [\d.]+ ms instead of", metrics["rule"]["summary"])

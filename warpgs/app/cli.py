@@ -61,8 +61,8 @@ def _fit(arguments: list[str]) -> int:
         from warpgs.app.cli_fit import fit
 
         request = fit(arguments, COMMANDS["fit"])
-        from warpgs.pipeline.runs.folder import fit_scene
-    fit_scene(request)
+        from warpgs.pipeline.runs.fit import fit_request
+    fit_request(request)
     return 0
 
 
@@ -183,8 +183,8 @@ def _priors_show(arguments: list[str]) -> int:
         priors: tyro.conf.OmitArgPrefixes[PriorConfig] = field(default_factory=PriorConfig)
 
     a = _parse(Show, "priors show", arguments)
-    from warpgs.pipeline.runs.folder import SceneRequest
     from warpgs.pipeline.runs.preview import show_priors
+    from warpgs.pipeline.runs.request import SceneRequest
 
     if a.threads < 0:
         raise UsageError(f"--threads must be 0 or more, not {a.threads}")

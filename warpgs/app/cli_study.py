@@ -37,7 +37,7 @@ def _flags() -> type:
 
 
 def _study(a, variants: dict, marks: dict) -> int:
-    from warpgs.pipeline.runs.folder import SceneRequest
+    from warpgs.pipeline.runs.request import SceneRequest
     from warpgs.pipeline.study.compare import run_study
     from warpgs.pipeline.study.study import StudyRequest
 

@@ -6,7 +6,6 @@ first, the rest channel-major), opacity as a logit, log scales, rotation wxyz as
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import secrets
@@ -18,6 +17,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from warpgs.coordinates import checked_normalization, convert_gaussians
 from warpgs.errors import DataError, ResourceError
 from warpgs.scene import Gaussians, Normalization
 
@@ -65,31 +65,30 @@ class _Element:
     """True where a property is a list, so that rows differ in length."""
 
 
-def write_ply(path: str | os.PathLike, gaussians: Gaussians, normalization: Normalization) -> None:
-    """Write Gaussians in the coordinates of the scene's files.
+def write_ply(
+    path: str | os.PathLike[str], gaussians: Gaussians, normalization: Normalization | None = None, *, units: str = "scene"
+) -> None:
+    """Write Gaussians to a PLY file, which is in the units of the scene's files.
 
     The file appears whole or not at all: it is written beside ``path`` and moved there once it is on the disk.
 
     Args:
         path: Where to write; an existing file is replaced.
-        gaussians: N Gaussians in scene coordinates [u], on any device.
-        normalization: How scene coordinates came from file coordinates.
+        gaussians: N Gaussians, on any device.
+        normalization: Similarity from file to scene units; needed where ``units`` is scene.
+        units: Units of ``gaussians``: scene, or file for those that are to be written as they are.
 
     Raises:
         DataError: A tensor holds a NaN or an infinity, or would after the change of coordinates.
         ResourceError: The folder or the disk does not take the file.
+        UsageError: The units are unknown, or scene units come without a normalization.
     """
     path = Path(path)
-    arrays = {name: t.detach().cpu().numpy() for name, t in gaussians.tensors().items()}
-    _refuse_non_finite(path, arrays)
-    if not (math.isfinite(normalization.scale) and normalization.scale > 0 and np.isfinite(normalization.offset).all()):
-        raise DataError(f"{path}: not written, the scene's normalization is not a similarity: {normalization}. Read it again.")
-    # float64 throughout: georeferenced offsets (10^6 m) would eat the millimetres of a float32 sum.
-    with np.errstate(over="ignore"):
-        means = arrays["means"].astype(np.float64) / normalization.scale + np.asarray(normalization.offset, np.float64)
-        log_scales = arrays["log_scales"].astype(np.float64) - math.log(normalization.scale)
-        arrays |= {"means": means.astype(np.float32), "log_scales": log_scales.astype(np.float32)}
-    _refuse_non_finite(path, arrays)
+    normalization = checked_normalization(normalization, units, f"{path}: not written")
+    in_file = convert_gaussians(gaussians, normalization, units, "file")
+    for g in (gaussians, in_file):  # finite numbers may leave float32 on the way
+        arrays = {name: t.detach().cpu().numpy() for name, t in g.tensors().items()}
+        _refuse_non_finite(path, arrays)
 
     n, k = arrays["sh"].shape[:2]
     try:
@@ -103,7 +102,7 @@ def write_ply(path: str | os.PathLike, gaussians: Gaussians, normalization: Norm
         ) from e
 
 
-def read_ply(path: str | os.PathLike) -> Gaussians:
+def read_ply(path: str | os.PathLike[str], normalization: Normalization | None = None, *, units: str = "file") -> Gaussians:
     """Read Gaussians from a PLY file in the INRIA 3DGS layout.
 
     Properties and elements that are not part of the layout are ignored. Nothing is allocated from the header's word
@@ -111,14 +110,18 @@ def read_ply(path: str | os.PathLike) -> Gaussians:
 
     Args:
         path: The file.
+        normalization: Similarity from file to scene units; needed where ``units`` is scene.
+        units: Units of the result: file as stored, or scene to go with a scene's cameras.
 
     Returns:
-        N Gaussians in the coordinates of the file, torch float32 tensors on the CPU.
+        N Gaussians, torch float32 tensors on the CPU.
 
     Raises:
         DataError: The file is missing, malformed, cut short or holds NaNs, infinities or a rotation of zero length.
+        UsageError: The units are unknown, or scene units are asked for without a normalization.
     """
     path = Path(path)
+    normalization = checked_normalization(normalization, units, str(path))
     try:
         with open(path, "rb") as file:
             size = os.fstat(file.fileno()).st_size
@@ -138,7 +141,7 @@ def read_ply(path: str | os.PathLike) -> Gaussians:
         raise DataError(f"{path}: cannot be read ({e.strerror or e}). Check the path and its permissions.") from e
     if len(rows) != vertex.count:
         raise _error(path, f"cut short: {vertex.count} Gaussians announced, {len(rows)} read")
-    return _assemble(path, rows, rest)
+    return convert_gaussians(_assemble(path, rows, rest), normalization, "file", units)
 
 
 @contextmanager

@@ -6,6 +6,7 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -23,7 +24,7 @@ class Net:
     """vgg or alex."""
     title: str
     """As papers write it."""
-    layers: tuple[tuple, ...]
+    layers: tuple[tuple[Any, ...], ...]
     """In order: ("conv", number, inputs, outputs, kernel, stride, padding), ("tap",) after a rectified convolution that is
     compared, or ("pool", kernel, stride)."""
     smallest: int
@@ -48,7 +49,7 @@ class Net:
         return found | {f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(self.channels)}
 
 
-def _conv(number: int, inputs: int, outputs: int, kernel: int = 3, stride: int = 1, padding: int = 1) -> tuple:
+def _conv(number: int, inputs: int, outputs: int, kernel: int = 3, stride: int = 1, padding: int = 1) -> tuple[Any, ...]:
     return ("conv", number, inputs, outputs, kernel, stride, padding)
 
 

@@ -1,4 +1,4 @@
-"""Quantiles of as many numbers as a photograph has pixels."""
+"""Quantiles of as many numbers as an image has pixels."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import torch
 
 
 def quantiles(values: torch.Tensor, *fractions: float) -> list[torch.Tensor]:
-    """Quantiles of numbers [N], N at least 1, for shares in [0, 1]: linear between neighbours in order; a NaN is the largest.
+    """Return quantiles of numbers [N], N at least 1, for fractions in [0, 1]: linear between neighbours; a NaN is the largest.
 
     torch.quantile refuses more than 2^24 numbers, and cameras have more pixels.
     """

@@ -1,4 +1,4 @@
-"""Which pixels of a photograph count, for the fit and for the score: its mask's, or the object where it stands before black."""
+"""Pixels of an image that count, for the fit and for the score: its mask's, or the object where it stands before black."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import numpy as np
 from warpgs.scene import View
 
 DARK = 16 / 255
-"""A pixel whose brightest channel is below this belongs to a black background."""
+"""Brightness below which the brightest channel of a pixel belongs to a black background, in [0, 1]."""
 DARK_FRACTION = 0.3
-"""A photograph with at least this share of such pixels, and a dark border, shows an object on black."""
+"""Fraction of dark pixels from which on an image with a dark border shows an object on black."""
 
 
 def scored_region(view: View) -> tuple[np.ndarray | None, str]:
-    """Pixels that a rendering is scored on, bool [H, W], and their name; None for all.
+    """Return the pixels that a render is scored on, bool [H, W], and their name; None for all.
 
-    The view's score mask where it has one (DTU's protocol), else what `counted_region` says.
+    The view's score mask where it has one (DTU's protocol), else the region of `counted_region`.
     """
     if view.score_mask is not None:
         return view.score_mask, "score mask"
@@ -23,7 +23,7 @@ def scored_region(view: View) -> tuple[np.ndarray | None, str]:
 
 
 def counted_region(view: View) -> tuple[np.ndarray | None, str]:
-    """Pixels that a view is scored on, bool [H, W], and their name; None for all.
+    """Return the pixels of a view that count in its fit, bool [H, W], and their name; None for all.
 
     The view's mask where it has one; else the bright pixels where it shows an object on black, because a black frame around
     a small object would otherwise decide the score.

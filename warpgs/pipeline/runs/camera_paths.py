@@ -12,7 +12,7 @@ PATHS = ("views", "orbit", "spiral")
 
 
 def camera_path(kind: str, cameras: list[Camera], depth: float, frames: int) -> list[Camera]:
-    """Cameras along a path with the size and intrinsics of the first camera.
+    """Return cameras along a path with the size and intrinsics of the first camera.
 
     Args:
         kind: ``orbit``, an ellipse through the region that the cameras span; ``spiral``, two turns that open and close

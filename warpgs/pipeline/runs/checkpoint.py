@@ -6,23 +6,27 @@ import hashlib
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import torch
 
+from warpgs import __version__
 from warpgs.errors import DataError, NotFiniteError
 from warpgs.files import write_bytes
 
 TENSORS = "checkpoint.safetensors"
-FORMAT = 1
+FORMAT = 2
+"""Number of the format of run folders: config.json and the checkpoint. 1 was that of warpgs 0.1.0."""
 DTYPES = {torch.float64: "F64", torch.float32: "F32", torch.int64: "I64", torch.int32: "I32", torch.uint8: "U8"}
 """Names of scalar types in the format."""
 
 
 def _chunks(tensors: dict[str, torch.Tensor], metadata: dict[str, str]) -> list[memoryview | bytes]:
-    """A safetensors file in pieces; those of tensors on the CPU are their own memory, so nothing is held twice."""
+    """Return a safetensors file in pieces; those of tensors on the CPU are their own memory, so nothing is held twice."""
     ordered = sorted(tensors.items(), key=lambda item: (-item[1].element_size(), item[0]))  # aligned for every reader
     parts = [t.detach().cpu().contiguous().reshape(-1).view(torch.uint8) for _, t in ordered]
-    header, end = {"__metadata__": metadata}, 0
+    header: dict[str, Any] = {"__metadata__": metadata}
+    end = 0
     for (name, t), part in zip(ordered, parts):
         begin, end = end, end + len(part)
         header[name] = {"dtype": DTYPES[t.dtype], "shape": list(t.shape), "data_offsets": [begin, end]}
@@ -31,7 +35,7 @@ def _chunks(tensors: dict[str, torch.Tensor], metadata: dict[str, str]) -> list[
     return [len(text).to_bytes(8, "little"), text, *(p.numpy().data for p in parts)]
 
 
-def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict) -> Path:
+def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> Path:
     """Write one checkpoint, replacing the last one only once the new one is complete on disk.
 
     ``state`` travels in the header of the same file, so tensors and state can never be of two different steps.
@@ -39,7 +43,7 @@ def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict)
     Args:
         folder: The run folder.
         tensors: Of the types in `DTYPES`, on any device.
-        state: Whatever JSON can hold.
+        state: Values that JSON can hold.
 
     Returns:
         The file's path.
@@ -57,7 +61,8 @@ def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict)
                 "there is one, can be trusted. A fit repeats exactly: continued with --resume, it comes to the same place; "
                 "other settings, lower learning rates above all, lead elsewhere"
             )
-    chunks = _chunks(tensors, {"format": str(FORMAT), "state": json.dumps(state)})
+    metadata = {"format": str(FORMAT), "version": __version__, "state": json.dumps(state)}
+    chunks = _chunks(tensors, metadata)
     digest = hashlib.sha256()
     for chunk in chunks:
         digest.update(chunk)
@@ -65,7 +70,7 @@ def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict)
     return path
 
 
-def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict]:
+def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     """Read a checkpoint back.
 
     Returns:
@@ -91,5 +96,9 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict]:
     except (SafetensorError, KeyError, ValueError) as e:
         raise DataError(f"{path} is not a warpgs checkpoint ({e})") from e
     if metadata.get("format") != str(FORMAT):
-        raise DataError(f"{path} has checkpoint format {metadata.get('format')}, this version reads {FORMAT}")
+        version = metadata.get("version", "0.1.0")
+        raise DataError(
+            f"{path}: this checkpoint is of warpgs {version}, in a format that warpgs {__version__} does not read. Open it "
+            f"with warpgs {version}, or fit the scene again into a new --out"
+        )
     return tensors, json.loads(metadata["state"])

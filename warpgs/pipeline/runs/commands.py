@@ -1,29 +1,41 @@
-"""What can be done with a run once it is there: score it again, render it, export it."""
+"""Commands on a run that is there: score it again, render it, export it."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from warpgs.errors import DataError, UsageError
 from warpgs.export.ply import write_ply
-from warpgs.files import write_bytes, write_json
+from warpgs.files import write_json
+from warpgs.io.splits import Split
 from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.model.compress import drop_unused_sh
-from warpgs.pipeline.runs.camera_paths import PATHS, camera_path
-from warpgs.pipeline.runs.folder import SceneRequest, choose_device, open_run, read_scene
-from warpgs.pipeline.runs.results import evaluate_run, file_stem, options_for, protocol_of, score_line
+from warpgs.pipeline.runs.camera_paths import PATHS
+from warpgs.pipeline.runs.folder import StoredRun, open_run
+from warpgs.pipeline.runs.paths import FILM, render_path
+from warpgs.pipeline.runs.request import choose_device, read_scene
+from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line
 from warpgs.pipeline.train.trainer import train_views
-from warpgs.render.rasterize import rasterize
-from warpgs.report.film import write_mp4
-from warpgs.report.images import png
-from warpgs.scene import Camera, Gaussians
+from warpgs.scene import Scene, View
+
+
+def scene_of(stored: StoredRun) -> tuple[Scene, list[View], list[View]]:
+    """Read the scene that a run was fitted to; returns it with its training and its held-out views.
+
+    Raises:
+        DataError: The scene is gone, or its images or cameras have changed since the fit.
+    """
+    scene, _, _ = read_scene(stored.scene_request())
+    if scene.fingerprint != stored.record["fingerprint"]:
+        raise DataError(f"{scene.path}: its images or cameras are not those that {stored.folder} was fitted to; restore them")
+    split = Split(stored.train, stored.test)
+    return scene, train_views(scene, split.train), train_views(scene, split.test)
 
 
 def evaluate(folder: Path, device_name: str, lpips_weights: Path | None = None) -> list[str]:
-    """Score a run on its held-out views and rewrite its pictures; returns lines for the user.
+    """Score a run on its held-out views and render them again; returns lines for the user.
 
     The scores go to eval.json beside metrics.json, which stays as the fit wrote it.
 
@@ -39,13 +51,9 @@ def evaluate(folder: Path, device_name: str, lpips_weights: Path | None = None) 
     device, _ = choose_device(device_name)
     lpips = None if lpips_weights is None else load_lpips(lpips_weights, device)
     stored = open_run(folder, device)
-    request = SceneRequest(**stored.record["scene"])
-    scene, _, _ = read_scene(request)
-    if scene.fingerprint != stored.record["fingerprint"]:
-        raise DataError(f"{scene.path}: its photographs or cameras are not those that {folder} was fitted to; restore them")
-    train, test = (train_views(scene, tuple(stored.record[k])) for k in ("train", "test"))
-    rule, background = stored.record["config"]["rule"], tuple(stored.record["background"])
-    metrics = evaluate_run(folder, stored.gaussians, train, test, rule, background, lpips)
+    scene, train, test = scene_of(stored)
+    request = stored.scene_request()
+    metrics = evaluate_run(folder, stored.gaussians(), train, test, stored.rule, stored.background, lpips)
     metrics |= {
         "protocol": protocol_of(scene, request.split, request.downscale, train, test),
         "config_hash": stored.record["config_hash"], "steps": stored.step,
@@ -55,17 +63,6 @@ def evaluate(folder: Path, device_name: str, lpips_weights: Path | None = None) 
         return [f"no view is held out; training PSNR {metrics['train']['psnr']:.2f} dB"]
     lines = [f"{r['name']}: PSNR {r['psnr']:.2f} dB, SSIM {r['ssim']:.4f} ({r['region']})" for r in metrics["views"]]
     return [*lines, f"mean of {len(test)}: {score_line(metrics['test'])}"]
-
-
-@torch.no_grad()
-def _median_depth(gaussians: Gaussians, cameras: list[Camera]) -> float:
-    """Median rendered depth [u] over covered pixels of at most five cameras; 1 where nothing is covered."""
-    depths = []
-    for camera in cameras[:: max(1, len(cameras) // 5)]:
-        r = rasterize(gaussians, camera)
-        depths.append(r.depth[r.alpha > 0.5].flatten().cpu().numpy())
-    values = np.concatenate(depths)
-    return float(np.median(values)) if len(values) else 1.0
 
 
 def render(folder: Path, kind: str, out: Path | None, frames: int, fps: int, device_name: str) -> str:
@@ -78,35 +75,15 @@ def render(folder: Path, kind: str, out: Path | None, frames: int, fps: int, dev
     """
     if kind not in PATHS:
         raise UsageError(f"path {kind!r} is not one of {', '.join(PATHS)}")
-    device, _ = choose_device(device_name)
-    stored = open_run(folder, device)
-    train = [stored.cameras[n] for n in stored.record["train"]]
-    if kind == "views":
-        cameras = [(file_stem(n), c) for n, c in stored.cameras.items()]
-    else:
-        path = camera_path(kind, train, _median_depth(stored.gaussians, train), frames)
-        cameras = [(f"{i:04d}", c) for i, c in enumerate(path)]
     out = folder / f"path-{kind}" if out is None else out
-    out.mkdir(parents=True, exist_ok=True)
-    options = options_for(stored.record["config"]["rule"], tuple(stored.record["background"]), stored.gaussians)
-    one_size = len({(c.width, c.height) for _, c in cameras}) == 1
-
-    def images():
-        for name, camera in cameras:
-            with torch.no_grad():
-                image = rasterize(stored.gaussians, camera, options).rgb.cpu().numpy()
-            write_bytes(out / f"{name}.png", png(image))
-            yield image
-
-    if one_size:
-        write_mp4(out / "film.mp4", images(), fps)
-        return f"{len(cameras)} pictures and film.mp4 in {out}"
-    count = sum(1 for _ in images())
-    return f"{count} pictures in {out}; no film, since the views differ in size"
+    *files, last = render_path(open_run(folder, device_name), kind, out=out, frames=frames, fps=fps)
+    if last.name == FILM:
+        return f"{len(files)} images and {FILM} in {out}"
+    return f"{len(files) + 1} images in {out}; no film, since the views differ in size"
 
 
 def export(folder: Path, target: Path) -> str:
-    """Write a run's Gaussians to a file, in the coordinates of the input; returns a line for the user.
+    """Write a run's Gaussians to a file, in the units of the scene's files; returns a line for the user.
 
     Raises:
         DataError: The folder is no run.
@@ -115,5 +92,5 @@ def export(folder: Path, target: Path) -> str:
     if target.suffix.lower() != ".ply":
         raise UsageError(f"{target}: format {target.suffix or '(none)'} is not supported; use .ply")
     stored = open_run(folder, torch.device("cpu"))
-    write_ply(target, drop_unused_sh(stored.gaussians), stored.normalization)
-    return f"{len(stored.gaussians):,} Gaussians in {target}"
+    write_ply(target, drop_unused_sh(stored.gaussians()), stored.normalization)
+    return f"{len(stored.gaussians()):,} Gaussians in {target}"

@@ -1,4 +1,4 @@
-"""Pictures of the priors of a scene's training views, to look at before a fit relies on them."""
+"""Images of the priors of a scene's training views, to look at before a fit relies on them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from warpgs.errors import ResourceError, UsageError
 from warpgs.files import write_bytes
 from warpgs.pipeline.metrics.region import counted_region
 from warpgs.pipeline.model.init import InitConfig, consistent_depths, seen_points
-from warpgs.pipeline.runs.folder import SceneRequest, read_scene
+from warpgs.pipeline.runs.request import SceneRequest, read_scene
 from warpgs.pipeline.runs.results import file_stem
 from warpgs.pipeline.train.strategies.importance import ImportanceConfig, geometry_score, semantic_score
 from warpgs.priors.cache import cache_folder
@@ -24,11 +24,11 @@ SOURCES = ("sweep", "flow")
 
 
 def prior_sheet(view: View, prior: Prior) -> np.ndarray:
-    """One sheet, [rows, columns, 3] in [0, 1]: photograph, the four maps, and the two scores that follow from them."""
+    """Return one sheet, [rows, columns, 3] in [0, 1]: image, the four maps, and the two scores that follow from them."""
     curvature = ImportanceConfig().curvature
     disparity, *semantics = map(torch.from_numpy, (prior.disparity, prior.confidence, prior.boundary, prior.foreground))
     tiles = [
-        Tile("photograph", view.image),
+        Tile("image", view.image),
         Tile("disparity, near is 1", prior.disparity, "TURBO"),
         Tile("confidence of the likeliest class", prior.confidence, "VIRIDIS"),
         Tile("foreground", prior.foreground, "VIRIDIS"),
@@ -50,8 +50,8 @@ def show_priors(request: SceneRequest, config: PriorConfig, source: str, out: Pa
 
     Args:
         request: The scene and its split.
-        config: Networks.
-        source: sweep or flow: how depth is found in other views, where no depth network is named.
+        config: Networks for the priors.
+        source: Method that finds depth in other views where no depth network is named: sweep or flow.
         out: Folder for the sheets.
         threads: CPU threads of the networks; 0 for as many as there are cores.
 
@@ -70,7 +70,7 @@ def show_priors(request: SceneRequest, config: PriorConfig, source: str, out: Pa
     depths = None
     if config.depth_model is None and len(views) > 1:
         depths = consistent_depths(views, seen_points(views, scene.points), InitConfig(source=source))
-    priors, said = view_priors(views, config, depths=lambda: depths, regions=regions, threads=threads, cache=cache_folder())
+    priors, found = view_priors(views, config, depths=lambda: depths, regions=regions, threads=threads, cache=cache_folder())
     for view, prior in zip(views, priors):
         write_bytes(out / f"{file_stem(view.name)}.png", png(prior_sheet(view, prior)))
-    return [*notes, *said, f"{len(views)} sheets in {out}"]
+    return [*notes, *found, f"{len(views)} sheets in {out}"]

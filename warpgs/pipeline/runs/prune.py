@@ -1,4 +1,4 @@
-"""A finished model made smaller: as many Gaussians and harmonics go as its training views do not miss (docs/complexity.md)."""
+"""Pruning of a finished model: Gaussians and harmonics that its training views do not miss go (docs/complexity.md)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 import secrets
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,17 +21,17 @@ from warpgs.pipeline.metrics.region import scored_region
 from warpgs.pipeline.model import compress
 from warpgs.pipeline.model.parameter_bounds import model_bytes, pack
 from warpgs.pipeline.runs.checkpoint import save_checkpoint
-from warpgs.pipeline.runs.folder import CONFIG, SceneRequest, choose_device, open_run, read_scene
-from warpgs.pipeline.runs.results import options_for
+from warpgs.pipeline.runs.commands import scene_of
+from warpgs.pipeline.runs.folder import CONFIG, StoredRun, open_run
+from warpgs.pipeline.runs.request import choose_device
 from warpgs.pipeline.train.strategies.importance_sampling import TrainingView
-from warpgs.pipeline.train.trainer import train_views
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.runtime.byte_units import format_bytes
-from warpgs.scene import Gaussians, View
+from warpgs.scene import Gaussians, Normalization, View
 
 
 def mean_psnr(gaussians: Gaussians, views: list[View], options: RasterizeOptions) -> float:
-    """Mean over views of the PSNR [dB] as `warpgs eval` has it: rounded to 8 bits, over scored pixels; NaN without views."""
+    """Return the mean PSNR [dB] over views as in `warpgs eval`: rounded to 8 bits, over scored pixels; NaN without views."""
     if not views:
         return math.nan
     scores = []
@@ -41,6 +42,7 @@ def mean_psnr(gaussians: Gaussians, views: list[View], options: RasterizeOptions
 
 
 def _new_folder(folder: Path, out: Path | None) -> Path:
+    """Return the folder to write; UsageError where it exists already, or cannot be made."""
     out = folder.with_name(f"{folder.resolve().name}-pruned") if out is None else out
     if out.exists():
         raise UsageError(f"{out} exists already; choose another --out")
@@ -49,8 +51,8 @@ def _new_folder(folder: Path, out: Path | None) -> Path:
     return out
 
 
-def _write(out: Path, record: dict, made: compress.Pruned, step: int, normalization) -> None:
-    """The new run folder, whole or not at all."""
+def _write(out: Path, record: dict[str, Any], made: compress.Pruned, step: int, normalization: Normalization) -> None:
+    """Write the new run folder, whole or not at all."""
     temporary = out.with_name(f".{out.name}.{secrets.token_hex(4)}.tmp")
     tensors = {f"param.{n}": t for n, t in made.gaussians.tensors().items() if n != "sh"}
     tensors |= {"param.sh_packed": pack(made.gaussians.sh, made.degrees), "degrees": made.degrees}
@@ -91,29 +93,14 @@ def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str) ->
     device, _ = choose_device(device_name)
     stored = open_run(folder, device)
     out = _new_folder(folder, out)
-    scene, _, _ = read_scene(SceneRequest(**stored.record["scene"]))
-    if scene.fingerprint != stored.record["fingerprint"]:
-        raise DataError(f"{scene.path}: its photographs or cameras are not those that {folder} was fitted to; restore them")
-    train, test = (train_views(scene, tuple(stored.record[k])) for k in ("train", "test"))
-    rule, background = stored.record["config"]["rule"], tuple(stored.record["background"])
-    before = stored.gaussians
-    options = options_for(rule, background, before)
-    whole = mean_psnr(before, train, options)
-    if not math.isfinite(whole):
-        raise DataError(
-            f"{folder}: its PSNR on the training views is {whole} dB, so no loss of it can be kept small; fit again"
-        )
-    kinds = torch.zeros(len(before), dtype=torch.int64, device=device)
-    view_set = compress.ViewSet([TrainingView.of(v, device).camera for v in train], options, stored.record["config"]["seed"])
-    made = compress.prune_model(
-        before, kinds, view_set, lambda g, fraction: mean_psnr(g, train, options) >= whole - fraction * keep_psnr
-    )
-    made = dataclasses.replace(made, gaussians=compress.drop_unused_sh(made.gaussians))
+    _, train, test = scene_of(stored)
+    before, options = stored.gaussians(), stored.options()
+    made = _pruned(stored, train, options, keep_psnr)
 
     degrees = compress.stored_degrees(before.sh)
     sizes = [model_bytes(d) for d in (degrees, made.degrees)]
     scores = [(mean_psnr(before, v, options), mean_psnr(made.gaussians, v, options)) for v in (train, test)]
-    figures = {
+    figures: dict[str, Any] = {
         "source": str(folder.resolve()), "keep_psnr": keep_psnr, "count": [len(before), len(made.degrees)], "bytes": sizes,
         "mean_degree": [float(d.double().mean()) for d in (degrees, made.degrees)],
         "train_psnr": scores[0], "test_psnr": scores[1] if test else None,
@@ -127,4 +114,21 @@ def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str) ->
     ]
     if test:
         lines.append(f"held-out PSNR {scores[1][0]:.2f} -> {scores[1][1]:.2f} dB over {len(test)} views")
-    return [*lines, f"in {out}: checkpoint, PLY; `warpgs eval {out}` scores it, `warpgs render {out}` draws it"]
+    return [*lines, f"in {out}: checkpoint, PLY; `warpgs eval {out}` scores it, `warpgs render {out}` renders it"]
+
+
+def _pruned(stored: StoredRun, train: list[View], options: RasterizeOptions, keep_psnr: float) -> compress.Pruned:
+    """Prune the model of a run; DataError where its PSNR on the training views is not finite."""
+    before = stored.gaussians()
+    device = before.means.device
+    whole = mean_psnr(before, train, options)
+    if not math.isfinite(whole):
+        raise DataError(
+            f"{stored.folder}: its PSNR on the training views is {whole} dB, so no loss of it can be kept small; fit again"
+        )
+    kinds = torch.zeros(len(before), dtype=torch.int64, device=device)
+    view_set = compress.ViewSet([TrainingView.of(v, device).camera for v in train], options, stored.record["config"]["seed"])
+    made = compress.prune_model(
+        before, kinds, view_set, lambda g, fraction: mean_psnr(g, train, options) >= whole - fraction * keep_psnr
+    )
+    return dataclasses.replace(made, gaussians=compress.drop_unused_sh(made.gaussians))

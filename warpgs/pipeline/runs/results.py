@@ -1,15 +1,17 @@
-"""What a fit leaves for people: pictures of held-out views, scores, the report page."""
+"""Results of a fit for people: images of held-out views, scores, the report page."""
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 
 from warpgs.files import write_bytes
 from warpgs.io.splits import Split
-from warpgs.pipeline.metrics.evaluate import ViewMetrics, baselines, render_view, score, summarize, variants
+from warpgs.kernels.sh import C0
+from warpgs.pipeline.metrics.evaluate import ViewMetrics, baselines, options_for, render_view, score, summarize, variants
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.report.curve import curve
@@ -25,40 +27,33 @@ LABELS = {
     "lpips_vgg_legacy": "LPIPS-VGG [0, 1]", "lpips_vgg_standard": "LPIPS-VGG [-1, 1]",
     "lpips_alex_legacy": "LPIPS-Alex [0, 1]", "lpips_alex_standard": "LPIPS-Alex [-1, 1]", "lpips": "LPIPS",
 }  # fmt: skip
-"""Names of figures for people."""
+"""Names of scores for people."""
+SHOWN_VIEWS = 6
+"""Held-out views with images in the report; all have files in the run folder."""
+RENDER_WORKERS = 4
+"""Threads that score and encode images while others are rendered."""
+OVERVIEW_POINTS = 60_000
+"""Gaussians shown in the 3D overview, sampled at random."""
 
 
-def score_keys(metrics: dict) -> list[str]:
-    """Names of the figures that result files hold for held-out views, in the order to show them."""
+def score_keys(metrics: dict[str, Any]) -> list[str]:
+    """Return the names of the scores that result files hold for held-out views, in the order to show them."""
     return [k for k in LABELS if k in metrics["test"]]
 
 
 def score_line(scores: dict[str, float]) -> str:
-    """Mean figures as one line for people."""
+    """Return mean scores as one line for people."""
     distances = [f", {LABELS[k]} {v:.3f}" for k, v in scores.items() if k.startswith("lpips")]
     return f"PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f}{''.join(distances) or ', LPIPS not measured'}"
 
 
-SHOWN_VIEWS = 6
-"""Held-out views with pictures in the report; all have files in the run folder."""
-RENDER_WORKERS = 4
-"""Threads that score and encode pictures while others are drawn."""
-
-
-def options_for(
-    rule: str, background: tuple[float, float, float], gaussians: Gaussians, max_instances: int | None = None
-) -> RasterizeOptions:
-    """Rendering options of a run."""
-    return RasterizeOptions(rule=rule, background=gaussians.means.new_tensor(background), max_instances=max_instances)
-
-
 def file_stem(name: str) -> str:
-    """A view's name as one file name without suffix."""
+    """Return a view's name as one file name without suffix."""
     return str(PurePosixPath(name).with_suffix("")).replace("/", "_")
 
 
-def protocol_of(scene: Scene, spec: str | None, downscale: int, train: list[View], test: list[View]) -> dict:
-    """What scores must agree in before they may be compared; stands in every result file and on the page."""
+def protocol_of(scene: Scene, spec: str | None, downscale: int, train: list[View], test: list[View]) -> dict[str, Any]:
+    """Return the conditions in which scores must agree before they may be compared, for result files and the page."""
     sizes = sorted({(v.camera.width, v.camera.height) for v in test or train})
     return {
         "split": spec or "default (no --split given)", "training_views": len(train), "held_out_views": len(test),
@@ -68,7 +63,7 @@ def protocol_of(scene: Scene, spec: str | None, downscale: int, train: list[View
 
 
 def evaluate_run(
-    out: Path,
+    out: Path | None,
     gaussians: Gaussians,
     train: list[View],
     test: list[View],
@@ -76,27 +71,38 @@ def evaluate_run(
     background: tuple[float, float, float],
     lpips: Lpips | None = None,
     max_instances: int | None = None,
-) -> dict:
-    """Score held-out and training views, and save a picture and a depth map of each held-out view.
+) -> dict[str, Any]:
+    """Score held-out and training views, and save a render and a depth map of each held-out view.
 
-    Where no view is held out, the pictures are of the training views. LPIPS is measured on held-out views alone.
-    ``max_instances`` as in RasterizeOptions.
+    Where no view is held out, the images are of the training views. LPIPS is measured on held-out views alone.
+
+    Args:
+        out: The run folder; None to write nothing.
+        gaussians: N Gaussians in scene units [u].
+        train: Training views.
+        test: Held-out views.
+        rule: Cut-offs of the rasterizer.
+        background: Colour behind the scene.
+        lpips: Network for LPIPS, or None.
+        max_instances: As in RasterizeOptions.
 
     Returns:
-        Means over held-out and over training views, a row per held-out view, what guessing scores, and what each figure is.
+        Means over held-out and over training views, a row per held-out view, scores of baselines, and what each score is.
     """
     options = options_for(rule, background, gaussians, max_instances)
-    (out / "renders").mkdir(exist_ok=True)
-    (out / "depth").mkdir(exist_ok=True)
+    if out is not None:
+        (out / "renders").mkdir(exist_ok=True)
+        (out / "depth").mkdir(exist_ok=True)
 
     def finish(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:
-        stem = file_stem(view.name)
-        row = side_by_side([np.clip(image, 0, 1), view.image, error_map(image, view.image)])
-        write_bytes(out / "renders" / f"{stem}.png", png(row))
-        write_bytes(out / "depth" / f"{stem}.png", png(depth_map(depth, alpha)))
+        if out is not None:
+            stem = file_stem(view.name)
+            row = side_by_side([np.clip(image, 0, 1), view.image, error_map(image, view.image)])
+            write_bytes(out / "renders" / f"{stem}.png", png(row))
+            write_bytes(out / "depth" / f"{stem}.png", png(depth_map(depth, alpha)))
         return score(view, image, lpips if test else None)
 
-    def compare(view: View, image: np.ndarray, *_) -> ViewMetrics:
+    def compare(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:
         return score(view, image)
 
     tasks, jobs = [(finish, v) for v in test or train] + [(compare, v) for v in train if test], []
@@ -104,7 +110,7 @@ def evaluate_run(
         for work, view in tasks:
             jobs.append(render_workers.submit(work, view, *render_view(gaussians, view, options)))
             if len(jobs) > RENDER_WORKERS:
-                jobs[-RENDER_WORKERS].result()  # not all pictures at once
+                jobs[-RENDER_WORKERS].result()  # not all images at once
         found = [j.result() for j in jobs]
     rows, train_rows = found[: len(test)], found[-len(train) :]
     return {
@@ -115,7 +121,8 @@ def evaluate_run(
     }  # fmt: skip
 
 
-def _images(views: list[View], gaussians: Gaussians, options: RasterizeOptions, rows: dict[str, dict]) -> list[ViewImages]:
+def _images(views: list[View], gaussians: Gaussians, options: RasterizeOptions, rows: dict[str, Any]) -> list[ViewImages]:
+    """Render up to `SHOWN_VIEWS` of the views, evenly spaced, and encode what the page shows of them."""
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(SHOWN_VIEWS, len(views))).round().astype(int))]
     result = []
     with ThreadPoolExecutor(RENDER_WORKERS) as render_workers:
@@ -129,20 +136,66 @@ def _images(views: list[View], gaussians: Gaussians, options: RasterizeOptions, 
     return [ViewImages(name, caption, *parts) for name, caption, parts in result]
 
 
-def write_report(
-    out: Path, scene: Scene, split: Split, gaussians: Gaussians, metrics: dict, record: dict, sampling: SamplingReport | None
-) -> None:
-    """Write report.html for a run whose scores are known; ``sampling`` is what it says of sampling events, if any."""
-    train, test = [scene.view(n) for n in split.train], [scene.view(n) for n in split.test]
-    notes = list(record["notes"])
+def _overview(gaussians: Gaussians, train: list[View], test: list[View]) -> tuple[bytes | None, str]:
+    """Return the PNG of the 3D overview, or None and the reason."""
     means = gaussians.means.cpu().numpy()
-    colors = np.clip(0.28209479 * gaussians.sh[:, 0].cpu().numpy() + 0.5, 0, 1)
-    sample = np.random.default_rng(0).permutation(len(means))[:60_000]
+    colors = np.clip(C0 * gaussians.sh[:, 0].cpu().numpy() + 0.5, 0, 1)
+    sample = np.random.default_rng(0).permutation(len(means))[:OVERVIEW_POINTS]
     cameras = ([v.camera for v in train], [v.camera for v in test])
-    overview, why = render_overview(*cameras, means[sample].astype(np.float64), colors[sample])
-    if why:
-        notes.append(why)
-        print(f"  {why}")
+    return render_overview(*cameras, means[sample].astype(np.float64), colors[sample])
+
+
+def _figures(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the headline figures of the page as pairs of label and value."""
+    held_out = []
+    if metrics["test"]:
+        best = max(metrics["baselines"].values(), default=float("nan"))
+        held_out = [
+            ("held-out PSNR", f"{metrics['test']['psnr']:.2f} dB"), ("held-out SSIM", f"{metrics['test']['ssim']:.3f}"),
+            ("best baseline without a fit", f"{best:.2f} dB"),
+        ]  # fmt: skip
+    return [
+        *held_out,
+        ("training PSNR", f"{metrics['train']['psnr']:.2f} dB"), ("Gaussians", f"{metrics['gaussians']:,}"),
+        ("mean SH degree", f"{metrics['complexity']['mean_degree']:.2f}"),
+        ("model", format_bytes(metrics["complexity"]["bytes"])),
+        ("steps", f"{metrics['steps']:,}"), ("time", f"{metrics['seconds']['total']:.0f} s"),
+    ]  # fmt: skip
+
+
+def _protocol(metrics: dict[str, Any]) -> dict[str, str]:
+    """Return the conditions of the scores, and what each score is, as the page words them."""
+    words = {k.replace("_", " "): ", ".join(v) if isinstance(v, list) else str(v) for k, v in metrics["protocol"].items()}
+    words["configuration"] = f"{metrics['config_hash']}, step {metrics['steps']:,}"
+    return words | {LABELS.get(k, k): v for k, v in metrics["variants"].items()}
+
+
+def write_report(
+    out: Path,
+    scene: Scene,
+    split: Split,
+    gaussians: Gaussians,
+    metrics: dict[str, Any],
+    record: dict[str, Any],
+    sampling: SamplingReport | None,
+) -> str:
+    """Write report.html for a run whose scores are known.
+
+    Args:
+        out: The run folder, whose metrics.jsonl gives the curves.
+        scene: The scene.
+        split: Its views to fit and those held out.
+        gaussians: The fitted model, in scene units [u].
+        metrics: Contents of metrics.json.
+        record: Contents of config.json.
+        sampling: The part on sampling events, or None.
+
+    Returns:
+        The reason why the page has no 3D overview; empty where it has one.
+    """
+    train, test = [scene.view(n) for n in split.train], [scene.view(n) for n in split.test]
+    overview, why = _overview(gaussians, train, test)
+    notes = [*record["notes"], *([why] if why else [])]
     events = read_events(out / "metrics.jsonl")
     steps = [e["step"] for e in events]
     curves = [
@@ -150,20 +203,6 @@ def write_report(
         curve("Training PSNR", steps, [e["psnr"] for e in events], "dB"),
         curve("Gaussians", steps, [e["count"] for e in events]),
     ]
-    figures = []
-    if metrics["test"]:
-        best = max(metrics["baselines"].values(), default=float("nan"))
-        figures = [
-            ("held-out PSNR", f"{metrics['test']['psnr']:.2f} dB"), ("held-out SSIM", f"{metrics['test']['ssim']:.3f}"),
-            ("best guess without a fit", f"{best:.2f} dB"),
-        ]  # fmt: skip
-    seconds = metrics["seconds"]
-    figures += [
-        ("training PSNR", f"{metrics['train']['psnr']:.2f} dB"), ("Gaussians", f"{metrics['gaussians']:,}"),
-        ("mean SH degree", f"{metrics['complexity']['mean_degree']:.2f}"),
-        ("model", format_bytes(metrics["complexity"]["bytes"])),
-        ("steps", f"{metrics['steps']:,}"), ("time", f"{seconds['total']:.0f} s"),
-    ]  # fmt: skip
     keys = score_keys(metrics)
     table = [["view", *(LABELS.get(k, k) for k in keys), "pixels"]] + [
         [r["name"], *(f"{r[k]:.{2 if k == 'psnr' else 4}f}" for k in keys), r["region"]] for r in metrics["views"]
@@ -171,15 +210,12 @@ def write_report(
     options = options_for(record["config"]["rule"], tuple(record["background"]), gaussians)
     images = _images(test or train, gaussians, options, {r["name"]: r for r in metrics["views"]})
     camera = train[0].camera
-    details = {k: v for k, v in record.items() if k != "cameras"}
-    protocol = {k.replace("_", " "): ", ".join(v) if isinstance(v, list) else str(v) for k, v in metrics["protocol"].items()}
-    protocol["configuration"] = f"{metrics['config_hash']}, step {metrics['steps']:,}"
     write_page(
         out / "report.html",
         title=Path(scene.path).resolve().name,
         subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
         f"{camera.width} x {camera.height} px, {metrics['device']}",
-        figures=figures, notes=notes, table=table, views=images, curves=curves, sampling=sampling, overview=overview,
-        details=details,
-        protocol=protocol | {LABELS.get(k, k): v for k, v in metrics["variants"].items()},
+        figures=_figures(metrics), notes=notes, table=table, views=images, curves=curves, sampling=sampling,
+        overview=overview, details={k: v for k, v in record.items() if k != "cameras"}, protocol=_protocol(metrics),
     )  # fmt: skip
+    return why

@@ -1,4 +1,4 @@
-"""Studies: several settings on the same scenes with the same seeds, what they score, and how sure that is."""
+"""Studies: several settings on the same scenes with the same seeds, their scores, and the certainty of the differences."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import torch
 
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.pipeline.metrics.lpips import load_lpips
-from warpgs.pipeline.runs.folder import FitRequest, choose_device, read_scene
+from warpgs.pipeline.runs.request import FitRequest, choose_device, read_scene
 from warpgs.pipeline.study.ensure_run import ensure_run
 from warpgs.pipeline.study.study import FILES, SWITCHES, Place, Runs, StudyRequest, run_folder, scene_name, write_study
 from warpgs.pipeline.train.config import PRESETS, FitConfig
 from warpgs.pipeline.train.trainer import train_views
 
 ABLATION_ROWS: dict[str, dict[str, bool]] = {"full": {}, **{f"no {name}": {name: False} for name in SWITCHES}}
-"""Rows of the ablation: all on, then each part off alone, last the whole sampling (the paper's ablation has no such row)."""
+"""Switches of each row of the ablation: all on, then each part off alone, last the whole sampling (not in the paper's)."""
 
 
 def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]:
-    """Presets as the variants of a study, in the order named; ``steps`` replaces the steps of all.
+    """Return presets as the variants of a study, in the order named; ``steps`` replaces the steps of all.
 
     Raises:
         UsageError: A preset is unknown or named twice.
@@ -34,7 +34,7 @@ def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]
 
 
 def ablation_variants(base: FitConfig) -> tuple[dict[str, FitConfig], dict[str, tuple[bool, ...]]]:
-    """The rows of the ablation of a configuration, and their check marks in the order of `SWITCHES`.
+    """Return the rows of the ablation of a configuration, and their check marks in the order of `SWITCHES`.
 
     Raises:
         UsageError: The configuration has the sampling off already, so there is nothing to ablate.
@@ -45,15 +45,17 @@ def ablation_variants(base: FitConfig) -> tuple[dict[str, FitConfig], dict[str, 
         raise UsageError(
             f"preset {base.preset!r} has {', '.join(off)} switched off already; ablate a preset of the full method"
         )
-    variants, marks = {}, {}
+    variants: dict[str, FitConfig] = {}
+    marks: dict[str, tuple[bool, ...]] = {}
     for row, switches in ABLATION_ROWS.items():
-        changed = dataclasses.replace(method, **switches)
+        changed = dataclasses.replace(method, **switches)  # type: ignore[arg-type]  # names of bool fields alone
         variants[row] = dataclasses.replace(base, method=changed)
         marks[row] = tuple(getattr(changed, name) for name in SWITCHES)
     return variants, marks
 
 
 def _places(request: StudyRequest) -> list[Place]:
+    """Read the scenes of a study; DataError where one holds out no view."""
     places = []
     for wanted in request.scenes:
         scene, split, _ = read_scene(wanted)
@@ -64,7 +66,7 @@ def _places(request: StudyRequest) -> list[Place]:
 
 
 def _run_all(request: StudyRequest, places: list[Place], device: torch.device, lpips: dict[str, str]) -> Runs:
-    """All runs, seed by seed, so that an interrupted study holds whole pairs."""
+    """Make all runs, seed by seed, so that an interrupted study holds whole pairs."""
     runs: Runs = {}
     total = len(places) * request.seeds * len(request.variants)
     for seed in range(request.seeds):
@@ -84,9 +86,9 @@ def _run_all(request: StudyRequest, places: list[Place], device: torch.device, l
 
 
 def run_study(request: StudyRequest) -> list[str]:
-    """Fit every variant to every scene with every seed, and write what came of it into the study's folder.
+    """Fit every variant to every scene with every seed, and write the results into the study's folder.
 
-    Scenes and weights are read before the first fit. A run that fails is told in the notes and left out of its pairs.
+    Scenes and weights are read before the first fit. A run that fails is named in the notes and left out of its pairs.
 
     Returns:
         Lines for the user: the table and the notes.

@@ -1,32 +1,35 @@
-"""One run of a study: kept where it is finished and the same, continued where it is half done, else fitted."""
+"""Runs of a study: each is kept where it is finished and the same, continued where it is half done, else fitted."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from warpgs import __version__
 from warpgs.errors import DataError, UsageError, WarpgsError
 from warpgs.io.splits import Split
 from warpgs.pipeline.runs.commands import evaluate
-from warpgs.pipeline.runs.folder import CONFIG, FitRequest, fit_scene
+from warpgs.pipeline.runs.fit import fit_request
+from warpgs.pipeline.runs.folder import CONFIG
+from warpgs.pipeline.runs.request import FitRequest
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one run."""
+    """Outcome of one run."""
 
     state: str
     """kept, continued, fitted, redone or failed."""
-    metrics: dict | None
+    metrics: dict[str, Any] | None
     """Contents of metrics.json, or of eval.json where LPIPS was measured later; None where it failed."""
     note: str = ""
-    """What a reader of the study must know of this run; empty where nothing is special."""
+    """Note on this run for readers of the study; empty where nothing is special."""
 
 
-def _read(path: Path) -> dict | None:
-    """A JSON object; None where there is none or it is not whole."""
+def _read(path: Path) -> dict[str, Any] | None:
+    """Read a JSON object; None where there is none or it is not whole."""
     try:
         value = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError):
@@ -34,8 +37,8 @@ def _read(path: Path) -> dict | None:
     return value if isinstance(value, dict) else None
 
 
-def _difference(record: dict, request: FitRequest, fingerprint: str, split: Split, device: str) -> str:
-    """In what a stored run differs from the one that is wanted, in words; empty where in nothing."""
+def _difference(record: dict[str, Any], request: FitRequest, fingerprint: str, split: Split, device: str) -> str:
+    """Name the properties in which a stored run differs from the one that is wanted; empty where in none."""
     wanted = {
         "configuration": (record.get("config_hash"), request.config.fingerprint()),
         "data": (record.get("fingerprint"), fingerprint),
@@ -56,8 +59,8 @@ def _set_aside(folder: Path) -> Path:
     return target
 
 
-def _with_lpips(metrics: dict, folder: Path, request: FitRequest, variants: dict[str, str]) -> dict:
-    """The scores of a finished run with LPIPS of the weights asked for, measured now where they are not there yet."""
+def _with_lpips(metrics: dict[str, Any], folder: Path, request: FitRequest, variants: dict[str, str]) -> dict[str, Any]:
+    """Return the scores of a finished run with LPIPS of the weights asked for, measured now where they are not there yet."""
     for found in (metrics, _read(folder / "eval.json")):
         if found and found.get("config_hash") == metrics["config_hash"] and variants.items() <= found["variants"].items():
             return metrics | {k: found[k] for k in ("test", "views", "variants")}
@@ -67,20 +70,20 @@ def _with_lpips(metrics: dict, folder: Path, request: FitRequest, variants: dict
 
 
 def ensure_run(request: FitRequest, fingerprint: str, split: Split, device: str, variants: dict[str, str]) -> Outcome:
-    """See to it that a run folder holds the finished run that is asked for.
+    """Ensure that a run folder holds the finished run that is asked for.
 
     A finished run of the same configuration, data, views, kind of device and version is kept. A half-finished one is
     continued from its checkpoint. What is there and is neither is moved aside, and the run is done anew.
 
     Args:
         request: The fit; ``out`` is its folder, ``resume`` is decided here.
-        fingerprint: Of the scene's data.
+        fingerprint: Fingerprint of the scene's data.
         split: The views that train and those held out.
         device: cpu or cuda.
-        variants: What LPIPS figures must be there, by name; empty for none.
+        variants: Names of the LPIPS scores that must be there, with their definitions; empty for none.
 
     Returns:
-        What became of it. An error of this one run is told in the outcome, so that the others can go on.
+        The outcome. It holds the error of this one run, if any, so that the others can go on.
     """
     folder, note, state = request.out, "", "fitted"
     record = _read(folder / CONFIG)
@@ -103,9 +106,8 @@ def ensure_run(request: FitRequest, fingerprint: str, split: Split, device: str,
         note = f"what was there is no run; moved to {_set_aside(folder).name} and done anew"
         state = "redone"
 
-    def fit(go_on: bool) -> dict:
-        r = request
-        return fit_scene(FitRequest(r.scene, r.out, r.config, r.device, go_on, r.lpips_weights))
+    def fit(go_on: bool) -> dict[str, Any]:
+        return fit_request(replace(request, resume=go_on)).metrics
 
     try:
         try:

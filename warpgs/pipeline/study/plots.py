@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 
@@ -12,11 +12,11 @@ from warpgs.report.curve import ticks
 
 INK, SOFT, RULE, BAND = "#1b1d21", "#666c76", "#d9dce1", "#f6f6f3"
 BETTER, WORSE, UNDECIDED = "#0b6e6e", "#c2570c", "#7a808a"
-"""Where the interval spares 0 on the good side, on the bad side, and where it holds 0: told apart with any colour vision."""
+"""Colours of an interval on the good side of 0, on the bad side, and of one that holds 0: distinct for any colour vision."""
 ROW, PANEL, VALUES, GAP, MARGIN = 38, 230, 184, 24, 24
 TOP, BOTTOM = 96, 78
 LETTER = 7.2
-"""Width of a letter of the row labels [px], for the room they take."""
+"""Width of a letter of the row labels [px], by which their column is sized."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,7 @@ class Line:
     """One variant in one panel."""
 
     name: str
+    """Name of the variant."""
     pairs: tuple[float, ...]
     """Difference of each seed."""
     difference: Difference | None
@@ -35,14 +36,17 @@ class Panel:
     """One metric; the lines stand in the same order in every panel."""
 
     label: str
+    """Name of the metric, with its unit."""
     upwards: bool
-    """Whether more is better."""
+    """True where more is better."""
     digits: int
     """Digits after the point of the printed figures."""
     lines: tuple[Line, ...]
+    """Variants in the order of the rows."""
 
 
 def _text(x: float, y: float, words: str, size: int = 12, anchor: str = "start", color: str = INK, weight: int = 400) -> str:
+    """Return a text element at ``x``, ``y`` [px]."""
     return (
         f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size}" text-anchor="{anchor}" fill="{color}" font-weight="{weight}">'
         f"{escape(words)}</text>"
@@ -50,14 +54,15 @@ def _text(x: float, y: float, words: str, size: int = 12, anchor: str = "start",
 
 
 def _reach(panel: Panel) -> float:
-    """Half the width of a panel's axis, which is centred on 0 so that sizes of both signs compare."""
+    """Return half the width of a panel's axis, which is centred on 0 so that sizes of both signs compare."""
     values = [abs(v) for line in panel.lines for v in line.pairs]
     values += [abs(v) for line in panel.lines if line.difference for v in (line.difference.low, line.difference.high)]
     largest = max((v for v in values if math.isfinite(v)), default=0.0)
     return 1.08 * largest or 10.0**-panel.digits
 
 
-def _line(panel: Panel, line: Line, y: float, x0: float, px) -> list[str]:
+def _line(panel: Panel, line: Line, y: float, x0: float, px: Callable[[float], float]) -> list[str]:
+    """Return the elements of one variant in one panel, at height ``y`` [px]; ``px`` maps values to x [px]."""
     d, right = line.difference, x0 + PANEL + 12
     if d is None:
         return [_text(right, y + 7, "the base", 11, color=SOFT)]
@@ -78,7 +83,7 @@ def _line(panel: Panel, line: Line, y: float, x0: float, px) -> list[str]:
 
 
 def forest(title: str, base: str, panels: Sequence[Panel]) -> str:
-    """An SVG of every variant's paired differences to ``base``; panels without a measured difference are left out."""
+    """Return an SVG of every variant's paired differences to ``base``; panels without a measured difference are left out."""
     panels = [p for p in panels if any(line.pairs for line in p.lines)]
     names = [line.name for line in panels[0].lines] if panels else []
     left = MARGIN + max([90.0, *(LETTER * len(n) + 18 for n in names)])
@@ -100,7 +105,7 @@ def forest(title: str, base: str, panels: Sequence[Panel]) -> str:
     for k, panel in enumerate(panels):
         x0, reach = left + k * step, _reach(panel)
 
-        def px(value: float, x0=x0, reach=reach) -> float:
+        def px(value: float, x0: float = x0, reach: float = reach) -> float:
             return x0 + PANEL * (value + reach) / (2 * reach)
 
         better = "right is better" if panel.upwards else "left is better"

@@ -1,4 +1,4 @@
-"""What a handful of repeated runs can say: mean, deviation, and the interval of a paired difference."""
+"""Statistics of a handful of repeated runs: mean, deviation, and the interval of a paired difference."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 CONFIDENCE = 0.95
+"""Probability that an interval holds the true mean."""
 
 
 @dataclass(frozen=True)
@@ -36,12 +37,12 @@ class Difference:
 
     @property
     def excludes_zero(self) -> bool:
-        """Whether the interval lies on one side of 0; never with fewer than two pairs."""
+        """True where the interval lies on one side of 0; never with fewer than two pairs."""
         return self.low > 0 or self.high < 0
 
 
 def sample(values: Sequence[float]) -> Sample:
-    """Mean and standard deviation (Bessel's correction) of measurements."""
+    """Return mean and standard deviation (Bessel's correction) of measurements."""
     n = len(values)
     mean = math.fsum(values) / n if n else math.nan
     sd = math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (n - 1)) if n > 1 else math.nan
@@ -49,13 +50,13 @@ def sample(values: Sequence[float]) -> Sample:
 
 
 def paired_difference(ours: Sequence[float], base: Sequence[float], confidence: float = CONFIDENCE) -> Difference:
-    """Student's interval of the mean of ``ours - base``, measured in pairs (Student 1908): mean ± t s / sqrt(n), n - 1 degrees.
+    """Return Student's interval of the mean of ``ours - base`` over pairs (Student 1908): mean ± t s / sqrt(n), n - 1 degrees.
 
     Pairing takes out what both have in common (the same seed, the same scene), which is most of the spread between runs.
 
     Args:
         ours: Measurements.
-        base: Measurements of what is compared with, in the same order.
+        base: Measurements of the base, in the same order.
         confidence: Probability that the interval holds the true mean, in (0, 1).
 
     Raises:

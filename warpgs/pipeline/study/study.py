@@ -1,4 +1,4 @@
-"""What the runs of a study amount to: tables, plot, figure, notes."""
+"""Results of a study: tables, plot, figure, notes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import torch
 from warpgs.errors import UsageError
 from warpgs.files import write_bytes, write_json, write_text
 from warpgs.io.splits import Split
-from warpgs.pipeline.runs.folder import SceneRequest
+from warpgs.pipeline.runs.request import SceneRequest
 from warpgs.pipeline.runs.results import LABELS
 from warpgs.pipeline.study.ensure_run import Outcome
 from warpgs.pipeline.study.plots import Line, Panel, forest
@@ -31,15 +31,17 @@ SWITCHES = {
 }  # fmt: skip
 """Parts of the method that can be switched off, with the headings of the paper's ablation table."""
 FIGURE_ROWS = 3
-"""Rows of the figure that a single scene gets; several scenes get one each, two of them two."""
+"""Rows of the figure for a single scene; two scenes get two rows each, more scenes one each."""
 FILES = ("table.md", "table.csv", "table.tex", "runs.csv", "plot.svg", "figure.png", "study.json")
+"""Files of a study, beside its runs."""
 
 
 @dataclass(frozen=True)
 class StudyRequest:
-    """What is compared with what, and on what."""
+    """A comparison: settings, scenes and seeds."""
 
     scenes: tuple[SceneRequest, ...]
+    """Scenes that every variant is fitted to."""
     variants: dict[str, FitConfig]
     """Settings by name; the others are compared with the first. The seed is set by the study."""
     seeds: int
@@ -47,11 +49,13 @@ class StudyRequest:
     out: Path
     """Folder of the study; each run lies in SCENE/VARIANT/SEED below it."""
     device: str = "auto"
+    """auto, cpu or cuda."""
     lpips_weights: Path | None = None
+    """File of `warpgs convert-lpips`; without one LPIPS is not measured."""
     marks: dict[str, tuple[bool, ...]] = field(default_factory=dict)
     """Check marks of each variant in the order of `SWITCHES`; empty for a comparison of presets."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not self.seeds >= 1:
             raise UsageError(f"--seeds must be at least 1, not {self.seeds}")
         if len(self.variants) < 2:
@@ -64,7 +68,7 @@ class StudyRequest:
 
 
 def scene_name(request: SceneRequest) -> str:
-    """Name of a scene in tables and folders: that of its folder."""
+    """Return the name of a scene in tables and folders: that of its folder."""
     return Path(request.path).resolve().name
 
 
@@ -73,11 +77,13 @@ class Place:
     """One scene of a study, read once."""
 
     name: str
-    """That of its folder."""
+    """Name of its folder."""
     request: SceneRequest
+    """Folder and options it is read with."""
     fingerprint: str
-    """Of its data."""
+    """Fingerprint of its data."""
     split: Split
+    """Views to fit and those held out."""
     test: list[View]
     """Its held-out views."""
 
@@ -87,24 +93,24 @@ Runs = dict[tuple[str, str, int], Outcome]
 
 
 def run_folder(request: StudyRequest, scene: str, variant: str, seed: int) -> Path:
-    """Where a run of a study lies."""
+    """Return the folder of a run of a study."""
     return request.out / scene / variant.replace(" ", "-") / str(seed)
 
 
 def _value(outcome: Outcome, key: str) -> float:
-    """A mean figure of a run; NaN where it was not measured."""
+    """Return a mean score of a run; NaN where it was not measured."""
     value = (outcome.metrics or {}).get("test", {}).get(key)
     return float(value) if isinstance(value, int | float) else math.nan
 
 
 def _by_seed(runs: Runs, scenes: list[str], variant: str, key: str, seeds: int) -> dict[int, float]:
-    """Mean over scenes by seed; seeds that lack a scene are left out."""
+    """Return the mean over scenes by seed; seeds that lack a scene are left out."""
     means = {s: math.fsum(_value(runs[p, variant, s], key) for p in scenes) / len(scenes) for s in range(seeds)}
     return {s: v for s, v in means.items() if math.isfinite(v)}
 
 
 def _metrics(runs: Runs) -> tuple[Metric, ...]:
-    """PSNR, SSIM, and the LPIPS variant that papers print where one was measured."""
+    """Return PSNR, SSIM, and the LPIPS variant that papers print where one was measured."""
     keys = {k for o in runs.values() for k in (o.metrics or {}).get("test", {})}
     order = ("lpips_vgg_legacy", "lpips_alex_legacy")
     found = next((k for k in order if k in keys), "lpips")
@@ -115,6 +121,7 @@ def _metrics(runs: Runs) -> tuple[Metric, ...]:
 
 
 def _table(request: StudyRequest, runs: Runs, scenes: list[str], metrics: tuple[Metric, ...], caption: str) -> Table:
+    """Return the means of all variants over scenes and seeds, and their differences to the first."""
     base = next(iter(request.variants))
     rows = []
     for name in request.variants:
@@ -132,6 +139,7 @@ def _table(request: StudyRequest, runs: Runs, scenes: list[str], metrics: tuple[
 
 
 def _plot(request: StudyRequest, runs: Runs, scenes: list[str], table: Table) -> str:
+    """Return the SVG of the paired differences of a table."""
     panels = []
     for m in table.metrics:
         theirs = _by_seed(runs, scenes, table.base, m.key, request.seeds)
@@ -145,19 +153,21 @@ def _plot(request: StudyRequest, runs: Runs, scenes: list[str], table: Table) ->
 
 
 def _figure(request: StudyRequest, runs: Runs, places: list[Place], device: torch.device) -> tuple[bytes | None, str]:
-    """The figure of the first seed for which every run is there, and a note where there is none."""
+    """Return the figure (PNG) of the first seed for which every run is there, and a note; None where there is no such seed."""
     whole = [s for s in range(request.seeds) if all(runs[p.name, v, s].metrics for p in places for v in request.variants)]
     if not whole:
         return None, "no figure: there is no seed for which every run succeeded"
     seed, rows, each = whole[0], [], {1: FIGURE_ROWS, 2: 2}.get(len(places), 1)
     for place in places:
         folders = {v: run_folder(request, place.name, v, seed) for v in request.variants}
-        scores = {v: {r["name"]: r["psnr"] for r in runs[place.name, v, seed].metrics["views"]} for v in request.variants}
+        found = {v: runs[place.name, v, seed].metrics or {} for v in request.variants}
+        scores = {v: {r["name"]: r["psnr"] for r in metrics["views"]} for v, metrics in found.items()}
         rows += strips(place.name, place.test, folders, scores, each, device)
-    return sheet([*request.variants, "photograph"], rows), f"the figure shows seed {seed}"
+    return sheet([*request.variants, "image"], rows), f"the figure shows seed {seed}"
 
 
 def _notes(request: StudyRequest, runs: Runs, metrics: tuple[Metric, ...]) -> list[str]:
+    """Return the caveats that a reader of the tables needs."""
     notes = [f"{p}, {v}, seed {s}: {o.note}" for (p, v, s), o in runs.items() if o.note]
     for v in request.variants:
         lost = [f"{p} seed {s}" for (p, name, s), o in runs.items() if name == v and o.metrics is None]
@@ -177,7 +187,7 @@ def _notes(request: StudyRequest, runs: Runs, metrics: tuple[Metric, ...]) -> li
 
 
 def _protocols(runs: Runs) -> list[str]:
-    """How each scene was scored, and what the figures are, as Markdown lines."""
+    """Return how each scene was scored, and the definition of each score, as Markdown lines."""
     lines, seen = [], set()
     variants: dict[str, str] = {}
     for (scene, _, _), outcome in runs.items():
@@ -194,6 +204,7 @@ def _protocols(runs: Runs) -> list[str]:
 
 
 def _runs_csv(request: StudyRequest, runs: Runs) -> str:
+    """Return CSV with a line per run."""
     keys = [k for k in LABELS if any(k in (o.metrics or {}).get("test", {}) for o in runs.values())]
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")

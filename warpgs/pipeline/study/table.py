@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from warpgs.pipeline.study.statistics import Difference, Sample
 
 NONE = "-"
-"""Stands for a figure that was not measured."""
+"""Sign for a figure that was not measured."""
 
 
 @dataclass(frozen=True)
@@ -22,21 +22,22 @@ class Metric:
     label: str
     """Name in tables."""
     upwards: bool
-    """Whether more is better."""
+    """True where more is better."""
     digits: int
     """Digits after the point."""
 
     @property
     def arrow(self) -> str:
-        """The direction that is better."""
+        """Arrow in the direction that is better."""
         return "↑" if self.upwards else "↓"
 
 
 @dataclass(frozen=True)
 class Row:
-    """What was measured of one variant."""
+    """Measurements of one variant."""
 
     name: str
+    """Name of the variant."""
     samples: dict[str, Sample]
     """Mean and deviation by metric; a metric that is not there was not measured."""
     differences: dict[str, Difference]
@@ -47,29 +48,32 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """A study."""
+    """Rows of a study, ready to print."""
 
     caption: str
+    """Title."""
     base: str
     """Name of the row that the others are compared with."""
     metrics: tuple[Metric, ...]
+    """Columns of figures."""
     rows: tuple[Row, ...]
+    """Variants, the base among them."""
     switches: tuple[str, ...] = ()
     """Headings of the columns of check marks, in LaTeX without dollar signs; empty for a table of methods."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if any(len(r.marks) != len(self.switches) for r in self.rows):
             raise ValueError("every row needs a check mark for each switch, and none where there are no switches")
 
     def best(self, metric: Metric) -> float:
-        """The best mean of a column as printed; NaN where nothing was measured."""
+        """Return the best mean of a column as printed; NaN where nothing was measured."""
         means = [round(r.samples[metric.key].mean, metric.digits) for r in self.rows if metric.key in r.samples]
         means = [m for m in means if math.isfinite(m)]
         return (max if metric.upwards else min)(means, default=math.nan)
 
 
 def figure(sample: Sample | None, digits: int, plus_minus: str = " ± ") -> str:
-    """Mean and deviation; a dash for what was not measured, the mean alone where there is no deviation."""
+    """Return mean and deviation as text; a dash where nothing was measured, the mean alone where there is no deviation."""
     if sample is None or not math.isfinite(sample.mean):
         return NONE
     spread = f"{plus_minus}{sample.sd:.{digits}f}" if math.isfinite(sample.sd) else ""
@@ -77,7 +81,7 @@ def figure(sample: Sample | None, digits: int, plus_minus: str = " ± ") -> str:
 
 
 def interval(d: Difference | None, digits: int) -> str:
-    """A paired difference with its interval, signed; a dash for none."""
+    """Return a paired difference with its interval as text, signed; a dash for none."""
     if d is None or not math.isfinite(d.mean):
         return NONE
     ends = f" [{d.low:+.{digits}f}, {d.high:+.{digits}f}]" if math.isfinite(d.low) else ""
@@ -85,7 +89,7 @@ def interval(d: Difference | None, digits: int) -> str:
 
 
 def _grid(head: list[str], body: list[list[str]], left: int) -> list[str]:
-    """A Markdown table whose first ``left`` columns are words, the rest figures."""
+    """Return the lines of a Markdown table whose first ``left`` columns are words, the rest figures."""
     rows = [[c.replace("|", "\\|") for c in r] for r in [head, *body]]
     widths = [max(len(r[i]) for r in rows) for i in range(len(head))]
     lines = [
@@ -97,12 +101,12 @@ def _grid(head: list[str], body: list[list[str]], left: int) -> list[str]:
 
 
 def _plain(heading: str) -> str:
-    """A LaTeX heading for readers without LaTeX: S_{render} becomes S_render."""
+    """Return a LaTeX heading for readers without LaTeX: S_{render} becomes S_render."""
     return heading.replace("\\mathit", "").replace("{", "").replace("}", "")
 
 
 def markdown(table: Table) -> str:
-    """Two tables: figures as mean ± deviation over seeds, the best in bold; and differences to the base with intervals."""
+    """Return two tables: means ± deviations over seeds, the best in bold; and differences to the base with intervals."""
 
     def cell(row: Row, m: Metric) -> str:
         s = row.samples.get(m.key)
@@ -118,7 +122,7 @@ def markdown(table: Table) -> str:
     ]  # fmt: skip
     lines = [*_grid(head, body, 1 + len(marks)), ""]
     lines += [
-        f"Difference to {table.base}, paired by seed, with its 95 % t interval (an interval that spares 0 is marked \\*):",
+        f"Difference to {table.base}, paired by seed, with its 95 % t interval (an interval without 0 is marked \\*):",
         "",
     ]
     rows = [r for r in table.rows if r.differences]
@@ -132,7 +136,7 @@ def markdown(table: Table) -> str:
 
 
 def csv_text(table: Table) -> str:
-    """One line per row and metric, every digit, empty where there is no number."""
+    """Return CSV: a line per row and metric, every digit, empty where there is no number."""
     out = io.StringIO()
     names = [_plain(s) for s in table.switches]
     writer = csv.writer(out, lineterminator="\n")
@@ -151,13 +155,14 @@ def csv_text(table: Table) -> str:
 
 
 def _escape(text: str) -> str:
+    """Escape the signs that mean something to LaTeX."""
     for sign in "\\&%$#_{}":
         text = text.replace(sign, "\\textbackslash " if sign == "\\" else f"\\{sign}")
     return text
 
 
 def latex(table: Table) -> str:
-    """A booktabs table: check marks or methods, figures as mean ± deviation, and the paired difference of the first metric."""
+    """Return a booktabs table: check marks or methods, means ± deviations, and the paired difference of the first metric."""
     first, space = table.metrics[0], "\\,["
 
     def cell(row: Row, m: Metric) -> str:

@@ -15,9 +15,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from warpgs.pipeline.metrics.evaluate import render_view, score
+from warpgs.pipeline.metrics.evaluate import options_for, render_view, score
 from warpgs.pipeline.model.init import sweeps
-from warpgs.pipeline.runs.results import options_for
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.trainer import Fit, run
 from warpgs.priors.sweep import SweepConfig, sweep_depths

@@ -1,0 +1,117 @@
+"""`warpgs.fit` from Python: the same fit as the command, with or without a run folder, in either units."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import warpgs
+from warpgs.app.cli import main
+from warpgs.coordinates import convert_camera
+from warpgs.errors import DataError, UsageError
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.synthetic.demo import split_spec, write_demo
+
+STEPS, SPLIT = 12, split_spec(8)
+CONFIG = warpgs.FitConfig(steps=STEPS, init=InitConfig(source="random", random_count=80))
+FLAGS = ["--preset", "3dgs", "--steps", str(STEPS), "--init.source", "random", "--init.random-count", "80", "--split", SPLIT]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A scene, and a run of the command on it."""
+    folder = tmp_path_factory.mktemp("fit")
+    write_demo(folder / "scene", views=8, width=40, height=32)
+    assert main(["fit", str(folder / "scene"), "--out", str(folder / "run"), "--device", "cpu", *FLAGS]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def fitted(folder):
+    """The same fit from Python on a scene in memory; the result and the reports of its steps."""
+    steps = []
+    scene = warpgs.load_scene(folder / "scene")
+    result = warpgs.fit(scene, CONFIG, split=SPLIT, device="cpu", on_step=steps.append, verbose=False)
+    return result, steps
+
+
+def test_command_and_function_are_one_fit(folder, fitted):
+    """Same Gaussians to the bit, same scores; the step reports are those of the log."""
+    result, steps = fitted
+    run = warpgs.open_run(folder / "run", "cpu")
+    for name, t in run.gaussians().tensors().items():
+        assert torch.equal(getattr(result.gaussians(), name), t), name
+    stored = json.loads((folder / "run" / "metrics.json").read_text())
+    assert {k: result.metrics[k] for k in ("test", "train", "views")} == {k: stored[k] for k in ("test", "train", "views")}
+    log = [json.loads(line) for line in (folder / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert [(r.step, r.loss, r.count) for r in steps] == [(r["step"], r["loss"], r["count"]) for r in log]
+    assert (result.config, result.step, result.folder) == (CONFIG, STEPS, None)
+    assert (result.train, result.test) == (run.train, run.test) and len(result.test) > 0
+    views = [warpgs.load_scene(folder / "scene").view(n) for n in result.test]
+    assert warpgs.evaluate(result.gaussians(), views, result.options())[0].psnr == stored["views"][0]["psnr"]
+
+
+def test_nothing_is_written_or_printed_unless_asked_for(folder, tmp_path, monkeypatch, capsys):
+    """Without a folder the current one stays empty; verbose prints what the command prints, else there is silence."""
+    monkeypatch.chdir(tmp_path)
+    few = dataclasses.replace(CONFIG, steps=2)
+    loud = warpgs.fit(folder / "scene", few, device="cpu")
+    printed = capsys.readouterr().out
+    assert "views to fit" in printed and "no folder was asked for" in printed and all(n in printed for n in loud.notes)
+    assert warpgs.fit(folder / "scene", few, device="cpu", verbose=False).notes == loud.notes
+    assert capsys.readouterr().out == "" and not list(tmp_path.iterdir())
+    with pytest.raises(UsageError, match="preset 'best' is not one of"):
+        warpgs.fit(folder / "scene", "best", device="cpu", out=tmp_path / "x")
+    with pytest.raises(UsageError, match="give out"):
+        warpgs.fit(folder / "scene", CONFIG, resume=True)
+    assert not list(tmp_path.iterdir())
+
+
+def test_units_lead_from_the_fit_to_its_files_and_back(folder, fitted):
+    """In file units the Gaussians are those of the PLY, the cameras those of the reconstruction."""
+    result, _ = fitted
+    ply = warpgs.read_ply(folder / "run" / "point_cloud.ply")
+    torch.testing.assert_close(result.gaussians("file").means, ply.means, rtol=0, atol=0)
+    again = warpgs.read_ply(folder / "run" / "point_cloud.ply", result.normalization, units="scene")
+    torch.testing.assert_close(again.means, result.gaussians().means, rtol=1e-5, atol=1e-5)
+    name, camera = next(iter(result.cameras("file").items()))
+    scene = warpgs.load_scene(folder / "scene")
+    wanted = (scene.view(name).camera.center / scene.normalization.scale) + scene.normalization.offset
+    np.testing.assert_allclose(camera.center, wanted, atol=1e-9)
+
+
+def test_render_path_takes_own_cameras_in_either_units(folder, fitted, tmp_path):
+    """The same camera in scene and in file units gives the same PNG, which is the view's render; a film comes with them."""
+    result, _ = fitted
+    camera = result.cameras()[result.test[0]]
+    in_file = convert_camera(camera, result.normalization, "scene", "file")
+    *scene_files, film = warpgs.render_path(result, [camera, camera], out=tmp_path / "a")
+    file_files = warpgs.render_path(result, [in_file], out=tmp_path / "b", units="file")
+    assert film.name == "film.mp4" and len(scene_files) == 2 and len(file_files) == 2
+    image, other = (np.asarray(Image.open(f), float) for f in (scene_files[0], file_files[0]))
+    assert np.abs(image - other).max() <= 1
+    with torch.no_grad():
+        rgb = warpgs.rasterize(result.gaussians(), camera, result.options()).rgb.numpy()
+    assert np.abs(image / 255 - rgb.clip(0, 1)).max() < 0.51 / 255
+    with pytest.raises(UsageError, match="no camera to render"):
+        warpgs.render_path(result, [], out=tmp_path / "c")
+
+
+def test_a_run_of_a_scene_from_python_is_complete_but_for_the_scene(folder, tmp_path, capsys):
+    """Its folder exports and renders; scoring it again needs the scene, which is said; it is continued with the scene."""
+    scene = warpgs.load_scene(folder / "scene")
+    few = dataclasses.replace(CONFIG, steps=3)
+    result = warpgs.fit(scene, few, out=tmp_path / "run", device="cpu", verbose=False)
+    assert result.folder == tmp_path / "run" and (tmp_path / "run" / "report.html").is_file()
+    assert main(["export", str(tmp_path / "run"), "--to", str(tmp_path / "a.ply")]) == 0
+    assert main(["eval", str(tmp_path / "run"), "--device", "cpu"]) == 3
+    assert "passed from Python" in capsys.readouterr().err
+    with pytest.raises(DataError, match="no record of a fit"):
+        (tmp_path / "x").mkdir()
+        (tmp_path / "x" / "config.json").write_text("{}")
+        warpgs.fit(scene, few, out=tmp_path / "x", resume=True)
+    again = warpgs.fit(scene, few, out=tmp_path / "run", device="cpu", resume=True, verbose=False)
+    assert torch.equal(again.gaussians().means, result.gaussians().means)
