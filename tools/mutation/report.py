@@ -1,16 +1,16 @@
-"""The outcome of a run in words: by file, the survivors, the claims, and last the score."""
+"""Report of a run: the survivors, the claims, a table by file, and last the score."""
 
 import difflib
 from collections import Counter
 
-from tests.mutate.candidates import KERNELS, ROOT, Candidate
+from tools.mutation.candidates import KERNELS, ROOT, Candidate
 
 KILLED = ("killed", "timeout")
 NOTICED_BY_NONE = ("survived", "untested", "broken")
 
 
 def difference(candidate: Candidate) -> str:
-    """The change as a diff without context."""
+    """Return the change as a diff without context."""
     source = (ROOT / KERNELS / candidate.file).read_bytes()
     new = candidate.edit.apply(source)
     lines = difflib.unified_diff(source.decode().splitlines(), new.decode().splitlines(), n=0, lineterm="")
@@ -18,38 +18,37 @@ def difference(candidate: Candidate) -> str:
 
 
 def describe(candidate: Candidate) -> str:
-    """Where and what, in one line."""
+    """Return the place and the change in one line."""
     return f"{candidate.id}  {KERNELS}/{candidate.file}:{candidate.number}  {candidate.change}"
 
 
-def summary(drawn: list[Candidate], status: dict[str, str], reasons: dict[str, str]) -> str:
-    """The whole report.
+def summary(sampled: list[Candidate], status: dict[str, str], reasons: dict[str, str]) -> str:
+    """Return the whole report.
 
     Args:
-        drawn: The sample.
+        sampled: The sample.
         status: By number of the mutant: killed, timeout, survived, untested, broken; mutants that were not run are missing.
         reasons: By number, why a mutant is claimed to be equivalent.
     """
     parts = []
-    for c in drawn:
+    for c in sampled:
         if status.get(c.id) in NOTICED_BY_NONE:
             parts.append(f"{status[c.id].upper()}  {describe(c)}\n{difference(c)}")
-    claimed = [c for c in drawn if c.id in reasons]
+    claimed = [c for c in sampled if c.id in reasons]
     parts += [f"CLAIMED  {describe(c)}\n    {reasons[c.id]}" for c in claimed]
-    table = [f"{'file':<28}{'drawn':>7}{'killed':>8}{'timeout':>9}{'survived':>10}{'claimed':>9}"]
-    for file in sorted({c.file for c in drawn}):
-        own = [c for c in drawn if c.file == file]
+    table = [f"{'file':<28}{'sampled':>9}{'killed':>8}{'timeout':>9}{'survived':>10}{'claimed':>9}"]
+    for file in sorted({c.file for c in sampled}):
+        own = [c for c in sampled if c.file == file]
         n = Counter("claimed" if c.id in reasons else status.get(c.id, "not run") for c in own)
         table.append(
-            f"{file:<28}{len(own):>7}{n['killed']:>8}{n['timeout']:>9}{sum(n[w] for w in NOTICED_BY_NONE):>10}{n['claimed']:>9}"
+            f"{file:<28}{len(own):>9}{n['killed']:>8}{n['timeout']:>9}{sum(n[w] for w in NOTICED_BY_NONE):>10}{n['claimed']:>9}"
         )
     parts.append("\n".join(table))
-    run = [c for c in drawn if c.id in status and c.id not in reasons]
+    run = [c for c in sampled if c.id in status and c.id not in reasons]
     killed = sum(status[c.id] in KILLED for c in run)
-    missing = len(drawn) - len(run) - len(claimed)
+    missing = len(sampled) - len(run) - len(claimed)
     note = f", {missing} not run" if missing else ""
     share = f"{100 * killed / len(run):.1f} %" if run else "none run"
-    parts.append(
-        f"mutation score {share}: {killed} killed of {len(run)} ({len(drawn)} drawn, {len(claimed)} claimed equivalent{note})"
-    )
+    counts = f"{len(sampled)} sampled, {len(claimed)} claimed equivalent{note}"
+    parts.append(f"mutation score {share}: {killed} killed of {len(run)} ({counts})")
     return "\n\n".join(parts)

@@ -1,4 +1,4 @@
-"""What is mutated, where it runs, and which tests look at it."""
+"""Rules: the code that is mutated, the device that runs it, and the tests that look at it."""
 
 import ast
 import re
@@ -24,7 +24,7 @@ CUDA_FUNCTIONS = {
     "adam.py": ("make_scheduled_kernel", "scheduled_rates", "adam_scheduled"),
     "ssim.py": ("make_kernels", "_Plan.padded", "_Plan.launch"),
 }
-"""What only a CUDA device runs, beside the branches that `sides` finds."""
+"""Code that only a CUDA device runs, beside the branches that `sides` finds."""
 
 CUDA_ARGUMENTS = {"deterministic", "block_dim"}
 """Arguments that mean something on CUDA alone: their defaults, and what is passed for them, are judged there."""
@@ -47,13 +47,8 @@ OPS = {
     "knn": ["kernels/test_knn.py", LIMITS],
     "memory": ["kernels/test_memory.py", "test_graphs.py", "test_recording.py"],
     "native": [
-        "kernels/test_project.py",
-        "kernels/test_project_adam.py",
-        "kernels/test_tiles.py",
-        "test_rasterizer.py",
-        LIMITS_PROJECT,
-        LIMITS_BLEND,
-        RECORDS,
+        "kernels/test_project.py", "kernels/test_project_adam.py", "kernels/test_tiles.py", "test_rasterizer.py",
+        LIMITS_PROJECT, LIMITS_BLEND, RECORDS,
     ],
     "project": ["kernels/test_project.py", LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "test_rasterizer.py"],
     "project_adam": ["kernels/test_project_adam.py"],
@@ -62,7 +57,7 @@ OPS = {
     "sh": ["kernels/test_sh.py", "kernels/test_project.py"],
     "ssim": ["kernels/test_ssim.py", LIMITS],
     "tiles": ["kernels/test_tiles.py", LIMITS_BLEND, RECORDS, "test_rasterizer.py", "test_window.py"],
-}
+}  # fmt: skip
 """The tests of a file by the beginning of its name, the longest that fits; those that fail soonest come first."""
 
 CUDA_OPS = {
@@ -71,14 +66,14 @@ CUDA_OPS = {
     "project_adam": [FENCES, "pipeline/test_graph.py"], "project_backward": [FENCES], "ssim": [FENCES],
     "tiles": [BODIES, FENCES, "pipeline/test_graph.py"],
 }  # fmt: skip
-"""More of them for CUDA: bodies one by one, memory beside a tensor, steps that are recorded and replayed."""
+"""More tests for CUDA: bodies one by one, memory beside a tensor, steps that are recorded and replayed."""
 
 SKIPPED = ("tests/kernels/test_blend.py::test_gradcheck",)
 """Tests that take most of a minute, and check what another in the list checks to the same digits by other means."""
 
 
 def tests_of(file: str, cuda: bool) -> list[str]:
-    """Test files for a kernel file, given by its path below warpgs/kernels, on CUDA or on the CPU."""
+    """Return the test files for a kernel file, given by its path below warpgs/kernels, on CUDA or on the CPU."""
     stem = file.removeprefix("cuda/").split(".")[0]
     op = max((name for name in OPS if stem.startswith(name)), key=len)
     if file.startswith("cuda/blend"):
@@ -88,7 +83,7 @@ def tests_of(file: str, cuda: bool) -> list[str]:
 
 
 def left_out(node: ast.AST) -> bool:
-    """Whether a node is not mutated, with all below it.
+    """Return whether a node is not mutated, with all below it.
 
     Errors: their text, and what is computed for it, is no arithmetic. Formatted text: names of modules and messages.
     Imports and `__all__` hold no operator. Hints and portions change the time, not the numbers. Slack: see `SLACK`.
@@ -106,28 +101,28 @@ def left_out(node: ast.AST) -> bool:
 
 
 def is_hint(node: ast.AST) -> bool:
-    """Whether a key of a dictionary is the name of a hint; its value is left out then."""
+    """Return whether a key of a dictionary is the name of a hint; its value is left out then."""
     return isinstance(node, ast.Constant) and node.value in HINTS
 
 
 def number_left_out(statement: ast.stmt | None) -> bool:
-    """Whether the numbers of a statement are left out, its operators not."""
+    """Return whether the numbers of a statement are left out, its operators not."""
     return isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) in SLACK
 
 
 def native_number_left_out(line: str) -> bool:
-    """The same for a line of a CUDA body, and the sizes of portions there."""
+    """Return the same for a line of a CUDA body; sizes of portions of work count there, too."""
     declared = re.match(r"\s*(?:const float|auto|constexpr int) (\w+) =", line)
     return bool(declared) and declared[1] in SLACK | SPEED
 
 
 def is_native(node: ast.Constant) -> bool:
-    """Whether a string is a CUDA body: it has a statement, or more, of its own."""
+    """Return whether a string is a CUDA body: it has a statement, or more, of its own."""
     return isinstance(node.value, str) and ";" in node.value and ("return " in node.value or ";\n" in node.value)
 
 
 def sides(node: ast.AST) -> tuple[bool, bool]:
-    """Whether only CUDA runs the body of an ``if`` (or conditional expression), and the same of its ``else``."""
+    """Return whether only CUDA runs the body of an ``if`` (or conditional expression), and the same of its ``else``."""
     if not isinstance(node, ast.If | ast.IfExp):
         return False, False
     test = ast.unparse(node.test)

@@ -6,9 +6,9 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.mutate.edit import Edit
-from tests.mutate.native import native_edits
-from tests.mutate.python import python_edits
+from tools.mutation.edit import Edit
+from tools.mutation.native import native_edits
+from tools.mutation.python import python_edits
 
 ROOT = Path(__file__).parents[2]
 KERNELS = "warpgs/kernels"
@@ -26,12 +26,13 @@ class Candidate:
     line: str
     """Its text, stripped."""
     change: str
-    """What is done; with ``#n`` where one line text of one function offers the same change n times."""
+    """The change, with ``#n`` where one statement offers the same change n times."""
 
     @property
-    def key(self) -> tuple[str, str, str, str]:
-        """File, function, line text and change: what names it whatever stands elsewhere in the file."""
-        return self.file, self.edit.function, self.line, self.change
+    def key(self) -> tuple[str, str, str, str, str]:
+        """File, function, path, shape and change: its name whatever stands elsewhere in the file."""
+        place = self.edit.place
+        return self.file, place.function, place.path, place.shape, self.change
 
     @property
     def id(self) -> str:
@@ -40,49 +41,41 @@ class Candidate:
 
     @property
     def cuda(self) -> bool:
-        """Whether only a CUDA device runs it."""
-        return self.edit.cuda
-
-    def mutated_line(self) -> str:
-        """The line as it becomes (of a statement over several lines, the first)."""
-        source = (ROOT / KERNELS / self.file).read_bytes()
-        return self.edit.apply(source).decode().splitlines()[self.number - 1].strip()
+        """True where only a CUDA device runs it."""
+        return self.edit.place.cuda
 
 
 def candidates_of(file: str, source: bytes) -> list[Candidate]:
-    """The mutants of one source text."""
-    edits = python_edits(source, file) if file.endswith(".py") else [
-        Edit(e.start, e.end, e.new, e.change, cuda=True) for e in native_edits(source)
-    ]  # fmt: skip
+    """Return the mutants of one source text."""
+    edits = python_edits(source, file) if file.endswith(".py") else native_edits(source)
     lines = source.decode().splitlines()
     seen: Counter = Counter()
     found = []
     for edit in edits:
         number = source.count(b"\n", 0, edit.start) + 1
-        line = lines[number - 1].strip()
-        seen[key := (edit.function, line, edit.change)] += 1
+        seen[key := (edit.place.function, edit.place.path, edit.change)] += 1
         change = edit.change if seen[key] == 1 else f"{edit.change} #{seen[key]}"
-        found.append(Candidate(file, edit, number, line, change))
+        found.append(Candidate(file, edit, number, lines[number - 1].strip(), change))
     return found
 
 
 def all_candidates() -> list[Candidate]:
-    """The mutants of every kernel file."""
+    """Return the mutants of every kernel file."""
     folder = ROOT / KERNELS
     paths = sorted([*folder.glob("*.py"), *(folder / "cuda").glob("*.cu")])
     return [c for p in paths for c in candidates_of(p.relative_to(folder).as_posix(), p.read_bytes())]
 
 
-def draw(candidates: list[Candidate], count: int, seed: int) -> list[Candidate]:
-    """A random sample: of each file, and apart for each device, a share in proportion to its candidates, rounded up.
+def sample(candidates: list[Candidate], count: int, seed: int) -> list[Candidate]:
+    """Return a random sample: of each file, and apart for each device, its proportion of the count, rounded up.
 
     A larger sample of the same seed holds the smaller one.
     """
     strata: dict[tuple[str, bool], list[Candidate]] = {}
     for c in candidates:
         strata.setdefault((c.file, c.cuda), []).append(c)
-    drawn = []
+    found = []
     for stratum, own in strata.items():
         order = random.Random(f"{seed} {stratum}").sample(own, len(own))
-        drawn.extend(order[: -(-count * len(own) // len(candidates))])
-    return sorted(drawn, key=lambda c: (c.file, c.edit.start, c.change))
+        found.extend(order[: -(-count * len(own) // len(candidates))])
+    return sorted(found, key=lambda c: (c.file, c.edit.start, c.change))
