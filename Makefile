@@ -20,7 +20,7 @@ demo: install
 	rm -rf $(OUT)
 	mkdir -p $(OUT)
 	$(BIN)/warpgs demo $(OUT)/scene | tee $(OUT)/next.txt
-	$(BIN)/warpgs fit $(OUT)/scene --split "$$($(BIN)/python -c 'from warpgs.demo import split_spec; print(split_spec(24))')" --out $(OUT)/run
+	$(BIN)/warpgs fit $(OUT)/scene --split "$$($(BIN)/python -c 'from warpgs.synthetic.demo import split_spec; print(split_spec(24))')" --out $(OUT)/run
 	@echo "pictures: $(OUT)/run/renders    report: $(OUT)/run/report.html"
 
 test: install lint

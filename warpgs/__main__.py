@@ -2,6 +2,6 @@
 
 import sys
 
-from warpgs.cli import main
+from warpgs.app.cli import main
 
 sys.exit(main())

@@ -1,0 +1,1 @@
+"""Torch and Warp side by side: interop, memory, CUDA graphs."""
