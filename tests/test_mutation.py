@@ -1,12 +1,13 @@
 """The mutation check: its mutants, its claims, and how it reads the end of a test run."""
 
 import ast
+import re
 
 import pytest
 
 from tools.mutation import claims, report, rules
 from tools.mutation.__main__ import arguments, check_unmutated
-from tools.mutation.candidates import KERNELS, ROOT, all_candidates, candidates_of, sample
+from tools.mutation.candidates import ROOT, all_candidates, candidates_of, sample
 from tools.mutation.native import native_edits
 from tools.mutation.process import Job, Outcome, run_jobs
 from tools.mutation.python import python_edits
@@ -84,24 +85,34 @@ def test_what_only_cuda_runs():
     )
     cuda = {e.change for e in python_edits(source, "some.py") if e.place.cuda}
     assert cuda == {"2 to 3", "True to False", "11 to 12", "13 to 14", "16 to 17"}
-    assert all(e.place.cuda for e in python_edits(source, "blend_cuda.py"))
+    assert all(e.place.cuda for e in python_edits(source, "warpgs/kernels/blend_cuda.py"))
     assert {e.place.cuda for e in python_edits(PYTHON.encode(), "some.py") if "2.0f" in e.change} == {True}
 
 
 def test_every_kernel_file_has_mutants_and_tests(candidates):
     """All files but the empty package; mutants have numbers of their own, samples are nested and take some of each file."""
     assert len(candidates) > 4000 and len({c.key for c in candidates}) == len({c.id for c in candidates}) == len(candidates)
-    files = {p.relative_to(ROOT / KERNELS).as_posix() for p in (ROOT / KERNELS).rglob("*") if p.suffix in (".py", ".cu")}
-    assert files - {c.file for c in candidates} == {"__init__.py"}
-    for file in files - {"__init__.py"}:
-        assert all((ROOT / test).is_file() for cuda in (False, True) for test in rules.tests_of(file, cuda))
-    assert all((ROOT / test.split("::")[0]).is_file() for test in rules.SKIPPED)
+    found = {pattern: [p.relative_to(ROOT).as_posix() for p in ROOT.glob(pattern)] for pattern in rules.MUTATED}
+    assert all(found.values())
+    files = {file for files in found.values() for file in files}
+    assert files - {c.file for c in candidates} == {"warpgs/kernels/__init__.py"}
+    tests = {test for c in candidates for cuda in (False, True) for test in rules.tests_of(c.file, cuda)}
+    assert [t for t in sorted(tests) + [t.split("::")[0] for t in rules.SKIPPED] if not (ROOT / t).is_file()] == []
     for c in candidates[::50]:
         if c.file.endswith(".py"):
-            ast.parse(c.edit.apply((ROOT / KERNELS / c.file).read_bytes()))
+            ast.parse(c.edit.apply((ROOT / c.file).read_bytes()))
     small, large = sample(candidates, 200, 0), sample(candidates, 400, 0)
     assert sample(candidates, 200, 0) == small and set(small) < set(large) and set(sample(candidates, 200, 1)) != set(small)
     assert 200 <= len(small) <= 240 and {c.file for c in small} == {c.file for c in candidates}
+
+
+def test_rules_name_what_exists(candidates):
+    """A file, function or variable of another name would be mutated, or run on the wrong device, unseen."""
+    text = {file: (ROOT / file).read_text() for file in {c.file for c in candidates} | set(rules.CUDA_FILES)}
+    functions = {(file, f.split(".")[-1]) for file, names in rules.CUDA_FUNCTIONS.items() for f in names}
+    assert [f for f in sorted(functions) if not re.search(rf"(?:def|class) {f[1]}\b", text[f[0]])] == []
+    words = set(re.findall(r"\w+", " ".join(text.values())))
+    assert sorted((rules.SPEED | rules.HINTS | rules.SLACK | rules.CUDA_ARGUMENTS) - words) == []
 
 
 def test_every_claim_finds_its_mutant(candidates):
@@ -160,7 +171,7 @@ def test_a_claim_keeps_its_mutant(after, tmp_path):
         (LOOP.replace(">= n", ">= n + 1"), "has changed; if the reason still holds, write 'some.kernel For1.If1 "),
         (LOOP.replace("def kernel", "def other"), "such a statement stands at 'some.other For1.If1 "),
         (LOOP.replace(">=", "<"), "the statement is gone; remove the claim"),
-        ("", "warpgs/kernels has no some.py with mutants; edit its line in [files]"),
+        ("", "some.py has no mutants; edit its line in [files]"),
     ],
     ids=["changed", "function renamed", "gone", "file moved"],
 )
@@ -237,8 +248,8 @@ def test_score_counts_no_claims(candidates):
 
 def test_tests_must_pass_without_a_mutant(monkeypatch):
     """A file without a test for the device is left out, unless none is left; one that fails ends the run."""
-    cuda, cpu = ("tests/kernels/test_bridge.py", True), ("tests/kernels/test_knn.py", False)
-    ends = {"tests/kernels/test_bridge.py on CUDA": "untested"}
+    cuda, cpu = ("tests/runtime/test_interop.py", True), ("tests/kernels/test_knn.py", False)
+    ends = {"tests/runtime/test_interop.py on CUDA": "untested"}
 
     def instead(jobs, *_, **__):
         return [Outcome(j.name, ends.get(j.name, "survived"), 0, "") for j in jobs]

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from tools.mutation import claims, report, rules
-from tools.mutation.candidates import KERNELS, ROOT, Candidate, all_candidates, sample
+from tools.mutation.candidates import ROOT, Candidate, all_candidates, sample
 from tools.mutation.process import COPIED, Job, Outcome, preload, run_jobs
 
 
@@ -46,7 +46,7 @@ def chosen(options: argparse.Namespace, pool: list[Candidate], claimed: dict[str
     if options.device != "both":
         pool = [c for c in pool if c.cuda == (options.device == "cuda")]
     if options.files:
-        pool = [c for c in pool if c.file in options.files]
+        pool = [c for c in pool if c.file.endswith(tuple(f"/{file}" for file in options.files))]
     return sample(pool, options.sample, options.seed) if pool else []
 
 
@@ -62,10 +62,10 @@ def has_cuda() -> bool:
 
 def job_of(candidate: Candidate, cuda: bool, untested: list[str]) -> Job:
     """Return the job of a mutant: the tests of its op on CUDA or on the CPU, without files that have none for it."""
-    source = candidate.edit.apply((ROOT / KERNELS / candidate.file).read_bytes())
+    source = candidate.edit.apply((ROOT / candidate.file).read_bytes())
     tests = tuple(test for test in rules.tests_of(candidate.file, cuda) if named(test, cuda) not in untested)
     patience = CUDA_PATIENCE if cuda else 1.0
-    return Job(candidate.id, tests, cuda, f"{KERNELS}/{candidate.file}", source, patience)
+    return Job(candidate.id, tests, cuda, candidate.file, source, patience)
 
 
 def named(test: str, cuda: bool) -> str:

@@ -1,4 +1,4 @@
-"""All mutants of warpgs/kernels, each under a key that edits elsewhere leave alone, and samples of them."""
+"""All mutants, each under a key that edits elsewhere leave alone, and samples of them."""
 
 import hashlib
 import random
@@ -6,12 +6,12 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
+from tools.mutation import rules
 from tools.mutation.edit import Edit
 from tools.mutation.native import native_edits
 from tools.mutation.python import python_edits
 
 ROOT = Path(__file__).parents[2]
-KERNELS = "warpgs/kernels"
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Candidate:
     """One mutant."""
 
     file: str
-    """Path below warpgs/kernels."""
+    """Path below the root of the repository."""
     edit: Edit
     number: int
     """Line, from 1."""
@@ -60,10 +60,9 @@ def candidates_of(file: str, source: bytes) -> list[Candidate]:
 
 
 def all_candidates() -> list[Candidate]:
-    """Return the mutants of every kernel file."""
-    folder = ROOT / KERNELS
-    paths = sorted([*folder.glob("*.py"), *(folder / "cuda").glob("*.cu")])
-    return [c for p in paths for c in candidates_of(p.relative_to(folder).as_posix(), p.read_bytes())]
+    """Return the mutants of all files that `rules.MUTATED` names."""
+    paths = [p for pattern in rules.MUTATED for p in sorted(ROOT.glob(pattern))]
+    return [c for p in paths for c in candidates_of(p.relative_to(ROOT).as_posix(), p.read_bytes())]
 
 
 def sample(candidates: list[Candidate], count: int, seed: int) -> list[Candidate]:

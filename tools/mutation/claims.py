@@ -16,7 +16,7 @@ class Claims:
     """The file of claims."""
 
     files: dict[str, str]
-    """Path below warpgs/kernels by the name that claims use."""
+    """Path by the name that claims use."""
     reasons: dict[tuple[str, str, str, str, str], str]
     """Reason by key of the mutant."""
 
@@ -68,7 +68,7 @@ def match(claims: Claims, candidates: list[Candidate]) -> tuple[dict[str, str], 
 def _advice(claims: Claims, key: tuple[str, str, str, str, str], candidates: list[Candidate]) -> str:
     file, function, path, _, change = key
     if not (own := [c for c in candidates if c.file == file]):
-        return f"warpgs/kernels has no {file} with mutants; edit its line in [files]"
+        return f"{file} has no mutants; edit its line in [files]"
     if there := [c for c in own if c.key[1:3] == (function, path) and c.change == change]:
         return f"that statement has changed; if the reason still holds, write '{claims.text(there[0].key)}'"
     if moved := [c for c in own if c.key[3:] == key[3:]] or [c for c in candidates if c.key[3:] == key[3:]]:
