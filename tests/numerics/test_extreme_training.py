@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from warpgs.pipeline.model.layers import ProtectConfig
 
 from tests.gaussians import cloud
 from tests.reference.knn import mean_square_distances_reference
@@ -20,13 +21,10 @@ from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.ssim import differences, ssim
 from warpgs.pipeline.metrics.quantiles import quantiles
 from warpgs.pipeline.model.init import InitConfig, initial_gaussians, initial_points
-from warpgs.pipeline.model.layers import ProtectConfig
-from warpgs.pipeline.model.table import Table
-from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LossConfig, photometric_loss
-from warpgs.pipeline.train.schedule import PhaseConfig
+from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig, DensityStats, DensityUpdate, refine
 from warpgs.pipeline.train.strategies.holdout_blocks import HoldoutConfig
 from warpgs.pipeline.train.strategies.importance import ImportanceConfig, normalized

@@ -7,7 +7,6 @@ import torch
 
 from tests.gaussians import cloud
 from warpgs.errors import UsageError
-from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig, DensityStats, DensityUpdate, refine
 from warpgs.scene import Gaussians

@@ -6,11 +6,11 @@ import itertools
 import numpy as np
 import pytest
 import torch
+from warpgs.pipeline.model.layers import COARSE, FINE, Layers, ProtectConfig
 
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig, initial_points
-from warpgs.pipeline.model.layers import COARSE, FINE, Layers, ProtectConfig
 from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases

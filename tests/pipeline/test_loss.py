@@ -11,11 +11,10 @@ from tests.scenes import photos, priors, seeds
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.train.config import PRESETS, FitConfig
-from warpgs.pipeline.train.views import half_size
 from warpgs.pipeline.train.loss import FLAT, MIN_ALPHA, LossConfig, depth_disagreement, training_loss
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.views import TrainingView
 from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.train.views import TrainingView, half_size
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Prior
 

@@ -20,11 +20,10 @@ from warpgs.pipeline.model.compress import (
     rows_of,
     stored_degrees,
 )
-from warpgs.pipeline.model.table import Table
-from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.runs.checkpoint import load_checkpoint
 from warpgs.pipeline.runs.folder import open_run
 from warpgs.pipeline.runs.prune import prune
+from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera
 from warpgs.synthetic.demo import split_spec, write_demo

@@ -14,10 +14,9 @@ from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.rule_report import TILE, rule_report_of
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.views import half_size
 from warpgs.pipeline.train.step import stack_views
-from warpgs.pipeline.train.views import TrainingView
 from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.train.views import TrainingView, half_size
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Gaussians, View
 

@@ -13,7 +13,7 @@ from warpgs.pipeline.train import step
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LossConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.trainer import Trainer, NotFiniteError
+from warpgs.pipeline.train.trainer import NotFiniteError, Trainer
 from warpgs.scene import View
 
 pytestmark = pytest.mark.cuda

@@ -24,7 +24,7 @@ from warpgs.pipeline.train.config import PRESETS, FitConfig
 from warpgs.pipeline.train.loss import LossConfig, photometric_loss
 from warpgs.pipeline.train.schedule import log_linear, sh_degree
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.trainer import Trainer, NotFiniteError
+from warpgs.pipeline.train.trainer import NotFiniteError, Trainer
 from warpgs.scene import Camera, PointCloud, View
 from warpgs.synthetic.demo import split_spec, write_demo
 
