@@ -4,39 +4,24 @@ Defaults depend on the preset, and the preset on the device; a strategy and loss
 flags that decide which others there are, are looked up first. This module parses and prints; it holds no logic of a fit.
 """
 
-import ast
 import dataclasses
-import inspect
-import itertools
-import textwrap
-import typing
+import re
+import traceback
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
-from warpgs.errors import UsageError
+from warpgs.app.flags import flags_of, settings_of, word_after
+from warpgs.errors import UsageError, WarpgsError
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device
 from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESETS, FitConfig
+from warpgs.pipeline.train.loss import LOSS_TERMS
+from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.pipeline.train.time_budget import check_budget
+from warpgs.plugins import Registry
 from warpgs.render.rule_costs import select_rule
 from warpgs.runtime.byte_units import parse_bytes
 from warpgs.runtime.interop import set_threads
-
-Settings = TypeVar("Settings")
-BYTES = ("memory_limit",)
-"""Fields of FitConfig in bytes, which people write with a unit."""
-UNPREFIXED = ("priors",)
-"""Groups of FitConfig whose flags need no prefix."""
-
-
-def _word(arguments: list[str], flag: str) -> str | None:
-    """Return the word after a flag that must be known before the others can be described; None where it is not given."""
-    for i, word in enumerate(arguments):
-        if word == flag and i + 1 < len(arguments):
-            return arguments[i + 1]
-        if word.startswith(f"{flag}="):
-            return word.removeprefix(f"{flag}=")
-    return None
 
 
 def _request_type() -> type:
@@ -77,48 +62,60 @@ def _request_type() -> type:
     return Request
 
 
-def field_docs(kind: type) -> dict[str, str]:
-    """Return the docstrings of the fields of a dataclass by name, each on one line; those of its bases included."""
-    docs: dict[str, str] = {}
-    for cls in reversed(kind.__mro__):
-        if not dataclasses.is_dataclass(cls):
-            continue
-        (tree,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
-        body = tree.body if isinstance(tree, ast.ClassDef) else []
-        for statement, after in itertools.pairwise(body):
-            match statement, after:
-                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str() as text)):
-                    docs[name] = " ".join(text.split())
-    return docs
+def _load(registry: Registry[Any], name: str) -> type[Any]:
+    """Return the class of a plug-in, importing code of the user's own where it is named by module or file.
 
-
-def flags_of(kind: type, default: Any) -> tuple[type, Any]:
-    """Derive the flags of a settings dataclass; returns a subclass that tyro can parse, and its default.
-
-    Every field becomes a flag with the field's docstring as its help, those of nested settings under the field's name.
+    Raises:
+        UsageError: There is no such class, or its code does not run; the message names the line.
     """
-    import tyro
-
-    hints, docs, fields, values = typing.get_type_hints(kind), field_docs(kind), [], {}
-    for f in dataclasses.fields(kind):
-        hint, value = hints[f.name], getattr(default, f.name)
-        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
-            hint, value = flags_of(hint, value)
-            hint = tyro.conf.OmitArgPrefixes[hint] if f.name in UNPREFIXED else hint  # type: ignore[valid-type,misc]
-        else:
-            extra = [_size()] if f.name in BYTES else []
-            hint = Annotated[hint, tyro.conf.arg(help=docs.get(f.name, "")), *extra]
-        values[f.name] = value
-        fields.append((f.name, hint, field(default=value)))
-    flags = dataclasses.make_dataclass(kind.__name__, fields, bases=(kind,), frozen=True, namespace={"__doc__": kind.__doc__})
-    return flags, flags(**values)
+    try:
+        return registry.load(name)
+    except WarpgsError:
+        raise
+    except Exception as e:  # whatever a user's module raises
+        last = traceback.extract_tb(e.__traceback__)[-1]
+        where = f"{e.filename}, line {e.lineno}" if isinstance(e, SyntaxError) else f"{last.filename}, line {last.lineno}"
+        raise UsageError(
+            f"the {registry.kind} {name!r} cannot be loaded: {type(e).__name__}: {e} ({where}); fix that code, or leave it out"
+        ) from e
 
 
-def settings_of(kind: type[Settings], flags: Any) -> Settings:
-    """Return the settings that parsed flags stand for: the inverse of `flags_of`."""
-    hints = typing.get_type_hints(kind)
-    values = {f.name: getattr(flags, f.name) for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    return kind(**{n: settings_of(hints[n], v) if dataclasses.is_dataclass(hints[n]) else v for n, v in values.items()})
+def _group(name: str) -> str:
+    """Return the name of the flags of a plug-in's own settings: ``my.module:MyStrategy`` has the group ``my_strategy``."""
+    word = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name.rpartition(":")[2])
+    return re.sub(r"\W", "_", word).lower()
+
+
+def _terms(arguments: list[str], base: FitConfig) -> dict[str, Any]:
+    """Return the loss terms that a command line names, with default settings, by the name of their flags."""
+    given = word_after(arguments, "--loss-terms")
+    if given is None:
+        return {_group(t.name): t for t in base.loss_terms}
+    terms = {}
+    for name in filter(None, (n.strip() for n in given.split(","))):
+        if _group(name) in terms:
+            raise UsageError(f"--loss-terms {given}: two terms have the flags --{_group(name)}; leave one out")
+        kind = _load(LOSS_TERMS, name)
+        try:
+            terms[_group(name)] = kind()
+        except TypeError as e:
+            raise UsageError(f"the loss term {name!r} has a setting without a default ({e}); give every field one") from e
+    return terms
+
+
+def _preset(arguments: list[str]) -> tuple[FitConfig, str]:
+    """Return the settings that the flags start from, and the kind of device that they go with."""
+    named, device = word_after(arguments, "--preset"), word_after(arguments, "--device") or "auto"
+    kind = "cpu" if {"-h", "--help"} & set(arguments) and device == "auto" else choose_device(device)[0].type
+    name = named or DEFAULT_PRESET[kind]
+    if name not in PRESETS:
+        raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
+    base = PRESETS[name]
+    strategy = word_after(arguments, "--strategy")
+    if strategy is None or strategy == base.strategy:
+        return base, kind
+    own = _load(STRATEGIES, strategy).Config
+    return dataclasses.replace(base, strategy=strategy, strategy_config=None if own is None else own()), kind
 
 
 def _size() -> Any:
@@ -132,13 +129,44 @@ def _size() -> Any:
     )  # fmt: skip
 
 
-def _flags(base: FitConfig) -> type:
-    """Return the dataclass of all flags, whose defaults are the settings ``base``."""
+def _names(terms: dict[str, Any]) -> Any:
+    """Return the specification of the flag that names loss terms; their settings are flags of their own."""
     import tyro
 
-    kind, default = flags_of(FitConfig, base)
-    config = ("config", Annotated[kind, tyro.conf.arg(name="")], field(default=default))
-    return dataclasses.make_dataclass("Fit", [config], bases=(_request_type(),), frozen=True, kw_only=True)
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1, metavar="NAME,...", instance_from_str=lambda words: tuple(terms.values()),
+        is_instance=lambda value: isinstance(value, tuple),
+        str_from_instance=lambda value: [",".join(t.name for t in value) or "none"],
+    )  # fmt: skip
+
+
+def _flags(base: FitConfig, terms: dict[str, Any]) -> type:
+    """Return the dataclass of all flags: the request, the settings ``base``, and those of the strategy and of loss terms."""
+    import tyro
+
+    special = {
+        "memory_limit": (_size(),), "loss_terms": (_names(terms),), "priors": (tyro.conf.OmitArgPrefixes,),
+        "strategy_config": (tyro.conf.Fixed, tyro.conf.Suppress),
+    }  # fmt: skip
+    kind, default = flags_of(FitConfig, dataclasses.replace(base, loss_terms=tuple(terms.values())), special)
+    fields: list[tuple[str, Any, Any]] = [("config", Annotated[kind, tyro.conf.arg(name="")], field(default=default))]
+    own = {} if base.strategy_config is None else {_group(base.strategy): base.strategy_config}
+    taken = {f.name for f in dataclasses.fields(FitConfig)}
+    for name, settings in [*own.items(), *terms.items()]:
+        if name in taken:
+            raise UsageError(f"a plug-in has the name {name}, whose flags --{name} there are already; call it something else")
+        taken.add(name)
+        group, default = flags_of(type(settings), settings)
+        fields.append((name, group, field(default=default)))
+    return dataclasses.make_dataclass("Fit", fields, bases=(_request_type(),), frozen=True, kw_only=True)
+
+
+def _config(a: Any, base: FitConfig, terms: dict[str, Any]) -> FitConfig:
+    """Return the settings that parsed flags stand for."""
+    config, own = settings_of(FitConfig, a.config), base.strategy_config
+    if own is not None:
+        config = dataclasses.replace(config, strategy_config=settings_of(type(own), getattr(a, _group(base.strategy))))
+    return dataclasses.replace(config, loss_terms=tuple(settings_of(type(t), getattr(a, n)) for n, t in terms.items()))
 
 
 def _chosen(a: Any, arguments: list[str], config: FitConfig) -> tuple[FitConfig, tuple[str, ...]]:
@@ -146,7 +174,7 @@ def _chosen(a: Any, arguments: list[str], config: FitConfig) -> tuple[FitConfig,
     if a.max_error is not None and a.time_budget is not None:
         raise UsageError("--max-error and --time-budget choose settings by different costs: give one of them")
     if a.time_budget is not None:
-        if a.resume or _word(arguments, "--steps"):
+        if a.resume or word_after(arguments, "--steps"):
             raise UsageError(
                 "--time-budget chooses the number of steps: leave out --steps, and to continue such a run give --resume with "
                 "the --steps that it chose instead of --time-budget"
@@ -154,20 +182,10 @@ def _chosen(a: Any, arguments: list[str], config: FitConfig) -> tuple[FitConfig,
         check_budget(a.time_budget)
     if a.max_error is None:
         return config, ()
-    if _word(arguments, "--rule"):
+    if word_after(arguments, "--rule"):
         raise UsageError("--max-error chooses the rule: leave out --rule")
     rule, note = select_rule(max_error=a.max_error)
     return dataclasses.replace(config, rule=rule), (note,)
-
-
-def _base(arguments: list[str]) -> tuple[FitConfig, str]:
-    """Return the preset that the flags start from, and the kind of device that it goes with."""
-    named, device = _word(arguments, "--preset"), _word(arguments, "--device") or "auto"
-    kind = "cpu" if {"-h", "--help"} & set(arguments) and device == "auto" else choose_device(device)[0].type
-    name = named or DEFAULT_PRESET[kind]
-    if name not in PRESETS:
-        raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
-    return PRESETS[name], kind
 
 
 def fit(arguments: list[str], description: str) -> FitRequest:
@@ -175,20 +193,19 @@ def fit(arguments: list[str], description: str) -> FitRequest:
 
     Raises:
         ResourceError: The device is not there.
-        UsageError: A flag is wrong.
+        UsageError: A flag is wrong, or a plug-in cannot be loaded.
     """
     import tyro
 
-    if "max_gaussians" not in FitConfig.__dataclass_fields__:
-        arguments = [w.replace("--max-gaussians", "--density.max-gaussians", 1) for w in arguments]
-    base, kind = _base(arguments)
-    a: Any = tyro.cli(_flags(base), args=arguments, prog="warpgs fit", description=description)
+    base, kind = _preset(arguments)
+    terms = _terms(arguments, base)
+    a: Any = tyro.cli(_flags(base, terms), args=arguments, prog="warpgs fit", description=description)
     if a.threads < 0:
         raise UsageError(f"--threads must be 0 or more, not {a.threads}")
     if a.threads:
         set_threads(a.threads)
-    config, notes = _chosen(a, arguments, settings_of(FitConfig, a.config))
-    if _word(arguments, "--preset") is None:
+    config, notes = _chosen(a, arguments, _config(a, base, terms))
+    if word_after(arguments, "--preset") is None:
         steps = "as many steps as the time allows" if a.time_budget else f"{config.steps} steps"
         print(f"preset {base.preset}, as usual on {kind}, {steps}; the time left stands in the line of progress")
     masks = None if a.score_masks is None else str(a.score_masks.resolve())

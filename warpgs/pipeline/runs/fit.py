@@ -26,10 +26,10 @@ from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line, write_report
 from warpgs.pipeline.runs.rule_report import rule_report_of
 from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, sampling_report_of
+from warpgs.pipeline.train.complexity import complexity_figures, complexity_summary
 from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESETS, FitConfig
-from warpgs.pipeline.train.strategies.holdout import complexity_figures, complexity_summary, fit_class
 from warpgs.pipeline.train.time_budget import within_budget
-from warpgs.pipeline.train.trainer import Fit, StepReport, run, train_views
+from warpgs.pipeline.train.trainer import StepReport, Trainer, run, train_views
 from warpgs.pipeline.train.warmup import rehearsal
 from warpgs.report.events import EventLog
 from warpgs.report.progress import Progress
@@ -180,7 +180,7 @@ def _scene_of(scene: Scene | SceneRequest | str | Path, spec: str | None) -> tup
     return request, *read_scene(request)
 
 
-def _prepare(job: _Job, resumed: Path | None) -> tuple[Fit, State | None, dict[str, Any]]:
+def _prepare(job: _Job, resumed: Path | None) -> tuple[Trainer, State | None, dict[str, Any]]:
     """Set up the trainer; returns it, the state to continue the run ``resumed`` from, if any, and the record of the run."""
     record, state = record_of(job.request, job.config, job.scene, job.split, job.notes, job.device), None
     if resumed is not None:
@@ -189,13 +189,13 @@ def _prepare(job: _Job, resumed: Path | None) -> tuple[Fit, State | None, dict[s
             state = load_checkpoint(resumed)
     c = job.config
     with rehearsal(c, job.device) as ready:
-        trainer = fit_class(c)(job.train, job.scene.points, c, job.device, job.scene.background, ready=ready)
+        trainer = Trainer(job.train, job.scene.points, c, job.device, job.scene.background, ready=ready)
     if job.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(job.device)  # the steps' need is told, not the start's or an earlier fit's
     return trainer, state, record
 
 
-def _finish(job: _Job, trainer: Fit, state: State | None, record: dict[str, Any], resume: bool) -> FitResult:
+def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, Any], resume: bool) -> FitResult:
     """Take the steps, score the model, and write the run folder where there is one."""
     if job.out is not None and not resume:
         write_json(job.out / CONFIG, record)
@@ -225,7 +225,7 @@ def _finish(job: _Job, trainer: Fit, state: State | None, record: dict[str, Any]
     )  # fmt: skip
 
 
-def _announce(job: _Job, trainer: Fit) -> None:
+def _announce(job: _Job, trainer: Trainer) -> None:
     """Print what is fitted and every choice made for the user."""
     job.notes += [*trainer.notes, trainer.memory.sentence()]
     train, test = job.train, job.test
@@ -235,14 +235,20 @@ def _announce(job: _Job, trainer: Fit) -> None:
         job.say(f"  {note}")
 
 
-def _score(job: _Job, trainer: Fit, seconds: dict[str, float]) -> dict[str, Any]:
+def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, Any]:
     """Score the finished fit; returns the contents of metrics.json."""
     c, scene, train, test, gaussians = job.config, job.scene, job.train, job.test, trainer.gaussians
     on_cuda = job.device.type == "cuda"
     peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(job.device)} if on_cuda else {}
-    metrics = evaluate_run(job.out, gaussians, train, test, c.rule, scene.background, job.lpips, trainer.most)
+    metrics = evaluate_run(job.out, gaussians, train, test, c.rule, scene.background, job.lpips, trainer.max_instances)
     rule = rule_report_of(
-        gaussians, train, c.rule, scene.background, seed=c.seed, half_resolution=c.half_resolution, max_instances=trainer.most
+        gaussians,
+        train,
+        c.rule,
+        scene.background,
+        seed=c.seed,
+        half_resolution=c.half_resolution,
+        max_instances=trainer.max_instances,
     )
     job.notes.append(rule["summary"])
     job.say(f"  {rule['summary']}")
@@ -279,12 +285,12 @@ def _stop_signals() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
-def _train(job: _Job, trainer: Fit) -> None:
+def _train(job: _Job, trainer: Trainer) -> None:
     """Take all remaining steps, with a log and checkpoints where there is a run folder."""
     out = job.out
     log = None if out is None else EventLog(out / "metrics.jsonl", trainer.step)
 
-    def save(current: Fit) -> None:
+    def save(current: Trainer) -> None:
         if out is not None and log is not None:
             log.flush()
             save_checkpoint(out, *current.state())

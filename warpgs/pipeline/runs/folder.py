@@ -180,8 +180,8 @@ def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredR
     except (KeyError, TypeError, ValueError) as e:
         raise DataError(f"{folder / CONFIG}: is not whole ({e!r} is missing or malformed); fit again, or restore it") from e
     tensors, state = load_checkpoint(folder)
-    if "param.sh_packed" in tensors:
-        tensors["param.sh"] = unpack(tensors["param.sh_packed"], tensors["degrees"])
-    gaussians = Gaussians(**{n: tensors[f"param.{n}"].to(where) for n in Gaussians.__dataclass_fields__})
+    if "params.sh_packed" in tensors:
+        tensors["params.sh"] = unpack(tensors["params.sh_packed"], tensors["degrees"])
+    gaussians = Gaussians(**{n: tensors[f"params.{n}"].to(where) for n in Gaussians.__dataclass_fields__})
     background = (red, green, blue)
     return StoredRun(gaussians, normalization, cameras, train, test, rule, background, state["step"], folder, record)

@@ -24,7 +24,7 @@ from warpgs.pipeline.runs.checkpoint import save_checkpoint
 from warpgs.pipeline.runs.commands import scene_of
 from warpgs.pipeline.runs.folder import CONFIG, StoredRun, open_run
 from warpgs.pipeline.runs.request import choose_device
-from warpgs.pipeline.train.strategies.importance_sampling import TrainingView
+from warpgs.pipeline.train.views import TrainingView
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.scene import Gaussians, Normalization, View
@@ -54,8 +54,8 @@ def _new_folder(folder: Path, out: Path | None) -> Path:
 def _write(out: Path, record: dict[str, Any], made: compress.Pruned, step: int, normalization: Normalization) -> None:
     """Write the new run folder, whole or not at all."""
     temporary = out.with_name(f".{out.name}.{secrets.token_hex(4)}.tmp")
-    tensors = {f"param.{n}": t for n, t in made.gaussians.tensors().items() if n != "sh"}
-    tensors |= {"param.sh_packed": pack(made.gaussians.sh, made.degrees), "degrees": made.degrees}
+    tensors = {f"params.{n}": t for n, t in made.gaussians.tensors().items() if n != "sh"}
+    tensors |= {"params.sh_packed": pack(made.gaussians.sh, made.degrees), "degrees": made.degrees}
     try:
         temporary.mkdir()
         write_json(temporary / CONFIG, record)
