@@ -122,13 +122,18 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
 
 
 def _check_named_again(now: dict[str, Any], then: dict[str, Any], out: Path) -> None:
-    """Raise a UsageError where a run used a strategy from outside warpgs that is not named again."""
-    strategy = then.get("strategy")
-    if isinstance(strategy, str) and ":" in strategy and now.get("strategy") != strategy:
-        raise UsageError(
-            f"--resume: the run in {out} was fitted with {strategy}, code from outside warpgs. A run folder never decides "
-            f"which code is loaded: name it again with --strategy {strategy}"
-        )
+    """Raise a UsageError where a run used code from outside warpgs that is not named again."""
+
+    def outside(config: dict[str, Any]) -> dict[str, list[str]]:
+        names = {"--strategy": [config.get("strategy")], "--loss-terms": [t["name"] for t in config.get("loss_terms", [])]}
+        return {flag: [n for n in found if isinstance(n, str) and ":" in n] for flag, found in names.items()}
+
+    for flag, names in outside(then).items():
+        if set(names) - set(outside(now)[flag]):
+            raise UsageError(
+                f"--resume: the run in {out} was fitted with {', '.join(names)}, code from outside warpgs. A run folder never "
+                f"decides which code is loaded: name it again with {flag} {','.join(names)}"
+            )
 
 
 @dataclass(frozen=True)
