@@ -22,6 +22,7 @@ __all__ = [
     "FitConfig",
     "FitResult",
     "Gaussians",
+    "LossTerm",
     "Model",
     "Normalization",
     "PointCloud",
@@ -30,6 +31,7 @@ __all__ = [
     "Scene",
     "StepReport",
     "StoredRun",
+    "Strategy",
     "View",
     "ViewMetrics",
     "clear_graph_cache",
@@ -55,6 +57,8 @@ if TYPE_CHECKING:
     from warpgs.pipeline.runs.model_file import Model, load, save
     from warpgs.pipeline.runs.paths import render_path
     from warpgs.pipeline.train.config import PRESETS, FitConfig
+    from warpgs.pipeline.train.loss import LossTerm
+    from warpgs.pipeline.train.strategies.base import Strategy
     from warpgs.pipeline.train.trainer import StepReport
     from warpgs.render.graphed import clear_graph_cache
     from warpgs.render.rasterize import RasterizeOptions, rasterize
@@ -72,6 +76,8 @@ _HOME = {
         "warpgs.pipeline.runs.model_file": ("Model", "load", "save"),
         "warpgs.pipeline.runs.paths": ("render_path",),
         "warpgs.pipeline.train.config": ("FitConfig", "PRESETS"),
+        "warpgs.pipeline.train.loss": ("LossTerm",),
+        "warpgs.pipeline.train.strategies.base": ("Strategy",),
         "warpgs.pipeline.train.trainer": ("StepReport",),
         "warpgs.render.graphed": ("clear_graph_cache",),
         "warpgs.render.rasterize": ("RasterizeOptions", "rasterize"),
