@@ -22,7 +22,7 @@ from warpgs.pipeline.model.table import Optimizer
 from warpgs.pipeline.train.loss import LossConfig, masked_mse, training_loss
 from warpgs.pipeline.train.strategies.clone_split import DensityStats
 from warpgs.pipeline.train.strategies.importance_sampling import TrainingView
-from warpgs.runtime import interop
+from warpgs.runtime.cuda_graph import CapturedGraph
 
 STEPS_PER_BATCH = 100
 """Most steps between two looks at the device."""
@@ -113,7 +113,7 @@ class StepGraph:
             self._step()
             buffers.release()
             stream.synchronize()
-            self.graph, self.lent = interop.capture(self._step)
+            self.graph = CapturedGraph(self._step, stream)
         torch.cuda.current_stream().wait_stream(stream)
 
     def _project(self, viewmat: torch.Tensor, K: torch.Tensor, factors: torch.Tensor | None = None):
