@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from warpgs.constants import FARTHEST_PIXEL, LARGEST_AXIS, SHORTEST_QUAT, SMALLEST_DETERMINANT
-from warpgs.kernels.cameras import find_camera_model
+from warpgs.kernels.cameras.base import CAMERA_MODELS
 
 
 @functools.cache
@@ -82,7 +82,7 @@ def make_projection(real, camera_model: str):
         camera_model: Name of the camera model, whose functions are compiled in.
     """
     r = make_rotations(real)
-    camera = find_camera_model(camera_model)(real)
+    camera = CAMERA_MODELS.find(camera_model).make_functions(real)
     t = make_types(real)
     vec2 = t.vec2
     vec3 = t.vec3

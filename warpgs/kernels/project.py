@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from warpgs.constants import LARGEST_COEFFICIENT, Rule
 from warpgs.kernels import sh
-from warpgs.kernels.cameras import find_camera_model
+from warpgs.kernels.cameras.base import CAMERA_MODELS
 from warpgs.kernels.functions import make_projection, make_spans, make_types
 from warpgs.kernels.native import BLOCK
 from warpgs.kernels.native import make_functions as make_native
@@ -331,7 +331,7 @@ def project(
         UsageError: The camera model is unknown.
         ValueError: A shape or device disagrees; the message names argument, wanted and found.
     """
-    find_camera_model(camera_model)
+    CAMERA_MODELS.find(camera_model)
     sh_count = sh.coefficient_count(degree)
     sizes = interop.check(
         means=(means, "N 3"), quats=(quats, "N 4"), log_scales=(log_scales, "N 3"),

@@ -9,7 +9,7 @@ import torch
 from warpgs.constants import RULES, Rule
 from warpgs.errors import UsageError
 from warpgs.kernels.blend import blend, contributions
-from warpgs.kernels.cameras import find_camera_model
+from warpgs.kernels.cameras.base import CAMERA_MODELS
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
 from warpgs.render import graphed
@@ -72,7 +72,7 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
         raise UsageError(f"unknown rule {options.rule!r}: choose one of {', '.join(RULES)}, or give a Rule")
     if options.tile_size not in TILE_SIZES:
         raise UsageError(f"tile size {options.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
-    find_camera_model(camera.model)
+    CAMERA_MODELS.find(camera.model)
     if options.max_instances is not None and (options.capacity is not None or options.max_instances < 1):
         raise UsageError("max_instances must be at least 1 and does not go with a capacity")
     return rule

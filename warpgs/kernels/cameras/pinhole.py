@@ -6,13 +6,21 @@ from types import SimpleNamespace
 import warp as wp
 
 from warpgs.constants import FAR, FRUSTUM_MARGIN
-from warpgs.kernels.cameras.base import register
+from warpgs.kernels.cameras.base import CameraModel, register
 
 
 @register("pinhole")
+class Pinhole(CameraModel):
+    """The pinhole camera."""
+
+    @staticmethod
+    def make_functions(real: type) -> SimpleNamespace:
+        """Make the functions; `CameraModel.make_functions` says what each must do."""
+        return _make_functions(real)
+
+
 @functools.cache
-def make_functions(real):
-    """Make the functions of this model for one scalar type; `CameraModel` says what each must do."""
+def _make_functions(real: type) -> SimpleNamespace:
     vec2 = wp.types.vector(2, real)
     vec3 = wp.types.vector(3, real)
     mat33 = wp.types.matrix((3, 3), real)
