@@ -165,7 +165,7 @@ def test_an_encoder_that_writes_nothing(monkeypatch):
 def test_little_disk_and_memory_are_notes(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(doctor.shutil, "disk_usage", lambda p: types.SimpleNamespace(free=2**20))
-    monkeypatch.setattr(doctor, "_memory", lambda: (2**32, 2**30))
+    monkeypatch.setattr(doctor, "machine_memory", lambda: (2**32, 2**30))
     found = by_topic([*doctor._disk(), *doctor._processor()])
     assert found["Disk"].status == found["Memory"].status == NOTE
     assert found["Disk"].remedy and "4.0 GiB" in found["Memory"].detail

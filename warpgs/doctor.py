@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from warpgs.runtime.device_memory import ASSUMED_BYTES, machine_memory
+from warpgs.runtime.processor import processor_name, usable_cores
 from warpgs.sizes import format_bytes
 
 OK, MISSING, NOTE = "ok", "missing", "note"
@@ -59,6 +61,7 @@ PACKAGES = (
     Package("scipy", "scipy", True, "rotations and neighbours"),
     Package("scikit-image", "skimage", True, "metrics"),
     Package("opencv-contrib-python-headless", "cv2", True, "images, matches, video"),
+    Package("psutil", "psutil", True, "free memory"),
     Package("safetensors", "safetensors", True, "checkpoints"),
     Package("onnxruntime", "onnxruntime", False, "depth and feature networks"),
     Package("pyvista", "pyvista", False, "3D overviews in reports"),
@@ -111,43 +114,12 @@ def _packages() -> Iterable[Finding]:
     return map(_package, PACKAGES)
 
 
-def _cpu_name() -> str:
-    """Model of the processor."""
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
-
-
-def _memory() -> tuple[int, int] | None:
-    """Total and available memory [bytes]; None where the system does not say."""
-    try:
-        rows = dict(r.split(":", 1) for r in Path("/proc/meminfo").read_text(encoding="utf-8").splitlines())
-        total, free = (int(rows[k].split()[0]) * 1024 for k in ("MemTotal", "MemAvailable"))
-    except (OSError, KeyError, ValueError):
-        try:
-            total = free = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-        except (AttributeError, OSError, ValueError):
-            return None
-    try:  # a container may hold less than the machine has
-        total = min(total, int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="utf-8")))
-    except (OSError, ValueError):
-        pass
-    return total, min(total, free)
-
-
 def _processor() -> Iterable[Finding]:
-    try:
-        usable = len(os.sched_getaffinity(0))
-    except AttributeError:
-        usable = os.cpu_count() or 1
-    yield Finding("CPU", OK, f"{_cpu_name()}, {usable} of {os.cpu_count()} cores usable")
-    memory = _memory()
+    yield Finding("CPU", OK, f"{processor_name()}, {usable_cores()} of {os.cpu_count()} cores usable")
+    memory = machine_memory()
     if memory is None:
-        yield Finding("Memory", NOTE, "the system does not say how much there is")
+        assumed = f"the system does not say how much there is; {format_bytes(ASSUMED_BYTES)} are assumed"
+        yield Finding("Memory", NOTE, assumed)
         return
     total, free = memory
     detail = f"{format_bytes(total)}, {format_bytes(free)} available"

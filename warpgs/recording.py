@@ -22,7 +22,8 @@ from warpgs.constants import Rule
 from warpgs.graphs import PAID, Graphs, Work
 from warpgs.kernels import blend, bridge, project, sh
 from warpgs.kernels.memory import Memory, fetch
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, Tiles, available_bytes, bin_tiles
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, Tiles, bin_tiles
+from warpgs.runtime.device_memory import available_bytes
 
 CALLS = 3
 """The call from which on kernels are recorded, of equal ones in a row. Where that did not pay, twice as many the next time."""

@@ -13,7 +13,6 @@ import torch
 
 from warpgs.errors import DataError, NotFiniteError
 from warpgs.kernels.dropout import opacity_dropout
-from warpgs.kernels.tiles import available_bytes
 from warpgs.pipeline.config import FitConfig
 from warpgs.pipeline.density import DensityStats, Refinement, refine
 from warpgs.pipeline.graph import BURST, NOT_FINITE, ROOM, Burst, OverLimitError, StepGraph, stack_views
@@ -27,6 +26,7 @@ from warpgs.pipeline.preparation import prepare
 from warpgs.pipeline.resolution import halved
 from warpgs.pipeline.schedule import Phase, plan_phases, sh_degree
 from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.runtime.device_memory import available_bytes
 from warpgs.scene import Gaussians, PointCloud, Prior, Scene, View
 
 

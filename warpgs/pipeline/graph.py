@@ -17,12 +17,13 @@ from warpgs.kernels.blend import blend
 from warpgs.kernels.burst import NOT_FINITE, begin_step, end_step
 from warpgs.kernels.dropout import opacity_dropout
 from warpgs.kernels.project import project
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, available_bytes, bin_tiles
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, bin_tiles
 from warpgs.pipeline.density import DensityStats
 from warpgs.pipeline.layers import Layers, ProtectConfig
 from warpgs.pipeline.loss import LossConfig, masked_mse, training_loss
 from warpgs.pipeline.method import TrainingView
 from warpgs.pipeline.optimizer import Optimizer
+from warpgs.runtime.device_memory import available_bytes
 
 BURST = 100
 """Most steps between two looks at the device."""
