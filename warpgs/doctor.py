@@ -14,7 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from warpgs.errors import ResourceError
 from warpgs.runtime.device_memory import ASSUMED_BYTES, machine_memory
+from warpgs.runtime.kernel_cache import prepare_kernel_cache
 from warpgs.runtime.processor import processor_name, usable_cores
 from warpgs.sizes import format_bytes
 
@@ -163,6 +165,7 @@ def _quiet_warp():
     """Warp, initialised without its banner and warnings: what they say is said by the report."""
     import warp
 
+    prepare_kernel_cache()
     before = warp.config.log_level
     warp.config.log_level = warp.LOG_ERROR
     try:
@@ -217,16 +220,16 @@ def _kernel_cache() -> Iterable[Finding]:
     topic = "Kernel cache"
     try:
         folder = Path(_quiet_warp().config.kernel_cache_dir)
+        refused = prepare_kernel_cache().refused
+    except ResourceError as e:
+        yield Finding(topic, MISSING, str(e), "set WARP_CACHE_PATH or TMPDIR to a folder that you may write to", True)
+        return
     except Exception as e:
         yield Finding(topic, MISSING, _reason(e), "mend warp-lang first", True)
         return
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as e:
-        remedy = "set WARP_CACHE_PATH to a folder that you may write to"
-        yield Finding(topic, MISSING, f"{folder} is not writable ({e.strerror})", remedy, True)
+    if refused:
+        remedy = "set WARP_CACHE_PATH to a folder that you, and nobody else, may write to"
+        yield Finding(topic, NOTE, f"{refused}; every run compiles its kernels for a minute or two", remedy, True)
         return
     size = _size(folder)
     first = "" if size else "; empty: the first fit compiles for a minute or two"
@@ -316,8 +319,6 @@ def print_report(findings: list[Finding], console=None) -> int:
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
-
-    from warpgs.errors import ResourceError
 
     console = console or Console()
     styles = {OK: "green", NOTE: "yellow", MISSING: "bold red"}
