@@ -2,6 +2,7 @@
 
 import ast
 import io
+import os
 import tokenize
 
 import pytest
@@ -13,6 +14,8 @@ from tests.mutate.edit import Edit
 from tests.mutate.native import native_edits
 from tests.mutate.process import Job, Outcome, run_jobs
 from tests.mutate.python import python_edits
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="the check forks, which Windows cannot")
 
 PYTHON = '''
 """A docstring with 1 + 1; it is left alone."""
