@@ -63,7 +63,7 @@ PACKAGES = (
     Package("scipy", "scipy", True, "rotations and neighbours"),
     Package("scikit-image", "skimage", True, "metrics"),
     Package("opencv-contrib-python-headless", "cv2", True, "images, matches, video"),
-    Package("psutil", "psutil", True, "free memory"),
+    Package("psutil", "psutil", False, "free memory"),
     Package("safetensors", "safetensors", True, "checkpoints"),
     Package("onnxruntime", "onnxruntime", False, "depth and feature networks"),
     Package("pyvista", "pyvista", False, "3D overviews in reports"),
