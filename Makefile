@@ -11,7 +11,7 @@ endif
 export PYTHONUTF8 := 1
 OUT ?= runs/demo
 
-.PHONY: demo test lint clean install
+.PHONY: demo test audit lint clean install
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -27,12 +27,15 @@ demo: install
 	rm -rf $(OUT)
 	mkdir -p $(OUT)
 	$(BIN)/warpgs demo $(OUT)/scene | tee $(OUT)/next.txt
-	$(BIN)/warpgs fit $(OUT)/scene --split "$$($(BIN)/python -c 'from warpgs.demo import split_spec; print(split_spec(24), end="")')" --out $(OUT)/run
+	$(BIN)/warpgs fit $(OUT)/scene --split "$$($(BIN)/python -c 'from warpgs.synthetic.demo import split_spec; print(split_spec(24), end="")')" --out $(OUT)/run
 	@echo "pictures: $(OUT)/run/renders    report: $(OUT)/run/report.html"
 
 test: install lint
 	$(BIN)/python -m coverage erase
-	$(BIN)/python -m pytest -q -n 2 -m "not slow and not cuda" --cov --cov-config=pyproject.toml --cov-report=term:skip-covered --cov-fail-under=90
+	$(BIN)/python -m pytest -q -n 2 -m "not slow and not cuda and not audit" --cov --cov-config=pyproject.toml --cov-report=term:skip-covered --cov-fail-under=90
+
+audit: install
+	$(BIN)/python -m pytest -q -m audit
 
 lint: install
 	$(BIN)/ruff check .

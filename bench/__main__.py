@@ -22,7 +22,7 @@ from bench.pairs import instances_and_pairs
 from bench.points import Point, growth, load, points
 from bench.series import SIZES
 from warpgs.errors import ResourceError
-from warpgs.kernels import bridge
+from warpgs.runtime import interop
 from warpgs.runtime.device_memory import available_bytes
 
 OPS = ("project", "sh", "tiles", "blend", "ssim", "adam", "burst", "dropout", "knn", "scanlines", "render", "step")
@@ -94,7 +94,7 @@ class Bench:
             return None
         everything = torch.get_num_threads()
         if point.threads:
-            bridge.set_threads(point.threads)
+            interop.set_threads(point.threads)
         tasks: list[Task] = []
         try:
             tasks += module.tasks(point, self.device, lambda p, d: (p, d) in chosen)
@@ -103,7 +103,7 @@ class Bench:
         except FAILURES as e:
             return " ".join(str(e).split())[:200] or type(e).__name__
         finally:
-            bridge.set_threads(everything)
+            interop.set_threads(everything)
             tasks.clear()
             gc.collect()
             if self.device.type == "cuda":

@@ -36,12 +36,12 @@ def budget_text(results: dict[str, dict]) -> str:
     """Two tables a machine: pictures and gradients."""
     parts = []
     for stem, result in results.items():
-        pictures, gradients = [], []
+        images, gradients = [], []
         for row in result["rows"]:
             name = row["scene"] + ("" if row["rule"] == "exact" else f", `{row['rule']}`")
             rgb, alpha, depth = (row["pictures"][n] for n in ("rgb", "alpha", "depth"))
             both = {k: max(rgb[k], alpha[k]) for k in ("E mean", "E max", "P32 max", "A mean", "A max")}
-            pictures.append([
+            images.append([
                 name, _e(both["E mean"]), _e(both["E max"]), _e(max(rgb["allowed"], alpha["allowed"])), _e(both["P32 max"]),
                 _e(depth["E max"]), _e(both["A mean"]), _e(both["A max"]),
                 f"{row['in band']} of {row['pixels']}", str(row["flips"]),
@@ -56,7 +56,7 @@ def budget_text(results: dict[str, dict]) -> str:
             ])  # fmt: skip
         kept = "Every line is kept." if not result["broken"] else "Broken: " + "; ".join(result["broken"]) + "."
         head = ["pictures", "mean E", "max E", "allowed", "max P32", "max E depth", "mean A", "max A", "band", "flips"]
-        parts += [f"{_machine(stem, result)} {kept}\n", _table(head, pictures)]
+        parts += [f"{_machine(stem, result)} {kept}\n", _table(head, images)]
         head = ["gradients", "relative L2", "1 - cosine", "bias", "max E", "max P32", "max A", "wrong zeros"]
         parts.append(_table(head, gradients))
     return "\n".join(parts)
@@ -75,7 +75,7 @@ def needles_text(results: dict[str, dict]) -> str:
                 line.append(f"{min(e[n]['max'] / e['factor']['max'] for n in peers):,.0f}")
             rows.append(line)
         head = ["length [px]", "weight: factor", "conic", "plain", "times", "picture: factor", "conic", "plain", "times"]
-        of = f"Max / mean over {result['needles']} needles (weight) and {result['pictures']} (picture, gradient)."
+        of = f"Max / mean over {result['needles']} needles (weight) and {result['images']} (picture, gradient)."
         parts += [f"{_machine(stem, result)} {of}\n", _table([*head, "gradient: factor", "plain", "times"], rows)]
     return "\n".join(parts)
 

@@ -22,10 +22,10 @@ from bench.harness import recorded
 from warpgs import RasterizeOptions, rasterize
 from warpgs.constants import RULES
 from warpgs.kernels.project import project
-from warpgs.pipeline.graph import BURST, Burst, StepGraph, Views
-from warpgs.pipeline.loss import LossConfig
-from warpgs.pipeline.optimizer import Optimizer, OptimizerConfig
-from warpgs.recording import CALLS, recorder
+from warpgs.pipeline.train.loss import LossConfig
+from warpgs.pipeline.train.schedule import OptimizerConfig
+from warpgs.pipeline.train.step import STEPS_PER_BATCH, StepBuffers, StepGraph, Views
+from warpgs.render.graphed import CALLS, recorder
 from warpgs.scene import Camera, Gaussians
 
 CONFIGURATIONS = {
@@ -81,17 +81,17 @@ def count_instances(gaussians: Gaussians, camera: Camera) -> int:
 def our_step(gaussians: Gaussians, camera: Camera, target: torch.Tensor):
     """Work: render, L1 + SSIM, backward, Adam as the fit records them."""
     device = target.device
-    optimizer, burst = Optimizer(gaussians, OptimizerConfig(), 1.0), Burst(device)
+    optimizer, buffers = Optimizer(gaussians, OptimizerConfig(), 1.0), StepBuffers(device)
     views = Views(camera.viewmat, camera.K, target[None], None)
     graph = StepGraph(
-        views, optimizer, None, burst, degree=gaussians.sh_degree, rule="gsplat", loss=LossConfig(),
+        views, optimizer, None, buffers, degree=gaussians.sh_degree, rule="gsplat", loss=LossConfig(),
         background=torch.zeros(3, device=device),
     )  # fmt: skip
-    steps = range(1, BURST + 1)
-    burst.load([0] * BURST, [optimizer.schedule(0.0, k) for k in steps], [(0.0, k) for k in steps])
+    steps = range(1, STEPS_PER_BATCH + 1)
+    buffers.load([0] * STEPS_PER_BATCH, [optimizer.schedule(0.0, k) for k in steps], [(0.0, k) for k in steps])
 
     def work():
-        burst.counter.zero_()
+        buffers.counter.zero_()
         graph.replay()
         return graph
 

@@ -22,9 +22,10 @@ from bench.against_gsplat import CONFIGURATIONS, first_camera, quartiles
 from bench.garden import garden_inputs
 from bench.kernels.bucket import SIZES, VALUES, make_backward
 from warpgs.constants import RULES, Rule
-from warpgs.kernels import blend_cuda, bridge
+from warpgs.kernels import blend_cuda
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import Tiles, bin_tiles
+from warpgs.runtime import interop
 from warpgs.scene import Camera, Gaussians
 
 NAMES = ("112k at 504x378", "2.8M at 1920x1080", "2.8M at 3840x2160")
@@ -46,7 +47,7 @@ class Launch:
     how: dict
 
     def __call__(self) -> None:
-        bridge.launch(self.kernel, self.count, self.inputs, self.device, **self.how)
+        interop.launch(self.kernel, self.count, self.inputs, self.device, **self.how)
 
 
 def put_off(work: Callable, *inputs) -> tuple[object, list[Launch]]:
@@ -56,7 +57,7 @@ def put_off(work: Callable, *inputs) -> tuple[object, list[Launch]]:
     def note(kernel, count, arguments, device, **how):
         launches.append(Launch(kernel, count, arguments, device, how))
 
-    with mock.patch.object(bridge, "launch", note):
+    with mock.patch.object(interop, "launch", note):
         result = work(*inputs)
     return result, launches
 
@@ -75,8 +76,8 @@ class Case:
         upstream: Gradients of colour [C, H, W, 3], and of alpha and depth [C, H, W] or None for neither.
     """
 
-    def __init__(self, splats: torch.Tensor, tiles: Tiles, width: int, height: int, rule: Rule, upstream: tuple):
-        how = (splats, tiles, torch.full((len(splats), 3), 0.3, device=splats.device), (0, 0), width, height, rule)
+    def __init__(self, projected: torch.Tensor, tiles: Tiles, width: int, height: int, rule: Rule, upstream: tuple):
+        how = (projected, tiles, torch.full((len(projected), 3), 0.3, device=projected.device), (0, 0), width, height, rule)
         chunk = blend_cuda.chunk_of(tiles, True)
         self.chunk, self.instances, self.tiles = chunk, len(tiles.slots), tiles
         self.values = 9 if upstream[1] is None else VALUES
@@ -89,7 +90,7 @@ class Case:
             states[size] = kept[-1]
             if size == chunk:
                 saved = (rgb, depth, *kept)
-        self.v_splats, (self.backward, self.gather) = put_off(blend_cuda.backward, *how, True, saved, *upstream)
+        self.v_projected, (self.backward, self.gather) = put_off(blend_cuda.backward, *how, True, saved, *upstream)
         assert self.backward.inputs[STATES].tensor is states[chunk]
         self.v_slots = self.backward.inputs[-1].tensor
         self.state_mib = {size: t.numel() * 4 / 2**20 for size, t in states.items()}
@@ -102,17 +103,17 @@ class Case:
 
     def _variant(self, kernel, size: int, states: dict) -> Launch:
         inputs = list(self.backward.inputs)
-        inputs[STATES] = bridge.view(states[size], wp.float32)
+        inputs[STATES] = interop.view(states[size], wp.float32)
         count = 32 * -(-self.instances // size)
         return Launch(kernel, count, inputs, self.backward.device, {"block_dim": 32 * blend_cuda.WARPS})
 
     def gradients(self, backward: Launch) -> tuple[torch.Tensor, torch.Tensor]:
         """Sums of each instance, shape [M, 9 or 10], and gradients of the records, [C, N, 12]; NaN where none was written."""
         self.v_slots.fill_(torch.nan)
-        self.v_splats.fill_(torch.nan)
+        self.v_projected.fill_(torch.nan)
         backward()
         self.gather()
-        return self.v_slots[:, : self.values].clone(), self.v_splats.clone()
+        return self.v_slots[:, : self.values].clone(), self.v_projected.clone()
 
     def disagreements(self) -> dict[str, dict]:
         """Distance of each variant's gradients from the product's, relative, the largest among the values."""
@@ -161,14 +162,16 @@ def case_of(gaussians: Gaussians, camera: Camera, rule: Rule, with_depth: bool) 
     size = {"width": camera.width, "height": camera.height}
     with torch.no_grad():
         tensors = gaussians.tensors().values()
-        splats, counts = project(*tensors, camera.viewmat, camera.K, **size, degree=gaussians.sh_degree, rule=rule)
-        tiles = bin_tiles(splats, counts, **size, rule=rule)
-    generator = torch.Generator(splats.device).manual_seed(1)
+        projected, counts = project(*tensors, camera.viewmat, camera.K, **size, degree=gaussians.sh_degree, rule=rule)
+        tiles = bin_tiles(projected, counts, **size, rule=rule)
+    generator = torch.Generator(projected.device).manual_seed(1)
 
     def rand(*shape):
-        return torch.rand(len(splats), camera.height, camera.width, *shape, device=splats.device, generator=generator)
+        return torch.rand(len(projected), camera.height, camera.width, *shape, device=projected.device, generator=generator)
 
-    return Case(splats, tiles, *size.values(), rule, (rand(3), rand() if with_depth else None, rand() if with_depth else None))
+    return Case(
+        projected, tiles, *size.values(), rule, (rand(3), rand() if with_depth else None, rand() if with_depth else None)
+    )
 
 
 def measure(case: Case, repeats: int) -> dict:

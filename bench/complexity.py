@@ -79,7 +79,7 @@ def _spread(values: list[float]) -> str:
 
 def curve_rows(run: Path, name: str, device: str) -> list[dict]:
     """The run itself, and the run pruned at every loss of `KEEP`."""
-    from warpgs.pipeline.prune import prune
+    from warpgs.pipeline.runs.prune import prune
 
     rows = []
     with tempfile.TemporaryDirectory() as folder:
@@ -143,12 +143,12 @@ def write_csv(path: Path, rows: list[dict]) -> None:
 
 def study(a: argparse.Namespace) -> list[tuple[str, Path]]:
     """Fit, write the tables, and name the runs whose curves are drawn."""
-    from warpgs.pipeline.compare import preset_variants, run_study
-    from warpgs.pipeline.run import SceneRequest
-    from warpgs.pipeline.study import StudyRequest, scene_name
+    from warpgs.pipeline.runs.folder import SceneRequest
+    from warpgs.pipeline.study.compare import preset_variants, run_study
+    from warpgs.pipeline.study.study import StudyRequest, scene_name
 
     base = preset_variants([a.preset], a.steps)[a.preset]
-    variants = {"fixed": dataclasses.replace(base, adaptive=False), "adaptive": dataclasses.replace(base, adaptive=True)}
+    variants = {"fixed": dataclasses.replace(base, adaptive=False), "adaptive": dataclasses.replace(base, strategy="holdout")}
     scenes = tuple(SceneRequest(s, a.split, a.downscale) for s in a.inputs)
     for line in run_study(StudyRequest(scenes, variants, a.seeds, a.out, a.device)):
         print(line)

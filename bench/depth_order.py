@@ -22,9 +22,9 @@ import torch
 from warpgs import geometry
 from warpgs.errors import DataError, WarpgsError
 from warpgs.io.load import load_scene
-from warpgs.pipeline.results import options_for
-from warpgs.pipeline.run import open_run
-from warpgs.rasterizer import rasterize
+from warpgs.pipeline.runs.folder import open_run
+from warpgs.pipeline.runs.results import options_for
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians, PointCloud
 
 MIN_POINTS = 10

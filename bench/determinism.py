@@ -16,8 +16,8 @@ import torch
 from bench.harness import Task, measure_in_turn, peak_bytes
 from bench.inputs import camera, gaussians
 from bench.machine import describe
-from warpgs.pipeline.run import choose_device
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.pipeline.runs.folder import choose_device
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
 
 MODES = {"deterministic": True, "atomic": False}
@@ -69,7 +69,7 @@ def atomic_spread(g: Gaussians, cam: Camera, repeats: int) -> dict[str, dict]:
     return rows
 
 
-def price(g: Gaussians, cam: Camera, repeats: int, device: torch.device) -> dict[str, dict]:
+def cost(g: Gaussians, cam: Camera, repeats: int, device: torch.device) -> dict[str, dict]:
     """Time [ms] of forward and backward in both modes, in turns, and on CUDA the memory that a run takes [bytes]."""
     tasks = [
         Task("warpgs", "both", lambda d=d: gradients_of(g, cam, deterministic=d), facts={"mode": name})
@@ -98,7 +98,7 @@ def main() -> None:
     for count in a.gaussians:
         g, cam = scene(count, *a.size, device)
         row = {"gaussians": count, "width": a.size[0], "height": a.size[1]}
-        row |= {"price": price(g, cam, a.repeats, device), "spread": atomic_spread(g, cam, a.repeats)}
+        row |= {"price": cost(g, cam, a.repeats, device), "spread": atomic_spread(g, cam, a.repeats)}
         rows.append(row)
         print(f"{count:,} Gaussians, {a.size[0]} x {a.size[1]} px, {where}")
         for mode, figures in row["price"].items():

@@ -134,7 +134,7 @@ def roof_table(rows: list[dict]) -> str:
         for r in {_key(r): r for r in chosen}.values():
             cells = [op, direction, *_sizes(r, ["N", "image", "degree", "cameras"])]
             cells += [figure(r["bytes"] / 1e6), figure(r["operations"] / 1e6), figure(r["roof_ms"]), r["bound"]]
-            body.append([*cells, figure(r.get("gpu_ms", r["median_ms"])), f"{figure(100 * r['share'])} %"])
+            body.append([*cells, figure(r.get("gpu_ms", r["median_ms"])), f"{figure(100 * r['fraction'])} %"])
     head = [
         "op",
         "direction",

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from bench import inputs
-from warpgs.pipeline.run import open_run
+from warpgs.pipeline.runs.folder import open_run
 from warpgs.scene import Camera, Gaussians
 
 

@@ -24,8 +24,8 @@ import torch
 
 from bench.tradeoff_outcome import fit_once
 from warpgs.errors import UsageError
-from warpgs.pipeline.config import PRESETS, FitConfig
-from warpgs.pipeline.run import SceneRequest, choose_device, read_scene
+from warpgs.pipeline.runs.folder import SceneRequest, choose_device, read_scene
+from warpgs.pipeline.train.config import PRESETS, FitConfig
 
 COLUMNS = ("scene", "trial", "left_out", "seed", "psnr", "ssim", "gaussians", "bytes")
 

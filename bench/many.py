@@ -16,13 +16,13 @@ import torch
 
 from bench.against_gsplat import first_camera
 from bench.garden import garden_inputs
-from warpgs.pipeline.graph import BURST, Burst, StepGraph, Views
-from warpgs.pipeline.loss import LossConfig
-from warpgs.pipeline.optimizer import Optimizer, OptimizerConfig
+from warpgs.pipeline.train.loss import LossConfig
+from warpgs.pipeline.train.schedule import OptimizerConfig
+from warpgs.pipeline.train.step import STEPS_PER_BATCH, StepBuffers, StepGraph, Views
 from warpgs.scene import Gaussians
 
 
-def smooth_picture(width: int, height: int, device: torch.device) -> torch.Tensor:
+def smooth_image(width: int, height: int, device: torch.device) -> torch.Tensor:
     """A picture to train towards: three slow waves, shape [H, W, 3]."""
     y, x = torch.meshgrid(
         torch.linspace(0, 6, height, device=device), torch.linspace(0, 9, width, device=device), indexing="ij"
@@ -36,20 +36,20 @@ def train(path: str, count: int, width: int, height: int, steps: int) -> dict:
     cells = math.ceil(math.sqrt(count / 111_000))
     gaussians, cameras = garden_inputs(path, tiles=cells, sh_degree=3, width=width, height=height)
     gaussians = Gaussians(**{n: t.detach()[:count].clone() for n, t in gaussians.tensors().items()})
-    camera, burst = first_camera(cameras), Burst(device)
+    camera, buffers = first_camera(cameras), StepBuffers(device)
     optimizer = Optimizer(gaussians, OptimizerConfig(), 1.0)
-    views = Views(camera.viewmat, camera.K, smooth_picture(width, height, device)[None], None)
+    views = Views(camera.viewmat, camera.K, smooth_image(width, height, device)[None], None)
     graph = StepGraph(
-        views, optimizer, None, burst, degree=3, rule="exact", loss=LossConfig(), background=torch.zeros(3, device=device)
+        views, optimizer, None, buffers, degree=3, rule="exact", loss=LossConfig(), background=torch.zeros(3, device=device)
     )
     losses, begin = [], time.perf_counter()
     while len(losses) < steps:
-        wanted = min(BURST, steps - len(losses))
+        wanted = min(STEPS_PER_BATCH, steps - len(losses))
         numbers = range(len(losses) + 1, len(losses) + wanted + 1)
-        burst.load([0] * wanted, [optimizer.schedule(0.0, n) for n in numbers], [(0.0, n) for n in numbers])
+        buffers.load([0] * wanted, [optimizer.schedule(0.0, n) for n in numbers], [(0.0, n) for n in numbers])
         for _ in range(wanted):
             graph.replay()
-        done, stop, history = burst.result()
+        done, stop, history = buffers.result()
         if stop:
             raise RuntimeError(f"stopped after {len(losses) + done} steps")
         losses += [loss for loss, _ in history[:done]]

@@ -100,8 +100,8 @@ def _panel(panel: Panel, left: float, top: float, colors: dict[str, str]) -> lis
         return left + PLOT_WIDTH * math.log(x / x_low) / math.log(x_high / x_low)
 
     def py(y: float) -> float:
-        share = math.log(y / y_low) / math.log(y_high / y_low) if panel.log_y else (y - y_low) / (y_high - y_low)
-        return top + PLOT_HEIGHT * (1 - share)
+        fraction = math.log(y / y_low) / math.log(y_high / y_low) if panel.log_y else (y - y_low) / (y_high - y_low)
+        return top + PLOT_HEIGHT * (1 - fraction)
 
     bottom = top + PLOT_HEIGHT
     out.append(_text(left, top - 41, panel.title, size=13, bold=True))

@@ -32,17 +32,17 @@ def peer(gaussians, camera, degree: int) -> torch.Tensor:
 def compare(path: str, degree: int, width: int, height: int) -> dict:
     """Differences of one configuration: the image's, and per parameter those of the gradient of a random projection."""
     gaussians, camera = garden_inputs(path, sh_degree=degree, width=width, height=height)
-    pictures, gradients = [], []
+    images, gradients = [], []
     for draw in (
         lambda: rasterize(gaussians, camera, RasterizeOptions(rule="gsplat")).rgb,
         lambda: peer(gaussians, camera, degree),
     ):
-        picture = draw()
-        generator = torch.Generator(device=picture.device).manual_seed(1)
-        weights = torch.rand(picture.shape, generator=generator, device=picture.device)
-        gradients.append(torch.autograd.grad((picture * weights).sum(), list(gaussians.tensors().values())))
-        pictures.append(picture.detach())
-    difference = (pictures[0] - pictures[1]).abs()
+        image = draw()
+        generator = torch.Generator(device=image.device).manual_seed(1)
+        weights = torch.rand(image.shape, generator=generator, device=image.device)
+        gradients.append(torch.autograd.grad((image * weights).sum(), list(gaussians.tensors().values())))
+        images.append(image.detach())
+    difference = (images[0] - images[1]).abs()
     row = {
         "sh_degree": degree, "width": width, "height": height, "gaussians": len(gaussians),
         "image_mean": difference.mean().item(), "image_max": difference.max().item(),

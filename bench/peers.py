@@ -98,12 +98,12 @@ def dense_rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
     device = gaussians.means.device
     y, x = torch.meshgrid(torch.arange(camera.height, device=device), torch.arange(camera.width, device=device), indexing="ij")
     centers = torch.stack([x, y], -1).reshape(-1, 2) + 0.5
-    pictures = []
+    images = []
     for view, K in zip(camera.viewmat, camera.K):
-        splats = _projected(gaussians, view, K, camera.width, camera.height)
-        parts = [checkpoint(_composite, part, *splats, use_reentrant=False) for part in centers.split(PIXELS_AT_ONCE)]
-        pictures.append(torch.cat(parts).view(camera.height, camera.width, 3))
-    return torch.stack(pictures)
+        projected = _projected(gaussians, view, K, camera.width, camera.height)
+        parts = [checkpoint(_composite, part, *projected, use_reentrant=False) for part in centers.split(PIXELS_AT_ONCE)]
+        images.append(torch.cat(parts).view(camera.height, camera.width, 3))
+    return torch.stack(images)
 
 
 def gsplat_rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
@@ -133,8 +133,8 @@ def absent(device: torch.device) -> dict[str, str]:
     for name, draw in RASTERIZERS.items():
         try:
             gaussians = inputs.gaussians(10, device)
-            picture = draw(gaussians, inputs.camera(32, 32, device))
-            torch.autograd.grad(picture.sum(), [gaussians.means])
+            image = draw(gaussians, inputs.camera(32, 32, device))
+            torch.autograd.grad(image.sum(), [gaussians.means])
         except Exception as e:  # whatever a foreign program fails with, the bench goes on without it
             reasons[name] = " ".join(f"{type(e).__name__}: {e}".split())[:200]
     if GSPLAT in reasons:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 
-from warpgs.kernels import bridge
+from warpgs.runtime import interop
 
 REAL = 4
 """Bytes of a number."""
@@ -114,7 +114,7 @@ def dropout(count: int) -> Cost:
     return Cost(REAL * count, 20 * count)
 
 
-def burst(pixels: int) -> Cost:
+def buffers(pixels: int) -> Cost:
     """A photograph in and out."""
     return Cost(6 * REAL * pixels, 0)
 
@@ -192,8 +192,8 @@ def ceilings(device: torch.device, tiny: bool = False) -> dict:
     out = torch.empty(tasks, device=device)
 
     def compute():
-        with bridge.stream_of(device):
-            bridge.launch(multiply_add, tasks, [0.999, steps, bridge.view(out, wp.float32)], device, cost=steps)
+        with interop.stream_of(device):
+            interop.launch(multiply_add, tasks, [0.999, steps, interop.view(out, wp.float32)], device, cost=steps)
 
     return {
         "bytes_per_s": 12 * length / triad,

@@ -11,7 +11,7 @@ from warpgs.constants import RULES, Rule
 from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
 
 EXACT = RULES["exact"]
@@ -65,23 +65,23 @@ class Setting:
             sh = gaussians.sh  # its gradient is passed straight through the rounding
             gaussians = dataclasses.replace(gaussians, sh=sh + (sh.half().to(sh.dtype) - sh).detach())
         if self.stale > 0:
-            return self._draw_stale(gaussians, camera)
+            return self._render_stale(gaussians, camera)
         options = RasterizeOptions(
             rule=self.rule, tile_size=self.tile_size, sh_degree=self.degree, deterministic=self.deterministic,
             max_instances=max_instances, capacity=capacity,
         )  # fmt: skip
         return rasterize(gaussians, camera, options).rgb
 
-    def _draw_stale(self, gaussians: Gaussians, camera: Camera) -> torch.Tensor:
+    def _render_stale(self, gaussians: Gaussians, camera: Camera) -> torch.Tensor:
         """Instances listed by depths that are off, blended with the true ones."""
         like, size = gaussians.means, {"width": camera.width, "height": camera.height}
         view, K = (torch.as_tensor(t, dtype=like.dtype, device=like.device)[None] for t in (camera.viewmat, camera.K))
-        splats, counts = project(*gaussians.tensors().values(), view, K, **size, degree=gaussians.sh_degree, rule=self.rule)
-        off = splats.detach().clone()
+        projected, counts = project(*gaussians.tensors().values(), view, K, **size, degree=gaussians.sh_degree, rule=self.rule)
+        off = projected.detach().clone()
         noise = torch.randn(off.shape[:2], generator=torch.Generator().manual_seed(0))
         off[..., 9] += self.stale * noise.to(off)
         tiles = bin_tiles(off, counts, **size, rule=self.rule)
-        return blend(splats, tiles, like.new_zeros(1, 3), **size, rule=self.rule)[0][0]
+        return blend(projected, tiles, like.new_zeros(1, 3), **size, rule=self.rule)[0][0]
 
 
 def cut_and_stop(cut: float, stop: float, name: str = "") -> Rule:

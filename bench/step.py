@@ -18,17 +18,17 @@ from warpgs.io.splits import split_views
 from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
-from warpgs.pipeline.config import FitConfig
-from warpgs.pipeline.fit import Fit, train_views
-from warpgs.pipeline.init import InitConfig
-from warpgs.pipeline.loss import LossConfig, photometric_loss
-from warpgs.pipeline.run import choose_device
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.runs.folder import choose_device
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loss import LossConfig, photometric_loss
+from warpgs.pipeline.train.trainer import Trainer, train_views
 
 
-def stages(fit: Fit) -> dict[str, dict[str, float]]:
+def stages(fit: Trainer) -> dict[str, dict[str, float]]:
     """Time each stage on the first training view, with SH degree 3, and the whole step."""
     device, rule = fit.device, RULES[fit.config.rule]
-    camera, target = fit.views[0].camera, fit.views[0].photo
+    camera, target = fit.views[0].camera, fit.views[0].image
     size = {"width": camera.width, "height": camera.height}
     inputs = [*fit.optimizer.gaussians.tensors().values(), camera.viewmat[None], camera.K[None]]
     background = fit.background[None]
@@ -36,12 +36,12 @@ def stages(fit: Fit) -> dict[str, dict[str, float]]:
     def run_project():
         return project(*inputs, **size, degree=3, rule=rule)
 
-    splats, counts = run_project()
-    tiles = bin_tiles(splats, counts, **size, rule=rule)
-    leaf = splats.detach().requires_grad_()
+    projected, counts = run_project()
+    tiles = bin_tiles(projected, counts, **size, rule=rule)
+    leaf = projected.detach().requires_grad_()
     rgb = blend(leaf, tiles, background, **size, rule=rule)[0][0]
     image = rgb.detach().requires_grad_()
-    v_splats, v_rgb = torch.rand_like(splats), torch.rand_like(rgb)
+    v_projected, v_rgb = torch.rand_like(projected), torch.rand_like(rgb)
     loss = LossConfig()
 
     def backward_of(outputs, sources, upstream=None):
@@ -57,12 +57,12 @@ def stages(fit: Fit) -> dict[str, dict[str, float]]:
 
     result = {
         "project forward": measure(run_project, device),
-        "tiles": measure(lambda: bin_tiles(splats, counts, **size, rule=rule), device),
+        "tiles": measure(lambda: bin_tiles(projected, counts, **size, rule=rule), device),
         "blend forward": measure(lambda: blend(leaf, tiles, background, **size, rule=rule), device),
         "loss forward": measure(lambda: photometric_loss(image, target, None, loss), device),
         "loss backward": measure(backward_of(value, [image]), device),
         "blend backward": measure(backward_of(rgb, [leaf], v_rgb), device),
-        "project backward": measure(backward_of(splats, params, v_splats), device),
+        "project backward": measure(backward_of(projected, params, v_projected), device),
         "adam": measure(optimize, device),
     }
     result["whole step"] = measure(fit.advance, device)
@@ -85,7 +85,7 @@ def main() -> None:
     scene = load_scene(a.scene, downscale=a.downscale)
     views = train_views(scene, split_views(scene, a.split).train)
     config = FitConfig(steps=100_000, init=InitConfig(source="random", random_count=a.gaussians))
-    fit = Fit(views, scene.points, config, device)
+    fit = Trainer(views, scene.points, config, device)
     for _ in range(a.warm_steps):
         fit.advance()
     table = stages(fit)

@@ -25,10 +25,10 @@ from bench.tradeoff_kernel import measure_scene, measured
 from bench.tradeoff_outcome import measured as measured_fits
 from bench.tradeoff_outcome import summary, trials
 from warpgs import load_scene
+from warpgs.app.precompile import fit_kernels
 from warpgs.files import write_json, write_text
-from warpgs.kernels.bridge import set_threads
-from warpgs.pipeline.run import choose_device
-from warpgs.warm import fit_kernels
+from warpgs.pipeline.runs.folder import choose_device
+from warpgs.runtime.interop import set_threads
 
 
 def _stored(path: Path, fresh: dict) -> dict:

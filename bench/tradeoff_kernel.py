@@ -13,8 +13,8 @@ import torch
 from bench.frozen import Frozen
 from bench.harness import measure_in_turn, recorded
 from bench.settings import UNCUT, Setting, settings
-from warpgs.kernels.bridge import set_threads
 from warpgs.kernels.project import project
+from warpgs.runtime.interop import set_threads
 from warpgs.scene import Camera, Gaussians
 
 VISIBLE = 0.5 / 255
@@ -45,7 +45,7 @@ def truth(scene: Frozen) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     return rgb.detach(), dict(zip(g.tensors(), gradients))
 
 
-def picture_errors(found: torch.Tensor, wanted: torch.Tensor) -> dict[str, float]:
+def image_errors(found: torch.Tensor, wanted: torch.Tensor) -> dict[str, float]:
     """Of colours [H, W, 3] in [0, 1]: largest, mean, p99.9, PSNR [dB], and the share of pixels that are visibly off."""
     error = (found.double() - wanted.double()).abs()
     square = float((error**2).mean())
@@ -111,7 +111,7 @@ def measure_scene(scene: Frozen, repeats: int, chosen: list[Setting] | None = No
         inputs = list(leaves.tensors().values())
         rgb = s.draw(leaves, scene.camera)
         gradients = dict(zip(leaves.tensors(), torch.autograd.grad(rgb, inputs, upstream, retain_graph=True)))
-        errors = picture_errors(rgb.detach(), wanted) | gradient_errors(gradients, wanted_gradients)
+        errors = image_errors(rgb.detach(), wanted) | gradient_errors(gradients, wanted_gradients)
         exact = rgb.detach() if exact is None else exact  # the first setting
         off = (rgb.detach() - exact).abs()
         errors |= {"max_to_exact": float(off.max()), "mean_to_exact": float(off.mean())}
@@ -176,8 +176,8 @@ def sorting_share(scene: Frozen, repeats: int) -> dict:
         torch.as_tensor(t, dtype=torch.float32, device=g.means.device)[None] for t in (scene.camera.viewmat, scene.camera.K)
     )
     size = {"width": scene.camera.width, "height": scene.camera.height}
-    splats, counts = project(*g.tensors().values(), view, K, **size, degree=0, rule=UNCUT)
-    depths = splats[0, counts[0] > 0, 9].contiguous()
+    projected, counts = project(*g.tensors().values(), view, K, **size, degree=0, rule=UNCUT)
+    depths = projected[0, counts[0] > 0, 9].contiguous()
     timing = times_in_turn([lambda: torch.sort(depths, stable=True)], g.means.device, repeats)[0]
     return {"scene": scene.name, "visible": len(depths), "sort_ms": timing["median_ms"]}
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import torch
 
 from warpgs.io.splits import split_views
-from warpgs.pipeline.adaptive import complexity_figures, fit_class
-from warpgs.pipeline.config import PRESETS, FitConfig
-from warpgs.pipeline.evaluate import render_view, score
-from warpgs.pipeline.fit import run, train_views
-from warpgs.pipeline.results import options_for
+from warpgs.pipeline.metrics.evaluate import render_view, score
+from warpgs.pipeline.runs.results import options_for
+from warpgs.pipeline.train.config import PRESETS, FitConfig
+from warpgs.pipeline.train.strategies.holdout import complexity_figures, fit_class
+from warpgs.pipeline.train.trainer import run, train_views
 from warpgs.scene import Scene
 
 

@@ -7,7 +7,7 @@ import torch
 
 from bench import bucket
 from bench.kernels.bucket import SIZES, make_backward
-from tests.splats import camera, cloud
+from tests.gaussians import camera, cloud
 from warpgs.constants import RULES
 
 

@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ET
 import pytest
 
 from bench import complexity
-from warpgs.demo import split_spec, write_demo
+from warpgs.synthetic.demo import split_spec, write_demo
 
 
 def test_study_tables_and_curve(tmp_path, monkeypatch, capsys):

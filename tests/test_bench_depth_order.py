@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from bench.depth_order import depth_order, main
-from warpgs import raycast
-from warpgs.cli import main as warpgs
-from warpgs.demo import split_spec, still_life, write_demo
+from warpgs.app.cli import main as warpgs
 from warpgs.io.load import load_scene
 from warpgs.scene import Camera
+from warpgs.synthetic import raycast
+from warpgs.synthetic.demo import split_spec, still_life, write_demo
 
 
 @pytest.fixture(scope="module")

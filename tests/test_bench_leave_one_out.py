@@ -5,10 +5,10 @@ import torch
 
 from bench.leave_one_out import folds, table, trial_config
 from bench.tradeoff_outcome import fit_once
-from warpgs.demo import write_demo
 from warpgs.errors import UsageError
-from warpgs.pipeline.config import PRESETS
-from warpgs.pipeline.run import SceneRequest, read_scene
+from warpgs.pipeline.runs.folder import SceneRequest, read_scene
+from warpgs.pipeline.train.config import PRESETS
+from warpgs.synthetic.demo import write_demo
 
 
 def test_a_trial_changes_what_it_names_and_nothing_else():

@@ -4,7 +4,7 @@ import torch
 
 import warpgs
 from bench.naive import Naive, rasterize
-from tests.splats import camera, cloud
+from tests.gaussians import camera, cloud
 from warpgs.constants import RULES
 from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
@@ -18,14 +18,14 @@ def test_naive_kernels_equal_the_real_ones(device):
     size = {"width": cam.width, "height": cam.height}
     gaussians = cloud(300, torch.float32, device)
     gaussians.logit_opacities[:] += 3  # some alphas are clamped, some pixels stop
-    splats, counts = project(*gaussians.tensors().values(), cam.viewmat, cam.K, **size, degree=1, rule=rule)
-    tiles = bin_tiles(splats, counts, **size, rule=rule)
+    projected, counts = project(*gaussians.tensors().values(), cam.viewmat, cam.K, **size, degree=1, rule=rule)
+    tiles = bin_tiles(projected, counts, **size, rule=rule)
     background = torch.rand(2, 3, generator=torch.Generator().manual_seed(1)).to(device)
-    leaf = splats.detach().requires_grad_()
+    leaf = projected.detach().requires_grad_()
     rgb = blend(leaf, tiles, background, **size, rule=rule)[0]
     v_rgb = torch.randn(rgb.shape, generator=torch.Generator().manual_seed(2)).to(device)
     (gradient,) = torch.autograd.grad(rgb, [leaf], v_rgb)
-    naive = Naive(splats, tiles, background, **size, rule=rule)
+    naive = Naive(projected, tiles, background, **size, rule=rule)
     # an alpha within a rounding of the cut may be drawn by one and not by the other
     for found, wanted in ((naive.forward(), rgb.detach()), (naive.backward(v_rgb), gradient)):
         assert float((found - wanted).norm()) <= 1e-4 * float(wanted.norm())

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from bench import accuracy, fused, many, needles, step
-from tests.scenes import photographs, seeds
-from warpgs.pipeline.config import FitConfig
-from warpgs.pipeline.fit import Fit
-from warpgs.pipeline.init import InitConfig
+from bench import accuracy, many, needles, step
+from tests.scenes import photos, seeds
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.trainer import Trainer
 
 
 def test_stages_of_a_step(device):
     """Every stage has a positive time, the whole step among them."""
-    fit = Fit(photographs(2), seeds(), FitConfig(init=InitConfig(source="points")), device)
+    fit = Trainer(photos(2), seeds(), FitConfig(init=InitConfig(source="points")), device)
     table = step.stages(fit)
     assert table.pop("instances")["count"] > 0
     assert len(table) == 9 and all(row["median_ms"] > 0 for row in table.values())
@@ -42,18 +42,9 @@ def test_many_gaussians_train(tmp_path):
     assert result["loss_last"] < result["loss_first"] and result["gaussians"] == 300
 
 
-@pytest.mark.cuda
-def test_fused_and_separate_steps_are_compared(tmp_path):
-    """Both have times, and after 20 steps they have gone the same way."""
-    row = fused.compare(points(tmp_path), 1, 64, 48, repeats=6)
-    assert max(row["difference"].values()) <= 1e-3
-    assert all(row[k][who]["median"] > 0 for k in ("wall_ms", "gpu_ms") for who in ("fused", "apart"))
-    assert len(fused.lines("tiny", row)) == 4
-
-
 def test_the_smooth_picture_is_a_picture():
     """Colours in [0, 1] that change slowly."""
-    picture = many.smooth_picture(40, 30, torch.device("cpu"))
+    picture = many.smooth_image(40, 30, torch.device("cpu"))
     assert picture.shape == (30, 40, 3) and 0 <= picture.min() and picture.max() <= 1
     assert float((picture[:, 1:] - picture[:, :-1]).abs().max()) < 0.15
 

@@ -10,11 +10,11 @@ import torch
 from bench import pareto, tradeoff, tradeoff_kernel, tradeoff_outcome
 from bench.frozen import scenes
 from bench.settings import UNCUT, Setting, settings
+from tests.gaussians import camera, cloud
 from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference
-from tests.splats import camera, cloud
-from warpgs.prices import RULE_PRICES
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.rule_costs import RULE_COSTS
 
 CPU = torch.device("cpu")
 RESULTS = Path(__file__).parent.parent / "bench/results"
@@ -56,10 +56,10 @@ def test_the_truth_is_the_model(device):
     g, cam = cloud(60, torch.float64, device), camera(40, 33, device=device)
     found = rasterize(g, cam, RasterizeOptions(rule=UNCUT)).rgb.cpu()
     plain = {n: t.cpu() for n, t in g.tensors().items()}
-    splats = project_reference(
+    projected = project_reference(
         *plain.values(), cam.viewmat[None].cpu(), cam.K[None].cpu(), width=40, height=33, degree=1, low_pass=UNCUT.low_pass
     )
-    means, covs, colors, depths, opacities = (t[0] if t.ndim > 1 else t for t in splats)
+    means, covs, colors, depths, opacities = (t[0] if t.ndim > 1 else t for t in projected)
     wanted = blend_reference(means, covs, opacities, colors, depths, torch.zeros(3).double(), 40, 33, UNCUT)[0]
     assert float((found - wanted).abs().max()) < 1e-12
 
@@ -124,9 +124,9 @@ def test_prices_quote_the_stored_results():
     """What `--max-error` goes by is what was measured, to two digits."""
     rows = json.loads((RESULTS / "tradeoff_kernel_cpu2.json").read_text())["scenes"]["trained"]["rows"]
     by_name = {r["setting"]: r for r in rows}
-    for price in RULE_PRICES[:-1]:
-        row = by_name[price.rule]
-        assert price.mean_error == pytest.approx(row["mean_to_exact"], rel=0.06)
-        assert price.max_error == pytest.approx(row["max_to_exact"], rel=0.06)
-        assert price.time == pytest.approx(row["both_ms"] / by_name["exact"]["both_ms"], abs=0.03)
+    for cost in RULE_COSTS[:-1]:
+        row = by_name[cost.rule]
+        assert cost.mean_error == pytest.approx(row["mean_to_exact"], rel=0.06)
+        assert cost.max_error == pytest.approx(row["max_to_exact"], rel=0.06)
+        assert cost.time == pytest.approx(row["both_ms"] / by_name["exact"]["both_ms"], abs=0.03)
     assert all(math.isfinite(r["mean"]) for r in rows)

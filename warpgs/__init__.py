@@ -12,15 +12,22 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 __version__ = "0.1.0"
 
 __all__ = [
-    "Camera", "Gaussians", "RasterizeOptions", "Render", "Scene", "choose_knobs", "forget_recordings", "load_scene",
+    "Camera",
+    "Gaussians",
+    "RasterizeOptions",
+    "Render",
+    "Scene",
+    "clear_graph_cache",
+    "load_scene",
     "rasterize",
+    "select_rule",
 ]  # fmt: skip
 
 if TYPE_CHECKING:
     from warpgs.io.load import load_scene
-    from warpgs.prices import choose_knobs
-    from warpgs.rasterizer import RasterizeOptions, rasterize
-    from warpgs.recording import forget_recordings
+    from warpgs.render.graphed import clear_graph_cache
+    from warpgs.render.rasterize import RasterizeOptions, rasterize
+    from warpgs.render.rule_costs import select_rule
     from warpgs.scene import Camera, Gaussians, Render, Scene
 
 _HOMES = {
@@ -28,10 +35,10 @@ _HOMES = {
     "Gaussians": "warpgs.scene",
     "Render": "warpgs.scene",
     "Scene": "warpgs.scene",
-    "RasterizeOptions": "warpgs.rasterizer",
-    "rasterize": "warpgs.rasterizer",
-    "choose_knobs": "warpgs.prices",
-    "forget_recordings": "warpgs.recording",
+    "RasterizeOptions": "warpgs.render.rasterize",
+    "rasterize": "warpgs.render.rasterize",
+    "select_rule": "warpgs.render.rule_costs",
+    "clear_graph_cache": "warpgs.render.graphed",
     "load_scene": "warpgs.io.load",
 }
 

@@ -200,7 +200,7 @@ class Render:
     """Accumulated opacity in [0, 1], shape [..., H, W]."""
     depth: torch.Tensor
     """Expected z-depth [u], divided by alpha; 0 where alpha is 0. Shape [..., H, W]."""
-    splats: torch.Tensor
+    projected: torch.Tensor
     """Projected Gaussians in the record layout of kernels/project.py, shape [C, N, 12]; retains gradients on request."""
     tile_counts: torch.Tensor
     """Number of tiles that a Gaussian touches, int32, shape [C, N]; 0 where it is culled."""

@@ -10,13 +10,13 @@ from bench import inputs, peers, roofline
 from bench.harness import OURS, Task
 from bench.kernels.bench_render import costs
 from warpgs import rasterize
-from warpgs.pipeline.loss import LossConfig, photometric_loss
-from warpgs.pipeline.optimizer import Optimizer, OptimizerConfig
+from warpgs.pipeline.train.loss import LossConfig, photometric_loss
+from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.scene import Camera
 
 AXES = ("count", "image", "degree", "threads")
 PROGRAMS = {OURS: ("step",), peers.GSPLAT_STEP: ("step",)}
-RATE = 1e-12
+LR = 1e-12
 
 
 def cost(point, device) -> roofline.Cost:
@@ -35,23 +35,23 @@ def tasks(point, device, wanted):
 
     if wanted(OURS, "step"):
         camera = Camera(batch.viewmat[0], batch.K[0], point.width, point.height)
-        rates = {f"{n}_lr": RATE for n in ("means", "quats", "scales", "opacities", "sh")}
-        optimizer = Optimizer(gaussians, OptimizerConfig(means_lr_final=RATE, **rates), extent=1.0)
+        lrs = {f"{n}_lr": LR for n in ("means", "quats", "scales", "opacities", "sh")}
+        optimizer = Optimizer(gaussians, OptimizerConfig(means_lr_final=LR, **lrs), extent=1.0)
 
         def step():
-            picture = rasterize(optimizer.gaussians, camera).rgb
-            photometric_loss(picture, target, None, loss).backward()
+            image = rasterize(optimizer.gaussians, camera).rgb
+            photometric_loss(image, target, None, loss).backward()
             optimizer.step(0.5)
 
         yield Task(OURS, "step", step, cost(point, device))
 
     if wanted(peers.GSPLAT_STEP, "step"):
-        adam = torch.optim.Adam(gaussians.tensors().values(), lr=RATE, eps=1e-15, fused=True)
+        adam = torch.optim.Adam(gaussians.tensors().values(), lr=LR, eps=1e-15, fused=True)
 
         def peer_step():
-            picture = peers.gsplat_rasterize(gaussians, batch)[0]
-            structural = peers.torch_ssim(picture, target).mean()
-            ((picture - target).abs().mean() * 0.8 + (1 - structural) * 0.2).backward()
+            image = peers.gsplat_rasterize(gaussians, batch)[0]
+            structural = peers.torch_ssim(image, target).mean()
+            ((image - target).abs().mean() * 0.8 + (1 - structural) * 0.2).backward()
             adam.step()
             adam.zero_grad(set_to_none=True)
 

@@ -42,8 +42,8 @@ def make_backward(tile_size: int, with_depth: bool, size: int, skip: bool):
 
     @wp.func_native(source("blend_common.cu", file, **numbers))
     def bucket_body(
-        item: int, splats: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        splat_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
+        item: int, projected: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
+        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
         backgrounds: wp.array(dtype=float),
         origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int, no_tile: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int,
@@ -57,8 +57,8 @@ def make_backward(tile_size: int, with_depth: bool, size: int, skip: bool):
 
     @wp.kernel(enable_backward=False, grid_stride=False, module=name, launch_bounds=32 * blend_cuda.WARPS)
     def bucket(
-        begin: int, splats: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        splat_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
+        begin: int, projected: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
+        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
         backgrounds: wp.array(dtype=float),
         origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int, no_tile: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int,
@@ -69,7 +69,7 @@ def make_backward(tile_size: int, with_depth: bool, size: int, skip: bool):
         v_slots: wp.array2d(dtype=float),
     ):  # fmt: skip
         bucket_body(
-            wp.tid() // 32, splats, keys, ranges, splat_ids, slots, totals, capacity, backgrounds,
+            wp.tid() // 32, projected, keys, ranges, gaussian_ids, slots, totals, capacity, backgrounds,
             origin_x, origin_y, width, height, columns, tiles, no_tile, alpha_cut, alpha_max, whole_tiles,
             rgb, depth, transmittances, weights, ends, states, v_rgb, v_alpha, v_depth, v_slots,
         )  # fmt: skip

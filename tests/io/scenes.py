@@ -59,7 +59,7 @@ def save(path: Path, rgb: np.ndarray, *options) -> None:
     path.write_bytes(encoded.tobytes())
 
 
-def save_pictures(folder: Path, names=NAMES, width: int = WIDTH, height: int = HEIGHT) -> None:
+def save_images(folder: Path, names=NAMES, width: int = WIDTH, height: int = HEIGHT) -> None:
     for i, name in enumerate(names):
         save(folder / name, picture(i, width, height))
 
@@ -116,13 +116,13 @@ def write_files(folder: Path, files: dict[str, bytes]) -> None:
 
 def write_colmap(root: Path, **options) -> Path:
     write_files(root / "sparse" / "0", colmap_bin(**options))
-    save_pictures(root / "images", options.get("names", NAMES))
+    save_images(root / "images", options.get("names", NAMES))
     return root
 
 
 def write_colmap_txt(root: Path, **options) -> Path:
     write_files(root / "sparse", colmap_txt(**options))
-    save_pictures(root / "images", options.get("names", NAMES))
+    save_images(root / "images", options.get("names", NAMES))
     return root
 
 
@@ -138,7 +138,7 @@ def transforms_json(names=NAMES, **shared) -> dict:
 
 
 def write_transforms(root: Path, content: dict | None = None, names=NAMES) -> Path:
-    save_pictures(root / "images", names)
+    save_images(root / "images", names)
     (root / "transforms.json").write_text(json.dumps(content or transforms_json(names)))
     return root
 
@@ -173,7 +173,7 @@ def llff_rows() -> np.ndarray:
 
 
 def write_llff(root: Path) -> Path:
-    save_pictures(root / "images")
+    save_images(root / "images")
     np.save(root / "poses_bounds.npy", llff_rows())
     return root
 
@@ -193,7 +193,7 @@ def dtu_matrices() -> dict[str, np.ndarray]:
 
 
 def write_dtu(root: Path) -> Path:
-    save_pictures(root / "image", [f"{i:06d}.png" for i in range(VIEWS)])
+    save_images(root / "image", [f"{i:06d}.png" for i in range(VIEWS)])
     np.savez(root / "cameras.npz", **dtu_matrices())
     return root
 
@@ -207,7 +207,7 @@ def middlebury_text() -> str:
 
 
 def write_middlebury(root: Path) -> Path:
-    save_pictures(root)
+    save_images(root)
     (root / "tiny_par.txt").write_text(middlebury_text())
     return root
 

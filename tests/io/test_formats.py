@@ -128,7 +128,7 @@ def test_fingerprint_follows_the_data(tmp_path):
 
 def test_ready_made_small_images_are_taken(tmp_path):
     scenes.write_colmap(tmp_path)
-    scenes.save_pictures(tmp_path / "images_2", width=8, height=6)
+    scenes.save_images(tmp_path / "images_2", width=8, height=6)
     scenes.save(tmp_path / "images_2" / "photo0.png", np.full((6, 8, 3), 7, np.uint8))
     scene = load_scene(tmp_path, downscale=2)
     assert (scene.views[0].image == np.float32(7 / 255)).all() and "images taken from images_2" in scene.notes
@@ -139,7 +139,7 @@ def test_ready_made_small_images_are_taken(tmp_path):
 def test_small_images_of_other_names_are_matched(other, tmp_path):
     scenes.write_colmap(tmp_path)
     names = [other.format(stem=n[:-4], i=i) for i, n in enumerate(scenes.NAMES)]
-    scenes.save_pictures(tmp_path / "images_2", names, 8, 6)
+    scenes.save_images(tmp_path / "images_2", names, 8, 6)
     scene = load_scene(tmp_path, downscale=2)
     assert [v.name for v in scene.views] == list(scenes.NAMES) and any("matched" in n for n in scene.notes)
     blues = [float(v.image[..., 2].mean()) for v in scene.views]
@@ -150,7 +150,7 @@ def test_small_images_of_other_names_are_matched(other, tmp_path):
 def test_llff_with_only_small_images(downscale, size, note, tmp_path):
     scenes.write_llff(tmp_path)
     (tmp_path / "images").rename(tmp_path / "gone")
-    scenes.save_pictures(tmp_path / "images_2", width=8, height=6)
+    scenes.save_images(tmp_path / "images_2", width=8, height=6)
     if size is None:  # 2 x 2 px would be left
         with pytest.raises(UsageError, match=note):
             load_scene(tmp_path, downscale=downscale)
@@ -164,7 +164,7 @@ def test_llff_small_images_are_resampled_further(tmp_path):
     rows = scenes.llff_rows()
     rows[:, [4, 9, 14]] *= 4  # made for 64 x 48
     np.save(tmp_path / "poses_bounds.npy", rows)
-    scenes.save_pictures(tmp_path / "images_4")
+    scenes.save_images(tmp_path / "images_4")
     scene = load_scene(tmp_path, downscale=2)
     assert scene.views[0].camera.width == 8 and scene.views[0].camera.K[0, 0] == 10
     assert any("images_4, area-resampled by 2" in n for n in scene.notes)

@@ -48,7 +48,7 @@ def test_a_complete_reconstruction_elsewhere_is_found(tmp_path):
 
 def test_the_folder_itself_may_be_the_reconstruction(tmp_path):
     scenes.write_files(tmp_path, scenes.colmap_bin())
-    scenes.save_pictures(tmp_path / "images")
+    scenes.save_images(tmp_path / "images")
     assert len(load_scene(tmp_path).views) == 5
 
 

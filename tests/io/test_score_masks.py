@@ -129,5 +129,5 @@ def test_where_pixels_come_from(tmp_path):
     scenes.write_colmap(tmp_path)
     assert load_scene(tmp_path).pixels == "images as stored"
     assert load_scene(tmp_path, downscale=2).pixels == "images area-resampled by 2"
-    scenes.save_pictures(tmp_path / "images_2", width=8, height=6)
+    scenes.save_images(tmp_path / "images_2", width=8, height=6)
     assert load_scene(tmp_path, downscale=2).pixels == "images_2 as stored"

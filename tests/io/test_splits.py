@@ -8,7 +8,7 @@ import pytest
 from tests.io import scenes
 from warpgs.errors import DataError, UsageError
 from warpgs.io.load import load_scene
-from warpgs.io.splits import Split, default_split, split_views, twins
+from warpgs.io.splits import Split, coincident_views, default_split, split_views
 from warpgs.scene import Camera
 
 
@@ -203,5 +203,5 @@ def test_twins_are_views_from_one_place():
     for unit in (1e-3, 1e3):
         views = [view("a", 0), view("b", 5e-4 * unit), view("c", unit), view("d", unit), view("e", unit, turned=True)]
         scene = SimpleNamespace(views=tuple(views))
-        assert twins(scene, Split(("b", "c", "e"), ("a", "d"))) == [("a", "b"), ("d", "c")]
-        assert twins(scene, Split(("c", "d", "e"), ("a", "b"))) == []
+        assert coincident_views(scene, Split(("b", "c", "e"), ("a", "d"))) == [("a", "b"), ("d", "c")]
+        assert coincident_views(scene, Split(("c", "d", "e"), ("a", "b"))) == []

@@ -9,14 +9,15 @@ import torch
 import warp as wp
 
 from warpgs.constants import ALPHA_CUT
-from warpgs.kernels import blend_cuda, bridge, native
+from warpgs.kernels import blend_cuda, native
+from warpgs.runtime import interop
 
 pytestmark = pytest.mark.cuda
 CUDA = torch.device("cuda", 0)
 
 
-def ints(tensor: torch.Tensor) -> bridge.View:
-    return bridge.view(tensor.view(-1), wp.int32)
+def ints(tensor: torch.Tensor) -> interop.View:
+    return interop.view(tensor.view(-1), wp.int32)
 
 
 @pytest.mark.parametrize("count", [1, 31, 1000, 1025, 8192, 8193, 20_000])
@@ -29,7 +30,7 @@ def test_long_lists_come_first(count):
     ranges = torch.stack([begins, begins + lengths], 1).to(CUDA)
     order = torch.full((count + 16 * 1024,), -1, dtype=torch.int32, device=CUDA)
     inputs = [ints(ranges), count, ints(order)]
-    bridge.launch(blend_cuda.make_kernels(16).order_tiles, blend_cuda.THREADS, inputs, CUDA, block_dim=blend_cuda.THREADS)
+    interop.launch(blend_cuda.make_kernels(16).order_tiles, blend_cuda.THREADS, inputs, CUDA, block_dim=blend_cuda.THREADS)
     found = order.cpu()
     assert bool((found[count:] == -1).all())
     assert torch.equal(found[:count].sort().values, torch.arange(count, dtype=torch.int32))
@@ -52,14 +53,14 @@ def small_kernels() -> SimpleNamespace:
         return s.touches(corners.data[2 * i], corners.data[2 * i + 1], limit_of(s.b.y, cut));
         """
     )
-    def touches(splats: wp.array(dtype=float), corners: wp.array(dtype=float), cut: float, i: int) -> int: ...
+    def touches(projected: wp.array(dtype=float), corners: wp.array(dtype=float), cut: float, i: int) -> int: ...
 
     @wp.kernel(enable_backward=False, module="unique")
     def block(
-        begin: int, splats: wp.array(dtype=float), corners: wp.array(dtype=float), cut: float, found: wp.array(dtype=int)
+        begin: int, projected: wp.array(dtype=float), corners: wp.array(dtype=float), cut: float, found: wp.array(dtype=int)
     ):
         i = begin + wp.tid()
-        found[i] = touches(splats, corners, cut, i)
+        found[i] = touches(projected, corners, cut, i)
 
     @wp.kernel(enable_backward=False, module="unique")
     def deal(begin: int, wanted: wp.array(dtype=int), found: wp.array(dtype=int)):
@@ -69,14 +70,14 @@ def small_kernels() -> SimpleNamespace:
     return SimpleNamespace(block=block, deal=deal)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.97, 1.0])
-def test_wanted_items_go_to_the_first_threads(share):
+@pytest.mark.parametrize("fraction", [0.0, 0.3, 0.97, 1.0])
+def test_wanted_items_go_to_the_first_threads(fraction):
     """In order within their block, whatever number says that they are wanted; -1 for the threads that are left over."""
     blocks = 50
     draw = torch.rand(blocks * native.BLOCK, generator=torch.Generator().manual_seed(0))
-    wanted = torch.where(draw < share, (draw * 1000).int() % 3 + 1, 0).int()
+    wanted = torch.where(draw < fraction, (draw * 1000).int() % 3 + 1, 0).int()
     found = torch.full_like(wanted, -7).to(CUDA)
-    bridge.launch(small_kernels().deal, len(wanted), [ints(wanted.to(CUDA)), ints(found)], CUDA, block_dim=native.BLOCK)
+    interop.launch(small_kernels().deal, len(wanted), [ints(wanted.to(CUDA)), ints(found)], CUDA, block_dim=native.BLOCK)
     for i, dealt in enumerate(found.cpu().view(blocks, -1).tolist()):
         items = range(i * native.BLOCK, (i + 1) * native.BLOCK)
         mine = [item for item in items if wanted[item] > 0]
@@ -119,8 +120,8 @@ def test_no_block_that_draws_is_left_out(longest, corner):
     alpha = opacity * torch.exp(-0.5 * ((u11 * dx + u12 * dy) ** 2 + (u22 * dy) ** 2))
     drawn = (alpha.amax((1, 2)) >= ALPHA_CUT).to(CUDA)
     found = torch.empty(len(records), dtype=torch.int32, device=CUDA)
-    floats = [bridge.view(t.to(CUDA).view(-1), wp.float32) for t in (records, corners)]
-    bridge.launch(small_kernels().block, len(records), [*floats, ALPHA_CUT, ints(found)], CUDA)
+    floats = [interop.view(t.to(CUDA).view(-1), wp.float32) for t in (records, corners)]
+    interop.launch(small_kernels().block, len(records), [*floats, ALPHA_CUT, ints(found)], CUDA)
     assert int(drawn.sum()) > 180_000 and int((drawn & (found == 0)).sum()) == 0
 
 
@@ -133,10 +134,10 @@ def test_chunks_are_the_larger_ones_in_large_pictures_and_without_an_order():
 def test_devices_and_streams_without_a_number():
     """The current device is meant; Warp's own work runs on torch's stream, and on no other afterwards."""
     unnumbered = torch.device("cuda")
-    assert bridge.warp_device(unnumbered) is bridge.warp_device(CUDA) and bridge.warp_device(torch.device("cpu")).is_cpu
-    where = bridge.warp_device(CUDA)
+    assert interop.warp_device(unnumbered) is interop.warp_device(CUDA) and interop.warp_device(torch.device("cpu")).is_cpu
+    where = interop.warp_device(CUDA)
     before = where.stream.cuda_stream
-    with torch.cuda.stream(torch.cuda.Stream(CUDA)), bridge.stream_of(CUDA):
+    with torch.cuda.stream(torch.cuda.Stream(CUDA)), interop.stream_of(CUDA):
         wanted = torch.cuda.current_stream(CUDA).cuda_stream
-        assert where.stream.cuda_stream == wanted == bridge.warp_stream(unnumbered).cuda_stream
+        assert where.stream.cuda_stream == wanted == interop.warp_stream(unnumbered).cuda_stream
     assert where.stream.cuda_stream == before != wanted

@@ -7,7 +7,8 @@ import pytest
 import torch
 import warp as wp
 
-from warpgs.kernels import bridge, falloff, functions
+from warpgs.kernels import falloff, functions
+from warpgs.runtime import interop
 
 COUNT = 4000
 
@@ -46,8 +47,8 @@ def make_probe():
 
 def probe(cases: torch.Tensor, device, whole_tiles=0, origin=16, size=53, tile_size=16) -> torch.Tensor:
     spans = torch.zeros(len(cases), 5, dtype=torch.int32, device=device)
-    inputs = [bridge.view(cases.to(device), wp.float64), whole_tiles, origin, size, tile_size, bridge.view(spans, wp.int32)]
-    bridge.launch(make_probe(), len(cases), inputs, device)
+    inputs = [interop.view(cases.to(device), wp.float64), whole_tiles, origin, size, tile_size, interop.view(spans, wp.int32)]
+    interop.launch(make_probe(), len(cases), inputs, device)
     return spans.cpu()
 
 
@@ -103,10 +104,10 @@ def test_strips_are_those_of_the_ellipse(device, far):
     cases = ellipses(far=far)
     mx, my, u11, u12, u22, _, half_width, half_height, _ = (t[:, None] for t in cases.unbind(-1))
     if far > 1:  # beside the ellipse, at a height of it
-        share = torch.linspace(-1, 1, COUNT, dtype=torch.float64)[:, None]
-        my[:] = 16.5 - share * half_height
-        mx[:] = 20.0 + u12 / u11 * share * half_height
-        mx[::2] += (u22 * half_height / u11 * (1 - share**2).sqrt())[::2] + 8 * share[::2].flip(0)
+        fraction = torch.linspace(-1, 1, COUNT, dtype=torch.float64)[:, None]
+        my[:] = 16.5 - fraction * half_height
+        mx[:] = 20.0 + u12 / u11 * fraction * half_height
+        mx[::2] += (u22 * half_height / u11 * (1 - fraction**2).sqrt())[::2] + 8 * fraction[::2].flip(0)
     radius, dy = u22 * (half_height + margin_of(my, half_height)), 16.5 - my
     side = 3.5 + margin_of(mx, half_width)
     dx = 20.0 - mx + side * torch.linspace(-1, 1, 4001, dtype=torch.float64)
@@ -181,9 +182,9 @@ def make_reach():
 
 def reaches(opacities, cut, square_sigma, xs):
     found, falls = torch.zeros_like(opacities), torch.zeros_like(xs)
-    inputs = [bridge.view(opacities, wp.float64), cut, square_sigma, bridge.view(xs, wp.float32)]
-    outputs = [bridge.view(found, wp.float64), bridge.view(falls, wp.float32)]
-    bridge.launch(make_reach(), len(opacities), [*inputs, *outputs], torch.device("cpu"))
+    inputs = [interop.view(opacities, wp.float64), cut, square_sigma, interop.view(xs, wp.float32)]
+    outputs = [interop.view(found, wp.float64), interop.view(falls, wp.float32)]
+    interop.launch(make_reach(), len(opacities), [*inputs, *outputs], torch.device("cpu"))
     return found, falls
 
 

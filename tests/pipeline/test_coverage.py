@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from tests.scenes import ring, three_gaussians
-from warpgs.pipeline.coverage import CONE, SEEN, Coverage, coverage, fisher
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.pipeline.model.coverage import CONE, SEEN, Coverage, coverage, fisher
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
 
 

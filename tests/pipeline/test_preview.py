@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from tests.priors import networks as nw
-from warpgs.cli import main
-from warpgs.demo import split_spec, write_demo
+from warpgs.app.cli import main
+from warpgs.synthetic.demo import split_spec, write_demo
 
 
 @pytest.fixture(scope="module")

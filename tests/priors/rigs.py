@@ -4,10 +4,10 @@ import functools
 
 import numpy as np
 
-from warpgs import demo, raycast
 from warpgs.geometry import look_at
 from warpgs.priors.epipolar import pixel_grid
 from warpgs.scene import Camera, View
+from warpgs.synthetic import demo, raycast
 
 SIZE = (160, 120)
 

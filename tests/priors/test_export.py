@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from warpgs.cli import main
+from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.priors.export import ExportRequest, build, export_network
 from warpgs.priors.session import open_network

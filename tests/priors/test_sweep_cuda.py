@@ -34,8 +34,8 @@ def test_costs_agree(device):
     found = computed(views[1], [views[0], views[2]], PLANES, 7, device)
     off = np.abs(found - wanted)
     assert off.max() < 2e-3 and np.quantile(off, 0.999) < 2e-4 + 0.5 / UNIT and off.mean() < 5e-6 + 0.25 / UNIT
-    silent = wanted == sweep.NO_OPINION
-    assert 0.001 < silent.mean() < 0.5 and (found[silent] == sweep.NO_OPINION).mean() > 0.999
+    silent = wanted == sweep.NEUTRAL_COST
+    assert 0.001 < silent.mean() < 0.5 and (found[silent] == sweep.NEUTRAL_COST).mean() > 0.999
 
 
 def test_costs_of_another_size_agree(device):
@@ -49,7 +49,7 @@ def test_costs_of_another_size_agree(device):
     inverses = np.array([0.15, 0.25, 0.5, 1.0])
     wanted = sweep.matching_costs(views[0], views[1:], inverses, 5)
     found = computed(views[0], views[1:], inverses, 5, device)
-    assert np.abs(found - wanted).max() < 1e-4 + 0.5 / UNIT and (wanted != sweep.NO_OPINION).mean() > 0.3
+    assert np.abs(found - wanted).max() < 1e-4 + 0.5 / UNIT and (wanted != sweep.NEUTRAL_COST).mean() > 0.3
 
 
 def test_paths_agree(device):

@@ -128,10 +128,10 @@ def test_a_region_beats_saliency():
 def test_classical_sources_say_so():
     image, inverse, near = two_planes()
     valid = np.random.default_rng(1).random(near.shape) < 0.1
-    confirmed = Depth(np.where(valid, 1 / inverse, 0), valid, np.where(valid, 0.01, np.inf))
+    consistent = Depth(np.where(valid, 1 / inverse, 0), valid, np.where(valid, 0.01, np.inf))
     nothing = Depth(np.zeros(near.shape), np.zeros(near.shape, bool), np.full(near.shape, np.inf))
     views = [view(image, "a.png"), view(image, "b.png")]
-    (a, b), notes = view_priors(views, PriorConfig(), depths=lambda: [confirmed, nothing])
+    (a, b), notes = view_priors(views, PriorConfig(), depths=lambda: [consistent, nothing])
     for p in (a, b):
         check(p, near.shape)
     assert a.disparity[near].min() > a.disparity[~near].max() and f"{valid.mean():.1%}" in a.depth_source

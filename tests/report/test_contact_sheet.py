@@ -3,7 +3,7 @@
 import numpy as np
 
 from warpgs.report.contact_sheet import GAP, HEAD, MARGIN, PAPER, TITLE_SIZE, Tile, contact_sheet
-from warpgs.report.pictures import colored
+from warpgs.report.images import colored
 
 TOP = MARGIN + TITLE_SIZE + 18
 
@@ -16,14 +16,14 @@ def corner(index, width, height, columns):
 def test_tiles_keep_their_pixels_and_order():
     """At their own size the pictures on the sheet are those that were given, maps by their colours."""
     rng = np.random.default_rng(0)
-    photo = np.round(rng.random((150, 200, 3)) * 255).astype(np.float32) / 255
+    image = np.round(rng.random((150, 200, 3)) * 255).astype(np.float32) / 255
     maps = [rng.random((150, 200), np.float32) for _ in range(3)]
-    tiles = [Tile("photo", photo), *(Tile(f"map {i}", m, "VIRIDIS") for i, m in enumerate(maps))]
+    tiles = [Tile("photo", image), *(Tile(f"map {i}", m, "VIRIDIS") for i, m in enumerate(maps))]
     sheet = contact_sheet("a view", ["one sentence"], tiles, columns=3, tile_width=200)
     assert (
         sheet.shape == (TOP + 2 * (HEAD + 150) + GAP + MARGIN, 2 * MARGIN + 3 * 200 + 2 * GAP, 3) and sheet.dtype == np.float32
     )
-    for i, wanted in enumerate([photo, *(colored(m, "VIRIDIS") for m in maps)]):
+    for i, wanted in enumerate([image, *(colored(m, "VIRIDIS") for m in maps)]):
         x, y = corner(i, 200, 150, 3)
         np.testing.assert_allclose(sheet[y : y + 150, x : x + 200], wanted, atol=0.51 / 255)
 

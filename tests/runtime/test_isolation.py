@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from warpgs.demo import split_spec, write_demo
 from warpgs.runtime.subprocesses import run_python
+from warpgs.synthetic.demo import split_spec, write_demo
 
 ROOT = Path(__file__).parent.parent.parent
 PLANTED = (

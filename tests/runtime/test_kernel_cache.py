@@ -17,10 +17,11 @@ COMPILE = """
 import os
 import torch
 import warp as wp
-from warpgs.kernels import bridge, tiles
+from warpgs.kernels import tiles
+from warpgs.runtime import interop
 
 module = tiles.make_kernels(wp.float32, False).find_ranges.module
-made = module.load(bridge.warp_device(torch.device("cpu")), block_dim=1).binary_path
+made = module.load(interop.warp_device(torch.device("cpu")), block_dim=1).binary_path
 folder = wp.config.kernel_cache_dir
 assert str(made).startswith(folder) and os.path.isfile(made)
 print(folder, oct(os.stat(os.path.dirname(os.path.dirname(folder))).st_mode & 0o777))
@@ -88,7 +89,7 @@ def test_nothing_can_be_written(python, tmp_path):
 import sys, tempfile
 def refuse(*_, **__): raise FileNotFoundError(2, "No usable temporary directory found")
 tempfile.mkdtemp = refuse
-from warpgs.cli import main
+from warpgs.app.cli import main
 sys.exit(main(["eval", "run"]))
 """
     done = python(code, HOME=home, USERPROFILE=home, LOCALAPPDATA=home)

@@ -158,7 +158,7 @@ def default_split(scene: Scene) -> tuple[Split, str]:
     return Split(tuple(n for n in names if n != middle), (middle,)), f"no --split given: {middle} is held out"
 
 
-def twins(scene: Scene, split: Split) -> list[tuple[str, str]]:
+def coincident_views(scene: Scene, split: Split) -> list[tuple[str, str]]:
     """Held-out views whose camera is that of a training view, each with that view: what they score, copying would score.
 
     The same means: the pose differs by less than a thousandth in every entry, lengths taken in extents of the camera set.

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from warpgs.kernels import bridge
 from warpgs.kernels.compiler import ROLLED
+from warpgs.runtime import interop
 
 BETAS = (0.9, 0.999)
 """Decay of the two running means (Kingma and Ba 2015)."""
@@ -34,9 +34,9 @@ def make_functions(real):
         return beta2 * s + rest2 * g * g
 
     @wp.func
-    def moved(p: real, m: real, s: real, rate: real, root_correction2: real, eps: real) -> real:
+    def moved(p: real, m: real, s: real, lr: real, root_correction2: real, eps: real) -> real:
         """The parameter after the step."""
-        return p - rate * m / (wp.sqrt(s) / root_correction2 + eps)
+        return p - lr * m / (wp.sqrt(s) / root_correction2 + eps)
 
     return SimpleNamespace(decayed=decayed, decayed_square=decayed_square, moved=moved)
 
@@ -52,7 +52,7 @@ def make_kernel(real, split: bool, lanes: int):
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def update(
-        begin: int, gradient: wp.array(dtype=real), length: int, row: int, head: int, head_rate: real, rate: real,
+        begin: int, gradient: wp.array(dtype=real), length: int, row: int, head: int, head_lr: real, lr: real,
         beta1: real, beta2: real, rest1: real, rest2: real, root_correction2: real, eps: real,
         # outputs
         parameter: wp.array(dtype=real), mean: wp.array(dtype=real), square: wp.array(dtype=real),
@@ -73,11 +73,11 @@ def make_kernel(real, split: bool, lanes: int):
                     g = gradient[i]
                     m[lane] = f.decayed(mean[i], g, beta1, rest1)
                     s[lane] = f.decayed_square(square[i], g, beta2, rest2)
-                    step = rate
+                    step = lr
                     if wp.static(split):
                         # place in the row, from its middle, so that no rounding moves it to another
                         place = (phase + real(lane)) / real(row)
-                        step = wp.where((place - wp.floor(place)) * real(row) < real(head), head_rate, rate)
+                        step = wp.where((place - wp.floor(place)) * real(row) < real(head), head_lr, lr)
                     p[lane] = f.moved(parameter[i], m[lane], s[lane], step, root_correction2, eps)
                 for lane in range(lanes):
                     parameter[base + lane] = p[lane]
@@ -88,9 +88,9 @@ def make_kernel(real, split: bool, lanes: int):
                     g = gradient[i]
                     mean[i] = f.decayed(mean[i], g, beta1, rest1)
                     square[i] = f.decayed_square(square[i], g, beta2, rest2)
-                    step = rate
+                    step = lr
                     if wp.static(split):
-                        step = wp.where(i % row < head, head_rate, rate)
+                        step = wp.where(i % row < head, head_lr, lr)
                     parameter[i] = f.moved(parameter[i], mean[i], square[i], step, root_correction2, eps)
 
     return update
@@ -139,42 +139,75 @@ def make_scheduled_kernel():
 
     @wp.func_native(_UPDATE)
     def update_body(
-        four: int, gradient: wp.array(dtype=float), row: int, head: int, rates: wp.array(dtype=float),
+        four: int, gradient: wp.array(dtype=float), row: int, head: int, lrs: wp.array(dtype=float),
         beta1: float, beta2: float, rest1: float, rest2: float, eps: float, skip: wp.array(dtype=int),
         parameter: wp.array(dtype=float), mean: wp.array(dtype=float), square: wp.array(dtype=float),
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, grid_stride=False, module="warpgs.kernels.adam.scheduled")
     def update(
-        begin: int, gradient: wp.array(dtype=float), row: int, head: int, rates: wp.array(dtype=float),
+        begin: int, gradient: wp.array(dtype=float), row: int, head: int, lrs: wp.array(dtype=float),
         beta1: float, beta2: float, rest1: float, rest2: float, eps: float, skip: wp.array(dtype=int),
         # outputs
         parameter: wp.array(dtype=float), mean: wp.array(dtype=float), square: wp.array(dtype=float),
     ):  # fmt: skip
         update_body(
-            wp.tid(), gradient, row, head, rates, beta1, beta2, rest1, rest2, eps, skip, parameter, mean, square
+            wp.tid(), gradient, row, head, lrs, beta1, beta2, rest1, rest2, eps, skip, parameter, mean, square
         )  # fmt: skip
 
     return update
 
 
-def scheduled_rates(lr: float, step: int, betas: tuple[float, float] = BETAS, head_lr: float | None = None) -> list[float]:
+def scheduled_lrs(lr: float, step: int, betas: tuple[float, float] = BETAS, head_lr: float | None = None) -> list[float]:
     """What `adam_scheduled` reads from memory at a step: both learning rates and the root of the second correction."""
     correction1, correction2 = 1 - betas[0] ** step, 1 - betas[1] ** step
     return [(lr if head_lr is None else head_lr) / correction1, lr / correction1, correction2**0.5]
 
 
 def adam_scheduled(
-    param: torch.Tensor, grad: torch.Tensor, exp_avg: torch.Tensor, exp_avg_sq: torch.Tensor, rates: torch.Tensor,
+    param: torch.Tensor, grad: torch.Tensor, exp_avg: torch.Tensor, exp_avg_sq: torch.Tensor, lrs: torch.Tensor,
     skip: torch.Tensor, *, head: int, betas: tuple[float, float] = BETAS, eps: float = EPS,
 ) -> None:  # fmt: skip
-    """`adam_step` on CUDA in float32, with ``rates`` [3] of `scheduled_rates`; nothing changes where ``skip`` [1] is not 0."""
+    """Take the step of `adam_step` in float32, with its learning rates in memory, so that CUDA can record it once.
+
+    Args:
+        param: Parameter, contiguous, shape [N, ...].
+        grad: Its gradient, same shape.
+        exp_avg: Running mean of the gradient, same shape, contiguous.
+        exp_avg_sq: Running mean of its square, same shape, contiguous.
+        lrs: What `scheduled_lrs` gives, float32, shape [3].
+        skip: Nothing changes where this is not 0, int32, shape [1].
+        head: How many numbers of a row take the first learning rate; 0 for none.
+        betas: Decay of the two running means.
+        eps: Added to the root.
+    """
+    if param.numel() == 0:
+        return
+    if param.device.type == "cpu":
+        if int(skip) == 0:
+            _update(param, grad, exp_avg, exp_avg_sq, lrs.tolist(), head, betas, eps)
+        return
     inputs = [
-        bridge.view(grad.view(-1), wp.float32), param[0].numel(), head, bridge.view(rates, wp.float32),
-        *betas, 1 - betas[0], 1 - betas[1], eps, bridge.view(skip, wp.int32),
-        *(bridge.view(t.view(-1), wp.float32) for t in (param, exp_avg, exp_avg_sq)),
+        interop.view(grad.contiguous().view(-1), wp.float32), param[0].numel(), head, interop.view(lrs, wp.float32),
+        *betas, 1 - betas[0], 1 - betas[1], eps, interop.view(skip, wp.int32),
+        *(interop.view(t.view(-1), wp.float32) for t in (param, exp_avg, exp_avg_sq)),
     ]  # fmt: skip
-    bridge.launch(make_scheduled_kernel(), -(-param.numel() // 4), inputs, param.device)
+    interop.launch(make_scheduled_kernel(), -(-param.numel() // 4), inputs, param.device)
+
+
+def _update(param, grad, exp_avg, exp_avg_sq, lrs: list[float], head: int, betas: tuple[float, float], eps: float) -> None:
+    """Launch the generic kernel, which is that of a CPU and of float64."""
+    real, device = interop.real_of(param), param.device
+    length, lanes = (SEGMENT, LANES) if device.type == "cpu" else (1, 1)
+    flat = [interop.view(t.view(-1), real) for t in (param, exp_avg, exp_avg_sq)]
+    head_lr, lr, root_correction2 = lrs
+    with interop.stream_of(device):
+        inputs = [
+            interop.view(grad.contiguous().view(-1), real), length, param[0].numel(), head, head_lr, lr,
+            *betas, 1 - betas[0], 1 - betas[1], root_correction2, eps, *flat,
+        ]  # fmt: skip
+        kernel = make_kernel(real, head > 0, lanes)
+        interop.launch(kernel, -(-param.numel() // length), inputs, device, cost=max(1, length // 16))
 
 
 def adam_step(
@@ -209,31 +242,18 @@ def adam_step(
         ValueError: A shape or device disagrees, a tensor to be updated is not contiguous, or ``step`` is below 1.
     """
     pattern = " ".join(str(s) for s in param.shape)
-    bridge.check(param=(param, pattern), grad=(grad, pattern), exp_avg=(exp_avg, pattern), exp_avg_sq=(exp_avg_sq, pattern))
+    interop.check(param=(param, pattern), grad=(grad, pattern), exp_avg=(exp_avg, pattern), exp_avg_sq=(exp_avg_sq, pattern))
     if not (param.is_contiguous() and exp_avg.is_contiguous() and exp_avg_sq.is_contiguous()):
         raise ValueError("param, exp_avg and exp_avg_sq are updated in place and must be contiguous")
     if step < 1:
         raise ValueError(f"step counts from 1, not {step}")
     if param.numel() == 0:
         return
-    real, device = bridge.real_of(param), param.device
-    if device.type == "cuda" and real is wp.float32:
+    lrs = scheduled_lrs(lr, step, betas, head_lr)
+    if param.is_cuda and param.dtype == torch.float32:
         # one kernel for this and for recorded steps, so that both give the same bits
-        rates = torch.tensor(scheduled_rates(lr, step, betas, head_lr), device=device)
-        skip = torch.zeros(1, dtype=torch.int32, device=device)
-        adam_scheduled(param, grad.contiguous(), exp_avg, exp_avg_sq, rates, skip, betas=betas, eps=eps, head=head)
+        skip = torch.zeros(1, dtype=torch.int32, device=param.device)
+        on_device = torch.tensor(lrs, device=param.device)
+        adam_scheduled(param, grad, exp_avg, exp_avg_sq, on_device, skip, betas=betas, eps=eps, head=head)
         return
-    beta1, beta2 = betas
-    correction1, correction2 = 1 - beta1**step, 1 - beta2**step
-    row = param[0].numel()
-    length, lanes = (SEGMENT, LANES) if device.type == "cpu" else (1, 1)
-    flat = [bridge.view(t.view(-1), real) for t in (param, exp_avg, exp_avg_sq)]
-    with bridge.stream_of(device):
-        inputs = [
-            bridge.view(grad.contiguous().view(-1), real), length, row, head,
-            (lr if head_lr is None else head_lr) / correction1, lr / correction1,
-            beta1, beta2, 1 - beta1, 1 - beta2, correction2**0.5, eps, *flat,
-        ]  # fmt: skip
-        bridge.launch(
-            make_kernel(real, head > 0, lanes), -(-param.numel() // length), inputs, device, cost=max(1, length // 16)
-        )
+    _update(param, grad, exp_avg, exp_avg_sq, lrs, head, betas, eps)

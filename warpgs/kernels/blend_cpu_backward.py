@@ -36,7 +36,7 @@ def make_backward(real, tile_size: int):
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def backward(
-        begin: int, splats: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), splat_ids: wp.array(dtype=int),
+        begin: int, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), gaussian_ids: wp.array(dtype=int),
         slots: wp.array(dtype=int), backgrounds: wp.array2d(dtype=real),
         origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
         alpha_cut: real, alpha_max: real, whole_tiles: int,
@@ -116,22 +116,22 @@ def make_backward(real, tile_size: int):
         totals = value_reals()
         ahead = real(0.0)
         if instance > ranges[tile, 0]:
-            ahead = splats[splat_ids[instance - 1], 0]
+            ahead = projected[gaussian_ids[instance - 1], 0]
         while instance > ranges[tile, 0]:
             instance -= 1
-            i = splat_ids[instance]
+            i = gaussian_ids[instance]
             mx = ahead
-            ahead = splats[splat_ids[wp.max(instance - 1, 0)], 0]  # asked for early, as it may be far away
-            my = splats[i, 1]
-            u11 = splats[i, 2]
-            u12 = splats[i, 3]
-            u22 = splats[i, 4]
-            opacity = splats[i, 5]
-            c0 = splats[i, 6]
-            c1 = splats[i, 7]
-            c2 = splats[i, 8]
-            distance = splats[i, 9]
-            bounds = f.bounds_of(mx, my, u11, u22, splats[i, 10], splats[i, 11], whole_tiles)
+            ahead = projected[gaussian_ids[wp.max(instance - 1, 0)], 0]  # asked for early, as it may be far away
+            my = projected[i, 1]
+            u11 = projected[i, 2]
+            u12 = projected[i, 3]
+            u22 = projected[i, 4]
+            opacity = projected[i, 5]
+            c0 = projected[i, 6]
+            c1 = projected[i, 7]
+            c2 = projected[i, 8]
+            distance = projected[i, 9]
+            bounds = f.bounds_of(mx, my, u11, u22, projected[i, 10], projected[i, 11], whole_tiles)
             for row in range(side):
                 dy = real(origin_y + top + row) + real(0.5) - my
                 e2 = u22 * dy

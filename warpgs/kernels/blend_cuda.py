@@ -11,10 +11,10 @@ import torch
 import warp as wp
 
 from warpgs.constants import Rule
-from warpgs.kernels import bridge
-from warpgs.kernels.memory import TORCH, Memory
 from warpgs.kernels.native import source
 from warpgs.kernels.tiles import Tiles, grid
+from warpgs.runtime import interop
+from warpgs.runtime.allocator import TORCH, Allocator
 
 CHUNKS = (64, 128)
 """Instances that one warp of the backward pass works through: the first in pictures of up to MANY tiles, to have enough
@@ -51,8 +51,8 @@ def make_kernels(tile_size: int):
 
     @wp.func_native(_source("forward", tile_size))
     def forward_body(
-        item: int, splats: wp.array(dtype=float), order: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        splat_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
+        item: int, projected: wp.array(dtype=float), order: wp.array(dtype=int), ranges: wp.array(dtype=int),
+        gaussian_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
         origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int, stop: float, inclusive: int, chunk: int,
         rgb: wp.array(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
@@ -65,7 +65,7 @@ def make_kernels(tile_size: int):
 
     @wp.func_native(_source("contributions", tile_size))
     def contributions_body(
-        tile: int, splats: wp.array(dtype=float), ranges: wp.array(dtype=int), splat_ids: wp.array(dtype=int),
+        tile: int, projected: wp.array(dtype=float), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int),
         slots: wp.array(dtype=int), origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
         alpha_cut: float, alpha_max: float, ends: wp.array(dtype=int), instance_weights: wp.array(dtype=float),
     ): ...  # fmt: skip
@@ -75,8 +75,8 @@ def make_kernels(tile_size: int):
 
     @wp.kernel(**options)
     def forward(
-        begin: int, splats: wp.array(dtype=float), order: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        splat_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
+        begin: int, projected: wp.array(dtype=float), order: wp.array(dtype=int), ranges: wp.array(dtype=int),
+        gaussian_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
         origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int, stop: float, inclusive: int, chunk: int,
         # outputs
@@ -85,7 +85,8 @@ def make_kernels(tile_size: int):
         states: wp.array2d(dtype=float),
     ):  # fmt: skip
         forward_body(
-            wp.tid() // 32, splats, order, ranges, splat_ids, backgrounds, origin_x, origin_y, width, height, columns, tiles,
+            wp.tid() // 32, projected, order, ranges, gaussian_ids, backgrounds,
+            origin_x, origin_y, width, height, columns, tiles,
             alpha_cut, alpha_max, whole_tiles, stop, inclusive, chunk,
             rgb, alpha_out, depth, transmittances, weights, ends, states,
         )  # fmt: skip
@@ -100,14 +101,14 @@ def make_kernels(tile_size: int):
 
     @wp.kernel(**options)
     def contributions(
-        begin: int, splats: wp.array(dtype=float), ranges: wp.array(dtype=int), splat_ids: wp.array(dtype=int),
+        begin: int, projected: wp.array(dtype=float), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int),
         slots: wp.array(dtype=int), origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
         alpha_cut: float, alpha_max: float, ends: wp.array(dtype=int),
         # outputs, zero on entry
         weights: wp.array(dtype=float),
     ):  # fmt: skip
         contributions_body(
-            wp.tid() // threads, splats, ranges, splat_ids, slots, origin_x, origin_y, width, height, columns, tiles,
+            wp.tid() // threads, projected, ranges, gaussian_ids, slots, origin_x, origin_y, width, height, columns, tiles,
             alpha_cut, alpha_max, ends, weights,
         )  # fmt: skip
 
@@ -124,8 +125,8 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
 
     @wp.func_native(_source("backward", tile_size, **numbers))
     def backward_body(
-        item: int, splats: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        splat_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
+        item: int, projected: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
+        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
         backgrounds: wp.array(dtype=float),
         origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int, no_tile: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int,
@@ -137,8 +138,8 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
 
     @wp.func_native(_source("gather", tile_size, **numbers))
     def gather_body(
-        i: int, splats: wp.array(dtype=float), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
-        v_slots: wp.array2d(dtype=float), v_splats: wp.array(dtype=float),
+        i: int, projected: wp.array(dtype=float), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
+        v_slots: wp.array2d(dtype=float), v_projected: wp.array(dtype=float),
     ): ...  # fmt: skip
 
     name = f"warpgs.kernels.blend_cuda.backward.{tile_size}.{int(with_depth)}.{chunk}.{int(atomic)}"
@@ -148,8 +149,8 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
 
     @wp.kernel(**registers, **options)
     def backward(
-        begin: int, splats: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        splat_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
+        begin: int, projected: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
+        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
         backgrounds: wp.array(dtype=float),
         origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int, no_tile: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int,
@@ -160,29 +161,29 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
         v_slots: wp.array2d(dtype=float),
     ):  # fmt: skip
         backward_body(
-            wp.tid() // 32, splats, keys, ranges, splat_ids, slots, totals, capacity, backgrounds,
+            wp.tid() // 32, projected, keys, ranges, gaussian_ids, slots, totals, capacity, backgrounds,
             origin_x, origin_y, width, height, columns, tiles, no_tile, alpha_cut, alpha_max, whole_tiles,
             rgb, depth, transmittances, weights, ends, states, v_rgb, v_alpha, v_depth, v_slots,
         )  # fmt: skip
 
     @wp.kernel(**options)
     def gather(
-        begin: int, splats: wp.array(dtype=float), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
+        begin: int, projected: wp.array(dtype=float), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
         v_slots: wp.array2d(dtype=float),
         # outputs
-        v_splats: wp.array(dtype=float),
+        v_projected: wp.array(dtype=float),
     ):  # fmt: skip
-        gather_body(wp.tid(), splats, starts, counts, v_slots, v_splats)
+        gather_body(wp.tid(), projected, starts, counts, v_slots, v_projected)
 
     return SimpleNamespace(backward=backward, gather=gather)
 
 
-def _floats(*tensors: torch.Tensor) -> list[bridge.View]:
-    return [bridge.view(t.view(-1), wp.float32) for t in tensors]
+def _floats(*tensors: torch.Tensor) -> list[interop.View]:
+    return [interop.view(t.view(-1), wp.float32) for t in tensors]
 
 
-def _ints(*tensors: torch.Tensor) -> list[bridge.View]:
-    return [bridge.view(t.view(-1), wp.int32) for t in tensors]
+def _ints(*tensors: torch.Tensor) -> list[interop.View]:
+    return [interop.view(t.view(-1), wp.int32) for t in tensors]
 
 
 def _frame(origin: tuple[int, int], width: int, height: int, tile_size: int) -> list[int]:
@@ -196,38 +197,38 @@ def chunk_of(tiles: Tiles, deterministic: bool) -> int:
 
 
 def forward(
-    splats, tiles: Tiles, backgrounds, origin: tuple[int, int], width: int, height: int, rule: Rule, keep: bool,
-    deterministic: bool, memory: Memory = TORCH,
+    projected, tiles: Tiles, backgrounds, origin: tuple[int, int], width: int, height: int, rule: Rule, keep: bool,
+    deterministic: bool, allocator: Allocator = TORCH,
 ):  # fmt: skip
     """Pictures and what the backward pass needs of them: rgb, alpha, depth, transmittances, weights, ends, states."""
-    device = splats.device
+    device = projected.device
     shape = (backgrounds.shape[0], height, width)
-    rgb, alpha, depth = (memory.own(s, torch.float32, device) for s in ((*shape, 3), shape, shape))
-    transmittances, weights = memory.kept((2, *shape), torch.float32, device).unbind()
-    ends = memory.kept(shape, torch.int32, device)
+    rgb, alpha, depth = (allocator.output(s, torch.float32, device) for s in ((*shape, 3), shape, shape))
+    transmittances, weights = allocator.saved((2, *shape), torch.float32, device).unbind()
+    ends = allocator.saved(shape, torch.int32, device)
     pixels = tiles.size * tiles.size
-    chunk = chunk_of(tiles, deterministic) if keep else bridge.MAX_SIZE  # of which no instance is a multiple but the first
-    states = memory.kept((tiles.slots.shape[0] // chunk + 1, STATE * pixels), torch.float32, device)
+    chunk = chunk_of(tiles, deterministic) if keep else interop.MAX_SIZE  # of which no instance is a multiple but the first
+    states = allocator.saved((tiles.slots.shape[0] // chunk + 1, STATE * pixels), torch.float32, device)
     k, count = make_kernels(tiles.size), tiles.ranges.shape[0]
-    order = memory.scratch((count,), torch.int32, device)
-    bridge.launch(k.order_tiles, THREADS, [*_ints(tiles.ranges), count, *_ints(order)], device, block_dim=THREADS)
+    order = allocator.workspace((count,), torch.int32, device)
+    interop.launch(k.order_tiles, THREADS, [*_ints(tiles.ranges), count, *_ints(order)], device, block_dim=THREADS)
     inputs = [
-        *_floats(splats), *_ints(order, tiles.ranges, tiles.splat_ids), *_floats(backgrounds),
+        *_floats(projected), *_ints(order, tiles.ranges, tiles.gaussian_ids), *_floats(backgrounds),
         *_frame(origin, width, height, tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
         rule.transmittance_stop, int(rule.inclusive_stop), chunk,
-        *_floats(rgb, alpha, depth, transmittances, weights), *_ints(ends), bridge.view(states, wp.float32),
+        *_floats(rgb, alpha, depth, transmittances, weights), *_ints(ends), interop.view(states, wp.float32),
     ]  # fmt: skip
-    bridge.launch(k.forward, count * pixels, inputs, device, block_dim=32 * WARPS)
+    interop.launch(k.forward, count * pixels, inputs, device, block_dim=32 * WARPS)
     return rgb, alpha, depth, transmittances, weights, ends, states
 
 
 def backward(
-    splats, tiles: Tiles, backgrounds, origin: tuple[int, int], width: int, height: int, rule: Rule, deterministic: bool,
-    saved, v_rgb, v_alpha, v_depth, memory: Memory = TORCH,
+    projected, tiles: Tiles, backgrounds, origin: tuple[int, int], width: int, height: int, rule: Rule, deterministic: bool,
+    saved, v_rgb, v_alpha, v_depth, allocator: Allocator = TORCH,
 ):  # fmt: skip
     """Gradient of the records, shape [C, N, 12], from what `forward` returned and the gradients of its pictures."""
     rgb, depth, transmittances, weights, ends, states = saved
-    device, count = splats.device, tiles.slots.shape[0]
+    device, count = projected.device, tiles.slots.shape[0]
     with_depth = v_alpha is not None or v_depth is not None
     chunk = chunk_of(tiles, deterministic)
     k = make_backward(tiles.size, with_depth, chunk, not deterministic)
@@ -235,33 +236,35 @@ def backward(
         v_alpha, v_depth = (torch.zeros_like(depth) if v is None else v.contiguous() for v in (v_alpha, v_depth))
     else:
         v_alpha = v_depth = depth  # never read
-    v_splats = memory.own(splats.shape, torch.float32, device)
+    v_projected = allocator.output(projected.shape, torch.float32, device)
     if deterministic:
-        v_slots = memory.scratch((count, STRIDE), torch.float32, device)
+        v_slots = allocator.workspace((count, STRIDE), torch.float32, device)
     else:
-        v_slots = v_splats.zero_().view(-1, STRIDE)
+        v_slots = v_projected.zero_().view(-1, STRIDE)
     inputs = [
-        *_floats(splats), *_ints(tiles.tile_ids, tiles.ranges, tiles.splat_ids, tiles.slots),
-        bridge.view(tiles.total, wp.int64), count, *_floats(backgrounds), *_frame(origin, width, height, tiles.size),
+        *_floats(projected), *_ints(tiles.tile_ids, tiles.ranges, tiles.gaussian_ids, tiles.slots),
+        interop.view(tiles.total, wp.int64), count, *_floats(backgrounds), *_frame(origin, width, height, tiles.size),
         tiles.ranges.shape[0], rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
-        *_floats(rgb, depth, transmittances, weights), *_ints(ends), bridge.view(states, wp.float32),
-        *_floats(v_rgb.contiguous(), v_alpha, v_depth), bridge.view(v_slots, wp.float32),
+        *_floats(rgb, depth, transmittances, weights), *_ints(ends), interop.view(states, wp.float32),
+        *_floats(v_rgb.contiguous(), v_alpha, v_depth), interop.view(v_slots, wp.float32),
     ]  # fmt: skip
-    bridge.launch(k.backward, 32 * -(-count // chunk), inputs, device, block_dim=32 * WARPS)
-    inputs = [*_floats(splats), *_ints(tiles.starts, tiles.counts), bridge.view(v_slots, wp.float32), *_floats(v_splats)]
-    bridge.launch(k.gather, -(-tiles.counts.shape[0] // 256) * 256, inputs, device)
-    return v_splats
+    interop.launch(k.backward, 32 * -(-count // chunk), inputs, device, block_dim=32 * WARPS)
+    inputs = [*_floats(projected), *_ints(tiles.starts, tiles.counts), interop.view(v_slots, wp.float32), *_floats(v_projected)]
+    interop.launch(k.gather, -(-tiles.counts.shape[0] // 256) * 256, inputs, device)
+    return v_projected
 
 
-def instance_weights(splats, tiles: Tiles, origin: tuple[int, int], width: int, height: int, rule: Rule, ends) -> torch.Tensor:
+def instance_weights(
+    projected, tiles: Tiles, origin: tuple[int, int], width: int, height: int, rule: Rule, ends
+) -> torch.Tensor:
     """Sum and maximum over a tile's pixels of the blending weight, for each instance at its slot, shape [M, 2]."""
-    weights = splats.new_zeros(tiles.slots.shape[0], 2)
+    weights = projected.new_zeros(tiles.slots.shape[0], 2)
     inputs = [
-        *_floats(splats), *_ints(tiles.ranges, tiles.splat_ids, tiles.slots), *_frame(origin, width, height, tiles.size),
+        *_floats(projected), *_ints(tiles.ranges, tiles.gaussian_ids, tiles.slots), *_frame(origin, width, height, tiles.size),
         rule.alpha_cut, rule.alpha_max, *_ints(ends), *_floats(weights),
     ]  # fmt: skip
     pixels = tiles.size * tiles.size
-    bridge.launch(
-        make_kernels(tiles.size).contributions, tiles.ranges.shape[0] * pixels, inputs, splats.device, block_dim=pixels
+    interop.launch(
+        make_kernels(tiles.size).contributions, tiles.ranges.shape[0] * pixels, inputs, projected.device, block_dim=pixels
     )
     return weights

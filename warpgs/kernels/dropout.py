@@ -5,7 +5,7 @@ import functools
 import torch
 import warp as wp
 
-from warpgs.kernels import bridge
+from warpgs.runtime import interop
 
 
 @functools.cache
@@ -44,8 +44,8 @@ def opacity_dropout(count: int, settings: torch.Tensor, seed: int) -> torch.Tens
     Raises:
         ValueError: ``settings`` is not of shape [2].
     """
-    bridge.check(settings=(settings, "2"))
+    interop.check(settings=(settings, "2"))
     factors = torch.empty(count, dtype=torch.float32, device=settings.device)
-    inputs = [bridge.view(settings, wp.float32), seed, bridge.view(factors, wp.float32)]
-    bridge.launch(make_kernel(), count, inputs, settings.device)
+    inputs = [interop.view(settings, wp.float32), seed, interop.view(factors, wp.float32)]
+    interop.launch(make_kernel(), count, inputs, settings.device)
     return factors

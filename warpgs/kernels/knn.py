@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from warpgs.kernels import bridge
+from warpgs.runtime import interop
 
 BOX = 32
 """Points per box, boxes per box of the level above, and most boxes of the highest level. A query enters a box only if it lies
@@ -126,14 +126,14 @@ def mean_square_distances(points: torch.Tensor, k: int = 3) -> torch.Tensor:
         TypeError: The scalar type is neither float32 nor float64.
         ValueError: The shape is wrong, k is out of range, or a position is not finite.
     """
-    count = bridge.check(points=(points, "N 3"))["N"]
+    count = interop.check(points=(points, "N 3"))["N"]
     if not 1 <= k <= MAX_NEIGHBORS:
         raise ValueError(f"k must be 1 to {MAX_NEIGHBORS}, not {k}")
     if not bool(torch.isfinite(points).all()):
         raise ValueError("points holds positions that are not finite")
     if count < 2:
         return points.new_zeros(count)
-    real, device = bridge.real_of(points), points.device
+    real, device = interop.real_of(points), points.device
     kernels = make_kernels(real)
     points = points.detach()
     order = torch.argsort(morton_codes(points), stable=True)
@@ -148,10 +148,12 @@ def mean_square_distances(points: torch.Tensor, k: int = 3) -> torch.Tensor:
     inside = (ordered, ordered)
     for begin, end in itertools.pairwise(starts):
         level = (lower[begin:end], upper[begin:end])
-        bridge.launch(kernels.bounds, end - begin, [bridge.view(t, kernels.vec3) for t in (*inside, *level)], device, cost=BOX)
+        interop.launch(
+            kernels.bounds, end - begin, [interop.view(t, kernels.vec3) for t in (*inside, *level)], device, cost=BOX
+        )
         inside = level
-    inputs = [bridge.view(t, kernels.vec3) for t in (ordered, lower, upper)]
-    inputs += [bridge.view(torch.tensor(starts, dtype=torch.int32, device=device), wp.int32), min(k, count - 1)]
-    bridge.launch(kernels.search, count, [*inputs, bridge.view(ordered_result, real)], device, cost=1000)
+    inputs = [interop.view(t, kernels.vec3) for t in (ordered, lower, upper)]
+    inputs += [interop.view(torch.tensor(starts, dtype=torch.int32, device=device), wp.int32), min(k, count - 1)]
+    interop.launch(kernels.search, count, [*inputs, interop.view(ordered_result, real)], device, cost=1000)
     result[order] = ordered_result
     return result

@@ -8,12 +8,13 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from warpgs.constants import LARGEST_COEFFICIENT, Rule
-from warpgs.kernels import bridge, sh
+from warpgs.kernels import sh
 from warpgs.kernels.functions import make_projection, make_spans
-from warpgs.kernels.memory import TORCH, Memory
 from warpgs.kernels.native import BLOCK
 from warpgs.kernels.native import make_functions as make_native
 from warpgs.kernels.project_backward import make_backward
+from warpgs.runtime import interop
+from warpgs.runtime.allocator import TORCH, Allocator
 
 RECORD = 12
 """Floats of a projected Gaussian ("splat"), 16-byte aligned in float32:
@@ -32,9 +33,9 @@ def make_forward(real, native: bool):
     vec12 = wp.types.vector(RECORD, real)
 
     @wp.func
-    def store_values(splats: wp.array2d(dtype=real), i: int, record: vec12):
+    def store_values(projected: wp.array2d(dtype=real), i: int, record: vec12):
         for k in range(wp.static(RECORD)):
-            splats[i, k] = record[k]
+            projected[i, k] = record[k]
 
     store = make_native().store_record if native else store_values
 
@@ -46,7 +47,7 @@ def make_forward(real, native: bool):
         coefficients: wp.array2d(dtype=m.vec3),
         width: int, height: int, origin_x: int, origin_y: int, window_width: int, window_height: int,
         tile_size: int, sh_count: int,
-        near: real, low_pass: real, alpha_cut: real, square_sigma: real, splats: wp.array2d(dtype=real),
+        near: real, low_pass: real, alpha_cut: real, square_sigma: real, projected: wp.array2d(dtype=real),
     ):  # fmt: skip
         """Write the record of Gaussian n; returns the tiles it touches, 0 where it is culled and nothing is written."""
         e = m.ellipse(
@@ -118,7 +119,7 @@ def make_forward(real, native: bool):
         record[9] = e.position[2]
         record[10] = half_width
         record[11] = half_height
-        store(splats, i, record)
+        store(projected, i, record)
         return tiles
 
     @wp.kernel(enable_backward=False, module=f"warpgs.kernels.project.forward.{real.__name__}.{int(native)}")
@@ -131,7 +132,7 @@ def make_forward(real, native: bool):
         tile_size: int, sh_count: int,
         near: real, low_pass: real, alpha_cut: real, square_sigma: real,
         # outputs
-        splats: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
+        projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
     ):  # fmt: skip
         i = begin + wp.tid()
         count = means.shape[0]
@@ -140,20 +141,20 @@ def make_forward(real, native: bool):
         tiles = draw(
             i, n, viewmats[camera], Ks[camera], means, quats, log_scales, logit_opacities, opacity_factors, coefficients,
             width, height, origin_x, origin_y, window_width, window_height, tile_size, sh_count,
-            near, low_pass, alpha_cut, square_sigma, splats,
+            near, low_pass, alpha_cut, square_sigma, projected,
         )  # fmt: skip
         tile_counts[i] = tiles
         if tiles == 0:
-            store(splats, i, vec12())
+            store(projected, i, vec12())
 
     return forward
 
 
 def _inputs(means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks) -> list[wp.array]:
-    m = make_projection(bridge.real_of(means))
-    types = (m.vec3, m.vec4, m.vec3, bridge.real_of(means), m.vec3, m.mat44, m.mat33)
+    m = make_projection(interop.real_of(means))
+    types = (m.vec3, m.vec4, m.vec3, interop.real_of(means), m.vec3, m.mat44, m.mat33)
     tensors = (means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks)
-    return [bridge.view(t, dtype) for t, dtype in zip(tensors, types)]
+    return [interop.view(t, dtype) for t, dtype in zip(tensors, types)]
 
 
 def _native(tensor: torch.Tensor) -> bool:
@@ -161,7 +162,7 @@ def _native(tensor: torch.Tensor) -> bool:
 
 
 def records(
-    tensors: Sequence[torch.Tensor], factors, size, window, sh_count, rule, tile, memory: Memory = TORCH
+    tensors: Sequence[torch.Tensor], factors, size, window, sh_count, rule, tile, allocator: Allocator = TORCH
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """What `project` returns for contiguous tensors, as plain numbers. Nothing is checked.
 
@@ -173,19 +174,19 @@ def records(
         sh_count: Coefficients a channel that are used.
         rule: Cut-offs.
         tile: Side of a tile [px].
-        memory: Where to put the records.
+        allocator: Where to put the records.
     """
-    means, real = tensors[0], bridge.real_of(tensors[0])
+    means, real = tensors[0], interop.real_of(tensors[0])
     cameras, count = len(tensors[5]), len(means)
-    splats = memory.own((cameras, count, RECORD), means.dtype, means.device)
-    tile_counts = memory.own((cameras, count), torch.int32, means.device)
+    projected = allocator.output((cameras, count, RECORD), means.dtype, means.device)
+    tile_counts = allocator.output((cameras, count), torch.int32, means.device)
     inputs = [
-        *_inputs(*tensors), bridge.view(factors, real), *size, *window, tile, sh_count,
+        *_inputs(*tensors), interop.view(factors, real), *size, *window, tile, sh_count,
         rule.near, rule.low_pass, rule.alpha_cut, rule.square_sigma,
-        bridge.view(splats.view(-1, RECORD), real), bridge.view(tile_counts.view(-1), wp.int32),
+        interop.view(projected.view(-1, RECORD), real), interop.view(tile_counts.view(-1), wp.int32),
     ]  # fmt: skip
-    bridge.launch(make_forward(real, _native(means)), cameras * count, inputs, means.device, cost=5)
-    return splats, tile_counts
+    interop.launch(make_forward(real, _native(means)), cameras * count, inputs, means.device, cost=5)
+    return projected, tile_counts
 
 
 class _Project(torch.autograd.Function):
@@ -194,24 +195,24 @@ class _Project(torch.autograd.Function):
         ctx, means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks, factors, size, window, sh_count, rule, tile
     ):  # fmt: skip
         tensors = [t.contiguous() for t in (means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks)]
-        splats, tile_counts = records(tensors, factors, size, window, sh_count, rule, tile)
-        ctx.save_for_backward(*tensors, splats, tile_counts)
+        projected, tile_counts = records(tensors, factors, size, window, sh_count, rule, tile)
+        ctx.save_for_backward(*tensors, projected, tile_counts)
         ctx.how = (size, sh_count, rule)
         ctx.mark_non_differentiable(tile_counts)
         ctx.set_materialize_grads(False)  # else torch makes zeros for the counts
-        return splats, tile_counts
+        return projected, tile_counts
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, v_splats, _):
-        *tensors, splats, tile_counts = ctx.saved_tensors
+    def backward(ctx, v_projected, _):
+        *tensors, projected, tile_counts = ctx.saved_tensors
         wants_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
-        return *gradients(tensors, *ctx.how, splats, tile_counts, v_splats, wants_camera), *(None,) * 6
+        return *gradients(tensors, *ctx.how, projected, tile_counts, v_projected, wants_camera), *(None,) * 6
 
 
 def gradients(
-    tensors: Sequence[torch.Tensor], size, sh_count, rule, splats, tile_counts, v_splats, wants_camera: bool,
-    memory: Memory = TORCH,
+    tensors: Sequence[torch.Tensor], size, sh_count, rule, projected, tile_counts, v_projected, wants_camera: bool,
+    allocator: Allocator = TORCH,
 ) -> list[torch.Tensor | None]:  # fmt: skip
     """Gradients of the seven tensors from that of the records, which may be None. Nothing is checked.
 
@@ -220,32 +221,32 @@ def gradients(
         size: Width and height of the picture [px].
         sh_count: Coefficients a channel that are used.
         rule: Cut-offs.
-        splats: What `records` returned, as is the next.
+        projected: What `records` returned, as is the next.
         tile_counts: See there.
-        v_splats: Gradient of the records.
+        v_projected: Gradient of the records.
         wants_camera: Whether those of viewmats and Ks are wanted; else they are None.
-        memory: Where to put the gradients.
+        allocator: Where to put the gradients.
     """
-    real, device = bridge.real_of(splats), splats.device
+    real, device = interop.real_of(projected), projected.device
     m = make_projection(real)
-    v_splats = torch.zeros_like(splats) if v_splats is None else v_splats.contiguous()
-    native = _native(splats)  # writes zeros itself
-    found = [memory.own(t.shape, t.dtype, device) for t in tensors[:5]]
+    v_projected = torch.zeros_like(projected) if v_projected is None else v_projected.contiguous()
+    native = _native(projected)  # writes zeros itself
+    found = [allocator.output(t.shape, t.dtype, device) for t in tensors[:5]]
     if not native:
         for t in found:
             t.zero_()
     cameras, count = len(tensors[5]), len(tensors[0])
     rows = (cameras, count) if wants_camera else (0, 0)
-    v_viewmats, v_Ks = (splats.new_zeros(*rows, n, n) if wants_camera else splats.new_empty(*rows, n, n) for n in (4, 3))
-    outputs = [bridge.view(g, t) for g, t in zip(found, (m.vec3, m.vec4, m.vec3, real, m.vec3))]
+    v_viewmats, v_Ks = (projected.new_zeros(*rows, n, n) if wants_camera else projected.new_empty(*rows, n, n) for n in (4, 3))
+    outputs = [interop.view(g, t) for g, t in zip(found, (m.vec3, m.vec4, m.vec3, real, m.vec3))]
     inputs = [
         *_inputs(*tensors), *size, sh_count, rule.near, rule.low_pass,
-        bridge.view(splats.view(-1, RECORD), real), bridge.view(tile_counts.view(-1), wp.int32),
-        bridge.view(v_splats.view(-1, RECORD), real),
-        int(wants_camera), *outputs, bridge.view(v_viewmats, m.mat44), bridge.view(v_Ks, m.mat33),
+        interop.view(projected.view(-1, RECORD), real), interop.view(tile_counts.view(-1), wp.int32),
+        interop.view(v_projected.view(-1, RECORD), real),
+        int(wants_camera), *outputs, interop.view(v_viewmats, m.mat44), interop.view(v_Ks, m.mat33),
     ]  # fmt: skip
     threads = -(-count // BLOCK) * BLOCK if native else count
-    bridge.launch(make_backward(real, native), threads, inputs, device, cost=10 * cameras, block_dim=BLOCK)
+    interop.launch(make_backward(real, native), threads, inputs, device, cost=10 * cameras, block_dim=BLOCK)
     return [*found, *((v_viewmats.sum(1), v_Ks.sum(1)) if wants_camera else (None, None))]
 
 
@@ -291,7 +292,7 @@ def project(
             What touches no tile in it is culled.
 
     Returns:
-        ``splats`` [C, N, 12], records laid out as ``RECORD`` says, and ``tile_counts`` [C, N] int32, the number of tiles
+        ``projected`` [C, N, 12], records laid out as ``RECORD`` says, and ``tile_counts`` [C, N] int32, the number of tiles
         each touches (0 where culled; no gradient).
 
     Raises:
@@ -299,7 +300,7 @@ def project(
         ValueError: A shape or device disagrees; the message names argument, wanted and found.
     """
     sh_count = sh.coefficient_count(degree)
-    sizes = bridge.check(
+    sizes = interop.check(
         means=(means, "N 3"), quats=(quats, "N 4"), log_scales=(log_scales, "N 3"),
         logit_opacities=(logit_opacities, "N"), sh=(sh_coefficients, "N K 3"),
         viewmats=(viewmats, "C 4 4"), Ks=(Ks, "C 3 3"),
@@ -311,7 +312,7 @@ def project(
     if opacity_factors is None:
         opacity_factors = means.new_empty(0)
     else:
-        bridge.check(means=(means, "N 3"), opacity_factors=(opacity_factors, "N"))
+        interop.check(means=(means, "N 3"), opacity_factors=(opacity_factors, "N"))
     factors = opacity_factors.detach().contiguous()
     size, window = (width, height), window or (0, 0, width, height)
     return _Project.apply(

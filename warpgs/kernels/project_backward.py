@@ -35,7 +35,7 @@ def make_functions(real):
     @wp.func
     def shape(
         mean: vec3, quat: vec4, log_scale: vec3, view: m.mat44, K: mat33,
-        width: real, height: real, near: real, low_pass: real, v_splats: wp.array2d(dtype=real), i: int,
+        width: real, height: real, near: real, low_pass: real, v_projected: wp.array2d(dtype=real), i: int,
     ) -> ShapeGradient:  # fmt: skip
         g = ShapeGradient()
         e = m.ellipse(mean, quat, log_scale, view, K, width, height, near, low_pass)
@@ -51,13 +51,13 @@ def make_functions(real):
         # factor -> projected axes (section 4); v_u and u are both per shrunk pixel
         inv_c = real(1.0) / wp.sqrt(e.c)
         inv_det = real(1.0) / wp.sqrt(e.det)
-        t11 = v_splats[i, 2] * e.shrink * (e.c * inv_c * inv_det)
-        t12 = v_splats[i, 3] * e.shrink * (-e.b * inv_c * inv_det)
-        t22 = v_splats[i, 4] * e.shrink * inv_c
+        t11 = v_projected[i, 2] * e.shrink * (e.c * inv_c * inv_det)
+        t12 = v_projected[i, 3] * e.shrink * (-e.b * inv_c * inv_det)
+        t22 = v_projected[i, 4] * e.shrink * inv_c
         # twice v_det det and v_c c, times shrink; det and c divide vectors of their own size, or needles overflow
         s_det = -(t11 + t12) * e.shrink
         s_c = (t11 - t12 - t22) * e.shrink
-        v_b = -v_splats[i, 3] * e.shrink * inv_c * (e.shrink * inv_det)
+        v_b = -v_projected[i, 3] * e.shrink * inv_c * (e.shrink * inv_det)
         blur = low_pass * e.shrink * e.shrink
         normal = wp.cross(e.m1, e.m2)
         per_det = real(1.0) / e.det
@@ -90,12 +90,12 @@ def make_functions(real):
         g.quat = (v_unit - e.quat * wp.dot(e.quat, v_unit)) / e.quat_length
 
         # mean in the image, Jacobian and depth -> position in the camera (section 3)
-        v_px = v_splats[i, 0]
-        v_py = v_splats[i, 1]
+        v_px = v_projected[i, 0]
+        v_py = v_projected[i, 1]
         v_K = mat33()
         v_x = v_px * jx
         v_y = v_py * jy
-        v_z = -(v_px * jx * x + v_py * jy * y + v_jx * jx + v_jy * jy + v_jxz * jxz + v_jyz * jyz) * inv_z + v_splats[i, 9]
+        v_z = -(v_px * jx * x + v_py * jy * y + v_jx * jx + v_jy * jy + v_jxz * jxz + v_jyz * jyz) * inv_z + v_projected[i, 9]
         v_K[0, 0] = (v_px * x + v_jx) * inv_z
         v_K[1, 1] = (v_py * y + v_jy) * inv_z
         v_K[0, 2] = v_px
@@ -120,11 +120,11 @@ def make_functions(real):
         return g
 
     @wp.func
-    def color(splats: wp.array2d(dtype=real), v_splats: wp.array2d(dtype=real), i: int) -> vec3:
+    def color(projected: wp.array2d(dtype=real), v_projected: wp.array2d(dtype=real), i: int) -> vec3:
         """Gradient of the colour before its clamp at zero (section 5)."""
-        v_color = vec3(v_splats[i, 6], v_splats[i, 7], v_splats[i, 8])
+        v_color = vec3(v_projected[i, 6], v_projected[i, 7], v_projected[i, 8])
         for channel in range(3):
-            if not (splats[i, 6 + channel] > real(0.0)):  # clamped at zero
+            if not (projected[i, 6 + channel] > real(0.0)):  # clamped at zero
                 v_color[channel] = real(0.0)
         return v_color
 
@@ -139,9 +139,9 @@ def make_functions(real):
         return v_centered
 
     @wp.func
-    def logit(splats: wp.array2d(dtype=real), v_splats: wp.array2d(dtype=real), i: int, logit_opacity: real) -> real:
+    def logit(projected: wp.array2d(dtype=real), v_projected: wp.array2d(dtype=real), i: int, logit_opacity: real) -> real:
         """Gradient of the opacity's logit (section 6)."""
-        return v_splats[i, 5] * splats[i, 5] * m.sigmoid(-logit_opacity)
+        return v_projected[i, 5] * projected[i, 5] * m.sigmoid(-logit_opacity)
 
     return SimpleNamespace(shape=shape, color=color, centered=centered, logit=logit)
 
@@ -173,7 +173,7 @@ def make_backward(real, native: bool):
         logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
         viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33),
         width: int, height: int, sh_count: int, near: real, low_pass: real,
-        splats: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), v_splats: wp.array2d(dtype=real),
+        projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), v_projected: wp.array2d(dtype=real),
         camera_gradients: int,
         # outputs, zero on entry where not native
         v_means: wp.array(dtype=m.vec3), v_quats: wp.array(dtype=m.vec4), v_log_scales: wp.array(dtype=m.vec3),
@@ -206,17 +206,27 @@ def make_backward(real, native: bool):
             if tile_counts[i] > 0:
                 view = viewmats[camera]
                 g = f.shape(
-                    means[n], quats[n], log_scales[n], view, Ks[camera], real(width), real(height), near, low_pass, v_splats, i
+                    means[n],
+                    quats[n],
+                    log_scales[n],
+                    view,
+                    Ks[camera],
+                    real(width),
+                    real(height),
+                    near,
+                    low_pass,
+                    v_projected,
+                    i,
                 )
                 v_mean += g.mean
                 v_quat += g.quat
                 v_log_scale += g.log_scale
                 # before the colour: its loads need not wait for what is stored there
-                v_logit += f.logit(splats, v_splats, i, logit_opacities[n])
+                v_logit += f.logit(projected, v_projected, i, logit_opacities[n])
 
                 d = m.direction(means[n], view)
                 basis = functions.basis(vec3(d[0], d[1], d[2]))
-                v_color = f.color(splats, v_splats, i)
+                v_color = f.color(projected, v_projected, i)
                 w = vec16()
                 if wp.static(native):
                     w = color_backward(coefficients, n, sh_count, basis, v_color, stored, v_coefficients)

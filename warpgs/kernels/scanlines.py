@@ -5,7 +5,7 @@ import functools
 import torch
 import warp as wp
 
-from warpgs.kernels import bridge
+from warpgs.runtime import interop
 
 BLOCK = 32
 """Threads of a block: there are some hundred lines, which more blocks spread over more multiprocessors."""
@@ -21,7 +21,7 @@ def make_kernel():
 
     @wp.kernel(enable_backward=False, module="warpgs.kernels.scanlines")
     def follow(
-        begin: int, costs: wp.array2d(dtype=wp.int16), limits: wp.array(dtype=int), small: int, planes: int,
+        begin: int, costs: wp.array2d(dtype=wp.int16), bounds: wp.array(dtype=int), small: int, planes: int,
         # pixels of a line: where it starts, from one to the next, how many; the same for the steps between them
         line_step: int, pixel_step: int, length: int, line_edge: int, pixel_edge: int,
         # outputs
@@ -40,7 +40,7 @@ def make_kernel():
                 pixel = line * line_step + j * pixel_step
                 most = int(0)  # what any change of depth may add to the best of the pixel before
                 if k > 0:
-                    most = lowest + limits[line * line_edge + edge * pixel_edge]
+                    most = lowest + bounds[line * line_edge + edge * pixel_edge]
                 left = int(FAR_AWAY)
                 here = path[line, 0]
                 least = int(FAR_AWAY)
@@ -88,15 +88,15 @@ def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor
                 f"not {tensor.dtype} of shape {list(tensor.shape)} on {tensor.device}"
             )
     total = torch.zeros_like(costs, memory_format=torch.contiguous_format)
-    flat = [bridge.view(t.contiguous().view(-1, planes), wp.int16) for t in (costs, total)]
-    for lines, length, steps, limits, edges in (
+    flat = [interop.view(t.contiguous().view(-1, planes), wp.int16) for t in (costs, total)]
+    for lines, length, steps, bounds, edges in (
         (width, height, (1, width), down, (1, width)),
         (height, width, (width, 1), across, (width - 1, 1)),
     ):
         path = torch.empty(lines, planes + 1, dtype=torch.int32, device=costs.device)
         inputs = [
-            flat[0], bridge.view(limits.contiguous().view(-1), wp.int32), small, planes, *steps, length, *edges,
-            bridge.view(path, wp.int32), flat[1],
+            flat[0], interop.view(bounds.contiguous().view(-1), wp.int32), small, planes, *steps, length, *edges,
+            interop.view(path, wp.int32), flat[1],
         ]  # fmt: skip
-        bridge.launch(make_kernel(), lines, inputs, costs.device, cost=max(1, length * planes // 2), block_dim=BLOCK)
+        interop.launch(make_kernel(), lines, inputs, costs.device, cost=max(1, length * planes // 2), block_dim=BLOCK)
     return total

@@ -7,7 +7,7 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from warpgs.kernels import bridge
+from warpgs.runtime import interop
 
 MAX_DEGREE = 3
 
@@ -143,12 +143,12 @@ def make_kernels(real):
 class _EvaluateSh(torch.autograd.Function):
     @staticmethod
     def forward(ctx, sh, dirs, count):
-        k = make_kernels(bridge.real_of(sh))
+        k = make_kernels(interop.real_of(sh))
         sh, dirs = sh.contiguous(), dirs.contiguous()
         colors = torch.empty_like(dirs)
-        with bridge.stream_of(sh.device):
-            inputs = [bridge.view(sh, k.vec3), bridge.view(dirs, k.vec3), count, bridge.view(colors, k.vec3)]
-            bridge.launch(k.forward, len(dirs), inputs, sh.device, cost=2)
+        with interop.stream_of(sh.device):
+            inputs = [interop.view(sh, k.vec3), interop.view(dirs, k.vec3), count, interop.view(colors, k.vec3)]
+            interop.launch(k.forward, len(dirs), inputs, sh.device, cost=2)
         ctx.save_for_backward(sh, dirs)
         ctx.count = count
         return colors
@@ -157,13 +157,13 @@ class _EvaluateSh(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, v_colors):
         sh, dirs = ctx.saved_tensors
-        k = make_kernels(bridge.real_of(sh))
+        k = make_kernels(interop.real_of(sh))
         v_colors = v_colors.contiguous()
         v_sh, v_dirs = torch.zeros_like(sh), torch.empty_like(dirs)
-        arrays = [bridge.view(t, k.vec3) for t in (v_colors, v_sh, v_dirs)]
-        with bridge.stream_of(sh.device):
-            inputs = [bridge.view(sh, k.vec3), bridge.view(dirs, k.vec3), ctx.count, *arrays]
-            bridge.launch(k.backward, len(dirs), inputs, sh.device, cost=4)
+        arrays = [interop.view(t, k.vec3) for t in (v_colors, v_sh, v_dirs)]
+        with interop.stream_of(sh.device):
+            inputs = [interop.view(sh, k.vec3), interop.view(dirs, k.vec3), ctx.count, *arrays]
+            interop.launch(k.backward, len(dirs), inputs, sh.device, cost=4)
         return v_sh, v_dirs, None
 
 
@@ -185,7 +185,7 @@ def evaluate_sh(sh: torch.Tensor, dirs: torch.Tensor, degree: int) -> torch.Tens
         ValueError: A shape or device disagrees, or K is too small for the degree.
     """
     count = coefficient_count(degree)
-    sizes = bridge.check(sh=(sh, "N K 3"), dirs=(dirs, "N 3"))
+    sizes = interop.check(sh=(sh, "N K 3"), dirs=(dirs, "N 3"))
     if sizes["K"] < count:
         raise ValueError(f"sh holds {sizes['K']} coefficients a channel, degree {degree} needs {count}")
     return _EvaluateSh.apply(sh, dirs, count)

@@ -10,8 +10,9 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from warpgs.kernels import bridge, ssim_cpu, ssim_cuda
+from warpgs.kernels import ssim_cpu, ssim_cuda
 from warpgs.kernels.ssim_cpu import BLOCK, CHANNELS, LANES, PADDING, RADIUS, make_functions
+from warpgs.runtime import interop
 
 
 @functools.cache
@@ -95,7 +96,7 @@ class _Plan:
     """Sizes, scratch memory and launches for one image shape [B, H, W, 3]."""
 
     def __init__(self, image: torch.Tensor, summed: bool = False):
-        self.device, self.real = image.device, bridge.real_of(image)
+        self.device, self.real = image.device, interop.real_of(image)
         batch, self.height, width, _ = image.shape
         self.rows, self.columns = batch * self.height, width * CHANNELS
         self.blocks = -(-self.height // BLOCK)
@@ -104,18 +105,18 @@ class _Plan:
         self.kernels = ssim_cpu.make_kernels(self.real, summed) if self.blocked else make_kernels(self.real)
 
     def flat(self, tensor: torch.Tensor) -> wp.array:
-        return bridge.view(tensor.view(-1), self.real)
+        return interop.view(tensor.view(-1), self.real)
 
     def padded(self, count: int, like: torch.Tensor) -> list[wp.array]:
         return [self.flat(m) for m in like.new_zeros(count, self.rows * (self.columns + 2 * PADDING))]
 
     def launch(self, kernel, inputs: list, outputs: list) -> None:
-        bridge.launch(kernel, self.rows * self.columns, [*inputs, self.columns, *outputs], self.device)
+        interop.launch(kernel, self.rows * self.columns, [*inputs, self.columns, *outputs], self.device)
 
     def launch_blocks(self, kernel, inputs: list, sums: int, outputs: list, like: torch.Tensor) -> None:
         scratch = like.new_empty(self.tasks * sums * (self.columns + 2 * PADDING))
         inputs = [*inputs, self.height, self.blocks, self.columns, self.flat(scratch), *map(self.flat, outputs)]
-        bridge.launch(kernel, self.tasks, inputs, self.device, cost=BLOCK * self.columns)
+        interop.launch(kernel, self.tasks, inputs, self.device, cost=BLOCK * self.columns)
 
 
 def _native(image: torch.Tensor) -> bool:
@@ -138,7 +139,7 @@ class _Ssim(torch.autograd.Function):
             plan.launch_blocks(plan.kernels.forward, pair, 5, [result, *partials], image)
         else:
             moments = plan.padded(5, image)
-            with bridge.stream_of(plan.device):
+            with interop.stream_of(plan.device):
                 plan.launch(plan.kernels.vertical, [*pair, plan.height], moments)
                 plan.launch(plan.kernels.similarity, moments, [plan.flat(t) for t in (result, *partials)])
         ctx.save_for_backward(image, target, *partials)
@@ -158,7 +159,7 @@ class _Ssim(torch.autograd.Function):
             plan.launch_blocks(plan.kernels.backward, inputs, 3, [v_image], image)
         else:
             sums = plan.padded(3, image)
-            with bridge.stream_of(plan.device):
+            with interop.stream_of(plan.device):
                 inputs = [plan.flat(t) for t in (v_result.contiguous(), *partials)]
                 plan.launch(plan.kernels.vertical_backward, [*inputs, plan.height], sums)
                 plan.launch(plan.kernels.combine, [*sums, *pair], [plan.flat(v_image)])
@@ -196,7 +197,7 @@ class _Differences(torch.autograd.Function):
 
 def _check(image: torch.Tensor, target: torch.Tensor) -> None:
     pattern = "B H W 3" if isinstance(image, torch.Tensor) and image.ndim == 4 else "H W 3"
-    bridge.check(image=(image, pattern), target=(target, pattern))
+    interop.check(image=(image, pattern), target=(target, pattern))
 
 
 def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

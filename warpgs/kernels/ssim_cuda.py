@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from warpgs.kernels import bridge
 from warpgs.kernels.native import source
 from warpgs.kernels.ssim_cpu import C1, C2, WINDOW
+from warpgs.runtime import interop
 
 SIDE = 16
 """Side [px] of the square that a thread block works on."""
@@ -70,9 +70,9 @@ def forward(image: torch.Tensor, target: torch.Tensor, summed: bool) -> tuple[to
     blocks, height, columns = _shape(image)
     result = image.new_empty(blocks, 2) if summed else torch.empty_like(image)
     partials = [torch.empty_like(image) for _ in range(3)]
-    arrays = [bridge.view(t.view(-1), wp.float32) for t in (image, target, result, *partials)]
+    arrays = [interop.view(t.view(-1), wp.float32) for t in (image, target, result, *partials)]
     inputs = [*arrays[:2], height, columns, int(summed), *arrays[2:]]
-    bridge.launch(make_kernels().forward, blocks * THREADS, inputs, image.device, block_dim=THREADS)
+    interop.launch(make_kernels().forward, blocks * THREADS, inputs, image.device, block_dim=THREADS)
     return result, *partials
 
 
@@ -80,7 +80,7 @@ def backward(image: torch.Tensor, target: torch.Tensor, partials, v_result: torc
     """Gradient of the image, from that of the similarities or of the two sums [2]."""
     blocks, height, columns = _shape(image)
     v_image = torch.empty_like(image)
-    arrays = [bridge.view(t.view(-1), wp.float32) for t in (image, target, v_result.contiguous(), *partials)]
-    inputs = [*arrays, height, columns, int(summed), bridge.view(v_image.view(-1), wp.float32)]
-    bridge.launch(make_kernels().backward, blocks * THREADS, inputs, image.device, block_dim=THREADS)
+    arrays = [interop.view(t.view(-1), wp.float32) for t in (image, target, v_result.contiguous(), *partials)]
+    inputs = [*arrays, height, columns, int(summed), interop.view(v_image.view(-1), wp.float32)]
+    interop.launch(make_kernels().backward, blocks * THREADS, inputs, image.device, block_dim=THREADS)
     return v_image

@@ -9,10 +9,10 @@ import warp as wp
 
 from warpgs.constants import Rule
 from warpgs.errors import ResourceError
-from warpgs.kernels import bridge
 from warpgs.kernels.functions import make_spans
-from warpgs.kernels.memory import TORCH, Memory
 from warpgs.kernels.native import make_functions as make_native
+from warpgs.runtime import interop
+from warpgs.runtime.allocator import TORCH, Allocator
 from warpgs.runtime.device_memory import available_bytes, installed_bytes
 
 LIST_BYTES = 20
@@ -29,7 +29,7 @@ MAX_VISIBLE = 2**63 // VISIBLE - 1
 SMALL = 32
 """Tiles of a Gaussian that one CUDA thread lists alone."""
 
-MAX_INSTANCES = bridge.MAX_SIZE // 2
+MAX_INSTANCES = interop.MAX_SIZE // 2
 """A radix sort wants one array of twice that size."""
 
 
@@ -44,7 +44,7 @@ class Tiles:
     """Side of a tile [px]."""
     ranges: torch.Tensor
     """First instance of each tile and one past its last, int32, shape [C * tiles, 2]."""
-    splat_ids: torch.Tensor
+    gaussian_ids: torch.Tensor
     """Flat Gaussian number of each instance, int32, shape [M]."""
     slots: torch.Tensor
     """Where an instance stood before the tile sort, int32, shape [M]: there the instances of a Gaussian are neighbours,
@@ -60,7 +60,7 @@ class Tiles:
 
     def tensors(self) -> tuple[torch.Tensor, ...]:
         """All but the size, in the order in which the constructor takes them."""
-        return self.ranges, self.splat_ids, self.slots, self.starts, self.counts, self.tile_ids, self.total
+        return self.ranges, self.gaussian_ids, self.slots, self.starts, self.counts, self.tile_ids, self.total
 
 
 def grid(width: int, height: int, tile_size: int) -> tuple[int, int]:
@@ -76,14 +76,14 @@ def make_kernels(real, native: bool):
 
     @wp.kernel(enable_backward=False, module=module)
     def depth_keys(
-        begin: int, splats: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
+        begin: int, projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
         # outputs
         keys: wp.array(dtype=real), ids: wp.array(dtype=int),
     ):  # fmt: skip
         i = begin + wp.tid()
         ids[i] = i
         if tile_counts[i] > 0:
-            keys[i] = splats[i, 9]
+            keys[i] = projected[i, 9]
         else:
             keys[i] = real(wp.inf)
 
@@ -104,7 +104,7 @@ def make_kernels(real, native: bool):
 
     @wp.kernel(enable_backward=False, module=module)
     def visible_keys(
-        begin: int, splats: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), packed: wp.array(dtype=wp.int64),
+        begin: int, projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), packed: wp.array(dtype=wp.int64),
         # outputs
         keys: wp.array(dtype=real), ids: wp.array(dtype=int),
     ):  # fmt: skip
@@ -116,7 +116,7 @@ def make_kernels(real, native: bool):
             after = lanes.broadcast(rank, 31) - rank
         if seen == 1:
             j = int(packed[i // per] / wp.int64(VISIBLE)) - 1 - after
-            keys[j] = splats[i, 9]
+            keys[j] = projected[i, 9]
             ids[j] = i
 
     @wp.kernel(enable_backward=False, module=module)
@@ -168,18 +168,18 @@ def make_emit(real, native: bool):
 
     @wp.func
     def span_of(
-        splats: wp.array2d(dtype=real), i: int, row: int, alpha_cut: real, square_sigma: real,
+        projected: wp.array2d(dtype=real), i: int, row: int, alpha_cut: real, square_sigma: real,
         origin_x: int, width: int, tile_size: int,
     ) -> vec2i:  # fmt: skip
-        factor = vec3(splats[i, 2], splats[i, 3], splats[i, 4])
-        reach = s.reach_of(splats[i, 5], alpha_cut, square_sigma)
+        factor = vec3(projected[i, 2], projected[i, 3], projected[i, 4])
+        reach = s.reach_of(projected[i, 5], alpha_cut, square_sigma)
         return s.tile_columns(
-            splats[i, 0], splats[i, 1], factor, reach, splats[i, 10], splats[i, 11], row, origin_x, width, tile_size
+            projected[i, 0], projected[i, 1], factor, reach, projected[i, 10], projected[i, 11], row, origin_x, width, tile_size
         )
 
     @wp.kernel(enable_backward=False, module=f"warpgs.kernels.tiles.emit.{real.__name__}.{int(native)}")
     def emit(
-        begin: int, splats: wp.array2d(dtype=real), order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
+        begin: int, projected: wp.array2d(dtype=real), order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
         ends: wp.array(dtype=wp.int64), count: int, per_camera: int,
         origin_x: int, origin_y: int, width: int, height: int, tile_size: int,
         alpha_cut: real, square_sigma: real, columns: int, tiles: int, no_tile: int, capacity: int,
@@ -206,10 +206,10 @@ def make_emit(real, native: bool):
             slot = end - touched
             starts[i] = slot
         if touched > 0 and wp.static(SMALL if native else 2**31 - 1) >= touched:
-            rows = s.tile_rows(splats[i, 1], splats[i, 11], origin_y, height, tile_size)
+            rows = s.tile_rows(projected[i, 1], projected[i, 11], origin_y, height, tile_size)
             base = (i // per_camera) * tiles - corner
             for row in range(rows[0], rows[1]):
-                span = span_of(splats, i, row, alpha_cut, square_sigma, origin_x, width, tile_size)
+                span = span_of(projected, i, row, alpha_cut, square_sigma, origin_x, width, tile_size)
                 for column in range(span[0], span[1]):
                     if slot < end:
                         keys[slot] = base + row * columns + column
@@ -232,13 +232,13 @@ def make_emit(real, native: bool):
                 at = lanes.broadcast(slot, owner)
                 last = lanes.broadcast(end, owner)
                 base = (g // per_camera) * tiles - corner
-                rows = s.tile_rows(splats[g, 1], splats[g, 11], origin_y, height, tile_size)
+                rows = s.tile_rows(projected[g, 1], projected[g, 11], origin_y, height, tile_size)
                 first = rows[0]
                 while first < rows[1]:
                     row = first + lane
                     span = vec2i(0, 0)
                     if row < rows[1]:
-                        span = span_of(splats, g, row, alpha_cut, square_sigma, origin_x, width, tile_size)
+                        span = span_of(projected, g, row, alpha_cut, square_sigma, origin_x, width, tile_size)
                     wide = span[1] - span[0]
                     sum = lanes.running_sum(wide)
                     to = at + sum - wide
@@ -279,7 +279,7 @@ def _check_total(total: int, visible: int, device: torch.device, tiles: int, bud
 
 
 def bin_tiles(
-    splats: torch.Tensor,
+    projected: torch.Tensor,
     tile_counts: torch.Tensor,
     *,
     width: int,
@@ -290,12 +290,12 @@ def bin_tiles(
     capacity: int | None = None,
     overflow: torch.Tensor | None = None,
     origin: tuple[int, int] = (0, 0),
-    memory: Memory = TORCH,
+    allocator: Allocator = TORCH,
 ) -> Tiles:
     """List for every tile the Gaussians that touch it, front to back. Not differentiable.
 
     Args:
-        splats: Records of `project`, shape [C, N, 12].
+        projected: Records of `project`, shape [C, N, 12].
         tile_counts: Tiles that each touches, int32, shape [C, N].
         width: Image width [px].
         height: Image height [px].
@@ -307,7 +307,7 @@ def bin_tiles(
         overflow: Set to 1 where there are more instances than ``capacity``: the lists are then cut short and must not be
             used. Int32, shape [1]; needed with ``capacity``.
         origin: Left and top [px] of the window of that width and height which `project` was given; a tile's corner.
-        memory: Where to put the lists.
+        allocator: Where to put the lists.
 
     Returns:
         The sorted instances; M is ``capacity`` where one is given.
@@ -318,26 +318,26 @@ def bin_tiles(
         TypeError: A scalar type is neither float32 nor float64.
         ValueError: A shape disagrees.
     """
-    sizes = bridge.check(splats=(splats, "C N 12"))
+    sizes = interop.check(projected=(projected, "C N 12"))
     if tuple(tile_counts.shape) != (sizes["C"], sizes["N"]) or tile_counts.dtype != torch.int32:
         raise ValueError(f"tile_counts must be int32 of shape {[sizes['C'], sizes['N']]}, not {list(tile_counts.shape)}")
-    device, real, native = splats.device, bridge.real_of(splats), splats.is_cuda
+    device, real, native = projected.device, interop.real_of(projected), projected.is_cuda
     k = make_kernels(real, native)
     (columns, rows), count = grid(width, height, tile_size), sizes["C"] * sizes["N"]
     tiles, no_tile = columns * rows, sizes["C"] * columns * rows
-    if no_tile > bridge.MAX_SIZE:
+    if no_tile > interop.MAX_SIZE:
         raise ResourceError(
             f"{sizes['C']:,} images of {width} x {height} px have {no_tile:,} tiles of {tile_size} px, beyond the "
-            f"{bridge.MAX_SIZE:,} that can be numbered; draw fewer cameras at once, or a window of each"
+            f"{interop.MAX_SIZE:,} that can be numbered; draw fewer cameras at once, or a window of each"
         )
     counts = tile_counts.contiguous().view(-1)
-    ranges = memory.kept((no_tile, 2), torch.int32, device).zero_()
+    ranges = allocator.saved((no_tile, 2), torch.int32, device).zero_()
     if count == 0:
         return Tiles(tile_size, ranges, counts, counts, counts, counts, counts, counts.new_zeros(1, dtype=torch.int64))
 
-    splats = splats.detach().contiguous().view(count, -1)
-    splats_view, counts_view, fixed = bridge.view(splats, real), bridge.view(counts, wp.int32), capacity is not None
-    with bridge.stream_of(device):
+    projected = projected.detach().contiguous().view(count, -1)
+    projected_view, counts_view, fixed = interop.view(projected, real), interop.view(counts, wp.int32), capacity is not None
+    with interop.stream_of(device):
         if fixed:
             visible, total = count, capacity
         else:
@@ -346,39 +346,47 @@ def bin_tiles(
                 _check_total(*reversed(many.tolist()), device, tiles, budget_bytes)
             # One look at the device, before the sorts, tells how many are visible and how many tiles they touch.
             sums, threads = (-(-count // 32), -(-count // 256) * 256) if native else (count, count)
-            packed = memory.scratch((sums,), torch.int64, device)
-            bridge.launch(k.pack_counts, threads, [counts_view, bridge.view(packed, wp.int64)], device)
+            packed = allocator.workspace((sums,), torch.int64, device)
+            interop.launch(k.pack_counts, threads, [counts_view, interop.view(packed, wp.int64)], device)
             torch.cumsum(packed, 0, out=packed)
             visible, total = divmod(int(packed[-1]), VISIBLE)
             _check_total(total, visible, device, tiles, budget_bytes)
-        depths, order = (memory.scratch((2 * visible,), t, device) for t in (splats.dtype, torch.int32))
-        depths_view, order_view = bridge.view(depths, real), bridge.view(order, wp.int32)
+        depths, order = (allocator.workspace((2 * visible,), t, device) for t in (projected.dtype, torch.int32))
+        depths_view, order_view = interop.view(depths, real), interop.view(order, wp.int32)
         if fixed:
-            bridge.launch(k.depth_keys, count, [splats_view, counts_view, depths_view, order_view], device)
+            interop.launch(k.depth_keys, count, [projected_view, counts_view, depths_view, order_view], device)
         else:
-            inputs = [splats_view, counts_view, bridge.view(packed, wp.int64), depths_view, order_view]
-            bridge.launch(k.visible_keys, threads, inputs, device)
+            inputs = [projected_view, counts_view, interop.view(packed, wp.int64), depths_view, order_view]
+            interop.launch(k.visible_keys, threads, inputs, device)
         wp.utils.radix_sort_pairs(depths_view.array(), order_view.array(), visible)
-        ends = memory.kept((max(visible, 1),), torch.int64, device)
-        ends_view = bridge.view(ends, wp.int64)
-        bridge.launch(k.ordered_counts, visible, [order_view, counts_view, ends_view], device)
+        ends = allocator.saved((max(visible, 1),), torch.int64, device)
+        ends_view = interop.view(ends, wp.int64)
+        interop.launch(k.ordered_counts, visible, [order_view, counts_view, ends_view], device)
         ends = torch.cumsum(ends, 0, out=ends) if visible > 0 else ends.zero_()
-        starts, keys, slots = (memory.kept((n,), torch.int32, device) for n in (count, 2 * total, 2 * total))
-        owners = memory.scratch((total,), torch.int32, device)
+        starts, keys, slots = (allocator.saved((n,), torch.int32, device) for n in (count, 2 * total, 2 * total))
+        owners = allocator.workspace((total,), torch.int32, device)
         if fixed:
             keys[:total].fill_(no_tile)
-        keys_view, slots_view, owners_view = (bridge.view(t, wp.int32) for t in (keys, slots, owners))
+        keys_view, slots_view, owners_view = (interop.view(t, wp.int32) for t in (keys, slots, owners))
         inputs = [
-            splats_view, order_view, counts_view, ends_view, visible, sizes["N"],
+            projected_view, order_view, counts_view, ends_view, visible, sizes["N"],
             *origin, width, height, tile_size, rule.alpha_cut, rule.square_sigma, columns, tiles, no_tile, total,
-            bridge.view(starts, wp.int32), keys_view, slots_view, owners_view,
-            bridge.view(overflow if fixed else starts, wp.int32),
+            interop.view(starts, wp.int32), keys_view, slots_view, owners_view,
+            interop.view(overflow if fixed else starts, wp.int32),
         ]  # fmt: skip
         threads = -(-visible // 256) * 256 if native else visible
-        bridge.launch(make_emit(real, native), threads, inputs, device, cost=10)
+        interop.launch(make_emit(real, native), threads, inputs, device, cost=10)
         wp.utils.radix_sort_pairs(keys_view.array(), slots_view.array(), total, end_bit=no_tile.bit_length())
         # the second half of the sorted buffers is free again
         ids = slots[total:]
-        inputs = [keys_view, slots_view, owners_view, total, no_tile, bridge.view(ids, wp.int32), bridge.view(ranges, wp.int32)]
-        bridge.launch(k.find_ranges, total, inputs, device)
+        inputs = [
+            keys_view,
+            slots_view,
+            owners_view,
+            total,
+            no_tile,
+            interop.view(ids, wp.int32),
+            interop.view(ranges, wp.int32),
+        ]
+        interop.launch(k.find_ranges, total, inputs, device)
     return Tiles(tile_size, ranges, ids, slots[:total], starts, counts, keys[:total], ends[-1:])

@@ -37,9 +37,9 @@ def complete(depth: np.ndarray, valid: np.ndarray, image: np.ndarray) -> np.ndar
     left = np.ones(depth.shape, bool)
     for strength in SMOOTHNESS:
         smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, strength, COLOR_SIGMA)
-        share = smoother.filter(valid.astype(np.float32))
-        reached = left & (share > REACHED)
-        filled[reached] = smoother.filter(inverse)[reached] / share[reached]
+        fraction = smoother.filter(valid.astype(np.float32))
+        reached = left & (fraction > REACHED)
+        filled[reached] = smoother.filter(inverse)[reached] / fraction[reached]
         left &= ~reached
     low, high = inverse[valid].min(), inverse[valid].max()
     return np.where(valid, depth, 1 / filled.clip(low, high)).astype(np.float32)

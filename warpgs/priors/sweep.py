@@ -17,16 +17,16 @@ import torch
 
 from warpgs.errors import UsageError
 from warpgs.priors.epipolar import nearest_views, pixel_grid
+from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.device_memory import installed_bytes
 from warpgs.scene import Camera, View, ViewDepth
-from warpgs.sizes import format_bytes
 
 CPU = torch.device("cpu")
 NOISE = (2 / 255) ** 2
 """Variance of a window below which its pattern is noise: correlation fades to 0 there."""
 EDGE = 0.06
 """Step of the picture at which the penalty for a jump in depth falls to 1/e."""
-NO_OPINION = 0.5
+NEUTRAL_COST = 0.5
 """Cost of correlation 0: where a plane leaves the other image, or nothing has texture."""
 UNIT = 4096
 """Cost 1 in the 16-bit whole numbers that volumes hold: to touch memory for the first time takes as long as to compute what
@@ -35,7 +35,7 @@ LARGEST_STEP = 0.99
 """P2 up to which the sum of four paths, each at most 1 + P2, stays below 2^15."""
 PLANES_AT_ONCE = 16
 """Planes whose costs one thread writes together, 32 bytes of each pixel."""
-GPU_SHARE = 0.25
+GPU_FRACTION = 0.25
 """Part of a GPU's memory that a sweep may take."""
 MAX_AT_ONCE = 4
 """Views swept at a time; each takes memory for three volumes."""
@@ -162,7 +162,7 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
             cost *= -0.5
             cost += 0.5
             np.logical_not(np.greater_equal(warped, 0, out=outside), out=outside)
-            np.copyto(cost, NO_OPINION, where=outside)
+            np.copyto(cost, NEUTRAL_COST, where=outside)
             total += cost
             np.minimum(least, cost, out=least)
         total *= 0.5 / len(others)
@@ -192,7 +192,7 @@ def path_costs(costs: np.ndarray, image: np.ndarray, small_step: float, large_st
     """
     total = np.zeros_like(costs)
     c, t, colors = (a if down else a.swapaxes(0, 1) for a in (costs, total, image))
-    limits, small = step_limits(colors, small_step, large_step), np.int16(round(small_step * UNIT))
+    bounds, small = step_limits(colors, small_step, large_step), np.int16(round(small_step * UNIT))
     for order, edge in ((range(len(c)), -1), (range(len(c) - 1, -1, -1), 0)):
         path = None
         for k in order:
@@ -200,7 +200,7 @@ def path_costs(costs: np.ndarray, image: np.ndarray, small_step: float, large_st
                 path = c[k].copy()
             else:
                 lowest = path.min(1, keepdims=True)
-                step = np.minimum(path, lowest + limits[k + edge, :, None])
+                step = np.minimum(path, lowest + bounds[k + edge, :, None])
                 path += small
                 np.minimum(step[:, 1:], path[:, :-1], out=step[:, 1:])
                 np.minimum(step[:, :-1], path[:, 1:], out=step[:, :-1])
@@ -329,8 +329,8 @@ def _inverses(views: Sequence[View], bounds: Sequence[tuple[float, float]], conf
         needed = max(sweep_cuda.needed_bytes(views[i], len(planes[i])) for i in left)
         smallest = min(min(v.image.shape[:2]) for v in views)
         # not by what is free now: a fit that is continued must find the same depths again
-        if needed > GPU_SHARE * installed_bytes(device):
-            notes.append(f"swept on the CPU: a GPU should have {format_bytes(needed / GPU_SHARE)} of memory for it")
+        if needed > GPU_FRACTION * installed_bytes(device):
+            notes.append(f"swept on the CPU: a GPU should have {format_bytes(needed / GPU_FRACTION)} of memory for it")
         elif smallest > config.window // 2:  # torch mirrors no border wider than the picture
             found |= {i: sweep_cuda.inverse_depths(views[i], others[i], planes[i], config, device) for i in left}
             left = []
@@ -359,10 +359,10 @@ def sweep_depths(
     small = [_reduced(v, config.max_pixels) for v in views]
     with _alone(), ThreadPoolExecutor(torch.get_num_threads()) as pool:
         inverses, said = _inverses(small, bounds, config, device, pool)
-        confirmed = list(pool.map(lambda i: confirm(small, inverses, i, config), range(len(views))))
+        consistent = list(pool.map(lambda i: confirm(small, inverses, i, config), range(len(views))))
     out = []
     for i, view in enumerate(views):
-        found, notes = confirmed[i], list(said if i == 0 else ())
+        found, notes = consistent[i], list(said if i == 0 else ())
         depth, valid, sensitivity = found.depth, found.valid, found.sensitivity
         size = (view.camera.width, view.camera.height)
         if small[i] is not view:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from warpgs.kernels.scanlines import scanline_costs
-from warpgs.priors.sweep import NO_OPINION, NOISE, PLANES_AT_ONCE, UNIT, SweepConfig, gray_of, plane_homography, step_limits
+from warpgs.priors.sweep import NEUTRAL_COST, NOISE, PLANES_AT_ONCE, UNIT, SweepConfig, gray_of, plane_homography, step_limits
 from warpgs.scene import View
 
 MAPS = 24
@@ -49,7 +49,7 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
             m = box(warped)
             v = (box(warped * warped) - m * m).clamp(min=0) + NOISE
             cost = 0.5 - 0.5 * (box(own * warped) - mean * m) / (variance * v).sqrt()
-            cost = torch.where(warped >= 0, cost, NO_OPINION)
+            cost = torch.where(warped >= 0, cost, NEUTRAL_COST)
             total = total + cost
             least = cost if least is None else torch.minimum(least, cost)
         found = (0.5 * least + total * (0.5 / len(others))).clamp(0, 1) * UNIT

@@ -23,7 +23,7 @@ from warpgs.scene import Prior, View
 if TYPE_CHECKING:
     from warpgs.scene import ViewDepth
 
-MIN_CONFIRMED = 50
+MIN_CONSISTENT = 50
 """Pixels with a confirmed depth below which a view's depth is taken for unknown."""
 LARGEST_OBJECT = 0.9
 """A region of a larger share of the photograph is no object but what a mask leaves."""
@@ -114,20 +114,20 @@ def _depth_views(views: Sequence[View], depths: Sequence[ViewDepth] | None, note
     if depths is None:
         notes.append("depth: none, since there is neither a network nor a depth from other views; geometry does not count")
         return lambda i: (np.zeros(views[i].image.shape[:2], np.float32), "none")
-    shares = [float(d.valid.mean()) for d in depths]
+    fractions = [float(d.valid.mean()) for d in depths]
     notes.append(
-        f"depth: from the other views, {min(shares):.1%} to {max(shares):.1%} of a view's pixels, completed along even colours"
+        f"depth: from the other views, {min(fractions):.1%} to {max(fractions):.1%} of a view's pixels, then filled in"
     )
-    poor = [v.name for v, d in zip(views, depths) if d.valid.sum() < MIN_CONFIRMED]
+    poor = [v.name for v, d in zip(views, depths) if d.valid.sum() < MIN_CONSISTENT]
     if poor:
         notes.append(f"no depth is confirmed in {', '.join(poor)}: geometry does not count there; --depth-model would help")
 
     def disparity(i: int) -> tuple[np.ndarray, str]:
         view, d = views[i], depths[i]
-        if d.valid.sum() < MIN_CONFIRMED:
+        if d.valid.sum() < MIN_CONSISTENT:
             return np.zeros(d.depth.shape, np.float32), "none"
         found = complete_disparity(view.image, d.depth, d.valid, d.sensitivity)
-        return found, f"depth that other views confirm at {shares[i]:.1%} of the pixels, completed"
+        return found, f"depth that other views confirm at {fractions[i]:.1%} of the pixels, completed"
 
     return disparity
 

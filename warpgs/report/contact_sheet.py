@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warpgs.report.pictures import colored, resized
+from warpgs.report.images import colored, resized
 
 PAPER, INK, SOFT, LINE = (251, 251, 249), (27, 29, 33), (102, 108, 118), (223, 226, 231)
 LABEL_SIZE, TEXT_SIZE, TITLE_SIZE = 15, 13, 22  # [px]
@@ -40,23 +40,23 @@ def _picture(tile: Tile, size: tuple[int, int]):
     values = tile.values
     if values.ndim == 2:
         values = colored(values / tile.largest, tile.colors)
-    picture = resized(values, *size)
-    return picture if tile.dots is None else _dotted(picture, (tile.dots + 0.5) * (size[0] / tile.values.shape[1]))
+    image = resized(values, *size)
+    return image if tile.dots is None else _dotted(image, (tile.dots + 0.5) * (size[0] / tile.values.shape[1]))
 
 
-def _dotted(picture, centers: np.ndarray):
+def _dotted(image, centers: np.ndarray):
     """A picture with small discs at rows and columns [px], shape [S, 2]; drawn large and shrunk, for their edges."""
     from PIL import Image, ImageDraw
 
-    least, most = 0.9, max(1.4, picture.width / 220)
-    radius = min(most, max(least, (DOTTED * picture.width * picture.height / (np.pi * max(1, len(centers)))) ** 0.5))
+    least, most = 0.9, max(1.4, image.width / 220)
+    radius = min(most, max(least, (DOTTED * image.width * image.height / (np.pi * max(1, len(centers)))) ** 0.5))
     fine = 4
-    cover = Image.new("L", (fine * picture.width, fine * picture.height))
+    cover = Image.new("L", (fine * image.width, fine * image.height))
     draw = ImageDraw.Draw(cover)
     for y, x in fine * centers:
         draw.ellipse((x - fine * radius, y - fine * radius, x + fine * radius, y + fine * radius), 255)
-    picture.paste(DOT, mask=cover.reduce(fine))
-    return picture
+    image.paste(DOT, mask=cover.reduce(fine))
+    return image
 
 
 def contact_sheet(

@@ -56,7 +56,7 @@ SCRIPT = (
 
 
 @dataclass(frozen=True)
-class ViewPictures:
+class ViewImages:
     """What the page shows of one view; pictures are PNG bytes."""
 
     name: str
@@ -68,12 +68,12 @@ class ViewPictures:
 
 
 @dataclass(frozen=True)
-class SamplingStory:
+class SamplingReport:
     """What the page says of the sampling events of a fit."""
 
     words: str
     """Sentences that say what the pictures show."""
-    pictures: list[tuple[str, bytes]]
+    images: list[tuple[str, bytes]]
     """Caption and PNG of each pictured event, the first shown, the others on request."""
     table: list[list[str]]
     """Header row, then rows."""
@@ -88,7 +88,7 @@ def _figure(data: bytes, caption: str) -> str:
     return f"<figure>{_embed(data, caption)}<figcaption>{html.escape(caption)}</figcaption></figure>"
 
 
-def _view(v: ViewPictures) -> str:
+def _view(v: ViewImages) -> str:
     name = html.escape(v.name)
     return (
         f'<div class="view"><div class="row"><figure><div class="slider">{_embed(v.truth, f"photograph {v.name}")}'
@@ -102,11 +102,11 @@ def _view(v: ViewPictures) -> str:
     )
 
 
-def _sampling(s: SamplingStory) -> str:
+def _sampling(s: SamplingReport) -> str:
     parts = [f"<h2>Why Gaussians were placed</h2><p>{html.escape(s.words)}</p>{_table(s.table)}"]
-    for i, (caption, data) in enumerate(s.pictures):
-        picture = f'<figure class="wide">{_embed(data, caption)}<figcaption>{html.escape(caption)}</figcaption></figure>'
-        parts.append(picture if i == 0 else f"<details><summary>{html.escape(caption)}</summary>{picture}</details>")
+    for i, (caption, data) in enumerate(s.images):
+        image = f'<figure class="wide">{_embed(data, caption)}<figcaption>{html.escape(caption)}</figcaption></figure>'
+        parts.append(image if i == 0 else f"<details><summary>{html.escape(caption)}</summary>{image}</details>")
     return "".join(parts)
 
 
@@ -123,9 +123,9 @@ def write_page(
     figures: list[tuple[str, str]],
     notes: list[str],
     table: list[list[str]],
-    views: list[ViewPictures],
+    views: list[ViewImages],
     curves: list[str],
-    sampling: SamplingStory | None,
+    sampling: SamplingReport | None,
     overview: bytes | None,
     protocol: dict[str, str],
     details: dict,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warpgs.report.pictures import resized
+from warpgs.report.images import resized
 
 INK, SOFT, PAPER = (27, 29, 33), (102, 108, 118), (255, 255, 255)
 BOXES = ((240, 78, 35), (0, 158, 190), (240, 190, 0))

@@ -1,1 +1,1 @@
-"""The machine that warpgs runs on: its memory, its processor, its folders and its processes."""
+"""What everything runs on: torch and Warp side by side, memory, CUDA graphs; the machine, its caches and its processes."""

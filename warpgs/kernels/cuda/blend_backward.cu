@@ -35,7 +35,7 @@ while (top_instance > floor) {
     top_instance = first;
     // the Gaussian of this lane in a batch is known a batch before its record is loaded
     int batch = (stop_at - 1) & ~31;
-    int next_id = splat_ids.data[min(batch + lane, stop_at - 1)];
+    int next_id = gaussian_ids.data[min(batch + lane, stop_at - 1)];
     const int camera = tile / tiles, in_camera = tile - camera * tiles;
     const int left = (in_camera % columns) * SIDE, top = (in_camera / columns) * SIDE;
     const float px = origin_x + left + lane % 8 + 0.5f, py = origin_y + top + lane / 8 + 0.5f;  // of the pixel in the first block
@@ -94,7 +94,7 @@ while (top_instance > floor) {
     for (; batch + 32 > first; batch -= 32) {
         const int i = batch + lane, id = next_id;
         const bool mine = i >= first && i < stop_at;
-        next_id = splat_ids.data[max(i - 32, 0)];
+        next_id = gaussian_ids.data[max(i - 32, 0)];
         unsigned mask = 0;
         int target = 0;
         __syncwarp();
@@ -102,7 +102,7 @@ while (top_instance > floor) {
             target = atomic ? id : slots.data[i];
             if (i < part_last) {
                 Splat s;
-                s.load(splats.data, id);
+                s.load(projected.data, id);
                 s.rescale();
                 const float limit = limit_of(s.b.y, alpha_cut);
                 #pragma unroll

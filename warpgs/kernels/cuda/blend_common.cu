@@ -6,8 +6,8 @@ constexpr int WIDE = SIDE / 8, BLOCKS = WIDE * (SIDE / 4), PIXELS = SIDE * SIDE;
 const int lane = threadIdx.x % 32;
 struct Splat {
     float4 a, b, c;  // the record; u11 = a.z, u12 = a.w, u22 = b.x in units where the falloff is 2^-|U d|^2
-    __device__ void load(const float* splats, int i) {
-        const float4* record = reinterpret_cast<const float4*>(splats) + 3ll * i;
+    __device__ void load(const float* projected, int i) {
+        const float4* record = reinterpret_cast<const float4*>(projected) + 3ll * i;
         a = record[0];
         b = record[1];
         c = record[2];

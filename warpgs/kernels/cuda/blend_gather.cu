@@ -38,9 +38,9 @@ while (heavy) {
     }
 }
 if (valid) {
-    float4* row = reinterpret_cast<float4*>(v_splats.data) + 3ll * i;
+    float4* row = reinterpret_cast<float4*>(v_projected.data) + 3ll * i;
     if (count > 0) {
-        const float4* record = reinterpret_cast<const float4*>(splats.data) + 3ll * i;
+        const float4* record = reinterpret_cast<const float4*>(projected.data) + 3ll * i;
         const float4 a = record[0], b = record[1];
         constexpr float back = 1.0f / SCALE;
         const float s1 = back * v[0], s2 = back * v[1];

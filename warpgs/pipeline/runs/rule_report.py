@@ -1,0 +1,123 @@
+"""What a fit's cut-offs cost on its own scene: error of training views against ``exact`` in float64, and time saved."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.reference import psnr_of, reference_image
+from warpgs.scene import Camera, Gaussians, View
+
+VIEWS = 3
+"""Training views that are looked at, drawn at random."""
+SIDE = 64
+"""Side of the part of each that is compared [px], a multiple of the tile's."""
+TILE = 16
+
+
+def _window(camera: Camera, generator: np.random.Generator) -> tuple[int, int, int, int]:
+    """A part of a picture, at random, whose edges are tile edges or the picture's."""
+    sides = []
+    for length in (camera.width, camera.height):
+        first = TILE * int(generator.integers(max(0, length - SIDE) // TILE + 1))
+        sides.append((first, min(SIDE, length - first)))
+    (x, width), (y, height) = sides
+    return x, y, width, height
+
+
+@contextlib.contextmanager
+def _one_thread():
+    """Work on many small tensors: threads would wait for each other longer than they compute."""
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(count)
+
+
+def _seconds(draw: Callable[[], object], device: torch.device) -> float:
+    """Wall time of the second of two calls [s]: the first loads kernels and makes room."""
+    for _ in range(2):
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        began = time.perf_counter()
+        draw()
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+    return time.perf_counter() - began
+
+
+@torch.no_grad()
+def rule_report_of(
+    gaussians: Gaussians, views: list[View], rule: str, background: tuple[float, float, float], *, seed: int,
+    half_resolution: float = 0.0, max_instances: int | None = None,
+) -> dict:  # fmt: skip
+    """Error and gain of a rule on a scene; takes some tenths of a second.
+
+    Three random views are drawn with the rule, as the fit draws them, and 64 x 64 px of each are compared with the picture
+    that rule `exact` defines, computed in float64 by other means than the kernels (`exact_picture`).
+
+    Args:
+        gaussians: Of the finished fit, float32.
+        views: Training views, at least one.
+        rule: Name of the fit's cut-offs.
+        background: Colour behind the scene.
+        seed: Decides views and parts.
+        half_resolution: Share of the steps that saw views at half their size.
+        max_instances: As in RasterizeOptions.
+
+    Returns:
+        ``max``, ``mean`` and ``psnr`` [dB] (None where infinite) of the error of colours in [0, 1] over all parts; ``views``
+        by name with their windows; ``render_ms`` and, where something was traded, ``exact_ms`` of one whole view; ``rule``;
+        and ``sentence``, all of it in words.
+    """
+    generator = np.random.default_rng(seed)
+    chosen = [views[i] for i in sorted(generator.permutation(len(views))[:VIEWS])]
+    device = gaussians.means.device
+    behind = gaussians.means.new_tensor(background)
+    exact = RasterizeOptions(rule="exact", background=behind, max_instances=max_instances)
+    traded = dataclasses.replace(exact, rule=rule)
+    errors, windows = [], {}
+    for view in chosen:
+        window = windows[view.name] = _window(view.camera, generator)
+        found = rasterize(gaussians, view.camera, dataclasses.replace(traded, window=window)).rgb
+        # what reaches the part under `exact`; tiles are listed with a margin
+        near = rasterize(gaussians, view.camera, dataclasses.replace(exact, window=window)).visible[0]
+        part = Gaussians(**{n: t[near] for n, t in gaussians.tensors().items()})
+        with _one_thread():
+            wanted = reference_image(part, view.camera, window, behind, gaussians.sh_degree)
+        errors.append((found.double() - wanted).abs().flatten())
+    error = torch.cat(errors)
+    whole = chosen[0].camera
+    result = {
+        "rule": rule, "max": float(error.max()), "mean": float(error.mean()), "psnr": psnr_of(float((error**2).mean())),
+        "views": {n: list(w) for n, w in windows.items()}, "half_resolution": half_resolution,
+        "render_ms": 1000 * _seconds(lambda: rasterize(gaussians, whole, traded), device),
+    }  # fmt: skip
+    if rule != "exact":
+        result["exact_ms"] = 1000 * _seconds(lambda: rasterize(gaussians, whole, exact), device)
+    return result | {"sentence": _sentence(result)}
+
+
+def _sentence(r: dict) -> str:
+    sizes = {f"{w} x {h} px" for _, _, w, h in r["views"].values()}
+    where = f"on {' or '.join(sorted(sizes))} of {len(r['views'])} random training view{'s' if len(r['views']) > 1 else ''}"
+    error = f"{r['mean']:.1e} on average and {r['max']:.1e} at most, {r['psnr']:.0f} dB, {where}"
+    if r["rule"] == "exact":
+        words = f"nothing in a picture was traded for speed (rule exact); float32 is off float64 by {error}"
+    else:
+        ratio = r["render_ms"] / r["exact_ms"]
+        words = (
+            f"rule {r['rule']} is off exact, in float64, by {error}; a view took {r['render_ms']:.1f} ms instead of "
+            f"{r['exact_ms']:.1f}, {abs(1 - ratio):.0%} {'less' if ratio <= 1 else 'more'}"
+        )
+    if r["half_resolution"] > 0:
+        words += f"; {r['half_resolution']:.0%} of the steps saw views at half their size, a quarter of the pixels"
+    return words
