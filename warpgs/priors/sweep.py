@@ -16,9 +16,9 @@ import numpy as np
 import torch
 
 from warpgs.errors import UsageError
-from warpgs.kernels.tiles import installed_bytes
 from warpgs.priors.epipolar import nearest_views, pixel_grid
 from warpgs.runtime.byte_units import format_bytes
+from warpgs.runtime.device_memory import installed_bytes
 from warpgs.scene import Camera, View, ViewDepth
 
 CPU = torch.device("cpu")
