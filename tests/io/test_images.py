@@ -10,7 +10,7 @@ from PIL import Image
 
 from tests.io import scenes
 from warpgs.errors import DataError, UsageError
-from warpgs.io.images import Lens, decode, load_photo
+from warpgs.io.images import Lens, decode, load_image
 from warpgs.io.load import load_scene
 
 
@@ -80,7 +80,7 @@ def test_exif_never_turns_a_raster_that_fits(orientation, tmp_path):
     exif = Image.Exif()
     exif[0x112] = orientation
     Image.fromarray(scenes.picture(0)).save(tmp_path / "a.png", exif=exif)
-    photo = load_photo(tmp_path / "a.png", lens(16, 12))
+    photo = load_image(tmp_path / "a.png", lens(16, 12))
     np.testing.assert_allclose(photo.image, scenes.picture(0) / 255, atol=1e-6)
     assert photo.done == ()
 
@@ -96,9 +96,9 @@ def test_exif_turns_only_what_fits_turned(orientation, tmp_path):
     mask = np.arange(12 * 16).reshape(12, 16) % 3 > 0
     if orientation < 5:
         with pytest.raises(DataError, match=r"a.png: the image is 16 x 12 px, its camera 12 x 16.*Give the images"):
-            load_photo(path, lens(12, 16))
+            load_image(path, lens(12, 16))
         return
-    photo = load_photo(path, lens(12, 16), mask=mask)
+    photo = load_image(path, lens(12, 16), mask=mask)
     np.testing.assert_allclose(photo.image, np.array(ImageOps.exif_transpose(Image.open(path))) / 255, atol=1e-6)
     stored = Image.fromarray(mask.astype(np.uint8) * 255)
     stored.getexif()[0x112] = orientation
@@ -109,10 +109,10 @@ def test_exif_turns_only_what_fits_turned(orientation, tmp_path):
 def test_size_within_a_pixel_is_rescaled_and_others_are_refused(tmp_path):
     path = tmp_path / "a.png"
     scenes.save(path, scenes.picture(0, 33, 25))  # a half of 65 x 49, rounded up
-    K = load_photo(path, lens(65, 49, 40.0)).K
+    K = load_image(path, lens(65, 49, 40.0)).K
     np.testing.assert_allclose(K[[0, 1, 0, 1], [0, 1, 2, 2]], [40 * 33 / 65, 40 * 25 / 49, 16.5, 12.5])
     with pytest.raises(DataError, match=r"a.png: the image is 33 x 25 px, its camera 60 x 60: the aspects differ"):
-        load_photo(path, lens(60, 60))
+        load_image(path, lens(60, 60))
 
 
 @pytest.mark.parametrize("factor", [2, 3, 4])
@@ -120,7 +120,7 @@ def test_resampling_is_an_area_mean_with_exact_intrinsics(factor, tmp_path):
     path = tmp_path / "a.png"
     rgb = np.random.default_rng(1).integers(0, 256, (24, 36, 3), np.uint8)
     scenes.save(path, rgb)
-    photo = load_photo(path, lens(36, 24, 30.0), downscale=factor)
+    photo = load_image(path, lens(36, 24, 30.0), downscale=factor)
     mean = rgb.reshape(24 // factor, factor, 36 // factor, factor, 3).mean(axis=(1, 3)) / 255
     np.testing.assert_allclose(photo.image, mean, atol=1e-5)
     np.testing.assert_allclose(photo.K[[0, 1, 0, 1], [0, 1, 2, 2]], np.array([30, 30, 18, 12]) / factor)
@@ -128,7 +128,7 @@ def test_resampling_is_an_area_mean_with_exact_intrinsics(factor, tmp_path):
 
 def test_uneven_resampling_scales_each_axis_by_itself(tmp_path):
     scenes.save(tmp_path / "a.png", scenes.picture(0, 35, 26))
-    photo = load_photo(tmp_path / "a.png", lens(35, 26), downscale=3)
+    photo = load_image(tmp_path / "a.png", lens(35, 26), downscale=3)
     assert photo.image.shape == (9, 12, 3)
     np.testing.assert_allclose(photo.K[[0, 1], [0, 1]], [20 * 12 / 35, 20 * 9 / 26])
 
@@ -156,7 +156,7 @@ def test_undistortion_agrees_with_the_analytic_picture(terms, tmp_path):
         x, y = x - (dx - xd), y - (dy - yd)
     path = tmp_path / "a.png"
     scenes.save(path, np.round(65535 * smooth(f * x + cx, f * y + cy)).astype(np.uint16))
-    photo = load_photo(path, Lens(K, width, height, tuple(terms), "OPENCV"))
+    photo = load_image(path, Lens(K, width, height, tuple(terms), "OPENCV"))
     mask = np.ones((height, width), bool) if photo.mask is None else photo.mask
     du, dv = distort((u - cx) / f, (v - cy) / f, *terms)
     du, dv = f * du + cx, f * dv + cy
@@ -173,7 +173,7 @@ def test_undistortion_agrees_with_the_analytic_picture(terms, tmp_path):
 
 def test_a_lens_that_folds_back_is_masked_there(tmp_path):
     scenes.save(tmp_path / "a.png", scenes.picture(0, 64, 48))
-    photo = load_photo(tmp_path / "a.png", lens(64, 48, 30.0, (-0.5, 0.0, 0.0, 0.0), "RADIAL"))
+    photo = load_image(tmp_path / "a.png", lens(64, 48, 30.0, (-0.5, 0.0, 0.0, 0.0), "RADIAL"))
     x, y = grid(64, 48)
     radius2 = ((x - 32) / 30) ** 2 + ((y - 24) / 30) ** 2
     assert not photo.mask[radius2 > 1 / 1.5].any() and photo.mask[radius2 < 0.6].all()

@@ -14,10 +14,11 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.io.folders import ViewList, child, find_mask, image_folder, view_name
-from warpgs.io.images import Lens, list_images, load_photo
+from warpgs.io.folders import ViewList, child, find_mask, has_folder, image_folder, pixel_source, view_name
+from warpgs.io.images import Lens, list_images, load_image
 from warpgs.io.poses import quat_rotation, rigid
-from warpgs.scene import PointCloud, View
+from warpgs.io.readers import Probe, Reader, ReadOptions, register
+from warpgs.scene import PointCloud, Scene, View
 
 MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}
 """Model number to name and number of parameters."""
@@ -279,7 +280,7 @@ def model_folder(root: Path) -> Path | None:
     return next((f for f in partial if complete_kind(f)), partial[0] if partial else None)
 
 
-def _photo_paths(images: Path, names: list[str], where: str, allow_outside: bool) -> tuple[dict[str, Path], str]:
+def _image_paths(images: Path, names: list[str], where: str, allow_outside: bool) -> tuple[dict[str, Path], str]:
     """The file of each view, and a note.
 
     Ready-made small folders often hold other suffixes (image_8/a.png for a.JPG) or names of their own (LLFF's image000.png);
@@ -301,28 +302,51 @@ def _photo_paths(images: Path, names: list[str], where: str, allow_outside: bool
     return paths, ""  # the missing file is named when it is read
 
 
-def load(
-    root: Path, *, downscale: int, allow_outside: bool, invert_masks: bool, **_
-) -> tuple[list[View], PointCloud | None, list[str]]:
-    """Read a scene folder with a COLMAP reconstruction.
+@register("colmap")
+class ColmapReader(Reader):
+    """COLMAP reconstructions, binary or text, with their image folder."""
 
-    Returns:
-        Views in file coordinates, points (None where there is no points file), notes.
+    description = "sparse/0, sparse or the folder itself with cameras and images .bin/.txt (COLMAP)"
+    priority = 10
 
-    Raises:
-        DataError: A file is missing or malformed, an image lacks, or a size does not fit.
-    """
-    folder = model_folder(root)
-    kind = None if folder is None else complete_kind(folder)
-    if folder is None or kind is None:
-        lacks = "cameras and images" if folder is None else " and ".join(missing_parts(folder))
-        raise DataError(f"{folder or root}: the COLMAP reconstruction lacks {lacks}; copy the whole folder")
-    lenses = read_cameras(folder / f"cameras.{kind}")
-    file = folder / f"images.{kind}"
-    poses = read_poses(file)
-    images, factor, note = image_folder(root, downscale)
+    def probe(self, folder: Path) -> Probe | None:
+        """See `Reader.probe`."""
+        model = model_folder(folder)
+        if model is None:
+            return None
+        found = f"the COLMAP reconstruction in {model.relative_to(folder).as_posix()}"
+        if missing := missing_parts(model):
+            return Probe(found, " and ".join(missing))
+        return Probe(found, "" if has_folder(folder, "images", "images_*") else "its images, a folder images")
+
+    def read(self, folder: Path, options: ReadOptions) -> Scene:
+        """See `Reader.read`."""
+        model = model_folder(folder)
+        kind = None if model is None else complete_kind(model)
+        if model is None or kind is None:
+            lacks = "cameras and images" if model is None else " and ".join(missing_parts(model))
+            raise DataError(f"{model or folder}: the COLMAP reconstruction lacks {lacks}; copy the whole folder")
+        poses = read_poses(model / f"images.{kind}")
+        views, notes = _read_views(folder, model, kind, poses, options)
+        points_path, points = model / f"points3D.{kind}", None
+        if not points_path.is_file():
+            notes.append(f"{points_path.name} is missing, so there are no points to start from")
+        else:
+            points = read_points(points_path, {n: view_name(p.name) for n, p in poses.items()})
+            if len(points) == 0:
+                notes.append(f"{points_path.name} holds no points")
+        return self.scene(folder, views, notes, points=points, pixels=pixel_source(folder, options.downscale, by_folder=True))
+
+
+def _read_views(
+    root: Path, model: Path, kind: str, poses: dict[int, Pose], options: ReadOptions
+) -> tuple[list[View], list[str]]:
+    """Return the views of a reconstruction in file coordinates, sorted by the names in the file, and notes."""
+    lenses = read_cameras(model / f"cameras.{kind}")
+    file = model / f"images.{kind}"
+    images, factor, note = image_folder(root, options.downscale)
     notes = [note] if note else []
-    paths, note = _photo_paths(images, [p.name for p in poses.values()], str(file), allow_outside)
+    paths, note = _image_paths(images, [p.name for p in poses.values()], str(file), options.allow_outside)
     notes += [note] if note else []
     views = ViewList()
     for pose in sorted(poses.values(), key=lambda p: p.name):
@@ -333,17 +357,10 @@ def load(
         viewmat[:3, :3] = quat_rotation(pose.quat, where)
         viewmat[:3, 3] = pose.translation
         path = paths[pose.name]
-        mask = find_mask(path, images, invert_masks)
-        photo = load_photo(path, lenses[pose.camera_id], downscale=factor, mask=mask)
-        views.add(view_name(pose.name), rigid(viewmat, where), photo)
+        mask = find_mask(path, images, options.invert_masks)
+        loaded = load_image(path, lenses[pose.camera_id], downscale=factor, mask=mask)
+        views.add(view_name(pose.name), rigid(viewmat, where), loaded)
     unposed = len(set(list_images(images)) - set(paths.values()))
     if unposed:
         notes.append(f"{unposed} images of {images.name} have no pose in the reconstruction and are left out")
-    notes += views.notes()
-    points_path = folder / f"points3D.{kind}"
-    if not points_path.is_file():
-        return views.views, None, [*notes, f"{points_path.name} is missing, so there are no points to start from"]
-    points = read_points(points_path, {n: view_name(p.name) for n, p in poses.items()})
-    if len(points) == 0:
-        notes.append(f"{points_path.name} holds no points")
-    return views.views, points, notes
+    return views.views, notes + views.notes()

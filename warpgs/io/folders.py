@@ -9,10 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.io.images import Photo, decode, list_images
+from warpgs.io.images import LoadedImage, decode, list_images
 from warpgs.scene import Camera, View
 
 LONGEST_NAME = 4096
+
+
+def has_folder(root: Path, *patterns: str) -> bool:
+    """Return True where a folder of one of the names or glob patterns lies in ``root``."""
+    return any(p.is_dir() for pattern in patterns for p in root.glob(pattern))
 
 
 def child(folder: Path, name: object, where: str, *, root: Path | None = None, allow_outside: bool = False) -> Path:
@@ -121,6 +126,11 @@ def pixel_source(root: Path, downscale: int, by_folder: bool) -> str:
     return f"{name} area-resampled by {factor}" if factor > 1 else f"{name} as stored"
 
 
+def resampling_note(downscale: int) -> list[str]:
+    """Return the note of a format whose images are always resampled; an empty list for a factor of 1."""
+    return [f"images area-resampled by {downscale}"] if downscale > 1 else []
+
+
 class ViewList:
     """The views of a scene as they are read, and a count of what was done to them."""
 
@@ -128,11 +138,11 @@ class ViewList:
         self.views: list[View] = []
         self._done: Counter[str] = Counter()
 
-    def add(self, name: str, viewmat: np.ndarray, photo: Photo) -> None:
+    def add(self, name: str, viewmat: np.ndarray, loaded: LoadedImage) -> None:
         """Append a view: ``viewmat`` is camera_from_world [4, 4] in file units, checked to be rigid."""
-        height, width = photo.image.shape[:2]
-        self.views.append(View(name, Camera(viewmat, photo.K, width, height), photo.image, photo.mask))
-        self._done.update(photo.done)
+        height, width = loaded.image.shape[:2]
+        self.views.append(View(name, Camera(viewmat, loaded.K, width, height), loaded.image, loaded.mask))
+        self._done.update(loaded.done)
 
     def notes(self) -> list[str]:
         """What was done to the pixels, a sentence each."""

@@ -53,7 +53,7 @@ class Lens:
 
 
 @dataclass(frozen=True)
-class Photo:
+class LoadedImage:
     """A decoded photograph with its intrinsics at its own size."""
 
     image: np.ndarray
@@ -175,36 +175,38 @@ def _fold_radius2(distortion: tuple[float, ...]) -> float:
     return float(min(real[real > 0], default=np.inf))
 
 
-def _undistort(photo: Photo, lens: Lens) -> Photo:
+def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     """Resample to a pinhole of the same K; pixels that the lens never saw leave the mask."""
     import cv2
 
-    height, width = photo.image.shape[:2]
-    K = photo.K.copy()
+    height, width = loaded.image.shape[:2]
+    K = loaded.K.copy()
     K[:2, 2] -= 0.5  # OpenCV's pixel centres are at whole numbers
     map_x, map_y = cv2.initUndistortRectifyMap(K, np.array(lens.distortion), None, K, (width, height), cv2.CV_32FC1)
-    image = cv2.remap(photo.image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    image = cv2.remap(loaded.image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     inside = (map_x >= -0.5) & (map_x <= width - 0.5) & (map_y >= -0.5) & (map_y <= height - 0.5)
     # where the polynomial turns back, the map leads into the image again but to a ray that the lens sent elsewhere
     x2 = ((np.arange(width) - K[0, 2]) / K[0, 0]) ** 2
     y2 = ((np.arange(height) - K[1, 2]) / K[1, 1]) ** 2
     inside &= y2[:, None] + x2 < _fold_radius2(lens.distortion)
-    if photo.mask is not None:
-        inside &= cv2.remap(photo.mask.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR) > 0.5
-    return Photo(image, None if inside.all() else inside, photo.K, (*photo.done, f"freed of lens distortion ({lens.model})"))
+    if loaded.mask is not None:
+        inside &= cv2.remap(loaded.mask.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR) > 0.5
+    return LoadedImage(
+        image, None if inside.all() else inside, loaded.K, (*loaded.done, f"freed of lens distortion ({lens.model})")
+    )
 
 
-def _shrink(path: Path, photo: Photo, downscale: int) -> Photo:
-    height, width = photo.image.shape[:2]
+def _shrink(path: Path, loaded: LoadedImage, downscale: int) -> LoadedImage:
+    height, width = loaded.image.shape[:2]
     small_w, small_h = round(width / downscale), round(height / downscale)
     if min(small_w, small_h) < SMALLEST_SIDE:
         raise UsageError(
             f"--downscale {downscale} leaves {small_w} x {small_h} px of {path} ({width} x {height} px); "
             f"both sides must keep at least {SMALLEST_SIDE} px. Choose a smaller factor"
         )
-    K = np.diag([small_w / width, small_h / height, 1.0]) @ photo.K
-    mask = None if photo.mask is None else _resize(photo.mask.astype(np.float32), small_w, small_h) > 0.5
-    return Photo(_resize(photo.image, small_w, small_h), mask, K, photo.done)
+    K = np.diag([small_w / width, small_h / height, 1.0]) @ loaded.K
+    mask = None if loaded.mask is None else _resize(loaded.mask.astype(np.float32), small_w, small_h) > 0.5
+    return LoadedImage(_resize(loaded.image, small_w, small_h), mask, K, loaded.done)
 
 
 def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tuple[int, int], orientation: int) -> np.ndarray:
@@ -236,14 +238,14 @@ def _upright(path: Path, lens: Lens, image: np.ndarray) -> int:
     return orientation
 
 
-def load_photo(
+def load_image(
     path: Path,
     lens: Lens | Callable[[int, int], Lens],
     *,
     downscale: int = 1,
     mask: np.ndarray | None = None,
     background: tuple[float, float, float] | None = None,
-) -> Photo:
+) -> LoadedImage:
     """Decode a photograph, set it upright if its camera says so, undo distortion, and resample.
 
     Args:
@@ -283,11 +285,11 @@ def load_photo(
             done.append("masked by its alpha channel")
     if mask is not None and not mask.any():
         raise DataError(f"{path}: its mask leaves no pixel; white keeps a pixel, so perhaps --invert-masks is wanted")
-    photo = Photo(image, mask, K, tuple(done))
+    loaded = LoadedImage(image, mask, K, tuple(done))
     if any(lens.distortion):
-        photo = _undistort(photo, lens)
+        loaded = _undistort(loaded, lens)
     if downscale > 1:
-        photo = _shrink(path, photo, downscale)
-    if photo.mask is not None and not photo.mask.any():
+        loaded = _shrink(path, loaded, downscale)
+    if loaded.mask is not None and not loaded.mask.any():
         raise DataError(f"{path}: no pixel is left after its mask, its lens distortion and --downscale; look at all three")
-    return Photo(np.ascontiguousarray(photo.image, np.float32), photo.mask, photo.K, photo.done)
+    return LoadedImage(np.ascontiguousarray(loaded.image, np.float32), loaded.mask, loaded.K, loaded.done)

@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.io.folders import ViewList, child, find_mask, read_mask, view_name_of
-from warpgs.io.images import SUFFIXES, Lens, load_photo
+from warpgs.io.folders import ViewList, child, find_mask, pixel_source, read_mask, resampling_note, view_name_of
+from warpgs.io.images import SUFFIXES, Lens, load_image
 from warpgs.io.poses import from_camera_to_world
-from warpgs.scene import PointCloud, View
+from warpgs.io.readers import Probe, Reader, ReadOptions, register
+from warpgs.scene import Scene
 
 BLENDER_FILES = tuple(f"transforms_{split}.json" for split in ("train", "val", "test"))
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
@@ -122,17 +123,15 @@ class _Reading:
     """A scene as it is read, frame by frame."""
 
     root: Path
-    downscale: int
-    allow_outside: bool
-    invert_masks: bool
-    blender: bool
+    options: ReadOptions
+    background: tuple[float, float, float] | None
     views: ViewList = field(default_factory=ViewList)
     missing: list[str] = field(default_factory=list)
     outside: int = 0
     total: int = 0
 
     def child(self, folder: Path, name: object, where: str) -> Path:
-        return child(folder, name, where, root=self.root, allow_outside=self.allow_outside)
+        return child(folder, name, where, root=self.root, allow_outside=self.options.allow_outside)
 
     def image_path(self, folder: Path, name: object, where: str) -> Path:
         """The image of a frame; Blender leaves the suffix out."""
@@ -144,8 +143,8 @@ class _Reading:
 
     def mask(self, file: Path, frame: dict, path: Path, where: str) -> np.ndarray | None:
         if frame.get("mask_path"):
-            return read_mask(self.child(file.parent, frame["mask_path"], f"{where}, mask"), self.invert_masks)
-        return find_mask(path, self.root / "images", self.invert_masks)
+            return read_mask(self.child(file.parent, frame["mask_path"], f"{where}, mask"), self.options.invert_masks)
+        return find_mask(path, self.root / "images", self.options.invert_masks)
 
     def frame(self, file: Path, shared: dict, number: int, frame: object) -> None:
         where = f"{file}, frame {number}"
@@ -160,46 +159,56 @@ class _Reading:
         self.outside += name.startswith("outside/")
         where = f"{where} ({name})"
         viewmat = from_camera_to_world(_matrix(frame, where), where, opengl=True)
-        photo = load_photo(
+        loaded = load_image(
             path,
             lambda width, height: lens_of(frame, shared, width, height, where),
-            downscale=self.downscale,
+            downscale=self.options.downscale,
             mask=self.mask(file, frame, path, where),
-            background=WHITE if self.blender else None,
+            background=self.background,
         )
-        self.views.add(name, viewmat, photo)
+        self.views.add(name, viewmat, loaded)
 
 
-def load(
-    root: Path, *, downscale: int, strict: bool, allow_outside: bool, invert_masks: bool
-) -> tuple[list[View], PointCloud | None, list[str]]:
-    """Read a scene folder with transforms.json, or Blender's transforms_train/val/test.json.
+@register("transforms")
+class TransformsReader(Reader):
+    """Scenes with transforms.json, or Blender's transforms_train/val/test.json.
 
-    Frames without a file are skipped and named in the notes; ``strict`` makes them an error. Transparent Blender images are
-    put over white.
-
-    Returns:
-        Views in file coordinates with OpenCV axes, None for points, notes.
-
-    Raises:
-        DataError: A file is malformed, a path leads out of the folder, or (strict) an image is missing.
+    Frames without a file are skipped and named in the notes; `ReadOptions.strict` makes them an error. Transparent Blender
+    images are put over white.
     """
-    reading = _Reading(root, downscale, allow_outside, invert_masks, is_blender(root))
-    notes = []
-    for file in files_of(root):
-        shared = read_json(file)
-        for number, frame in enumerate(shared["frames"]):
-            reading.frame(file, shared, number, frame)
-        if shared.get("ply_file_path"):
-            notes.append(f"the points of {str(shared['ply_file_path'])[:80]} are not read")
-    if missing := reading.missing:
-        some = f"{', '.join(missing[:5])}{' ...' if len(missing) > 5 else ''}"
-        text = f"{len(missing)} of {reading.total} frames have no image file: {some}"
-        if strict:
-            raise DataError(f"{files_of(root)[0]}: {text}. Restore them, or leave out --strict to go on without them")
-        notes.append(f"skipped: {text}")
-    if reading.outside:
-        notes.append(f"{reading.outside} images lie outside the scene folder; their views are named outside/...")
-    if downscale > 1:
-        notes.append(f"images area-resampled by {downscale}")
-    return reading.views.views, None, notes + reading.views.notes()
+
+    description = "transforms.json or transforms_train.json (nerfstudio, instant-ngp, Blender)"
+    priority = 20
+
+    def probe(self, folder: Path) -> Probe | None:
+        """See `Reader.probe`."""
+        files = files_of(folder)
+        return Probe(files[0].name) if files else None
+
+    def read(self, folder: Path, options: ReadOptions) -> Scene:
+        """See `Reader.read`."""
+        background = WHITE if is_blender(folder) else None
+        reading = _Reading(folder, options, background)
+        notes = []
+        for file in files_of(folder):
+            shared = read_json(file)
+            for number, frame in enumerate(shared["frames"]):
+                reading.frame(file, shared, number, frame)
+            if shared.get("ply_file_path"):
+                notes.append(f"the points of {str(shared['ply_file_path'])[:80]} are not read")
+        if missing := reading.missing:
+            some = f"{', '.join(missing[:5])}{' ...' if len(missing) > 5 else ''}"
+            text = f"{len(missing)} of {reading.total} frames have no image file: {some}"
+            if options.strict:
+                raise DataError(f"{files_of(folder)[0]}: {text}. Restore them, or leave out --strict to go on without them")
+            notes.append(f"skipped: {text}")
+        if reading.outside:
+            notes.append(f"{reading.outside} images lie outside the scene folder; their views are named outside/...")
+        notes += resampling_note(options.downscale) + reading.views.notes()
+        return self.scene(
+            folder,
+            reading.views.views,
+            notes,
+            background=background or (0.0, 0.0, 0.0),
+            pixels=pixel_source(folder, options.downscale, by_folder=False),
+        )
