@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError, UsageError
-from warpgs.files import write_bytes
 from warpgs.priors.epipolar import FlowBetween, fundamental
 from warpgs.scene import View
 
@@ -57,18 +56,6 @@ def read_flo(path: Path) -> np.ndarray:
         )
     flow = np.frombuffer(raw, "<f4", offset=12).reshape(height, width, 2)
     return np.where((np.abs(flow) < UNKNOWN).all(2, keepdims=True), flow, np.float32(np.nan)).astype(np.float32)
-
-
-def write_flo(path: Path, flow: np.ndarray) -> None:
-    """Write flow [H, W, 2] as a Middlebury file, atomically; what is not finite is written as unknown.
-
-    Raises:
-        ResourceError: The file cannot be written.
-    """
-    height, width = flow.shape[:2]
-    known = np.isfinite(flow).all(2, keepdims=True)
-    values = np.where(known, flow, 10 * UNKNOWN).astype("<f4")
-    write_bytes(path, FLO_MAGIC.astype("<f4").tobytes(), np.array([width, height], "<i4").tobytes(), values.tobytes())
 
 
 def resize_flow(flow: np.ndarray, width: int, height: int, second: tuple[int, int] | None = None) -> np.ndarray:
