@@ -9,19 +9,9 @@ from warpgs.errors import UsageError
 from warpgs.geometry import back_project, project_points
 from warpgs.priors.completion import complete
 from warpgs.priors.epipolar import pixel_grid
-from warpgs.priors.sweep import (
-    LARGEST_STEP,
-    UNIT,
-    SweepConfig,
-    best_inverse,
-    confirm,
-    matching_costs,
-    path_costs,
-    plane_homography,
-    plane_inverses,
-    project_inverse,
-    sweep_depths,
-)
+from warpgs.priors.sweep import confirm, sweep_depths
+from warpgs.priors.sweep_cpu import best_inverse, matching_costs, path_costs
+from warpgs.priors.sweep_planes import MAX_LARGE_STEP, UNIT, SweepConfig, plane_homography, plane_inverses, project_inverse
 from warpgs.scene import Camera, View
 
 
@@ -89,10 +79,10 @@ def test_paths_of_the_dearest_costs_fit_in_16_bits():
     costs = np.full((6, 6, 8), UNIT, np.int16)
     y, x = np.indices((6, 6))
     costs[y, x, (3 * y + 5 * x) % 8] = 0
-    parts = [path_costs(costs, np.zeros((6, 6, 3), np.float32), 0.03, LARGEST_STEP, down=down) for down in (True, False)]
+    parts = [path_costs(costs, np.zeros((6, 6, 3), np.float32), 0.03, MAX_LARGE_STEP, down=down) for down in (True, False)]
     wide = sum(p.astype(int) for p in parts)
     assert np.array_equal((parts[0] + parts[1]).astype(int), wide) and wide.max() > 3 * UNIT and wide.min() >= 0
-    assert 4 * (1 + LARGEST_STEP) * UNIT + 4 < 2**15
+    assert 4 * (1 + MAX_LARGE_STEP) * UNIT + 4 < 2**15
 
 
 def test_parabola_between_planes():

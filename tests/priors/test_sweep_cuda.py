@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from tests.priors.rigs import still_life
-from warpgs.priors import sweep, sweep_cuda
-from warpgs.priors.sweep import UNIT, SweepConfig, sweep_depths
+from warpgs.priors import sweep, sweep_cpu, sweep_cuda
+from warpgs.priors.sweep import sweep_depths
+from warpgs.priors.sweep_planes import NEUTRAL_COST, UNIT, SweepConfig, plane_inverses
 from warpgs.scene import Camera, View
 
 CPU = torch.device("cpu")
@@ -30,12 +31,12 @@ def computed(view: View, others: list[View], inverses: np.ndarray, window: int, 
 def test_costs_agree(device):
     """To half a unit, and the rounding of correlations where there is little pattern; no opinion is none in both."""
     views, _ = still_life()
-    wanted = sweep.matching_costs(views[1], [views[0], views[2]], PLANES, 7)
+    wanted = sweep_cpu.matching_costs(views[1], [views[0], views[2]], PLANES, 7)
     found = computed(views[1], [views[0], views[2]], PLANES, 7, device)
     off = np.abs(found - wanted)
     assert off.max() < 2e-3 and np.quantile(off, 0.999) < 2e-4 + 0.5 / UNIT and off.mean() < 5e-6 + 0.25 / UNIT
-    silent = wanted == sweep.NEUTRAL_COST
-    assert 0.001 < silent.mean() < 0.5 and (found[silent] == sweep.NEUTRAL_COST).mean() > 0.999
+    silent = wanted == NEUTRAL_COST
+    assert 0.001 < silent.mean() < 0.5 and (found[silent] == NEUTRAL_COST).mean() > 0.999
 
 
 def test_costs_of_another_size_agree(device):
@@ -47,9 +48,9 @@ def test_costs_of_another_size_agree(device):
     behind[:3, 3] = [-0.5, 0.1, -3.0]
     views = [View("a", Camera(np.eye(4), K, 40, 30), texture[:, :40]), View("b", Camera(behind, K, 60, 30), texture)]
     inverses = np.array([0.15, 0.25, 0.5, 1.0])
-    wanted = sweep.matching_costs(views[0], views[1:], inverses, 5)
+    wanted = sweep_cpu.matching_costs(views[0], views[1:], inverses, 5)
     found = computed(views[0], views[1:], inverses, 5, device)
-    assert np.abs(found - wanted).max() < 1e-4 + 0.5 / UNIT and (wanted != sweep.NEUTRAL_COST).mean() > 0.3
+    assert np.abs(found - wanted).max() < 1e-4 + 0.5 / UNIT and (wanted != NEUTRAL_COST).mean() > 0.3
 
 
 def test_paths_agree(device):
@@ -57,7 +58,7 @@ def test_paths_agree(device):
     generator = np.random.default_rng(1)
     costs = generator.integers(0, UNIT + 1, (9, 7, 12)).astype(np.int16)
     image = generator.uniform(0.4, 0.55, (9, 7, 3)).astype(np.float32)
-    wanted = sum(sweep.path_costs(costs, image, 0.05, 0.6, down=down) for down in (True, False))
+    wanted = sum(sweep_cpu.path_costs(costs, image, 0.05, 0.6, down=down) for down in (True, False))
     found = sweep_cuda.path_costs(torch.from_numpy(costs).to(device), image, 0.05, 0.6)
     assert np.array_equal(found.cpu().numpy(), wanted)
 
@@ -67,7 +68,7 @@ def test_parabola_agrees(device):
     generator = np.random.default_rng(2)
     costs = generator.integers(0, 1000, (6, 5, 40)).astype(np.float32)
     costs[0], costs[1, :, 0], costs[2, :, -1] = 7.0, -1.0, -1.0
-    wanted = sweep.best_inverse(costs, PLANES)
+    wanted = sweep_cpu.best_inverse(costs, PLANES)
     assert np.allclose(sweep_cuda.best_inverse(torch.from_numpy(costs).to(device), PLANES), wanted, rtol=1e-12)
 
 
@@ -75,7 +76,7 @@ def test_depths_agree(device):
     """Of a view of the still life: nearly all the same, and as near to the truth."""
     views, depths = still_life()
     config, others = SweepConfig(), [views[0], views[2]]
-    planes = sweep.plane_inverses(views[1].camera, [o.camera for o in others], (2, 12), config.spacing, config.max_planes)
+    planes = plane_inverses(views[1].camera, [o.camera for o in others], (2, 12), config.spacing, config.max_planes)
     with ThreadPoolExecutor(2) as pool:
         wanted, _ = sweep._inverses(views, [(2, 12)] * 3, config, CPU, pool)
     found = sweep_cuda.inverse_depths(views[1], others, planes, config, device)

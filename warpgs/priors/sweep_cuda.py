@@ -8,7 +8,16 @@ import numpy as np
 import torch
 
 from warpgs.kernels.scanlines import scanline_costs
-from warpgs.priors.sweep import NEUTRAL_COST, NOISE, PLANES_AT_ONCE, UNIT, SweepConfig, gray_of, plane_homography, step_limits
+from warpgs.priors.sweep_planes import (
+    NEUTRAL_COST,
+    NOISE,
+    PLANES_AT_ONCE,
+    UNIT,
+    SweepConfig,
+    gray_of,
+    plane_homography,
+    step_limits,
+)
 from warpgs.scene import View
 
 MAPS = 24
