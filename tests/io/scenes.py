@@ -1,4 +1,4 @@
-"""Tiny scenes, five photographs of 16 x 12 px seen by the same cameras, written in every format that warpgs reads."""
+"""Tiny scenes, five images of 16 x 12 px seen by the same cameras, written in every format that warpgs reads."""
 
 import json
 import struct
@@ -42,7 +42,7 @@ def pixel(i: int, point: np.ndarray = POINT) -> np.ndarray:
     return (K @ (x / x[2]))[:2]
 
 
-def picture(i: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+def image(i: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
     """RGB, uint8: red grows to the right, green downwards, blue with the view."""
     x, y = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
     red, green = np.meshgrid(x, y)
@@ -61,7 +61,7 @@ def save(path: Path, rgb: np.ndarray, *options) -> None:
 
 def save_images(folder: Path, names=NAMES, width: int = WIDTH, height: int = HEIGHT) -> None:
     for i, name in enumerate(names):
-        save(folder / name, picture(i, width, height))
+        save(folder / name, image(i, width, height))
 
 
 def quaternion(R: np.ndarray) -> np.ndarray:
@@ -158,7 +158,7 @@ def write_blender(root: Path) -> Path:
         for i in ids:
             alpha = np.full((HEIGHT, WIDTH, 1), 255, np.uint8)
             alpha[:, : WIDTH // 2] = 0
-            save(root / part / f"r_{i}.png", np.concatenate([picture(i), alpha], axis=2))
+            save(root / part / f"r_{i}.png", np.concatenate([image(i), alpha], axis=2))
         (root / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
     return root
 

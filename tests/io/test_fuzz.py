@@ -88,7 +88,7 @@ def test_damaged_files_of_the_other_formats(name, data):
     read, good = OTHERS[name]
     if good is None:
         with tempfile.TemporaryDirectory() as folder:
-            scenes.save(Path(folder) / "a.png", scenes.picture(0))
+            scenes.save(Path(folder) / "a.png", scenes.image(0))
             good = (Path(folder) / "a.png").read_bytes()
     survives(read, name, data.draw(damaged(good)))
 

@@ -1,4 +1,4 @@
-"""Broken LLFF, DTU and Middlebury scenes, and broken photographs in any format, end in a message."""
+"""Broken LLFF, DTU and Middlebury scenes, and broken images in any format, end in a message."""
 
 import numpy as np
 import pytest

@@ -43,7 +43,7 @@ def test_masks_of_a_scene_folder_are_found_and_matched_by_id(tmp_path, names, in
 
 
 def test_masks_elsewhere_of_more_views_than_there_are(tmp_path):
-    """Masks of 64 photographs serve a scan of five; a folder can be named."""
+    """Masks of 64 images serve a scan of five; a folder can be named."""
     scenes.write_colmap(tmp_path / "scene", names=RECT)
     write_masks(tmp_path / "scan8" / "mask", range(8), "{:05d}.png")
     scene = load_scene(tmp_path / "scene", score_masks=tmp_path / "scan8")
@@ -87,7 +87,7 @@ def test_masks_that_cannot_be_used_are_named(tmp_path):
     shutil.rmtree(folder)
     write_masks(folder)
     scenes.save(folder / "002.png", np.full((20, 20), 255, np.uint8))
-    refused("002.png: the mask is 20 x 20 px, its photograph photo2.png 16 x 12")
+    refused("002.png: the mask is 20 x 20 px, its image photo2.png 16 x 12")
     scenes.save(folder / "002.png", np.zeros((12, 16), np.uint8))
     refused("leaves no pixel of photo2.png")
 

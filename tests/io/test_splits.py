@@ -102,7 +102,7 @@ def test_dtu_ids_are_those_of_the_names(form):
 
 
 def test_dtu_scan_with_a_gap_is_refused():
-    """64 photographs less one would still be enough, with every id after the gap shifted by one."""
+    """64 images less one would still be enough, with every id after the gap shifted by one."""
     names = [f"rect_{i + 1:03d}_3_r5000.png" for i in range(64)]
     with pytest.raises(DataError, match=r"with the ids 10 are missing .* rect_001_3_r5000.png to rect_064"):
         split_views(scene_of(names[:10] + names[11:]), "dtu:3")

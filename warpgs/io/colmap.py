@@ -1,6 +1,6 @@
 """COLMAP reconstructions, binary and text: cameras, images, points (colmap.github.io, "Output Format").
 
-Other files of a reconstruction (rigs, frames, project.ini) say nothing that a pinhole scene needs and are not read.
+Other files of a reconstruction (rigs, frames, project.ini) hold nothing that a pinhole scene needs and are not read.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from warpgs.io.readers import Probe, Reader, ReadOptions, register
 from warpgs.scene import PointCloud, Scene, View
 
 MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}
-"""Model number to name and number of parameters."""
+"""Name and number of parameters by model number."""
 OTHER_MODELS = {
     5: "OPENCV_FISHEYE", 6: "FULL_OPENCV", 7: "FOV", 8: "SIMPLE_RADIAL_FISHEYE", 9: "RADIAL_FISHEYE",
     10: "THIN_PRISM_FISHEYE",
@@ -43,15 +43,15 @@ class Pose:
     """Translation of camera_from_world [file units]."""
 
 
-class _Reader:
-    """A binary file read front to back, each read checked against what is left."""
+class _BinaryFile:
+    """A binary file that is read front to back; every read is checked against the bytes that are left."""
 
     def __init__(self, path: Path):
         self.path, self.at = path, 0
         try:
             self.data = path.read_bytes()
         except OSError as e:
-            raise DataError(f"{path}: cannot be read ({e.strerror}); mend its permissions or copy it again") from e
+            raise DataError(f"{path}: cannot be read ({e.strerror}); fix its permissions or copy it again") from e
 
     def _need(self, size: int) -> None:
         if size > len(self.data) - self.at:
@@ -61,31 +61,31 @@ class _Reader:
             )
 
     def take(self, layout: str) -> tuple:
-        """The next values, little endian."""
+        """Return the next values, little endian."""
         size = struct.calcsize("<" + layout)
         self._need(size)
         self.at += size
         return struct.unpack_from("<" + layout, self.data, self.at - size)
 
-    def skip(self, size: int) -> bytes:
-        """The next bytes as they are."""
+    def raw(self, size: int) -> bytes:
+        """Return the next bytes as they are."""
         self._need(size)
         self.at += size
         return self.data[self.at - size : self.at]
 
     def count(self, smallest: int) -> int:
-        """A record count, held against the bytes that are left before anything is allocated."""
+        """Return a record count; DataError where the bytes that are left cannot hold so many records."""
         (count,) = self.take("Q")
-        room = (len(self.data) - self.at) // smallest
-        if count > room:
+        capacity = (len(self.data) - self.at) // smallest
+        if count > capacity:
             raise DataError(
-                f"{self.path}: announces {count:,} records but holds bytes for at most {room:,}; it is truncated or no "
+                f"{self.path}: announces {count:,} records but holds bytes for at most {capacity:,}; it is truncated or no "
                 "COLMAP file. Copy it again"
             )
         return count
 
     def text(self) -> str:
-        """A name that ends in a zero byte, UTF-8."""
+        """Return the next name, which is UTF-8 and ends in a zero byte."""
         end = self.data.find(b"\0", self.at)
         if end < 0:
             raise DataError(f"{self.path}: a name has no end, so the file is truncated; copy it again")
@@ -96,7 +96,7 @@ class _Reader:
             raise DataError(f"{self.path}: the name {raw[:80]!r} is not UTF-8; rename the image, run COLMAP again") from e
 
     def end(self) -> None:
-        """Nothing may follow the last record: leftover bytes mean a wrong count."""
+        """Raise a DataError where bytes follow the last record, which means a wrong count."""
         if self.at != len(self.data):
             raise DataError(
                 f"{self.path}: {len(self.data) - self.at} bytes follow the last record, so its count "
@@ -105,11 +105,11 @@ class _Reader:
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
-    """Numbered lines of a text file; only line feeds end a line, since names may hold other separators."""
+    """Return the numbered lines of a text file; only line feeds end a line, since names may hold other separators."""
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except OSError as e:
-        raise DataError(f"{path}: cannot be read ({e.strerror}); mend its permissions or copy it again") from e
+        raise DataError(f"{path}: cannot be read ({e.strerror}); fix its permissions or copy it again") from e
     except UnicodeDecodeError as e:
         raise DataError(f"{path}: is not UTF-8 text ({e.reason} at byte {e.start}); write it again") from e
     return list(enumerate(text.replace("\r\n", "\n").split("\n"), 1))
@@ -156,10 +156,10 @@ def _unknown_model(path: Path, model: object) -> DataError:
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:
-    """Lenses by camera number from cameras.bin or cameras.txt; DataError where the file is malformed."""
+    """Return lenses by camera number from cameras.bin or cameras.txt; DataError where the file is malformed."""
     cameras: dict[int, Lens] = {}
     if path.suffix == ".bin":
-        r = _Reader(path)
+        r = _BinaryFile(path)
         for _ in range(r.count(24)):
             number, model, width, height = r.take("iiQQ")
             if model not in MODELS:
@@ -183,15 +183,15 @@ def read_cameras(path: Path) -> dict[int, Lens]:
 
 
 def read_poses(path: Path) -> dict[int, Pose]:
-    """Poses by image number from images.bin or images.txt; DataError where the file is malformed."""
+    """Return poses by image number from images.bin or images.txt; DataError where the file is malformed."""
     poses: dict[int, Pose] = {}
     if path.suffix == ".bin":
-        r = _Reader(path)
+        r = _BinaryFile(path)
         for _ in range(r.count(73)):
             number, *values, camera = r.take("i7di")
             pose = Pose(r.text(), camera, tuple(values[:4]), tuple(values[4:]))
             (observed,) = r.take("Q")
-            r.skip(24 * observed)
+            r.raw(24 * observed)
             _store(poses, number, pose, str(path))
         r.end()
         return poses
@@ -215,11 +215,14 @@ def read_poses(path: Path) -> dict[int, Pose]:
 
 
 def read_points(path: Path, names: dict[int, str]) -> PointCloud:
-    """Points with the views that saw them from points3D.bin or points3D.txt.
+    """Return points, with the views that saw them, from points3D.bin or points3D.txt.
 
     Args:
         path: The file; an empty one gives no points.
         names: View names by image number; numbers that are not in it are left out of the tracks.
+
+    Returns:
+        N points in file coordinates with colours in [0, 1] and tracks.
 
     Raises:
         DataError: The file is malformed, or a point is not finite.
@@ -228,10 +231,10 @@ def read_points(path: Path, names: dict[int, str]) -> PointCloud:
     colors: list[tuple[int, ...]] = []
     tracks: list[frozenset[str]] = []
     if path.suffix == ".bin":
-        r = _Reader(path)
+        r = _BinaryFile(path)
         for _ in range(r.count(51)):
             _, x, y, z, red, green, blue, _, length = r.take("Q3d3BdQ")
-            track = np.frombuffer(r.skip(8 * length), "<i4")[::2]
+            track = np.frombuffer(r.raw(8 * length), "<i4")[::2]
             points.append((x, y, z))
             colors.append((red, green, blue))
             tracks.append(frozenset(names[i] for i in track.tolist() if i in names))
@@ -252,7 +255,7 @@ def read_points(path: Path, names: dict[int, str]) -> PointCloud:
 
 
 def complete_kind(folder: Path) -> str | None:
-    """The kind of files, bin before txt, of which cameras and images are there; None where neither is complete."""
+    """Return bin or txt, the kind of which cameras and images are there (bin first); None where neither is complete."""
     for kind in ("bin", "txt"):
         if not _missing(folder, kind):
             return kind
@@ -264,14 +267,14 @@ def _missing(folder: Path, kind: str) -> list[str]:
 
 
 def missing_parts(folder: Path) -> list[str]:
-    """Names of the files that a complete reconstruction needs and this folder lacks."""
+    """Return the names of the files that a complete reconstruction needs and this folder lacks."""
     if complete_kind(folder):
         return []
     return min((_missing(folder, kind) for kind in ("bin", "txt")), key=len)
 
 
 def model_folder(root: Path) -> Path | None:
-    """The folder of the reconstruction: sparse/0, sparse, or the root; None if none holds any COLMAP file.
+    """Return the folder of the reconstruction: sparse/0, sparse, or the root; None where none holds any COLMAP file.
 
     The first complete one is taken, else the first that holds anything, for the error message.
     """
@@ -281,7 +284,7 @@ def model_folder(root: Path) -> Path | None:
 
 
 def _image_paths(images: Path, names: list[str], where: str, allow_outside: bool) -> tuple[dict[str, Path], str]:
-    """The file of each view, and a note.
+    """Return the image file by view name, and a note for the user (empty where nothing was chosen).
 
     Ready-made small folders often hold other suffixes (image_8/a.png for a.JPG) or names of their own (LLFF's image000.png);
     the former are matched by stem, the latter by sorted order where the counts agree.

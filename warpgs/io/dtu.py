@@ -16,15 +16,15 @@ from warpgs.scene import Scene
 
 FILES = ("cameras.npz", "cameras_sphere.npz")
 FOLDERS = ("image", "images")
-LARGEST_MEMBER = 4096
-"""Bytes that a 4 x 4 matrix and its header stay below, unpacked."""
+MAX_MATRIX_BYTES = 4096
+"""Size of an unpacked 4 x 4 matrix with its header [bytes] above which it is refused."""
 
 
 def decompose(P: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
     """Split a projection matrix [3, 4] into intrinsics [3, 3] and camera_from_world [4, 4].
 
     Raises:
-        DataError: It is not finite or singular, or its axes are skewed by more than a thousandth.
+        DataError: The matrix is not finite or singular, or its axes are skewed by more than a thousandth.
     """
     M = P[:3, :3]
     if not (np.isfinite(P).all() and abs(np.linalg.det(M)) > 1e-12 * np.abs(M).max() ** 3):
@@ -47,13 +47,13 @@ def decompose(P: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_matrices(path: Path) -> dict[str, np.ndarray]:
-    """The world and scale matrices of the archive, float64 [4, 4] each, by name."""
+    """Return the world and scale matrices of the archive by name, float64, shape [4, 4] each."""
     matrices = {}
     try:
         with np.load(path, allow_pickle=False) as archive:
             for key in archive.files:
                 if key.startswith(("world_mat_", "scale_mat_")) and "inv" not in key:
-                    if archive.zip.getinfo(f"{key}.npy").file_size > LARGEST_MEMBER:
+                    if archive.zip.getinfo(f"{key}.npy").file_size > MAX_MATRIX_BYTES:
                         raise ValueError(f"{key} is too large for a 4 x 4 matrix")
                     matrices[key] = archive[key].astype(np.float64)
     except Exception as e:  # numpy and zipfile raise a dozen types on foreign bytes
@@ -70,7 +70,7 @@ def _number(file: Path) -> int | None:
 
 
 def _masks(root: Path, files: list[Path]) -> dict[Path, Path]:
-    """Mask of each image: by name, else by the number in it (image/000003.png, mask/003.png)."""
+    """Return the mask file of each image that has one, by name, else by the number in it (image/000003.png, mask/003.png)."""
     folder = next((root / f for f in ("mask", "masks") if (root / f).is_dir()), None)
     masks = [] if folder is None else list_images(folder)
     by_name, by_number = {m.stem: m for m in masks}, {_number(m): m for m in masks}

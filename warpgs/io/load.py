@@ -1,4 +1,4 @@
-"""From a folder to a `Scene`: choose a reader, read, bring to scene coordinates, fingerprint."""
+"""Loading of a `Scene` from a folder: choose a reader, read, bring to scene coordinates, fingerprint."""
 
 from __future__ import annotations
 

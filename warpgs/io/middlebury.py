@@ -15,12 +15,12 @@ from warpgs.scene import Scene
 
 
 def files_of(root: Path) -> list[Path]:
-    """The parameter files of a folder, sorted; a scene has one."""
+    """Return the parameter files of a folder, sorted; a scene has one."""
     return sorted(p for p in root.glob("*_par.txt") if p.is_file() and not p.name.startswith("."))
 
 
 def read_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
-    """Line number, image name and 21 numbers (K, R, t) of each camera; DataError where the file is malformed."""
+    """Return line number, image name and 21 numbers (K, R, t) of each camera; DataError where the file is malformed."""
     try:
         lines = path.read_bytes().decode("utf-8-sig").splitlines()
         words = [(number, line.split()) for number, line in enumerate(lines, 1) if line.strip()]

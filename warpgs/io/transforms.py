@@ -19,18 +19,18 @@ from warpgs.scene import Scene
 BLENDER_FILES = tuple(f"transforms_{split}.json" for split in ("train", "val", "test"))
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 UNSUPPORTED_TERMS = ("k4", "k5", "k6", "is_fisheye", "fisheye_crop_radius")
-"""Keys of lens models that OpenCV's five terms cannot express."""
+"""Keys of lens models that the five distortion terms of OpenCV cannot express."""
 WHITE = (1.0, 1.0, 1.0)
 
 
 def files_of(root: Path) -> list[Path]:
-    """The JSON files of the scene: transforms.json, or Blender's three."""
+    """Return the JSON files of the scene that exist: transforms.json, or Blender's three."""
     single = root / "transforms.json"
     return [single] if single.is_file() else [root / f for f in BLENDER_FILES if (root / f).is_file()]
 
 
 def is_blender(root: Path) -> bool:
-    """Whether the folder is in Blender's layout, where transparent pixels stand for a white background."""
+    """Return True where the folder has Blender's layout, in which transparent pixels stand for a white background."""
     return not (root / "transforms.json").is_file() and bool(files_of(root))
 
 
@@ -39,7 +39,7 @@ def _reject_constant(name: str):
 
 
 def read_json(path: Path) -> dict:
-    """Parsed file with a list of frames; DataError where it is malformed or holds NaN or Infinity."""
+    """Return the parsed file with its list of frames; DataError where it is malformed or holds NaN or Infinity."""
     try:
         values = json.loads(path.read_bytes().decode("utf-8-sig"), parse_constant=_reject_constant)
     except (OSError, ValueError, RecursionError) as e:
@@ -50,7 +50,7 @@ def read_json(path: Path) -> dict:
 
 
 def _number(frame: dict, shared: dict, key: str) -> float | None:
-    """A number of the frame, else of the file; None where neither has it. ValueError where it is no finite number."""
+    """Return a number of the frame, else of the file; None where neither has it, ValueError where it is no finite number."""
     value = frame.get(key, shared.get(key))
     if value is None:
         return None
@@ -63,14 +63,14 @@ def _number(frame: dict, shared: dict, key: str) -> float | None:
 
 
 def lens_of(frame: dict, shared: dict, width: int, height: int, where: str) -> Lens:
-    """Intrinsics of a frame, its own before the shared ones.
+    """Return the intrinsics of a frame; its own values come before the shared ones.
 
     Args:
-        frame: Of the list of frames.
+        frame: An entry of the list of frames.
         shared: The whole file.
-        width: Width of the image [px], where the file does not say.
-        height: Height of the image [px], likewise.
-        where: Names file and frame in errors.
+        width: Width of the image [px], where the file has none.
+        height: Height of the image [px], where the file has none.
+        where: File and frame, for errors.
 
     Raises:
         DataError: There is no focal length, a number is not finite, or the lens model is not supported.
@@ -120,7 +120,7 @@ def _matrix(frame: dict, where: str) -> np.ndarray:
 
 @dataclass
 class _Reading:
-    """A scene as it is read, frame by frame."""
+    """State of a scene that is read frame by frame."""
 
     root: Path
     options: ReadOptions
@@ -134,7 +134,7 @@ class _Reading:
         return child(folder, name, where, root=self.root, allow_outside=self.options.allow_outside)
 
     def image_path(self, folder: Path, name: object, where: str) -> Path:
-        """The image of a frame; Blender leaves the suffix out."""
+        """Return the image file of a frame; Blender leaves the suffix out."""
         path = self.child(folder, name, where)
         if path.suffix.lower() in SUFFIXES:
             return path
