@@ -9,7 +9,7 @@ import pytest
 
 from tests.priors import networks as nw
 from warpgs.errors import DataError, UsageError
-from warpgs.priors.depth import USUAL, complete_disparity, network_disparity, unit_range
+from warpgs.priors.depth import DEFAULTS, complete_disparity, network_disparity, unit_range
 from warpgs.priors.preprocess import HALF, IMAGENET, Preprocessing, describe, resize
 from warpgs.priors.session import open_network
 
@@ -80,17 +80,17 @@ def test_depth_that_is_not_positive_is_refused(tmp_path):
 def test_an_output_that_is_no_map_is_refused(tmp_path):
     network = open_network(nw.segmentation_network(tmp_path / "s.onnx"))
     with pytest.raises(DataError, match=r"shape \(1, 21, 384, 384\), not that of one depth map"):
-        network_disparity(network, USUAL, photo(32, 32))
+        network_disparity(network, DEFAULTS, photo(32, 32))
 
 
 def described(path, **flags):
-    return describe(open_network(path), flags, USUAL, "depth")
+    return describe(open_network(path), flags, DEFAULTS, "depth")
 
 
 def test_flags_come_before_the_side_file_and_that_before_what_is_usual(tmp_path):
     path = nw.depth_network(tmp_path / "d.onnx")
     how, notes = described(path)
-    assert how == USUAL
+    assert how == DEFAULTS
     assert notes == [
         "d.onnx: assumed size 384, multiple 32, mean 0.5 0.5 0.5, std 0.5 0.5 0.5, output disparity; "
         "flags --depth-... or d.onnx.json say otherwise"
@@ -132,7 +132,7 @@ def test_a_size_against_the_graph_is_refused(tmp_path):
     path = nw.depth_network(tmp_path / "d.onnx", size=(32, 48))
     with pytest.raises(UsageError, match=r"--depth-size 64: .* takes 48 x 32 px only"):
         described(path, size=64)
-    assert described(path, size=32)[0].mean == USUAL.mean
+    assert described(path, size=32)[0].mean == DEFAULTS.mean
 
 
 def test_unit_range_of_a_wall_is_zero():

@@ -54,10 +54,10 @@ def test_the_architecture_gives_in_onnxruntime_what_it_gives_in_torch(name, shap
     request, path = ExportRequest(name, random_weights=True, size=64), tmp_path / "n.onnx"
     lines = export_network(request, path)
     assert "small and untrained" in lines[0] and "warpgs priors show" in lines[1]
-    picture = np.random.default_rng(3).normal(size=(64, 64, 3)).astype(np.float32)
-    found = open_network(path).run(picture)[0]
+    image = np.random.default_rng(3).normal(size=(64, 64, 3)).astype(np.float32)
+    found = open_network(path).run(image)[0]
     with torch.no_grad():
-        wanted = build(request)(torch.from_numpy(picture).permute(2, 0, 1)[None])[0].numpy()
+        wanted = build(request)(torch.from_numpy(image).permute(2, 0, 1)[None])[0].numpy()
     assert found.shape == wanted.shape == shape and wanted.std() > 1e-3
     assert np.abs(found - wanted).max() < 1e-4 * wanted.std()
     assert json.loads((tmp_path / "n.onnx.json").read_text())["output"] == ("disparity" if name == "dpt" else "classes")

@@ -59,7 +59,7 @@ def test_cost_is_least_at_the_true_plane():
 
 
 def test_paths_are_those_of_the_definition():
-    """Against the recursion written out pixel by pixel, to the last unit; an edge of the picture lets depth jump."""
+    """Against the recursion written out pixel by pixel, to the last unit; an edge of the image lets depth jump."""
     generator = np.random.default_rng(1)
     costs = generator.integers(0, UNIT + 1, (4, 5, 6)).astype(np.int16)
     image = generator.uniform(0.4, 0.55, (4, 5, 3)).astype(np.float32)

@@ -54,7 +54,7 @@ def test_costs_of_another_size_agree(device):
 
 
 def test_paths_agree(device):
-    """To the last unit, in a picture with edges."""
+    """To the last unit, in an image with edges."""
     generator = np.random.default_rng(1)
     costs = generator.integers(0, UNIT + 1, (9, 7, 12)).astype(np.int16)
     image = generator.uniform(0.4, 0.55, (9, 7, 3)).astype(np.float32)

@@ -31,7 +31,7 @@ def view(image, name="a.png", mask=None):
 
 
 def dark(name="dark.png"):
-    """A photograph in which the network finds background alone."""
+    """An image in which the network finds background alone."""
     return view(0.02 * np.random.default_rng(1).random((32, 64, 3), np.float32), name)
 
 

@@ -1,4 +1,4 @@
-"""Depth by sweeping planes: how well do the other views agree with this one at every depth, smoothed along scanlines.
+"""Depth by sweeping planes: agreement with other views at every depth, smoothed along scanlines, then cross-checked.
 
 Poses are known, so a match is sought along the epipolar line only: one plane per inverse depth (Collins 1996), zero-mean
 normalised correlation over a window, semi-global aggregation (Hirschmüller 2008), a parabola between planes, and depths kept
@@ -28,7 +28,7 @@ MAX_AT_ONCE = 4
 
 
 def _reduced(view: View, max_pixels: int) -> View:
-    """The view at the largest size of at most ``max_pixels``."""
+    """Return the view, resized to at most ``max_pixels`` where it is larger."""
     import cv2
 
     c = view.camera
@@ -42,10 +42,16 @@ def _reduced(view: View, max_pixels: int) -> View:
 
 
 def confirm(views: Sequence[View], inverses: Sequence[np.ndarray], index: int, config: SweepConfig) -> ViewDepth:
-    """Keep the inverse depths [H, W] of one view that the depths of another confirm.
+    """Return the depth of one view where the depth of at least one other view confirms it.
 
-    The point is taken to each other view and back by the depth found there; it must return nearer than ``max_round_trip``
-    to its pixel, with both rays at least ``min_parallax`` apart. The sensitivity is the least of the confirming views.
+    A point is projected to each other view and back by the depth found there. It must return nearer than ``max_round_trip``
+    to its pixel, with both rays at least ``min_parallax`` apart. The sensitivity is the smallest of the confirming views.
+
+    Args:
+        views: All views.
+        inverses: Inverse depths of each [1/u], shape [H, W].
+        index: Index of the view.
+        config: Checks.
     """
     import cv2
 
@@ -82,7 +88,7 @@ def confirm(views: Sequence[View], inverses: Sequence[np.ndarray], index: int, c
 
 
 def _inverses(views: Sequence[View], bounds: Sequence[tuple[float, float]], config: SweepConfig, device: torch.device, pool):
-    """Inverse depths [H, W] of every view, and what a user must know of how they were found."""
+    """Return the inverse depths [1/u], shape [H, W], of every view, and messages on how they were found."""
     others = {i: [views[j] for j in nearest_views(views, i, config.near_count)] for i in range(len(views))}
     planes = {
         i: plane_inverses(views[i].camera, [o.camera for o in found], bounds[i], config.spacing, config.max_planes)
@@ -96,7 +102,7 @@ def _inverses(views: Sequence[View], bounds: Sequence[tuple[float, float]], conf
         # not by what is free now: a fit that is continued must find the same depths again
         if needed > GPU_FRACTION * installed_bytes(device):
             notes.append(f"swept on the CPU: a GPU should have {format_bytes(needed / GPU_FRACTION)} of memory for it")
-        elif smallest > config.window // 2:  # torch mirrors no border wider than the picture
+        elif smallest > config.window // 2:  # torch mirrors no border wider than the image
             found |= {i: sweep_cuda.inverse_depths(views[i], others[i], planes[i], config, device) for i in left}
             left = []
     for first in range(0, len(left), MAX_AT_ONCE):
@@ -108,26 +114,26 @@ def _inverses(views: Sequence[View], bounds: Sequence[tuple[float, float]], conf
 def sweep_depths(
     views: Sequence[View], bounds: Sequence[tuple[float, float]], config: SweepConfig, device: torch.device = CPU
 ) -> list[ViewDepth]:
-    """Depth of every view by sweeping planes against its nearest others.
+    """Return the depth of every view by sweeping planes against its nearest others.
 
     Args:
         views: The views; a single one confirms nothing.
         bounds: Nearest and farthest depth of each view [u], 0 < near < far.
         config: Planes, smoothing and checks.
-        device: Where to compute costs and paths; the CPU does it where a GPU has too little memory, or pictures are tiny.
+        device: Device of costs and paths; the CPU computes them where a GPU has too little memory, or images are tiny.
 
     Returns:
-        One depth per view at its own size; what was reduced or found nothing is in its notes.
+        One depth per view at its own size; its notes name a reduced size and views that confirm nothing.
     """
     import cv2
 
     small = [_reduced(v, config.max_pixels) for v in views]
     with sweep_cpu.single_threaded_opencv(), ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        inverses, said = _inverses(small, bounds, config, device, pool)
+        inverses, messages = _inverses(small, bounds, config, device, pool)
         consistent = list(pool.map(lambda i: confirm(small, inverses, i, config), range(len(views))))
     out = []
     for i, view in enumerate(views):
-        found, notes = consistent[i], list(said if i == 0 else ())
+        found, notes = consistent[i], list(messages if i == 0 else ())
         depth, valid, sensitivity = found.depth, found.valid, found.sensitivity
         size = (view.camera.width, view.camera.height)
         if small[i] is not view:

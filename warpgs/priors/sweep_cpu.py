@@ -22,10 +22,10 @@ from warpgs.scene import View
 
 
 def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, window: int) -> np.ndarray:
-    """Disagreement of views at D inverse depths, in [0, 1], float32, shape [D, H, W].
+    """Return the disagreement of views at D inverse depths [1/u], in [0, 1], float32, shape [D, H, W].
 
-    Of the costs 0.5 (1 - correlation) of the other views half the mean and half the least: a view that does not see the
-    point counts, but cannot outvote one that does.
+    The cost of one other view is 0.5 (1 - correlation). Their mean and their smallest count one half each: a view that does
+    not see the point counts, but cannot outvote one that does.
     """
     import cv2
 
@@ -67,14 +67,14 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
 
 
 def path_costs(costs: np.ndarray, image: np.ndarray, small_step: float, large_step: float, *, down: bool) -> np.ndarray:
-    """Sum of the semi-global path costs from above and below, or from left and right.
+    """Return the sum of the semi-global path costs from above and below, or from left and right.
 
     Args:
         costs: Matching costs in units of 1 / `UNIT`, int16, shape [H, W, D].
         image: Colours in [0, 1] whose edges allow jumps, shape [H, W, 3].
         small_step: Penalty for a change of one plane.
-        large_step: Penalty for any other change, times exp(-step of the picture / EDGE).
-        down: Whether paths run along columns; else along rows.
+        large_step: Penalty for any other change, times exp(-step of the image / EDGE).
+        down: Paths run along columns; else along rows.
 
     Returns:
         Sums in units of 1 / `UNIT`, int16, shape [H, W, D].
@@ -101,7 +101,7 @@ def path_costs(costs: np.ndarray, image: np.ndarray, small_step: float, large_st
 
 
 def best_inverse(costs: np.ndarray, inverses: np.ndarray) -> np.ndarray:
-    """Inverse depth [H, W] of least cost [H, W, D], in any unit, between planes by the parabola through three costs."""
+    """Return the inverse depth [1/u], shape [H, W], of least cost [H, W, D], refined by the parabola through three costs."""
     k = np.clip(costs.argmin(2), 1, len(inverses) - 2)
     left, middle, right = (np.take_along_axis(costs, (k + o)[..., None], 2)[..., 0].astype(float) for o in (-1, 0, 1))
     bend = left - 2 * middle + right
@@ -111,7 +111,7 @@ def best_inverse(costs: np.ndarray, inverses: np.ndarray) -> np.ndarray:
 
 @contextlib.contextmanager
 def single_threaded_opencv():
-    """OpenCV without threads of its own: its calls here are so short that starting threads takes longer than they save."""
+    """Keep OpenCV from using threads: its calls here are so short that starting threads takes longer than they save."""
     import cv2
 
     before = cv2.getNumThreads()

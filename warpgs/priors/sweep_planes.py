@@ -1,4 +1,4 @@
-"""Planes of a depth sweep and the scale of their costs: what the CPU and the GPU backend share."""
+"""Planes of a depth sweep and the scale of their costs, which the CPU and the GPU backend share."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ PLANES_AT_ONCE = 16
 
 @dataclass(frozen=True)
 class SweepConfig:
-    """How planes are laid, costs smoothed and depths confirmed."""
+    """Settings of the planes, of the smoothing of costs and of the confirmation of depths."""
 
     near_count: int = 4
-    """Nearest other views that each view is compared with."""
+    """Number of nearest other views with which each view is compared."""
     window: int = 7
     """Side of the square in which pixels are correlated [px]; odd, at least 3."""
     spacing: float = 0.5
     """Largest step of a match from one plane to the next [px], while `max_planes` allows it."""
     max_planes: int = 256
-    """Planes at most, at least 8; memory is 6 bytes per pixel and plane, for up to four views."""
+    """Largest number of planes, at least 8; memory is 6 bytes per pixel and plane, for up to four views."""
     max_pixels: int = 200_000
-    """Larger images are swept at a reduced size."""
+    """Largest number of pixels of an image; larger ones are swept at a reduced size."""
     small_step: float = 0.03
     """Penalty for a depth one plane off the neighbouring pixel's (P1); costs lie in [0, 1]."""
     large_step: float = 0.5
-    """Penalty for any other depth (P2) where the picture is even; less across its edges, but above 1.5 P1."""
+    """Penalty for any other depth (P2) where the image is even; less across its edges, but above 1.5 P1."""
     max_round_trip: float = 0.6
-    """A depth counts where the depth that another view found leads back nearer than this [px]."""
+    """Largest distance [px] from a pixel after a round trip by the depth that another view found."""
     min_parallax: float = 0.5
     """Smallest angle between the two rays [deg]; below it depth is noise."""
 
@@ -63,7 +63,7 @@ class SweepConfig:
 
 
 def project_inverse(first: Camera, second: Camera, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """Positions in the second image [px], shape [N, 2], of pixels [N, 2] at inverse depths [N] [1/u]; NaN behind the camera."""
+    """Return the positions [px] in the second image, shape [N, 2], of pixels [N, 2] at inverse depths [1/u] [N]; NaN behind."""
     relative = second.viewmat @ np.linalg.inv(first.viewmat)
     rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1) @ np.linalg.inv(first.K).T
     p = (rays @ relative[:3, :3].T + inverse[:, None] * relative[:3, 3]) @ second.K.T
@@ -79,10 +79,10 @@ def inside_image(camera: Camera, pixels: np.ndarray) -> np.ndarray:
 def plane_inverses(
     first: Camera, others: Sequence[Camera], bounds: tuple[float, float], spacing: float, max_planes: int
 ) -> np.ndarray:
-    """Inverse depths [1/u], evenly spaced and ascending, from the far to the near bound [u].
+    """Return inverse depths [1/u] of planes, evenly spaced and ascending, from the far to the near bound [u].
 
-    Their number is the fewest at which no match inside an image moves more than about ``spacing`` px between planes, 8 to
-    ``max_planes``.
+    Their number, 8 to ``max_planes``, is the smallest at which no match inside an image moves more than about ``spacing`` px
+    between planes.
     """
     near, far = bounds
     x, y = np.meshgrid(np.linspace(0, first.width, 5), np.linspace(0, first.height, 5))
@@ -98,7 +98,7 @@ def plane_inverses(
 
 
 def plane_homography(first: Camera, second: Camera, inverse: float) -> np.ndarray:
-    """H [3, 3] from first to second by the plane z = 1 / inverse, for pixels whose centres are whole numbers (OpenCV)."""
+    """Return H [3, 3] from first to second by the plane z = 1 / inverse, for pixel centres at whole numbers (OpenCV)."""
     relative = second.viewmat @ np.linalg.inv(first.viewmat)
     H = second.K @ (relative[:3, :3] + inverse * np.outer(relative[:3, 3], [0, 0, 1])) @ np.linalg.inv(first.K)
     shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
@@ -106,13 +106,13 @@ def plane_homography(first: Camera, second: Camera, inverse: float) -> np.ndarra
 
 
 def gray_of(view: View) -> np.ndarray:
-    """Brightness of its pixels in [0, 1], float32, shape [H, W]."""
+    """Return the brightness of a view's pixels in [0, 1], float32, shape [H, W]."""
     import cv2
 
     return cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
 
 
 def step_limits(colors: np.ndarray, small_step: float, large_step: float) -> np.ndarray:
-    """P2 of the steps along the first axis of a picture [L, B, 3], in units of 1 / `UNIT`, int16, shape [L - 1, B]."""
+    """Return P2 of the steps along the first axis of an image [L, B, 3], in units of 1 / `UNIT`, int16, shape [L - 1, B]."""
     jumps = np.abs(np.diff(colors, axis=0)).max(2)
     return np.rint(np.maximum(large_step * np.exp(-jumps / EDGE), 1.5 * small_step) * UNIT).astype(np.int16)
