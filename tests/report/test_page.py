@@ -82,7 +82,7 @@ def test_nothing_is_loaded_from_anywhere(tmp_path):
 def test_all_pictures_are_embedded_byte_for_byte(tmp_path):
     values, _, page = write(tmp_path / "report.html")
     embedded = [base64.b64decode(a["src"].split(",", 1)[1], validate=True) for a in page.all("img")]
-    given = [b for v in values["views"] for b in (v.truth, v.render, v.error, v.depth)]
+    given = [b for v in values["views"] for b in (v.reference, v.render, v.error, v.depth)]
     given += [values["overview"], *(data for _, data in values["sampling"].images)]
     assert sorted(embedded) == sorted(given)
     for data in embedded:

@@ -1,4 +1,4 @@
-"""The demo folder, read back by a parser of its own and checked against its own pictures."""
+"""The demo folder, read back by a parser of its own and checked against its own images."""
 
 import cv2
 import numpy as np

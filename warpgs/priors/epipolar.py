@@ -140,7 +140,7 @@ def _triangulate(rays: np.ndarray, others: np.ndarray, tau: np.ndarray) -> tuple
 
 
 def round_trip(matches: np.ndarray, pixels: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """Return the distance [px], shape [N], from pixels to where the flow ``back`` [H, W, 2] takes their matches; inf outside."""
+    """Return distances [px], shape [N], from pixels to their matches moved by the flow ``back`` [H, W, 2]; inf outside."""
     import cv2
 
     height, width = back.shape[:2]

@@ -147,7 +147,7 @@ def _classic(kind: str) -> Callable[[View, View], np.ndarray]:
 
 
 def _sparse(views: Sequence[View]) -> FlowBetween:
-    """Return a function for the flow from SIFT matches near their epipolar lines, interpolated along edges (Revaud et al. 2015)."""
+    """Return a function for the flow from SIFT matches near epipolar lines, interpolated along edges (Revaud et al. 2015)."""
     import cv2
 
     sift, matcher = cv2.SIFT_create(contrastThreshold=0.01), cv2.BFMatcher(cv2.NORM_L2)
