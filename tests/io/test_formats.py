@@ -10,14 +10,14 @@ from warpgs.io.splits import split_views
 
 
 def landing(scene, i, point):
-    """Where a point in file coordinates lands in the i-th view [px], through everything that the scene says."""
+    """Return the position in the i-th view [px] of a point in file coordinates, by all that the scene holds."""
     camera, n = scene.views[i].camera, scene.normalization
     x = camera.viewmat[:3, :3] @ (n.scale * (point - n.offset)) + camera.viewmat[:3, 3]
     return (camera.K @ (x / x[2]))[:2]
 
 
 def by_index(scene):
-    """Positions of the views in the order of their cameras; only Blender's folders shuffle them."""
+    """Return the positions of the views in the order of their cameras; only Blender's folders change it."""
     return sorted(range(len(scene.views)), key=lambda j: scene.views[j].name.rpartition("/")[2])
 
 

@@ -20,7 +20,7 @@ def lens(width, height, focal=20.0, distortion=(), model="PINHOLE"):
 
 
 def smooth(x, y):
-    """An analytic image over pixel coordinates (centres at +0.5), three channels in [0, 1]."""
+    """Return an analytic image over pixel coordinates (centres at +0.5), three channels in [0, 1]."""
     return np.stack([0.5 + 0.4 * np.sin(x / 9), 0.5 + 0.4 * np.cos(y / 7), 0.5 + 0.3 * np.sin((x + y) / 11)], axis=-1)
 
 
@@ -134,7 +134,7 @@ def test_uneven_resampling_scales_each_axis_by_itself(tmp_path):
 
 
 def distort(x, y, k1, k2, p1, p2, k3=0.0):
-    """OpenCV's model, written out anew (image plane to image plane)."""
+    """Apply OpenCV's model, written anew, from image plane to image plane."""
     r2 = x * x + y * y
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
     return (
@@ -144,7 +144,7 @@ def distort(x, y, k1, k2, p1, p2, k3=0.0):
 
 
 @pytest.mark.parametrize("terms", [(0.1, 0, 0, 0), (-0.15, 0.04, 0, 0), (0.05, -0.02, 0.004, -0.006), (0.1, 0.02, 0, 0, 0.05)])
-def test_undistortion_agrees_with_the_analytic_picture(terms, tmp_path):
+def test_undistortion_agrees_with_the_analytic_image(terms, tmp_path):
     width, height, f, cx, cy = 64, 48, 50.0, 30.0, 26.0
     K = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1.0]])
     # invert the model by fixed-point iteration: the image shows at its pixel what a pinhole shows at the ideal one

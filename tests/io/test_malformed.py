@@ -154,7 +154,7 @@ def test_no_points_are_a_note(tmp_path):
 
 
 def patched_pose(tmp_path, **changes):
-    """A scene whose second pose is changed: the value at an index of its seven numbers."""
+    """Write a scene in which some of the words of the second pose are replaced, by index."""
     scenes.write_colmap_txt(tmp_path)
     path = tmp_path / "sparse" / "images.txt"
     lines = path.read_text().split("\n")

@@ -124,7 +124,7 @@ def test_middlebury_files(old, new, message, tmp_path):
 
 
 @pytest.mark.parametrize("kind", scenes.WRITERS)
-def test_corrupt_photographs_are_named(kind, tmp_path):
+def test_corrupt_images_are_named(kind, tmp_path):
     scenes.WRITERS[kind](tmp_path)
     path = sorted(tmp_path.rglob("*.png"))[2]
     path.write_bytes(path.read_bytes()[:60])

@@ -13,7 +13,7 @@ from warpgs.scene import Camera
 
 
 def scene_of(names):
-    """A stand-in: a split only looks at names."""
+    """Return a stand-in for a scene: a split only looks at names."""
     return SimpleNamespace(views=[SimpleNamespace(name=n) for n in names])
 
 
@@ -190,7 +190,7 @@ def test_a_split_of_a_real_folder(tmp_path):
     assert split_views(scene, "llff:3") == Split(("photo1.png", "photo3.png", "photo4.png"), ("photo0.png",))
 
 
-def test_twins_are_views_from_one_place():
+def test_coincident_views_are_views_from_one_place():
     """Equal poses across the split count, in any unit; equal poses within training and turned cameras do not."""
 
     def view(name, x, turned=False):

@@ -50,7 +50,7 @@ def test_a_missing_package_is_named_with_its_remedy(name, tmp_path, monkeypatch,
 @needs_extra
 @pytest.mark.parametrize(("name", "shape"), [("dpt", (64, 64)), ("fcn-resnet18", (21, 64, 64))])
 def test_the_architecture_gives_in_onnxruntime_what_it_gives_in_torch(name, shape, tmp_path):
-    """Small random weights of the real classes; differences in standard deviations of the output."""
+    """The real classes with small random weights; differences in standard deviations of the output."""
     request, path = ExportRequest(name, random_weights=True, size=64), tmp_path / "n.onnx"
     lines = export_network(request, path)
     assert "small and untrained" in lines[0] and "warpgs priors show" in lines[1]

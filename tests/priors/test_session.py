@@ -26,7 +26,7 @@ def test_a_network_knows_its_file_layout_and_size(tmp_path):
 
 
 @pytest.mark.parametrize("layout", ["nchw", "nhwc"])
-def test_a_picture_goes_in_with_its_axes_in_order(tmp_path, layout):
+def test_an_image_goes_in_with_its_axes_in_order(tmp_path, layout):
     path = nw.write(tmp_path / "a.onnx", nw.linear(EYE, ZERO, layout=layout))
     image = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float32)
     output = open_network(path).run(image)[0]
@@ -85,7 +85,7 @@ def test_files_that_are_refused(tmp_path, name):
 
 
 def external(where: str) -> bytes:
-    """A model with a constant in a side file: as initializer, in a node's attribute, or in a branch of an If."""
+    """Return a model with a constant in a side file: as initializer, in a node's attribute, or in a branch of an If."""
     x, y = nw.value("x", (1, 3, "h", "w")), nw.value("y", (1, 3, "h", "w"))
     outside = nw.external_tensor("k", (1,), "weights.bin")
     add = nw.node("Add", ["x", "k"], ["y"])
@@ -131,7 +131,7 @@ def test_nested_graphs_end(tmp_path):
 
 
 def test_no_bytes_crash_the_reader(tmp_path):
-    """Damaged files give a message or still work; nothing else, and at once."""
+    """Damaged files raise a DataError or still work."""
     rng, began = np.random.default_rng(5), time.perf_counter()
     for i in range(150):
         data = bytearray(GOOD)

@@ -18,18 +18,18 @@ PLANES = np.linspace(1 / 12, 1 / 2, 40)
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 def device(request):
-    """Where torch works."""
+    """Return the device of torch."""
     return torch.device(request.param)
 
 
 def computed(view: View, others: list[View], inverses: np.ndarray, window: int, device: torch.device) -> np.ndarray:
-    """Costs as `sweep` gives them, [D, H, W]."""
+    """Return costs in the layout of `sweep_cpu`, [D, H, W]."""
     found = sweep_cuda.matching_costs(view, others, inverses, window, device)
     return found.cpu().numpy().transpose(2, 0, 1) / UNIT
 
 
 def test_costs_agree(device):
-    """To half a unit, and the rounding of correlations where there is little pattern; no opinion is none in both."""
+    """Costs agree to half a unit and the rounding of correlations; neutral costs are neutral in both."""
     views, _ = still_life()
     wanted = sweep_cpu.matching_costs(views[1], [views[0], views[2]], PLANES, 7)
     found = computed(views[1], [views[0], views[2]], PLANES, 7, device)
@@ -40,7 +40,7 @@ def test_costs_agree(device):
 
 
 def test_costs_of_another_size_agree(device):
-    """The other view has other sides, and planes behind its camera have no opinion in either."""
+    """The other view has another size, and planes behind its camera are neutral in both."""
     generator = np.random.default_rng(0)
     texture = generator.uniform(0.1, 0.9, (30, 60, 3)).astype(np.float32)
     K = np.array([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]])
@@ -54,7 +54,7 @@ def test_costs_of_another_size_agree(device):
 
 
 def test_paths_agree(device):
-    """To the last unit, in an image with edges."""
+    """Paths agree to the last unit, in an image with edges."""
     generator = np.random.default_rng(1)
     costs = generator.integers(0, UNIT + 1, (9, 7, 12)).astype(np.int16)
     image = generator.uniform(0.4, 0.55, (9, 7, 3)).astype(np.float32)
@@ -64,7 +64,7 @@ def test_paths_agree(device):
 
 
 def test_parabola_agrees(device):
-    """Between planes, at the first and last plane, and where costs are flat."""
+    """Inverse depths agree between planes, at the first and last plane, and where costs are flat."""
     generator = np.random.default_rng(2)
     costs = generator.integers(0, 1000, (6, 5, 40)).astype(np.float32)
     costs[0], costs[1, :, 0], costs[2, :, -1] = 7.0, -1.0, -1.0
@@ -73,7 +73,7 @@ def test_parabola_agrees(device):
 
 
 def test_depths_agree(device):
-    """Of a view of the still life: nearly all the same, and as near to the truth."""
+    """Depths of a view of the still life are nearly all the same, with the same error."""
     views, depths = still_life()
     config, others = SweepConfig(), [views[0], views[2]]
     planes = plane_inverses(views[1].camera, [o.camera for o in others], (2, 12), config.spacing, config.max_planes)
@@ -86,7 +86,7 @@ def test_depths_agree(device):
 
 
 def test_a_small_gpu_leaves_it_to_the_cpu(monkeypatch):
-    """The same depths as on the CPU, and one note that says so and how much there should be."""
+    """Depths are those of the CPU, and one note names the memory that a GPU should have."""
     views, _ = still_life()
     monkeypatch.setattr(sweep, "installed_bytes", lambda _: 2**20)
     found = sweep_depths(views, [(2, 12)] * 3, SweepConfig(), torch.device("cuda"))
@@ -96,8 +96,8 @@ def test_a_small_gpu_leaves_it_to_the_cpu(monkeypatch):
 
 
 @pytest.mark.parametrize("size", [(40, 3), (3, 40), (3, 3), (40, 1), (1, 1)])
-def test_tiny_pictures_are_left_to_the_cpu(size, monkeypatch):
-    """Narrower than half a window: torch mirrors no border there."""
+def test_tiny_images_are_left_to_the_cpu(size, monkeypatch):
+    """Images narrower than half a window are swept on the CPU: torch mirrors no border there."""
     width, height = size
     K = np.array([[40.0, 0, width / 2], [0, 40, height / 2], [0, 0, 1]])
     aside = np.eye(4)
@@ -123,7 +123,7 @@ def test_the_gpu_takes_no_more_than_it_says():
 
 @pytest.mark.cuda
 def test_a_gpu_confirms_as_much():
-    """Of the still life, within half a per cent of the pixels."""
+    """Coverage of the still life agrees within half a per cent of the pixels."""
     views, _ = still_life()
     for a, b in zip(*(sweep_depths(views, [(2, 12)] * 3, SweepConfig(), d) for d in (CPU, torch.device("cuda")))):
         assert abs(a.coverage - b.coverage) < 0.005

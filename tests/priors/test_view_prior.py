@@ -31,7 +31,7 @@ def view(image, name="a.png", mask=None):
 
 
 def dark(name="dark.png"):
-    """An image in which the network finds background alone."""
+    """Return an image in which the network finds background alone."""
     return view(0.02 * np.random.default_rng(1).random((32, 64, 3), np.float32), name)
 
 
@@ -45,7 +45,7 @@ def networks(tmp_path, **more):
 
 
 def check(prior, shape):
-    """Every map is float32, finite, in [0, 1] and of the view's size."""
+    """Assert that every map is float32, finite, in [0, 1] and of the view's size."""
     for m in (prior.disparity, prior.confidence, prior.boundary, prior.foreground):
         assert m.dtype == np.float32 and m.shape == shape and m.min() >= 0 and m.max() <= 1
     assert prior.depth_source and prior.semantics_source

@@ -99,7 +99,7 @@ def test_frames_of_two_sizes_are_refused(tmp_path):
 
 
 def test_threads_may_write_one_file(tmp_path):
-    """The file is one of what they wrote, whole, and nothing else is left."""
+    """The file is one of those written, complete, and no other file is left."""
     contents = [bytes([i]) * 50_000 for i in range(8)]
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda c: [write_bytes(tmp_path / "a.png", c) for _ in range(20)], contents))

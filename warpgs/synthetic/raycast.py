@@ -115,7 +115,7 @@ class Sphere(Shape):
     """A sphere around ``center``."""
 
     size: float = 1.0
-    """Its radius [u]."""
+    """Radius of the shape [u]."""
 
     @property
     def radius(self) -> float:
@@ -169,7 +169,7 @@ class Cylinder(Shape):
     """An upright cylinder (axis: local y) with flat caps."""
 
     size: float = 1.0
-    """Its radius [u]."""
+    """Radius of the shape [u]."""
     half_height: float = 1.0
     """Half its height [u]."""
 
