@@ -1,4 +1,4 @@
-"""Disparity from networks with known answers, and from depth that other views confirm at some pixels."""
+"""Disparity from networks with known answers, and from depth that is consistent between views at some pixels."""
 
 import json
 import re

@@ -9,7 +9,7 @@ from warpgs.errors import UsageError
 from warpgs.geometry import back_project, project_points
 from warpgs.priors.completion import complete
 from warpgs.priors.epipolar import pixel_grid
-from warpgs.priors.sweep import confirm, sweep_depths
+from warpgs.priors.sweep import consistent_depth, sweep_depths
 from warpgs.priors.sweep_cpu import best_inverse, matching_costs, path_costs
 from warpgs.priors.sweep_planes import MAX_LARGE_STEP, UNIT, SweepConfig, plane_homography, plane_inverses, project_inverse
 from warpgs.scene import Camera, View
@@ -94,26 +94,26 @@ def test_parabola_between_planes():
     assert np.allclose(best_inverse(np.zeros((1, 1, 9)), inverses), inverses[1])
 
 
-def test_only_what_another_view_confirms_counts():
+def test_only_consistent_depth_counts():
     """True depths pass where a second view sees them, a wrong patch does not, nor does anything without parallax."""
     views, depths = still_life()
     inverses = [1 / d for d in depths]
     config = SweepConfig()
-    right = confirm(views, inverses, 1, config)
+    right = consistent_depth(views, inverses, 1, config)
     assert right.coverage > 0.85 and np.allclose(right.depth[right.valid], depths[1][right.valid], rtol=1e-5)
     wrong = [i.copy() for i in inverses]
     wrong[1][40:60, 60:90] *= 1.2
-    patch = confirm(views, wrong, 1, config)
+    patch = consistent_depth(views, wrong, 1, config)
     assert not patch.valid[42:58, 62:88].any() and np.array_equal(patch.valid[:38], right.valid[:38])
     assert np.isinf(patch.sensitivity[~patch.valid]).all() and (patch.depth[~patch.valid] == 0).all()
-    still = confirm([views[0], views[0]], [inverses[0]] * 2, 0, config)
+    still = consistent_depth([views[0], views[0]], [inverses[0]] * 2, 0, config)
     assert still.coverage == 0 and "agrees" in still.notes[0]
 
 
 def test_sensitivity_is_depth_per_pixel():
     """A change of depth by the sensitivity moves the match by a pixel, in the view where it moves most."""
     views, depths = still_life()
-    found = confirm(views, [1 / d for d in depths], 1, SweepConfig())
+    found = consistent_depth(views, [1 / d for d in depths], 1, SweepConfig())
     pixels, z = pixel_grid(views[1].camera), depths[1].ravel()
     moved = []
     for j in (0, 2):
@@ -121,12 +121,12 @@ def test_sensitivity_is_depth_per_pixel():
         moved.append(np.linalg.norm(ends[0] - ends[1], axis=1) / 2e-4)
     product = found.sensitivity.ravel() * np.maximum(*moved)
     valid = found.valid.ravel()
-    # where only the other view confirms, that one decides
+    # where only the other view is consistent, that one decides
     assert np.median(np.abs(product[valid] - 1)) < 1e-3 and product[valid].min() > 0.999
 
 
 def test_depth_of_a_known_scene():
-    """Of every ray-cast view three quarters are confirmed; half of these err by at most 0.8 %, nine tenths by 5 %."""
+    """Of every ray-cast view three quarters are consistent; half of these err by at most 0.8 %, nine tenths by 5 %."""
     views, depths = still_life()
     for found, true in zip(sweep_depths(views, [(2, 12)] * 3, SweepConfig()), depths):
         error = np.abs(found.depth / true - 1)[found.valid]
@@ -157,7 +157,7 @@ def test_bad_settings_are_refused(bad):
 
 
 def test_completion_follows_the_image():
-    """Each of two flat regions takes the depth of its few confirmed pixels, up to the edge between them."""
+    """Each of two flat regions takes the depth of its few valid pixels, up to the edge between them."""
     image = np.zeros((40, 60, 3), np.float32)
     image[:, 30:] = 0.8
     true = np.where(np.arange(60) < 30, 2.0, 5.0)[None].repeat(40, 0).astype(np.float32)

@@ -122,7 +122,7 @@ def test_the_gpu_takes_no_more_than_it_says():
 
 
 @pytest.mark.cuda
-def test_a_gpu_confirms_as_much():
+def test_a_gpu_finds_as_much_consistent_depth():
     """Coverage of the still life agrees within half a per cent of the pixels."""
     views, _ = still_life()
     for a, b in zip(*(sweep_depths(views, [(2, 12)] * 3, SweepConfig(), d) for d in (CPU, torch.device("cuda")))):

@@ -18,7 +18,7 @@ PLAIN = {"segmentation_size": 32, "segmentation_mean": (0.0, 0.0, 0.0), "segment
 
 @dataclass(frozen=True)
 class Depth:
-    """What other views confirm."""
+    """A stand-in for `warpgs.scene.ViewDepth`."""
 
     depth: np.ndarray
     valid: np.ndarray
@@ -137,7 +137,7 @@ def test_classical_sources_say_so():
     assert a.disparity[near].min() > a.disparity[~near].max() and f"{valid.mean():.1%}" in a.depth_source
     assert not b.disparity.any() and b.depth_source == "none"
     text = "\n".join(notes)
-    assert f"0.0% to {valid.mean():.1%} of a view's pixels" in text and "no depth is confirmed in b.png" in text
+    assert f"0.0% to {valid.mean():.1%} of a view's pixels" in text and "no depth is consistent in b.png" in text
     assert "saliency stands for foreground" in text and "--segmentation-model" in text
 
 

@@ -1,4 +1,4 @@
-"""Completion of a depth map from its confirmed pixels, along the surfaces that the image shows."""
+"""Completion of a depth map from its consistent pixels, along the surfaces that the image shows."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ SMOOTHNESS = (1e2, 1e4, 1e6)
 COLOR_SIGMA = 8.0
 """Colour difference [1/255] at which neighbours stop having one depth, times e."""
 MIN_FRACTION = 1e-3
-"""Smallest fraction of a smoothed value that must come from confirmed pixels."""
+"""Smallest fraction of a smoothed value that must come from consistent pixels."""
 
 
 def complete(depth: np.ndarray, valid: np.ndarray, image: np.ndarray) -> np.ndarray:
     """Fill a depth map by edge-aware averages of inverse depth.
 
-    The result is the fast global smoother (Min et al. 2014) of the confirmed inverse depths divided by that of the mask.
+    The result is the fast global smoother (Min et al. 2014) of the consistent inverse depths divided by that of the mask.
     Planes stay planes in inverse depth, and far surfaces are not pulled near. Measured in docs/decisions/007-coarse-start.md.
 
     Args:
@@ -24,7 +24,7 @@ def complete(depth: np.ndarray, valid: np.ndarray, image: np.ndarray) -> np.ndar
         image: Colours in [0, 1], shape [H, W, 3].
 
     Returns:
-        z-depths [u], float32, shape [H, W]: unchanged where valid, the median where no confirmed pixel reaches; 0 everywhere
+        z-depths [u], float32, shape [H, W]: unchanged where valid, the median where no consistent pixel reaches; 0 everywhere
         where nothing is valid.
     """
     import cv2

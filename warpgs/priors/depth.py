@@ -1,4 +1,4 @@
-"""Relative inverse depth of an image: from a monocular network, or completed from what other views confirm."""
+"""Relative inverse depth of an image: from a monocular network, or completed from depths that are consistent between views."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from warpgs.priors.session import Network
 DEFAULTS = Preprocessing(384, 32, *HALF, output="disparity")
 """Input and output of DPT (Ranftl et al. 2021), the paper's network."""
 CLIP = (0.5, 99.5)
-"""Percentiles to which confirmed inverse depths are clipped: one wrong match must not decide the range of the map."""
+"""Percentiles to which consistent inverse depths are clipped: one wrong match must not decide the range of the map."""
 COLOR_SIGMA = 8.0
 """Colour difference [1/255] at which the smoother takes neighbours for different surfaces, times e."""
 REACHES = ((10.0, 1.0), (100.0, 1e-3), (1000.0, 1e-6))
-"""Pairs (length [px] over which confirmed depths spread within an even surface, weight): a long one counts only where no
-confirmed depth is near."""
+"""Pairs (length [px] over which consistent depths spread within an even surface, weight): a long one counts only where no
+consistent depth is near."""
 MAX_ERROR_RATIO = 1e3
-"""Largest ratio of an error to the median error that matters: no confirmed depth has a weight below a millionth."""
+"""Largest ratio of an error to the median error that matters: no consistent depth has a weight below a millionth."""
 MEAN_WEIGHT = 1e-9
-"""Weight of the mean of all confirmed depths, for pixels that edges shut off from every one of them."""
+"""Weight of the mean of all consistent depths, for pixels that edges separate from all of them."""
 
 
 def unit_range(values: np.ndarray) -> np.ndarray:

@@ -41,7 +41,7 @@ def _triangulate(a: View, b: View, pixels_a: np.ndarray, pixels_b: np.ndarray) -
 
 
 def triangulate_matches(views: list[View]) -> PointCloud:
-    """Match SIFT features between pairs of views (Lowe 2004) and triangulate the matches that the known poses confirm.
+    """Match SIFT features between pairs of views (Lowe 2004) and triangulate the matches that agree with the known poses.
 
     Returns:
         N points [u] with the colours of their pixels in [0, 1]; none where nothing matched.

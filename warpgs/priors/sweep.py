@@ -41,11 +41,11 @@ def _reduced(view: View, max_pixels: int) -> View:
     return View(view.name, Camera(c.viewmat, K, width, height), image)
 
 
-def confirm(views: Sequence[View], inverses: Sequence[np.ndarray], index: int, config: SweepConfig) -> ViewDepth:
-    """Return the depth of one view where the depth of at least one other view confirms it.
+def consistent_depth(views: Sequence[View], inverses: Sequence[np.ndarray], index: int, config: SweepConfig) -> ViewDepth:
+    """Return the depth of one view where it is geometrically consistent with that of at least one other view.
 
     A point is projected to each other view and back by the depth found there. It must return nearer than ``max_round_trip``
-    to its pixel, with both rays at least ``min_parallax`` apart. The sensitivity is the smallest of the confirming views.
+    to its pixel, with both rays at least ``min_parallax`` apart. The sensitivity is the smallest of the consistent views.
 
     Args:
         views: All views.
@@ -117,20 +117,20 @@ def sweep_depths(
     """Return the depth of every view by sweeping planes against its nearest others.
 
     Args:
-        views: The views; a single one confirms nothing.
+        views: The views; a single one has no consistent depth.
         bounds: Nearest and farthest depth of each view [u], 0 < near < far.
         config: Planes, smoothing and checks.
         device: Device of costs and paths; the CPU computes them where a GPU has too little memory, or images are tiny.
 
     Returns:
-        One depth per view at its own size; its notes name a reduced size and views that confirm nothing.
+        One depth per view at its own size; its notes name a reduced size and views without a consistent depth.
     """
     import cv2
 
     small = [_reduced(v, config.max_pixels) for v in views]
     with sweep_cpu.single_threaded_opencv(), ThreadPoolExecutor(torch.get_num_threads()) as pool:
         inverses, messages = _inverses(small, bounds, config, device, pool)
-        consistent = list(pool.map(lambda i: confirm(small, inverses, i, config), range(len(views))))
+        consistent = list(pool.map(lambda i: consistent_depth(small, inverses, i, config), range(len(views))))
     out = []
     for i, view in enumerate(views):
         found, notes = consistent[i], list(messages if i == 0 else ())

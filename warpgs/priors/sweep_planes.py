@@ -27,7 +27,7 @@ PLANES_AT_ONCE = 16
 
 @dataclass(frozen=True)
 class SweepConfig:
-    """Settings of the planes, of the smoothing of costs and of the confirmation of depths."""
+    """Settings of the planes, of the smoothing of costs and of the consistency check."""
 
     near_count: int = 4
     """Number of nearest other views with which each view is compared."""

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from warpgs.scene import ViewDepth
 
 MIN_CONSISTENT = 50
-"""Smallest number of pixels with a confirmed depth; below it a view's depth counts as unknown."""
+"""Smallest number of pixels with a geometrically consistent depth; below it a view's depth counts as unknown."""
 MAX_OBJECT_FRACTION = 0.9
 """Largest fraction of the image that an object's region covers; a larger region is what a mask leaves."""
 FLAGS = ("size", "multiple", "mean", "std")
@@ -120,14 +120,14 @@ def _depth_views(views: Sequence[View], depths: Sequence[ViewDepth] | None, note
     )
     poor = [v.name for v, d in zip(views, depths) if d.valid.sum() < MIN_CONSISTENT]
     if poor:
-        notes.append(f"no depth is confirmed in {', '.join(poor)}: geometry does not count there; --depth-model would help")
+        notes.append(f"no depth is consistent in {', '.join(poor)}: geometry does not count there; --depth-model would help")
 
     def disparity(i: int) -> tuple[np.ndarray, str]:
         view, d = views[i], depths[i]
         if d.valid.sum() < MIN_CONSISTENT:
             return np.zeros(d.depth.shape, np.float32), "none"
         found = complete_disparity(view.image, d.depth, d.valid, d.sensitivity)
-        return found, f"depth that other views confirm at {fractions[i]:.1%} of the pixels, completed"
+        return found, f"depth consistent with other views at {fractions[i]:.1%} of the pixels, completed"
 
     return disparity
 
@@ -217,7 +217,7 @@ def view_priors(
     Args:
         views: The training views.
         config: Networks and their inputs.
-        depths: Function that gives for each view the depth that the others confirm, or None for no depth; called last, and
+        depths: Function that gives for each view the depth consistent with the others, or None for no depth; called last, and
             only where no depth network is named.
         regions: For each view the pixels that show its object, bool [H, W], or None; it replaces an unknown foreground.
         threads: CPU threads of a network; 0 for as many as the process may use.
