@@ -10,10 +10,10 @@ Run without arguments to write a small scene of that format, read it back and ch
 
     python examples/06_own_format.py
 
-Fit it from the command line (the module is found through PYTHONPATH):
+Fit it from the command line:
 
     python examples/06_own_format.py --out shots
-    PYTHONPATH=examples warpgs fit shots --reader 06_own_format:ShotsReader --out run
+    warpgs fit shots --reader examples/06_own_format.py:ShotsReader --out run
 """
 
 from __future__ import annotations

@@ -1,11 +1,14 @@
-"""Classes that plug in by name: built-in ones found in a package, a user's own given in Python or as ``module:Class``."""
+"""Parts that plug in: classes found by name, whether ours or a user's."""
 
 from __future__ import annotations
 
+import hashlib
 import importlib
+import importlib.util
 import pkgutil
-import re
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Generic, TypeVar
 
 from warpgs.errors import UsageError
@@ -14,87 +17,101 @@ T = TypeVar("T")
 
 
 class Registry(Generic[T]):
-    """Named subclasses of one base class, found by importing every module of a package.
+    """Classes of one kind by name.
 
-    A registered class gets its name as the attribute ``name``.
+    Ours are the modules of a package, each imported when a name is looked for, so that a new one is a new file. A user's own
+    is given as a class in Python, or as ``module:Class`` or ``path/to/file.py:Class`` on the command line. Nothing is ever
+    imported because a stored file names it.
     """
 
-    def __init__(self, base: type[T], package: str, kind: str):
-        """Make an empty registry.
+    def __init__(self, kind: str, base: type[T], package: str):
+        """Begin with nothing.
 
         Args:
-            base: Class that every member derives from.
-            package: Dotted name of the package whose modules register the built-in members.
-            kind: Noun for the members in messages, such as ``reader``.
+            kind: What the classes are, for messages: strategy, loss term, reader.
+            base: What each class derives from.
+            package: Dotted name of the package, or module, that ours live in.
         """
-        self.base, self.package, self.kind = base, package, kind
+        self.kind, self.base, self.package = kind, base, package
         self._classes: dict[str, type[T]] = {}
-        self._discovered = False
+        self._searched = False
 
     def register(self, name: str) -> Callable[[type[T]], type[T]]:
-        """Return a class decorator that adds a class under ``name``.
+        """Return a decorator that registers a class by a name and sets its ``name``."""
 
-        Raises:
-            ValueError: Another class has that name, the name holds a colon, or the class does not derive from the base.
-        """
-
-        def add(cls: type[T]) -> type[T]:
-            if ":" in name or not issubclass(cls, self.base):
-                raise ValueError(f"{self.kind} {name!r}: needs a name without a colon and a subclass of {self.base.__name__}")
-            known = self._classes.get(name, cls)
-            if (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
-                raise ValueError(
-                    f"{self.kind} {name!r} is already {known.__module__}:{known.__qualname__}; choose another name"
-                )
+        def decorate(cls: type[T]) -> type[T]:
             cls.name = name
             self._classes[name] = cls
             return cls
 
-        return add
+        return decorate
 
-    def classes(self) -> dict[str, type[T]]:
-        """Return all registered classes by name; the first call imports the modules of the package."""
-        if not self._discovered:
-            for module in pkgutil.iter_modules(importlib.import_module(self.package).__path__):
+    def names(self) -> list[str]:
+        """Return the names of ours, sorted."""
+        if not self._searched:
+            package = importlib.import_module(self.package)
+            for module in pkgutil.iter_modules(getattr(package, "__path__", [])):
                 importlib.import_module(f"{self.package}.{module.name}")
-            self._discovered = True
-        return dict(self._classes)
+            self._searched = True
+        return sorted(n for n in self._classes if ":" not in n)
 
-    def find(self, choice: str | type[T]) -> type[T]:
-        """Return the class that a registered name, ``module:Class`` or a class itself stands for.
-
-        A module is imported by its name alone: its folder must be on the import path (PYTHONPATH). Never pass a string that
-        comes from a file of others, because importing a module runs it.
+    def find(self, name: str | type[T]) -> type[T]:
+        """Return the class of a name, or the class itself.
 
         Raises:
-            UsageError: There is no such name, module or class, or the class does not derive from the base.
+            UsageError: No class has that name, or a user's own class was not loaded in this process.
         """
-        if not isinstance(choice, str):
-            return self._derived(choice, repr(choice))
-        if ":" not in choice:
-            classes = self.classes()
-            if choice not in classes:
-                names = ", ".join(sorted(classes))
-                raise UsageError(f"{self.kind} {choice!r} is unknown; use one of {names}, or name your own as module:Class")
-            return classes[choice]
-        match = re.fullmatch(r"(\w+(?:\.\w+)*):(\w+)", choice)
-        if match is None:
-            raise UsageError(f"{self.kind} {choice!r} is not of the form module:Class; write for example my_module:MyClass")
-        try:
-            module = importlib.import_module(match[1])
-        except ImportError as e:
+        if isinstance(name, type):
+            return self._checked(name, name.__name__)
+        if name in self._classes or name in self.names():
+            return self._classes[name]
+        if ":" in name:
             raise UsageError(
-                f"{self.kind} {choice!r}: the module cannot be imported ({e}); put its folder on the import path, for example "
-                "PYTHONPATH=FOLDER"
-            ) from e
-        if not hasattr(module, match[2]):
-            raise UsageError(f"{self.kind} {choice!r}: {module.__file__} has no {match[2]}; check the spelling")
-        return self._derived(getattr(module, match[2]), repr(choice))
+                f"the {self.kind} {name!r} is a class of your own, which is never imported because a file names it; give it "
+                "again, on the command line or as a class in Python"
+            )
+        raise UsageError(f"there is no {self.kind} {name!r}; choose one of {', '.join(self.names())}, or give module:Class")
 
-    def _derived(self, cls: object, shown: str) -> type[T]:
-        if isinstance(cls, type) and issubclass(cls, self.base):
-            return cls
-        raise UsageError(
-            f"{self.kind} {shown} is not a class derived from {self.base.__module__}.{self.base.__qualname__}; derive it from "
-            "that class"
-        )
+    def load(self, spec: str) -> type[T]:
+        """Return the class of a name, importing ``module:Class`` or ``path/to/file.py:Class``: runs that code.
+
+        Raises:
+            UsageError: The module, file or class is not there, or the class is of another kind.
+        """
+        where, colon, name = spec.rpartition(":")
+        if not colon or spec in self._classes:
+            return self.find(spec)
+        try:
+            module = _load_file(Path(where)) if where.endswith(".py") else importlib.import_module(where)
+        except (ImportError, OSError) as e:
+            raise UsageError(f"the {self.kind} {spec!r} cannot be imported ({e}); give path/to/file.py:Class") from e
+        if not hasattr(module, name):
+            raise UsageError(f"the {self.kind} {spec!r} is not there: {where} has no class {name}")
+        cls = self._checked(getattr(module, name), spec)
+        self._classes[spec] = cls
+        cls.name = spec
+        return cls
+
+    def _checked(self, cls: object, name: str) -> type[T]:
+        if not (isinstance(cls, type) and issubclass(cls, self.base)):
+            raise UsageError(f"{name} is no {self.kind}: it must be a class that derives from warpgs.{self.base.__name__}")
+        return cls
+
+
+def _load_file(path: Path):
+    """Import a file by its path, once, under a name of its own."""
+    path = path.resolve()
+    name = f"_warpgs_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise OSError(f"there is no file {path}")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module

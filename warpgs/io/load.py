@@ -32,8 +32,8 @@ def load_scene(
 
     Args:
         path: The scene folder.
-        reader: Name of a format (colmap, transforms, llff, dtu, middlebury), ``module:Class``, or a `Reader` class or object of
-            your own; None to ask every built-in reader which format the folder has.
+        reader: Name of a format (colmap, transforms, llff, dtu, middlebury), or a `Reader` of your own: an object, a class,
+            ``module:Class`` or ``path/to/file.py:Class``. None asks every built-in reader whether the folder has its format.
         downscale: Factor by which both image sides shrink; a ready-made folder `images_N` is used where there is one.
         strict: A frame without an image file is an error instead of a note.
         allow_outside: Let the scene name image files outside its folder.

@@ -1,7 +1,7 @@
 """Readers of scene formats: the base class, the registry, and the choice of a reader by name, class or object.
 
 One module of `warpgs.io` holds one format and registers its reader. Adding a format means adding one such module; a user's
-own reader is passed to `warpgs.load_scene` or named as ``module:Class`` (examples/06_own_format.py).
+own reader is passed to `warpgs.load_scene`, or named as ``module:Class`` or ``file.py:Class`` (examples/06_own_format.py).
 """
 
 from __future__ import annotations
@@ -48,16 +48,17 @@ class Reader(abc.ABC):
     """Base class of the readers of scene formats."""
 
     name: ClassVar[str] = ""
-    """Name of the format, set by `register`; the class name where a reader is not registered."""
+    """Name of the format: set by `register`, else declared by the class, else the name of the class."""
     description: ClassVar[str] = ""
     """Files that make the format, then its name in brackets, on one line: for the message on an unknown folder."""
     priority: ClassVar[int] = 100
     """Order in which complete formats of one folder are preferred, lowest first; the built-in ones have 10 to 50."""
 
+    _declared_name: ClassVar[str] = ""
+
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
-        if "name" not in cls.__dict__:
-            cls.name = cls.__name__
+        cls.name = cls._declared_name = cls.__dict__.get("name", cls.__name__)
 
     @abc.abstractmethod
     def probe(self, folder: Path) -> Probe | None:
@@ -85,20 +86,31 @@ class Reader(abc.ABC):
         return Scene(str(folder), self.name, tuple(views), notes=tuple(notes), **fields)
 
 
-_REGISTRY = Registry(Reader, "warpgs.io", "reader")
-register = _REGISTRY.register
+READERS: Registry[Reader] = Registry("reader", Reader, __package__)
+
+register = READERS.register
 """Class decorator ``@register("name")`` that adds a reader to the built-in ones."""
 
 
 def all_readers() -> list[Reader]:
     """Return a reader of every registered format, by ascending ``priority``, then by name."""
-    return sorted((cls() for cls in _REGISTRY.classes().values()), key=lambda r: (r.priority, r.name))
+    return sorted((READERS.find(name)() for name in READERS.names()), key=lambda r: (r.priority, r.name))
 
 
 def find_reader(choice: str | type[Reader] | Reader) -> Reader:
-    """Return the reader that a name, ``module:Class``, a class or a reader itself stands for.
+    """Return the reader that a name, ``module:Class``, ``path/to/file.py:Class``, a class or a reader itself stands for.
+
+    A string with a colon imports the module or file, which runs its code: never pass one that a file of others names.
 
     Raises:
         UsageError: There is no such reader, or it does not derive from `Reader`.
     """
-    return choice if isinstance(choice, Reader) else _REGISTRY.find(choice)()
+    if isinstance(choice, Reader):
+        return choice
+    if not isinstance(choice, (str, type)):
+        raise UsageError(f"{choice!r} is no reader; give a name, module:Class, or a class or object derived from Reader")
+    if isinstance(choice, type) or ":" not in choice:
+        return READERS.find(choice)()
+    cls = READERS.load(choice)
+    cls.name = cls._declared_name  # a scene's format is named by its reader, not by the place of the code
+    return cls()
