@@ -34,7 +34,9 @@ def advanced(config: FitConfig, steps: int) -> Trainer:
     return fit
 
 
-def finished(views: list[View], points: PointCloud | None = None, steps: int = PRESETS["quick"].steps, **holdout) -> Trainer:
+def finished(
+    views: list[View], points: PointCloud | None = None, steps: int = PRESETS["quick"].steps, **holdout
+) -> Trainer:
     quick = dataclasses.replace(PRESETS["quick"], holdout=HoldoutConfig(**holdout))
     start = quick.init if points is None else dataclasses.replace(quick.init, source="points")
     fit = Trainer(

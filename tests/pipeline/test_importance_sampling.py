@@ -83,11 +83,7 @@ def test_coarse_layer_is_stable_and_fine_layer_grows():
     fit = fitted(steps=8)
     before = fit.gaussians.means.clone()
     coarse = int((~fit.strategy.fine).sum())
-    assert (
-        len(fit.strategy.events) == 1
-        and fit.strategy.events[0]["step"] == 8
-        and fit.strategy.events[0]["added"] == int(fit.strategy.fine.sum()) > 0
-    )
+    assert len(fit.strategy.events) == 1 and fit.strategy.events[0]["step"] == 8 and fit.strategy.events[0]["added"] == int(fit.strategy.fine.sum()) > 0
     fit.advance()
     moved = (fit.gaussians.means - before).abs().amax(1)
     lr = fit.lrs(8 / 39)["means"]

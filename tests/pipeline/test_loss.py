@@ -113,9 +113,7 @@ def test_depth_term_hides_no_nan():
 def test_depth_term_reaches_the_gaussians():
     """The whole way from means to the term, in float64, against central differences along a random direction."""
     view, prior = photos(1)[0], priors(photos(1))[0]
-    fit = Trainer(
-        [view], seeds(), dataclasses.replace(GUIDED, init=InitConfig(source="points", opacity=0.9)), CPU, priors=[prior]
-    )
+    fit = Trainer([view], seeds(), dataclasses.replace(GUIDED, init=InitConfig(source="points", opacity=0.9)), CPU, priors=[prior])
     tensors = {n: t.double() for n, t in fit.gaussians.tensors().items()}
     disparity = torch.as_tensor(prior.disparity, dtype=torch.float64)
 
