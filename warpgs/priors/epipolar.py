@@ -74,7 +74,8 @@ def nearest_views(views: Sequence[View], index: int, count: int) -> list[int]:
     return [int(j) for j in np.argsort(distances, kind="stable") if j != index][:count]
 
 
-def _homogeneous(pixels: np.ndarray) -> np.ndarray:
+def homogeneous(pixels: np.ndarray) -> np.ndarray:
+    """Return pixels [N, 2] as homogeneous coordinates (x, y, 1), shape [N, 3]."""
     return np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
 
 
@@ -110,17 +111,17 @@ def epipolar_depth(
         Without a baseline nothing is valid.
     """
     F, R_st, tau = fundamental(first, second)
-    rays = _homogeneous(pixels) @ np.linalg.inv(first.K).T
-    lines = _homogeneous(pixels) @ F.T
+    rays = homogeneous(pixels) @ np.linalg.inv(first.K).T
+    lines = homogeneous(pixels) @ F.T
     to_first = np.linalg.inv(second.K).T @ R_st
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         lines /= np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
         signed = (lines[:, :2] * matches).sum(1) + lines[:, 2]
         feet = matches - signed[:, None] * lines[:, :2]
-        depth, along, sine = _triangulate(rays, _homogeneous(feet) @ to_first, tau)
+        depth, along, sine = _triangulate(rays, homogeneous(feet) @ to_first, tau)
         direction = np.stack([-lines[:, 1], lines[:, 0]], 1)
-        ahead, ahead_along, _ = _triangulate(rays, _homogeneous(feet + STEP * direction) @ to_first, tau)
-        behind, behind_along, _ = _triangulate(rays, _homogeneous(feet - STEP * direction) @ to_first, tau)
+        ahead, ahead_along, _ = _triangulate(rays, homogeneous(feet + STEP * direction) @ to_first, tau)
+        behind, behind_along, _ = _triangulate(rays, homogeneous(feet - STEP * direction) @ to_first, tau)
         sensitivity = np.abs(ahead - behind) / (2 * STEP)
         inside = (feet >= 0).all(1) & (feet[:, 0] < second.width) & (feet[:, 1] < second.height)
         valid = (depth > 0) & (along > 0) & (sine > np.sin(np.radians(min_parallax))) & inside & np.isfinite(depth)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError, UsageError
-from warpgs.priors.epipolar import FlowBetween, fundamental
+from warpgs.priors.epipolar import FlowBetween, fundamental, homogeneous
 from warpgs.scene import View
 
 KINDS = ("dis", "deepflow", "sparse")
@@ -165,7 +165,7 @@ def _sparse(views: Sequence[View]) -> FlowBetween:
         a, b = a[ids[:, 0]], b[ids[:, 1]]
         F = fundamental(views[i].camera, views[j].camera)[0]
         # OpenCV's pixel centres are at whole numbers
-        lines = np.concatenate([a + 0.5, np.ones((len(a), 1))], 1) @ F.T
+        lines = homogeneous(a + 0.5) @ F.T
         with np.errstate(divide="ignore", invalid="ignore"):
             off = np.abs((lines[:, :2] * (b + 0.5)).sum(1) + lines[:, 2]) / np.linalg.norm(lines[:, :2], axis=1)
         a, b = a[off < LINE_DISTANCE], b[off < LINE_DISTANCE]

@@ -15,7 +15,7 @@ import torch
 
 from warpgs.kernels.tiles import installed_bytes
 from warpgs.priors import sweep_cpu, sweep_cuda
-from warpgs.priors.epipolar import nearest_views, pixel_grid
+from warpgs.priors.epipolar import homogeneous, nearest_views, pixel_grid
 from warpgs.priors.sweep_planes import SweepConfig, inside_image, plane_inverses, project_inverse
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.scene import Camera, View, ViewDepth
@@ -58,7 +58,7 @@ def consistent_depth(views: Sequence[View], inverses: Sequence[np.ndarray], inde
     view, own = views[index], inverses[index]
     camera, pixels, w = view.camera, pixel_grid(view.camera), own.ravel()
     sensitivity = np.full(len(pixels), np.inf)
-    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ np.linalg.inv(camera.K).T
+    rays = homogeneous(pixels) @ np.linalg.inv(camera.K).T
     world = (rays / w[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
     notes, own_direction = [], world - camera.center
     own_direction /= np.linalg.norm(own_direction, axis=1, keepdims=True)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpgs.errors import UsageError
+from warpgs.priors.epipolar import homogeneous
 from warpgs.scene import Camera, View
 
 NOISE = (2 / 255) ** 2
@@ -65,7 +66,7 @@ class SweepConfig:
 def project_inverse(first: Camera, second: Camera, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     """Return the positions [px] in the second image, shape [N, 2], of pixels [N, 2] at inverse depths [1/u] [N]; NaN behind."""
     relative = second.viewmat @ np.linalg.inv(first.viewmat)
-    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1) @ np.linalg.inv(first.K).T
+    rays = homogeneous(pixels) @ np.linalg.inv(first.K).T
     p = (rays @ relative[:3, :3].T + inverse[:, None] * relative[:3, 3]) @ second.K.T
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(p[:, 2:] > 1e-9, p[:, :2] / p[:, 2:], np.nan)
