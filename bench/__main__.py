@@ -24,7 +24,7 @@ from bench.series import SIZES
 from warpgs.errors import ResourceError
 from warpgs.runtime import interop
 
-OPS = ("project", "sh", "tiles", "blend", "ssim", "adam", "burst", "dropout", "knn", "scanlines", "render", "step")
+OPS = ("project", "tiles", "blend", "ssim", "adam", "burst", "dropout", "knn", "scanlines", "render", "step")
 FAILURES = (ResourceError, RuntimeError, MemoryError)
 """What running out of memory looks like, in our code, torch's and Warp's; one failure must not cost the other results."""
 

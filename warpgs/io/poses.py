@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from warpgs.errors import DataError
+from warpgs.geometry import rotation_matrices
 
 TOLERANCE = 1e-3
 """Largest entry of R R^T - 1 that is put down to rounding in the file."""
@@ -40,14 +41,7 @@ def quat_rotation(quat: tuple[float, ...], where: str) -> np.ndarray:
     norm = float(np.linalg.norm(q)) if (np.abs(q) < 1e100).all() else np.inf
     if not 1e-12 < norm < np.inf:
         raise DataError(f"{where}: the rotation quaternion {tuple(quat)} is zero or not finite; estimate the pose again")
-    w, x, y, z = q / norm
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return rotation_matrices(q / norm)
 
 
 def from_camera_to_world(matrix: np.ndarray, where: str, *, opengl: bool) -> np.ndarray:

@@ -1,1 +1,1 @@
-"""Torch and Warp side by side: interop, memory, CUDA graphs."""
+"""Interop of torch and Warp, memory, and CUDA graphs."""
