@@ -15,7 +15,7 @@ CODE = " ".join(
 
 
 def named_files(text: str) -> set[tuple[str, str]]:
-    """Return the paths in a text that end with .py, but for placeholders X.py, with the test behind ``::`` or an empty string."""
+    """Return the paths of a text that end with .py, each with the test behind ``::``; placeholders such as X.py left out."""
     found = re.findall(r"(?<![\w./-])((?:\w+/)+\w+\.py)(?:::(test_\w+))?", text)
     return {(name, test) for name, test in found if not name.endswith(("/X.py", "_X.py"))}
 

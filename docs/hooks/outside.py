@@ -1,4 +1,4 @@
-"""Pages of the site that lie outside of docs/: the README as the first page, two more documents, the charts of bench/results/."""
+"""Pages of the site from outside of docs/: the README as the first page, two more documents, charts of bench/results/."""
 
 from __future__ import annotations
 
