@@ -20,14 +20,14 @@ from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.folder import choose_device
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.trainer import Fit, train_views
+from warpgs.pipeline.train.trainer import Trainer, train_views
 
 REPEATS = 15
 STEPS_PER_BATCH = 100
 """Steps of a repeat on CUDA, where they are recorded; on a CPU a repeat is one step."""
 
 
-def step_ms(fit: Fit) -> float:
+def step_ms(fit: Trainer) -> float:
     """Time of a step: wall time on CUDA, CPU time elsewhere, which other programs disturb less."""
     clock, steps = (time.perf_counter, STEPS_PER_BATCH) if fit.device.type == "cuda" else (time.process_time, 1)
     began, done = clock(), 0
@@ -54,7 +54,7 @@ def main() -> None:
     for count in a.gaussians:
         init = InitConfig(source="random", random_count=count)
         config = FitConfig(steps=10**6, init=init, density=DensityConfig(start=10**6))
-        fits = {"as they came": Fit(views, None, config, device), "morton": Fit(views, None, config, device)}
+        fits = {"as they came": Trainer(views, None, config, device), "morton": Trainer(views, None, config, device)}
         fits["morton"].optimizer.sort_along_curve()
         for fit in fits.values():
             step_ms(fit), step_ms(fit)

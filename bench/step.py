@@ -22,10 +22,10 @@ from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.folder import choose_device
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LossConfig, photometric_loss
-from warpgs.pipeline.train.trainer import Fit, train_views
+from warpgs.pipeline.train.trainer import Trainer, train_views
 
 
-def stages(fit: Fit) -> dict[str, dict[str, float]]:
+def stages(fit: Trainer) -> dict[str, dict[str, float]]:
     """Time each stage on the first training view, with SH degree 3, and the whole step."""
     device, rule = fit.device, RULES[fit.config.rule]
     camera, target = fit.views[0].camera, fit.views[0].image
@@ -85,7 +85,7 @@ def main() -> None:
     scene = load_scene(a.scene, downscale=a.downscale)
     views = train_views(scene, split_views(scene, a.split).train)
     config = FitConfig(steps=100_000, init=InitConfig(source="random", random_count=a.gaussians))
-    fit = Fit(views, scene.points, config, device)
+    fit = Trainer(views, scene.points, config, device)
     for _ in range(a.warm_steps):
         fit.advance()
     table = stages(fit)
