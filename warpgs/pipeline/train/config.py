@@ -176,7 +176,7 @@ PRESETS: dict[str, FitConfig] = {
 }  # fmt: skip
 """paper: the method, with the constants of docs/decisions/008-method.md. quick: the same in a fifth of the steps; balanced: in
 two fifths, the first at half size (docs/trade.md). strong-3dgs: the start, degree, rates, dropout and schedule of ``paper``,
-none of its parts. 3dgs: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few. 
+none of its parts. 3dgs: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few.
 mcmc: Kheradmand et al. 2024, from the same points. nexusgs: Zheng et al.
 2025, a start from flow with every pixel, and its resets. dropgaussian: Park et al. 2025. fsgs: our trainer with
 the depth term, rates, threshold and resets of Zhu et al. 2024, without their unpooling and unseen views, from our own sweep.
