@@ -41,9 +41,9 @@ types: install
 	$(BIN)/mypy
 	$(if $(wildcard examples),$(BIN)/mypy examples)
 
-# The documents as a site in site/; a broken link or an unknown formula fails.
+# The documents as a site in site/; a broken link or an unknown formula fails. (With --quiet mkdocs counts no warnings.)
 docs: install
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # Run these before a change is called done: CONTRIBUTING.md says which one when.
 test-slow test-fault test-browser test-audit test-cuda: test-%: install

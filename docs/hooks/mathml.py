@@ -18,7 +18,7 @@ def simplified(tex: str) -> str:
     tex = re.sub(r"\\(begin|end)\{aligned\}", lambda m: r"\begin{array}{rl}" if m[1] == "begin" else r"\end{array}", tex)
     tex = re.sub(r"\\\\\[\d+pt\]", r"\\\\", tex)
     tex = re.sub(r"\\operatorname\{([^}]*)\}", lambda m: rf"\text{{{m[1].replace(chr(92) + ',', '')}}}", tex)
-    return re.sub(r"\\texttt\{([^}]*)\}", lambda m: m[0].replace(r"\_", "_"), tex)
+    return re.sub(r"\\text(?:tt)?\{([^}]*)\}", lambda m: m[0].replace(r"\_", "_"), tex)
 
 
 def on_page_content(content: str, page, **_) -> str:

@@ -24,6 +24,8 @@ def on_files(files, config, **_):
 
 
 def on_page_markdown(markdown: str, page, **_) -> str:
-    """Point the links to charts at their copies in the site."""
+    """Point the links to charts and to the pages of the root at their copies in the site."""
     up = "../" * page.file.src_uri.count("/")
+    for source, target in PAGES.items():
+        markdown = markdown.replace(f"]({up}../{source}", f"]({up}{target}")
     return CHARTS.sub(lambda match: f"]({up}{match[1]}", markdown)
