@@ -128,7 +128,11 @@ def check(scene: Scene) -> float:
 
 
 def main(arguments: list[str] | None = None) -> float:
-    """Write, read and check a scene; return the PSNR [dB] of `check`."""
+    """Write, read and check a scene; return the PSNR [dB] of `check`.
+
+    Raises:
+        SystemExit: The poses that were read do not fit the images.
+    """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, help="folder to keep the scene in; without it a temporary one is used")
     out = parser.parse_args(arguments).out

@@ -14,22 +14,27 @@ import numpy as np
 
 from warpgs.errors import ResourceError
 from warpgs.files import write_bytes
+from warpgs.runtime.folders import cache_home, private_folder
 
 CODE = 1
 """Version of the code between image and maps; it counts up whenever the same inputs give other maps."""
 
 
 def cache_folder() -> Path:
-    """Return the folder for files that can be made again: WARPGS_CACHE, or the system's place for caches."""
+    """Return where warpgs may keep what it can make again: WARPGS_CACHE, or the place that the system has for such files.
+
+    Where the user has no home folder it is a private folder of this process, and a line on stderr says so.
+
+    Raises:
+        ResourceError: There is no home folder, and no folder for temporary files either.
+    """
     if own := os.environ.get("WARPGS_CACHE"):
         return Path(own)
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local") / "warpgs" / "Cache"
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "warpgs"
-    # the XDG rules ask to pass over a relative path
-    base = Path(os.environ.get("XDG_CACHE_HOME") or "")
-    return (base if base.is_absolute() else Path.home() / ".cache") / "warpgs"
+    home = cache_home()
+    if home is None:
+        print("warpgs: there is no home folder, so maps are kept for this run alone; WARPGS_CACHE names one", file=sys.stderr)
+        return private_folder() / "maps"
+    return home / "warpgs" / "Cache" if sys.platform == "win32" else home / "warpgs"
 
 
 @dataclass

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +11,7 @@ import numpy as np
 
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.priors.onnx_file import check_onnx
+from warpgs.runtime.processor import usable_cores
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -85,8 +85,7 @@ def _start(data: bytes, path: Path, provider: str, threads: int) -> InferenceSes
             f"--onnx-provider {provider}: this onnxruntime {ort.__version__} has only {', '.join(there)}. {remedy}"
         )
     options = ort.SessionOptions()
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    options.intra_op_num_threads = threads or usable
+    options.intra_op_num_threads = threads or usable_cores()
     options.inter_op_num_threads = 1
     options.log_severity_level = ERRORS_ONLY
     options.use_deterministic_compute = True

@@ -14,11 +14,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from warpgs.kernels.tiles import installed_bytes
 from warpgs.priors import sweep_cpu, sweep_cuda
 from warpgs.priors.epipolar import homogeneous, nearest_views, pixel_grid
 from warpgs.priors.sweep_planes import SweepConfig, inside_image, plane_inverses, project_inverse
 from warpgs.runtime.byte_units import format_bytes
+from warpgs.runtime.device_memory import installed_bytes
 from warpgs.scene import View, ViewDepth
 
 CPU = torch.device("cpu")

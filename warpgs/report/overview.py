@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
+from warpgs.runtime.subprocesses import run_python
 from warpgs.scene import Camera
 
 REMEDY = "install a software renderer: on Debian or Ubuntu `apt-get install libegl1 libgl1 libgl1-mesa-dri libxrender1`"
@@ -24,16 +23,8 @@ PROBE = (
 
 def _python(code: str, *arguments: str) -> tuple[bool, str]:
     """Run Python code in a process of its own, since VTK ends the process where it cannot render; return success and reason."""
-    environment = {**os.environ, "VTK_DEFAULT_OPENGL_WINDOW": "vtkEGLRenderWindow"}
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", code, *arguments],
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=TIMEOUT,
-            check=False,
-        )
+        done = run_python(code, *arguments, timeout=TIMEOUT, environment={"VTK_DEFAULT_OPENGL_WINDOW": "vtkEGLRenderWindow"})
     except subprocess.TimeoutExpired:
         return False, f"pyvista did not finish within {TIMEOUT} s"
     if done.returncode == 0:
@@ -130,7 +121,7 @@ def render_overview(
     core = points[((points >= low) & (points <= high)).all(1)]
     view = _framing(np.concatenate([core, *(f.reshape(-1, 3) for f in frusta.values())]), direction, up)
     with tempfile.TemporaryDirectory() as folder:
-        source, target = Path(folder) / "scene.npz", Path(folder) / "overview.png"
+        source, target = (Path(folder).resolve() / name for name in ("scene.npz", "overview.png"))
         np.savez(
             source, points=points[inside].astype(np.float32),
             colors=np.round(255 * np.clip(colors[inside], 0, 1)).astype(np.uint8), view=view, **frusta,
