@@ -127,11 +127,15 @@ def check(scene: Scene) -> float:
     return worst
 
 
-def main() -> None:
-    """Write, read and check a scene."""
+def main(arguments: list[str] | None = None) -> float:
+    """Write, read and check a scene; return the PSNR [dB] of `check`.
+
+    Raises:
+        SystemExit: The poses that were read do not fit the images.
+    """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, help="folder to keep the scene in; without it a temporary one is used")
-    out = parser.parse_args().out
+    out = parser.parse_args(arguments).out
     with tempfile.TemporaryDirectory() as temporary:
         folder = out or Path(temporary)
         write_shots(folder)
@@ -140,6 +144,7 @@ def main() -> None:
     if psnr < 50:
         raise SystemExit(f"the poses that were read do not fit the images: {psnr:.1f} dB; at least 50 dB are expected")
     print(f"{scene.format}: {len(scene.views)} views read; rendered again, they equal their images to {psnr:.1f} dB")
+    return psnr
 
 
 if __name__ == "__main__":
