@@ -1,7 +1,14 @@
-# Everything a fresh machine needs: Python 3.11 to 3.13, and `make demo` or `make test`.
-PYTHON ?= python3
+# Everything a fresh machine needs: Python 3.11 to 3.13, and `make demo` or `make test`. On Windows call it from Git's bash.
 VENV := .venv
+ifeq ($(OS),Windows_NT)
+PYTHON ?= python
+BIN := $(VENV)/Scripts
+else
+PYTHON ?= python3
 BIN := $(VENV)/bin
+endif
+# files and pipes are UTF-8 on Windows too
+export PYTHONUTF8 := 1
 OUT ?= runs/demo
 
 .PHONY: demo install lint types docs test test-slow test-fault test-browser test-audit test-cuda clean
@@ -20,7 +27,7 @@ demo: install
 	rm -rf $(OUT)
 	mkdir -p $(OUT)
 	$(BIN)/warpgs demo $(OUT)/scene | tee $(OUT)/next.txt
-	$(BIN)/warpgs fit $(OUT)/scene --split "$$($(BIN)/python -c 'from warpgs.synthetic.demo import split_spec; print(split_spec(24))')" --out $(OUT)/run
+	$(BIN)/warpgs fit $(OUT)/scene --split "$$($(BIN)/python -c 'from warpgs.synthetic.demo import split_spec; print(split_spec(24), end="")')" --out $(OUT)/run
 	@echo "images: $(OUT)/run/renders    report: $(OUT)/run/report.html"
 
 # Everything that must pass before a change is offered. PYTEST are the words of one pytest run.
