@@ -119,10 +119,10 @@ def check(scene: Scene) -> float:
     shapes, light, worst = still_life(), raycast.Light(), math.inf
     n = scene.normalization
     for view in scene.views:
-        viewmat = view.camera.viewmat.copy()
+        viewmat = np.array(view.camera.viewmat)
         # back from scene units to those of the file
         viewmat[:3, 3] = viewmat[:3, 3] / n.scale - viewmat[:3, :3] @ n.offset
-        rgb = raycast.render(shapes, light, view.camera.K, viewmat, view.camera.width, view.camera.height)
+        rgb = raycast.render(shapes, light, np.asarray(view.camera.K), viewmat, view.camera.width, view.camera.height)
         worst = min(worst, -10 * math.log10(float(np.mean((rgb - view.image) ** 2))))
     return worst
 
