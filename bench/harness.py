@@ -1,4 +1,4 @@
-"""How things are timed here: warm-up, then repeats that go round all programs, median and quartiles, one row per task.
+"""Timing: warm-up, then repeats that go round all programs, median and quartiles, one row per task.
 
 Programs that are compared run in turn, one repeat each, so that whatever else the machine does meets all of them alike;
 only programs far slower than the others run after them.

@@ -1,13 +1,13 @@
-"""What storing a triangular factor is worth: errors of needles in its form and in that of an inverse covariance ("conic").
+"""Errors of needles in the form of a triangular factor, in that of an inverse covariance ("conic") and in textbook form.
 
 usage: python -m bench.needles [--device cuda] [--out bench/results/needles_cpu.json]
 
 Needles of one length lie in the middle of a picture at many angles, tilted out of the image plane, their other axes at the
-pixel filter. Truth is the float64 twin of the same float32 parameters. Three programs in float32:
+pixel filter. Truth is the float64 reference of the same float32 parameters. Three programs in float32:
 
 * factor: the kernels.
 * conic: the kernels' own factor multiplied out to an inverse covariance, so that nothing but the form differs.
-* plain: the whole projection as textbooks have it, with determinant a c - b^2 (tests/reference/twins.py, P32).
+* plain: the whole projection as textbooks have it, with determinant a c - b^2 (tests/reference/low_precision.py, P32).
 
 Errors: of the weight exp(-power / 2) at places along the needle up to two standard deviations; of alpha in a picture; and of
 the gradient of the projected mean, relative, for a random gradient of that picture (there is no conic kernel to ask).
@@ -22,14 +22,14 @@ from pathlib import Path
 
 import torch
 
-from bench.machine import describe
+from bench import result_file
 from tests.reference.low_precision import Frame, Inputs, ProjectedGaussians, layers, pixel_centers, projected_of
 from warpgs.constants import RULES
-from warpgs.files import write_json
 from warpgs.kernels.project import project
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
 
+WHAT = "errors of needles in the form of a triangular factor and in that of an inverse covariance"
 LENGTHS = (1, 3, 10, 30, 100, 300, 1000, 3000, 10000)
 """Standard deviations of the long axis [px]."""
 SIDE = 256
@@ -171,7 +171,7 @@ def measure(device: torch.device, lengths=LENGTHS) -> list[dict]:
     rows = []
     for length in lengths:
         image, gradient = image_errors(length, device)
-        rows.append({"sigma": length, "weight": weight_errors(length, device), "picture": image, "gradient": gradient})
+        rows.append({"sigma": length, "weight": weight_errors(length, device), "image": image, "gradient": gradient})
     return rows
 
 
@@ -185,9 +185,8 @@ def main() -> None:
     rows = measure(device)
     for row in rows:
         print(row["sigma"], *(f"{what} " + " ".join(f"{n} {e['max']:.1e}" for n, e in row[what].items())
-                              for what in ("weight", "picture", "gradient")), sep=" | ")  # fmt: skip
-    if a.out:
-        write_json(a.out, {"machine": describe(device), "needles": ANGLES, "pictures": IMAGES, "side": SIDE, "rows": rows})
+                              for what in ("weight", "image", "gradient")), sep=" | ")  # fmt: skip
+    result_file.write(a.out, result_file.result(WHAT, device, rows, needles=ANGLES, images=IMAGES, side=SIDE))
 
 
 if __name__ == "__main__":

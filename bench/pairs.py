@@ -1,4 +1,4 @@
-"""How many (Gaussian, pixel) pairs a picture is made of: the work that no way of blending can avoid."""
+"""Number of (Gaussian, pixel) pairs of an image: the work that no way of blending can avoid."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the ops are measured: a base point, one axis varied at a time, and the diagonal along which all grows together."""
+"""Sizes at which ops are measured: a base point, one axis varied at a time, and the diagonal along which all grows together."""
 
 from __future__ import annotations
 

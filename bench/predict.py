@@ -1,4 +1,4 @@
-"""What a measurement will take, foretold from smaller ones, so that hopeless ones are left out and said to be."""
+"""Prediction of time and memory from smaller measurements, so that hopeless ones are left out and listed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a stage must move and compute, and what the machine could move and compute at best.
+"""Bytes and operations that a stage needs at least, and what the machine could move and compute at best.
 
 How bytes are counted: every input read once and every output written once, in float32, as if caches were perfect; what a
 stage stores for its backward pass counts, scratch memory does not. Two exceptions, because no known method does without:
@@ -203,7 +203,7 @@ def ceilings(device: torch.device, tiny: bool = False) -> dict:
 
 
 def against_roof(cost: Cost, seconds: float, roof: dict) -> dict:
-    """The least time the two ceilings allow [ms], which of them binds, and the share of it that was reached."""
+    """The least time the two ceilings allow [ms], which of them binds, and the fraction of it that was reached."""
     memory, compute = cost.bytes / roof["bytes_per_s"], cost.operations / roof["operations_per_s"]
     least = max(memory, compute)
     return {
@@ -211,5 +211,5 @@ def against_roof(cost: Cost, seconds: float, roof: dict) -> dict:
         "operations": round(cost.operations),
         "roof_ms": float(f"{1000 * least:.4g}"),
         "bound": "bytes" if memory >= compute else "operations",
-        "share": float(f"{least / seconds:.4g}"),
+        "fraction": float(f"{least / seconds:.4g}"),
     }

@@ -8,8 +8,8 @@ from xml.etree import ElementTree
 import pytest
 import torch
 
-from bench import document, harness, inputs, peers, predict
-from bench.__main__ import OPS, Bench, run
+from bench import document, harness, inputs, peers, predict, result_file
+from bench.ops import OPS, Bench, run
 from bench.plot import spread
 from bench.points import Point, growth, points
 from bench.series import exponent
@@ -36,7 +36,7 @@ def result():
 
 
 def test_every_op_gives_rows(result):
-    """A positive time for each op and direction, sizes, and a share of the roof for our own."""
+    """A positive time for each op and direction, sizes, and a fraction of the roof for our own."""
     rows = result["rows"]
     assert not result["skipped"]
     assert {r["op"] for r in rows} == set(OPS)
@@ -44,7 +44,7 @@ def test_every_op_gives_rows(result):
     backward = {r["op"] for r in rows if r["direction"] in ("backward", "both")}
     assert backward == {"project", "sh", "blend", "ssim", "render"}
     ours = [r for r in rows if r["program"] == "warpgs" and not r.get("threads")]
-    assert all(r["share"] > 0 and r["bytes"] > 0 and r["roof_ms"] > 0 for r in ours)
+    assert all(r["fraction"] > 0 and r["bytes"] > 0 and r["roof_ms"] > 0 for r in ours)
     assert result["roofline"]["bytes_per_s"] > 0 and result["roofline"]["operations_per_s"] > 0
     assert {r["program"] for r in rows} >= {"warpgs", peers.TORCH_SSIM, peers.DENSE}
 
@@ -174,7 +174,7 @@ def hand_made(device: str) -> dict:
     size = {"width": 504, "height": 378}
     cuda = {"gpu_ms": 0.5, "peak_bytes": 2**20} if device == "cuda" else {}
     common = {"quartiles_ms": [0.5, 2.0], "repeats": 30, **cuda}
-    roof = {"bytes": 1e6, "operations": 1e6, "roof_ms": 0.25, "bound": "bytes", "share": 0.25}
+    roof = {"bytes": 1e6, "operations": 1e6, "roof_ms": 0.25, "bound": "bytes", "fraction": 0.25}
     rows = [
         {"op": "render", "program": program, "direction": "both", "N": n, **size, "median_ms": n / scale, **common}
         | (roof if program == "warpgs" else {})
@@ -185,8 +185,11 @@ def hand_made(device: str) -> dict:
              | common | roof for d in ("forward", "backward") for k in (40, 80, 120)]  # fmt: skip
     skipped = [{"op": "render", "program": "gsplat", "direction": "both", "N": 10**6, **size, "reason": "predicted 9 s"}]
     return {
-        "device": device, "name": "Device <A & B>", "processor": "P", "cores": 2, "threads": 2, "memory_gib": 8.0,
-        "device_memory_gib": 9.0, "versions": {"torch": "2"}, "commit": "abc", "date": "2026-01-02", "repeats": 30,
+        "what": "w", "command": "c", "commit": "abc", "date": "2026-01-02", "versions": {"torch": "2"}, "repeats": 30,
+        "machine": {
+            "device": device, "name": "Device <A & B>", "processor": "P", "cores": 2, "threads": 2, "memory_gib": 8.0,
+            "device_memory_gib": 9.0,
+        },
         "note": "Words about it.", "absent": {"naive": "not there"}, "rows": rows, "skipped": skipped,
         "roofline": {"bytes_per_s": 1e10, "operations_per_s": 1e11, "how": "measured"},
     }  # fmt: skip
@@ -220,7 +223,7 @@ def test_labels_keep_their_distance():
 def test_the_document_is_that_of_the_committed_results():
     """docs/performance.md and its charts are what `python -m bench.document` writes, and nothing else lies there."""
     files = document.generate(document.committed())
-    docs = document.ROOT / "docs"
+    docs = result_file.ROOT / "docs"
     for path, text in files.items():
         assert (docs / path).read_text("utf-8") == text, f"{path} is stale: run python -m bench.document"
     assert {f"plots/{p.name}" for p in (docs / "plots").glob("*.svg")} == set(files) - {"performance.md"}

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from bench import bucket
-from bench.kernels.bucket import SIZES, make_backward
+from bench.experiments import bucket
+from bench.experiments.bucket_kernel import SIZES, make_backward
 from tests.gaussians import camera, cloud
 from warpgs.constants import RULES
 

@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from bench import complexity
+from bench.experiments import complexity
 from warpgs.synthetic.demo import split_spec, write_demo
 
 
@@ -39,4 +39,4 @@ def test_study_tables_and_curve(tmp_path, monkeypatch, capsys):
 def test_what_fails_is_one_line(tmp_path, capsys):
     """A folder that is no run: the exit code of its kind, and what is wrong."""
     assert complexity.main([str(tmp_path / "none"), "--from-runs", "--out", str(tmp_path / "out"), "--device", "cpu"]) == 3
-    assert "bench.complexity:" in capsys.readouterr().err
+    assert "bench.experiments.complexity:" in capsys.readouterr().err

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from bench.depth_order import depth_order, main
+from bench.experiments.depth_order import depth_order, main
 from warpgs.app.cli import main as warpgs
 from warpgs.io.load import load_scene
 from warpgs.scene import Camera

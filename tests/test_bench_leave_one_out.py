@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from bench.leave_one_out import folds, table, trial_config
-from bench.tradeoff_outcome import fit_once
+from bench.experiments.leave_one_out import folds, table, trial_config
+from bench.experiments.tradeoff_outcome import fit_once
 from warpgs.errors import UsageError
 from warpgs.pipeline.runs.folder import SceneRequest, read_scene
 from warpgs.pipeline.train.config import PRESETS

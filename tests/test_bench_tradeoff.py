@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench import pareto, tradeoff, tradeoff_kernel, tradeoff_outcome
-from bench.frozen import scenes
-from bench.settings import UNCUT, Setting, settings
+from bench.experiments import pareto, tradeoff, tradeoff_kernel, tradeoff_outcome
+from bench.experiments.frozen import scenes
+from bench.experiments.settings import UNCUT, Setting, settings
 from tests.gaussians import camera, cloud
 from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference

@@ -1,6 +1,6 @@
-"""Blending's backward pass by buckets, a lane per Gaussian, against the product's by chunks: same inputs, same outputs.
+"""Backward pass of blending by buckets, a lane per Gaussian, against the product's by chunks: same inputs, same outputs.
 
-usage: python -m bench.bucket GARDEN.npz [--out FILE.json] [--only NAME] [--depth] [--repeats 30]
+usage: python -m bench.experiments.bucket GARDEN.npz [--out FILE.json] [--only NAME] [--depth] [--repeats 30]
 Needs a CUDA device; GARDEN.npz as for bench.garden. For each size all gradients are compared first. Then the kernels are timed,
 one launch each in turn, between events, and with them the forward kernel that leaves states for either. The last lines are
 a table; the exit code is 1 if gradients disagree.
@@ -9,7 +9,6 @@ a table; the exit code is 1 if gradients disagree.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +17,10 @@ from unittest import mock
 import torch
 import warp as wp
 
+from bench import result_file
 from bench.against_gsplat import CONFIGURATIONS, first_camera, quartiles
+from bench.experiments.bucket_kernel import SIZES, VALUES, make_backward
 from bench.garden import garden_inputs
-from bench.kernels.bucket import SIZES, VALUES, make_backward
 from warpgs.constants import RULES, Rule
 from warpgs.kernels import blend_cuda
 from warpgs.kernels.project import project
@@ -28,6 +28,7 @@ from warpgs.kernels.tiles import Tiles, bin_tiles
 from warpgs.runtime import interop
 from warpgs.scene import Camera, Gaussians
 
+WHAT = "the backward pass of blending by buckets against the one in use: gradients and time"
 NAMES = ("112k at 504x378", "2.8M at 1920x1080", "2.8M at 3840x2160")
 REPEATS, WARM_UP = 30, 5
 TOLERANCE = 1e-5
@@ -219,14 +220,7 @@ def main() -> None:
         rows.append({"configuration": name, "depth": a.depth} | measure(case, a.repeats))
         del case, gaussians
         torch.cuda.empty_cache()
-        if a.out:  # after each size: nothing is lost if the next one fails
-            result = {
-                "device": torch.cuda.get_device_name(),
-                "torch": torch.__version__,
-                "warp": wp.config.version,
-                "rows": rows,
-            }
-            a.out.write_text(json.dumps(result, indent=1) + "\n")
+        result_file.write(a.out, result_file.result(WHAT, torch.device("cuda"), rows))  # nothing is lost if the next size fails
         print(f"{name} done", flush=True)
     print(table(rows))
     if not all(agrees(row) for row in rows):

@@ -1,38 +1,36 @@
 """Time of a training step with Gaussians in the order in which they came, and along a Morton curve, in turns.
 
-usage: python -m bench.order SCENE [--split llff:3] [--gaussians 20000 300000] [--device auto] [--threads 1] [--out FILE.json]
+usage: python -m bench.experiments.order SCENE [--split llff:3] [--gaussians 20000 300000] [--device auto]
+           [--threads 1] [--out FILE.json]
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import time
 from pathlib import Path
 
 import torch
 
-from bench.machine import describe
+from bench import result_file
+from bench.training import Trainer, make_trainer, sort_along_curve, take_steps, without_density
 from warpgs import load_scene
 from warpgs.io.splits import split_views
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.folder import choose_device
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.trainer import Fit, train_views
 
 REPEATS = 15
 STEPS_PER_BATCH = 100
 """Steps of a repeat on CUDA, where they are recorded; on a CPU a repeat is one step."""
 
 
-def step_ms(fit: Fit) -> float:
-    """Time of a step: wall time on CUDA, CPU time elsewhere, which other programs disturb less."""
-    clock, steps = (time.perf_counter, STEPS_PER_BATCH) if fit.device.type == "cuda" else (time.process_time, 1)
-    began, done = clock(), 0
-    while done < steps:
-        done += len(fit.buffers(steps - done))
+def step_ms(trainer: Trainer) -> float:
+    """Return the time of a step: wall time on CUDA, CPU time elsewhere, which other programs disturb less."""
+    clock, steps = (time.perf_counter, STEPS_PER_BATCH) if trainer.device.type == "cuda" else (time.process_time, 1)
+    began = clock()
+    done = take_steps(trainer, steps)
     return 1e3 * (clock() - began) / done
 
 
@@ -49,13 +47,13 @@ def main() -> None:
     torch.set_num_threads(a.threads)
     device, where = choose_device(a.device)
     scene = load_scene(a.scene)
-    views = train_views(scene, split_views(scene, a.split).train)
+    views = [scene.view(name) for name in split_views(scene, a.split).train]
     rows = []
     for count in a.gaussians:
         init = InitConfig(source="random", random_count=count)
-        config = FitConfig(steps=10**6, init=init, density=DensityConfig(start=10**6))
-        fits = {"as they came": Fit(views, None, config, device), "morton": Fit(views, None, config, device)}
-        fits["morton"].optimizer.sort_along_curve()
+        config = without_density(FitConfig(steps=10**6, init=init))
+        fits = {name: make_trainer(views, None, config, device) for name in ("as they came", "morton")}
+        sort_along_curve(fits["morton"])
         for fit in fits.values():
             step_ms(fit), step_ms(fit)
         times = {name: [] for name in fits}
@@ -65,9 +63,9 @@ def main() -> None:
         row = {"gaussians": count} | {f"{n} [ms]": round(statistics.median(t), 3) for n, t in times.items()}
         rows.append(row)
         print(where, row, flush=True)
-    if a.out:
-        record = {"scene": Path(a.scene).name, "split": a.split, "threads": a.threads, "repeats": REPEATS, "rows": rows}
-        a.out.write_text(json.dumps({"machine": describe(device), **record}, indent=1) + "\n")
+    facts = {"scene": Path(a.scene).name, "split": a.split, "threads": a.threads, "repeats": REPEATS}
+    what = "time of a training step with Gaussians as they came and along a Morton curve"
+    result_file.write(a.out, result_file.result(what, device, rows, **facts))
 
 
 if __name__ == "__main__":

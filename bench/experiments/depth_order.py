@@ -1,6 +1,6 @@
-"""Whether a run puts near and far in the right order: rendered depth of held-out views against a reconstruction's points.
+"""Order of near and far in a run: rendered depth of held-out views against a reconstruction's points.
 
-    python -m bench.depth_order RUN SCENE
+    python -m bench.experiments.depth_order RUN SCENE
 
 SCENE is a COLMAP folder of the same photographs, usually the one that was fitted. For each held-out view of the run the points
 that the reconstruction saw in it are looked up in the rendering, and Spearman's rank correlation of the two depths is printed:
@@ -100,7 +100,9 @@ def _of_view(name: str, gaussians: Gaussians, camera: Camera, source, record: di
 
 def main(arguments: list[str] | None = None) -> int:
     """Print a line per held-out view and the mean; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m bench.depth_order", description=__doc__.split("\n\n", maxsplit=1)[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m bench.experiments.depth_order", description=__doc__.split("\n\n", maxsplit=1)[0]
+    )
     parser.add_argument("run", type=Path, help="run folder of `warpgs fit`")
     parser.add_argument("scene", type=Path, help="COLMAP folder of the same photographs")
     parser.add_argument("--device", default="cpu", help="where to render")

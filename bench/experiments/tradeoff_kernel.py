@@ -1,4 +1,4 @@
-"""Time of a picture and its gradients against their error to float64 without cut-offs, for every knob, on frozen scenes."""
+"""Time of a render and its gradients against their error to float64 without cut-offs, for every knob, on frozen scenes."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from collections.abc import Callable
 
 import torch
 
-from bench.frozen import Frozen
+from bench.experiments.frozen import Frozen
+from bench.experiments.settings import UNCUT, Setting, settings
 from bench.harness import measure_in_turn, recorded
-from bench.settings import UNCUT, Setting, settings
 from warpgs.kernels.project import project
 from warpgs.runtime.interop import set_threads
 from warpgs.scene import Camera, Gaussians
@@ -194,8 +194,9 @@ def measured(makers, done: dict, repeats: int, echo, save) -> dict:
         rows = measure_scene(scene, repeats)
         done["scenes"][scene.name] = {
             "what": scene.what, "gaussians": len(scene.gaussians), "width": scene.camera.width, "height": scene.camera.height,
-            "sorting": sorting_share(scene, repeats), "seconds": round(time.perf_counter() - began, 1), "rows": rows,
+            "sorting": sorting_share(scene, repeats), "seconds": round(time.perf_counter() - began, 1),
         }  # fmt: skip
+        done["rows"] += rows
         save(done)
         for r in rows:
             times = f"{r['forward_ms']:8.2f} + {r['backward_ms']:8.2f} ms" if "both_ms" in r else "      simulated        "

@@ -1,4 +1,4 @@
-"""The settings of the rasterizer that speed and accuracy are weighed for, and how each draws."""
+"""The settings of the rasterizer that speed and accuracy are weighed for, and the renderer of each."""
 
 from __future__ import annotations
 

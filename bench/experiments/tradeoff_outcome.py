@@ -9,12 +9,11 @@ from dataclasses import dataclass
 
 import torch
 
+from bench.training import finish, make_trainer, model_bytes, with_cap
 from warpgs.io.splits import split_views
 from warpgs.pipeline.metrics.evaluate import render_view, score
 from warpgs.pipeline.runs.results import options_for
 from warpgs.pipeline.train.config import PRESETS, FitConfig
-from warpgs.pipeline.train.strategies.holdout import complexity_figures, fit_class
-from warpgs.pipeline.train.trainer import run, train_views
 from warpgs.scene import Scene
 
 
@@ -39,10 +38,7 @@ def trials() -> list[Trial]:
     made += [turned(f"{n} steps", "iterations", steps=n) for n in (300, 1200)]
     made += [turned(f"rule {r}", "rule", rule=r) for r in ("balanced", "fast")]
     made += [turned(f"half size {s:g}", "resolution schedule", half_resolution=s) for s in (0.3, 0.6)]
-    made += [
-        turned(f"{n} Gaussians", "Gaussian budget", density=dataclasses.replace(base.density, max_gaussians=n))
-        for n in (3000, 5000)
-    ]
+    made += [Trial(f"{n} Gaussians", "Gaussian budget", with_cap(base, n)) for n in (3000, 5000)]
     made += [turned("degree 0", "SH degree", init=dataclasses.replace(base.init, max_sh_degree=0))]
     pairs = ((1200, "balanced", 0.3), (1200, "fast", 0.6))
     made += [turned(f"{n} steps, {r}, half {h:g}", "pairs", steps=n, rule=r, half_resolution=h) for n, r, h in pairs]
@@ -52,19 +48,17 @@ def trials() -> list[Trial]:
 def fit_once(scene: Scene, split: str, config: FitConfig, device: torch.device) -> dict:
     """Wall and processor time of one fit [s], without reading, scoring and reporting, and its mean scores."""
     chosen = split_views(scene, split)
-    train, test = train_views(scene, chosen.train), train_views(scene, chosen.test)
+    train, test = ([scene.view(name) for name in names] for names in (chosen.train, chosen.test))
     wall, cpu = time.perf_counter(), time.process_time()
-    fit = fit_class(config)(train, scene.points, config, device, scene.background)
+    trainer = make_trainer(train, scene.points, config, device, scene.background)
     setup, setup_cpu = time.perf_counter() - wall, time.process_time() - cpu
-    run(fit, lambda _: None, lambda _: None, lambda: False)
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
+    finish(trainer)
     row = {
         "seconds": time.perf_counter() - wall, "setup": setup, "cpu_seconds": time.process_time() - cpu, "setup_cpu": setup_cpu,
-        "gaussians": len(fit.gaussians), "bytes": complexity_figures(fit)["complexity"]["bytes"], "steps": config.steps,
+        "gaussians": len(trainer.gaussians), "bytes": model_bytes(trainer), "steps": config.steps,
     }  # fmt: skip
-    options = options_for(config.rule, scene.background, fit.gaussians)
-    scores = [score(v, render_view(fit.gaussians, v, options)[0]) for v in test]
+    options = options_for(config.rule, scene.background, trainer.gaussians)
+    scores = [score(v, render_view(trainer.gaussians, v, options)[0]) for v in test]
     return row | {"psnr": statistics.mean(s.psnr for s in scores), "ssim": statistics.mean(s.ssim for s in scores)}
 
 

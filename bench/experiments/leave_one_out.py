@@ -1,7 +1,7 @@
 """Settings of a fit compared by leaving out one training view at a time: the only evidence by which they may be chosen.
 
-usage: python -m bench.leave_one_out SCENE... --trials paper paper:optimizer.scales_decay=0.1 [--split llff:3] [--seeds 3]
-           [--jobs 1] [--downscale 1] [--device auto] [--seconds S] --out FILE.csv
+usage: python -m bench.experiments.leave_one_out SCENE... --trials paper paper:optimizer.scales_decay=0.1 [--split llff:3]
+           [--seeds 3] [--jobs 1] [--downscale 1] [--device auto] [--seconds S] --out FILE.json
 Each training view of the split is fitted without and scored once; its held-out views are never read. A trial is a preset and,
 after a colon, settings with commas between. Several fits at a time say nothing of speed, so no times are kept.
 """
@@ -9,7 +9,6 @@ after a colon, settings with commas between. Several fits at a time say nothing 
 from __future__ import annotations
 
 import argparse
-import csv
 import gc
 import json
 import math
@@ -22,11 +21,13 @@ from pathlib import Path
 
 import torch
 
-from bench.tradeoff_outcome import fit_once
+from bench import result_file
+from bench.experiments.tradeoff_outcome import fit_once
 from warpgs.errors import UsageError
 from warpgs.pipeline.runs.folder import SceneRequest, choose_device, read_scene
 from warpgs.pipeline.train.config import PRESETS, FitConfig
 
+WHAT = "settings of a fit compared by leaving out one training view at a time"
 COLUMNS = ("scene", "trial", "left_out", "seed", "psnr", "ssim", "gaussians", "bytes")
 
 
@@ -98,7 +99,7 @@ def table(rows: list[dict], trials: list[str], views: int) -> list[str]:
 
 def main() -> int:
     """Run every trial on every fold, seed by seed, and write one row for each."""
-    p = argparse.ArgumentParser(prog="python -m bench.leave_one_out", description=__doc__.splitlines()[0])
+    p = argparse.ArgumentParser(prog="python -m bench.experiments.leave_one_out", description=__doc__.splitlines()[0])
     p.add_argument("scenes", nargs="+")
     p.add_argument("--trials", nargs="+", required=True)
     p.add_argument("--split", default="llff:3")
@@ -111,11 +112,11 @@ def main() -> int:
     a = p.parse_args()
     for trial in a.trials:
         trial_config(trial)
-    device = str(choose_device(a.device)[0])
+    device = choose_device(a.device)[0]
     requests = [SceneRequest(s, a.split, a.downscale) for s in a.scenes]
     cut = {r.path: folds(r) for r in requests}
     tasks = [
-        (r, trial, name, split, seed, device)
+        (r, trial, name, split, seed, str(device))
         for seed in range(a.seeds)
         for trial in a.trials
         for r in requests
@@ -130,7 +131,7 @@ def main() -> int:
             running.remove(done)
             rows.append(done.result())
             print(f"{len(rows)}/{len(tasks)}", *(rows[-1][c] for c in COLUMNS), flush=True)
-            _write(a.out, rows)
+            result_file.write(a.out, result_file.result(WHAT, device, rows))
             if time.monotonic() - began < a.seconds and (task := next(waiting, None)) is not None:
                 running.add(pool.submit(_one, task))
         left = sum(1 for _ in waiting)
@@ -139,13 +140,6 @@ def main() -> int:
     if left:
         print(f"{left} fits were not begun: --seconds {a.seconds:g} had passed")
     return 0
-
-
-def _write(path: Path, rows: list[dict]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as f:
-        writer = csv.DictWriter(f, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 if __name__ == "__main__":

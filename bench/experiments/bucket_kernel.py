@@ -53,7 +53,7 @@ def make_backward(tile_size: int, with_depth: bool, size: int, skip: bool):
         v_slots: wp.array2d(dtype=float),
     ): ...  # fmt: skip
 
-    name = f"bench.kernels.bucket.{tile_size}.{int(with_depth)}.{size}.{int(skip)}"
+    name = f"bench.experiments.bucket.{tile_size}.{int(with_depth)}.{size}.{int(skip)}"
 
     @wp.kernel(enable_backward=False, grid_stride=False, module=name, launch_bounds=32 * blend_cuda.WARPS)
     def bucket(

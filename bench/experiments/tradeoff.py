@@ -1,29 +1,29 @@
-"""What speed costs in accuracy: kernels on frozen scenes, fits on a real one; CSV, JSON and charts of both.
+"""Time against accuracy for every setting: kernels on frozen scenes, fits on a real one, with charts of both.
 
-usage: python -m bench.tradeoff kernel --device cpu|cuda --out FILE.json [--run FOLDER] [--width 252] [--count 8000]
-       python -m bench.tradeoff outcome SCENE --split llff:3 --out FILE.json [--downscale 1] [--seeds 0,1,2] [--only NAMES]
-       python -m bench.tradeoff plot FILE.json    (draws again, prints tables)
+usage: python -m bench.experiments.tradeoff kernel --device cpu|cuda --out FILE.json [--run FOLDER] [--width 252] [--count 8000]
+       python -m bench.experiments.tradeoff outcome SCENE --split llff:3 --out FILE.json [--downscale 1] [--seeds 0,1,2]
+           [--only NAMES]
+       python -m bench.experiments.tradeoff plot FILE.json    (draws again, prints tables)
 
-An interrupted run goes on where it stopped: what FILE.json holds is not measured again. FILE.csv and FILE.svg follow.
+An interrupted run goes on where it stopped: what FILE.json holds is not measured again. FILE.svg follows.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import json
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-from bench import machine, pareto
-from bench.frozen import scenes
-from bench.settings import Setting
-from bench.tradeoff_kernel import measure_scene, measured
-from bench.tradeoff_outcome import measured as measured_fits
-from bench.tradeoff_outcome import summary, trials
+from bench import result_file
+from bench.experiments import pareto
+from bench.experiments.frozen import scenes
+from bench.experiments.settings import Setting
+from bench.experiments.tradeoff_kernel import measure_scene, measured
+from bench.experiments.tradeoff_outcome import measured as measured_fits
+from bench.experiments.tradeoff_outcome import summary, trials
 from warpgs import load_scene
 from warpgs.app.precompile import fit_kernels
 from warpgs.files import write_json, write_text
@@ -35,20 +35,11 @@ def _stored(path: Path, fresh: dict) -> dict:
     """What an earlier run left, if it was of the same kind and size."""
     if not path.is_file():
         return fresh
-    found = json.loads(path.read_text("utf-8"))
+    found = result_file.read(path)
     same = ("kind", "size", "scene", "device")
     if any(found.get(k) != fresh.get(k) for k in same):
         raise SystemExit(f"{path} holds another measurement ({[found.get(k) for k in same]}); choose another --out")
     return found
-
-
-def _csv(rows: list[dict]) -> str:
-    names = list(dict.fromkeys(k for r in rows for k in r))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows([{k: f"{v:.6g}" if isinstance(v, float) else v for k, v in r.items()} for r in rows])
-    return text.getvalue()
 
 
 def kernel_chart(done: dict) -> str:
@@ -58,7 +49,7 @@ def kernel_chart(done: dict) -> str:
     for name, scene in done["scenes"].items():
         points = tuple(
             pareto.Point(r["setting"], r["knob"], r["both_ms"], max(r["mean"], 1e-9), preset=r["preset"])
-            for r in scene["rows"] if "both_ms" in r
+            for r in done["rows"] if r["scene"] == name and "both_ms" in r
         )  # fmt: skip
         panels.append(pareto.Panel(name, scene["what"], f"{what} [ms]", "mean error to float64 without cut-offs", points))
     m = done["machine"]
@@ -68,7 +59,7 @@ def kernel_chart(done: dict) -> str:
 def kernel_table(done: dict) -> str:
     """Markdown: time and mean error of every setting as multiples of `exact`'s, scene by scene."""
     names = list(done["scenes"])
-    rows = {n: {r["setting"]: r for r in done["scenes"][n]["rows"]} for n in names}
+    rows = {n: {r["setting"]: r for r in done["rows"] if r["scene"] == n} for n in names}
     lines = ["| setting | " + " | ".join(f"{n}: time, error" for n in names) + " |", "|---" * (len(names) + 1) + "|"]
     for setting in rows[names[0]]:
         cells = []
@@ -95,9 +86,8 @@ def outcome_table(lines: list[dict]) -> str:
 
 
 def write_kernel(path: Path, done: dict) -> None:
-    """JSON, CSV and chart."""
-    write_json(path, done)
-    write_text(path.with_suffix(".csv"), _csv([r for s in done["scenes"].values() for r in s["rows"]]))
+    """Write result and chart."""
+    result_file.write(path, done)
     write_text(path.with_suffix(".svg"), kernel_chart(done))
 
 
@@ -105,7 +95,7 @@ def _fast_math_rows(a: argparse.Namespace) -> dict[str, dict]:
     """The row `exact` of each scene, measured in a process whose kernels are compiled with fast math."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "fast.json"
-        command = [sys.executable, "-m", "bench.tradeoff", "kernel", "--fast-math", "--out", str(out)]
+        command = [sys.executable, "-m", "bench.experiments.tradeoff", "kernel", "--fast-math", "--out", str(out)]
         for name in ("device", "width", "count", "seed", "repeats"):
             command += [f"--{name}", str(getattr(a, name))]
         subprocess.run(command + (["--run", str(a.run)] if a.run else []), check=True)
@@ -122,17 +112,18 @@ def kernel(a: argparse.Namespace) -> None:
         fast = Setting("fast math", "fast math")
         write_json(a.out, {m.name: measure_scene(m, a.repeats, [fast])[0] for m in (make() for make in makers)})
         return
-    fresh = {
+    facts = {
         "kind": "kernel", "size": [a.width, height, a.count, a.seed], "scene": str(a.run and a.run.name), "device": device.type,
-        "repeats": a.repeats, "machine": machine.describe(device), "scenes": {},
+        "repeats": a.repeats, "scenes": {},
     }  # fmt: skip
+    fresh = result_file.result("time of a render and its gradients against their error, for every setting", device, [], **facts)
     print(f"{where}; {len(makers)} scenes")
     done = measured(makers, _stored(a.out, fresh), a.repeats, lambda s: print(s, flush=True), lambda d: write_kernel(a.out, d))
-    have = {r["setting"] for s in done["scenes"].values() for r in s["rows"]}
+    have = {r["setting"] for r in done["rows"]}
     if device.type == "cuda" and "fast math" not in have:  # on a CPU Warp has no such option
-        for name, row in _fast_math_rows(a).items():
+        for row in _fast_math_rows(a).values():
             own = {k: v for k, v in row.items() if not k.endswith("_to_exact")}  # that process has no `exact` of its own
-            done["scenes"][name]["rows"].append(own)
+            done["rows"].append(own)
     write_kernel(a.out, done)
 
 
@@ -150,10 +141,9 @@ def outcome_chart(done: dict, lines: list[dict]) -> str:
 
 
 def write_outcome(path: Path, done: dict) -> None:
-    """JSON, CSV and chart."""
+    """Write result and chart."""
     done["summary"] = summary(done["rows"], "cpu_seconds" if done["device"] == "cpu" else "seconds")
-    write_json(path, done)
-    write_text(path.with_suffix(".csv"), _csv(done["rows"]))
+    result_file.write(path, done)
     write_text(path.with_suffix(".svg"), outcome_chart(done, done["summary"]))
 
 
@@ -164,10 +154,11 @@ def outcome(a: argparse.Namespace) -> None:
     scene = load_scene(a.scene, downscale=a.downscale)
     camera = scene.views[0].camera
     chosen = [t for t in trials() if a.only is None or t.name in a.only.split(",")]
-    fresh = {
+    facts = {
         "kind": "outcome", "size": [a.split, a.downscale], "scene": Path(a.scene).name, "device": device.type,
-        "resolution": f"{camera.width} x {camera.height} px", "machine": machine.describe(device), "rows": [],
+        "resolution": f"{camera.width} x {camera.height} px",
     }  # fmt: skip
+    fresh = result_file.result("time of whole fits against scores of held-out views", device, [], **facts)
     print(f"{fresh['scene']} {fresh['resolution']}, {where}")
     seeds = [int(s) for s in a.seeds.split(",")]
     done = measured_fits(
@@ -209,7 +200,7 @@ def main(arguments: list[str] | None = None) -> None:
     p.add_argument("out", type=Path)
     a = parser.parse_args(arguments)
     if a.kind == "plot":
-        done = json.loads(a.out.read_text("utf-8"))
+        done = result_file.read(a.out)
         (write_kernel if done["kind"] == "kernel" else write_outcome)(a.out, done)
         print(kernel_table(done) if done["kind"] == "kernel" else outcome_table(done["summary"]))
         return

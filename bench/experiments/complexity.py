@@ -1,17 +1,15 @@
 """Bytes against PSNR: fixed and adaptive fits over seeds, and what is left of them when they are pruned further.
 
-    python -m bench.complexity SCENE ... --out DIR [--split llff:3] [--preset paper] [--seeds 5] [--device auto]
+    python -m bench.experiments.complexity SCENE ... --out DIR [--split llff:3] [--preset paper] [--seeds 5] [--device auto]
 
 DIR is a study as `warpgs compare` makes it, with finished runs kept when the command is given again, and besides its files
-complexity.csv (a row per run), complexity.md (means, paired differences), curve.csv and curve.svg (every scene's first seed at
-growing loss of training PSNR). ``--from-runs`` takes RUN folders in place of scenes and only draws their curves.
+complexity.json (a row per run), complexity.md (means, paired differences), curve.json and curve.svg (every scene's first seed
+at growing loss of training PSNR). ``--from-runs`` takes RUN folders in place of scenes and only draws their curves.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
-import dataclasses
 import json
 import statistics
 import sys
@@ -19,9 +17,11 @@ import tempfile
 from html import escape
 from pathlib import Path
 
+from bench import result_file, training
 from bench.plot import PALETTE
 from warpgs.errors import WarpgsError
 from warpgs.files import write_text
+from warpgs.pipeline.runs.folder import choose_device
 from warpgs.report.curve import ticks
 
 KEEP = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0)
@@ -133,12 +133,8 @@ def curve_svg(rows: list[dict]) -> str:
     return "\n".join([*out, "</svg>"]) + "\n"
 
 
-def write_csv(path: Path, rows: list[dict]) -> None:
-    """Rows of equal keys as a CSV file."""
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+def _write(a: argparse.Namespace, name: str, what: str, rows: list[dict]) -> None:
+    result_file.write(a.out / f"{name}.json", result_file.result(what, choose_device(a.device)[0], rows))
 
 
 def study(a: argparse.Namespace) -> list[tuple[str, Path]]:
@@ -148,13 +144,13 @@ def study(a: argparse.Namespace) -> list[tuple[str, Path]]:
     from warpgs.pipeline.study.study import StudyRequest, scene_name
 
     base = preset_variants([a.preset], a.steps)[a.preset]
-    variants = {"fixed": dataclasses.replace(base, adaptive=False), "adaptive": dataclasses.replace(base, adaptive=True)}
+    variants = {"fixed": training.adaptive(base, False), "adaptive": training.adaptive(base, True)}
     scenes = tuple(SceneRequest(s, a.split, a.downscale) for s in a.inputs)
     for line in run_study(StudyRequest(scenes, variants, a.seeds, a.out, a.device)):
         print(line)
     names = [scene_name(s) for s in scenes]
     rows = run_rows(a.out, names, list(variants), a.seeds)
-    write_csv(a.out / "complexity.csv", rows)
+    _write(a, "complexity", "size and scores of fixed and adaptive fits over seeds", rows)
     table = summary(rows)
     write_text(a.out / "complexity.md", table)
     print(table)
@@ -179,9 +175,9 @@ def main(arguments: list[str] | None = None) -> int:
         runs = [(Path(r).name, Path(r)) for r in a.inputs] if a.from_runs else study(a)
         rows = [row for name, folder in runs for row in curve_rows(folder, name, a.device)]
     except WarpgsError as e:
-        print(f"bench.complexity: {e}", file=sys.stderr)
+        print(f"bench.experiments.complexity: {e}", file=sys.stderr)
         return e.exit_code
-    write_csv(a.out / "curve.csv", rows)
+    _write(a, "curve", "what is left of a model when it is pruned, by the training PSNR that is given up", rows)
     write_text(a.out / "curve.svg", curve_svg(rows))
     for r in rows:
         print(
