@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= runs/demo
 
-.PHONY: demo test lint clean install
+.PHONY: demo test audit lint clean install
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -25,7 +25,10 @@ demo: install
 
 test: install lint
 	$(BIN)/python -m coverage erase
-	$(BIN)/python -m pytest -q -n 2 -m "not slow and not cuda" --cov --cov-config=pyproject.toml --cov-report=term:skip-covered --cov-fail-under=90
+	$(BIN)/python -m pytest -q -n 2 -m "not slow and not cuda and not audit" --cov --cov-config=pyproject.toml --cov-report=term:skip-covered --cov-fail-under=90
+
+audit: install
+	$(BIN)/python -m pytest -q -m audit
 
 lint: install
 	$(BIN)/ruff check .

@@ -19,7 +19,7 @@ import warp as wp
 from bench import result_file
 from bench.garden import garden_inputs
 from bench.harness import recorded
-from bench.training import GraphedSteps
+from bench.training import Steps
 from warpgs import RasterizeOptions, clear_graph_cache, rasterize
 from warpgs.constants import RULES
 from warpgs.kernels.project import project
@@ -233,7 +233,7 @@ def compare(path: str, name: str, kernels: bool) -> dict:
     del works, work
     target = torch.rand(height, width, 3, device="cuda", generator=torch.Generator("cuda").manual_seed(2))
     steps = {
-        "warpgs graph": GraphedSteps(gaussians, camera, target, "gsplat").replay,
+        "warpgs graph": Steps(gaussians, camera, target, "gsplat").replay,
         "gsplat": peer_step(gaussians, camera, target),
     }
     row["step_wall_ms"] = wall_times(steps)

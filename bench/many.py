@@ -16,7 +16,7 @@ import torch
 from bench import result_file
 from bench.against_gsplat import first_camera
 from bench.garden import garden_inputs
-from bench.training import GraphedSteps
+from bench.training import Steps
 from warpgs.scene import Gaussians
 
 
@@ -35,13 +35,13 @@ def train(path: str, count: int, width: int, height: int, steps: int) -> dict:
     gaussians, cameras = garden_inputs(path, tiles=cells, sh_degree=3, width=width, height=height)
     gaussians = Gaussians(**{n: t.detach()[:count].clone() for n, t in gaussians.tensors().items()})
     target = smooth_image(width, height, device)
-    trainer = GraphedSteps(gaussians, first_camera(cameras), target, "exact")
+    trainer = Steps(gaussians, first_camera(cameras), target, "exact")
     begin = time.perf_counter()
     losses = trainer.train(steps)
     seconds = time.perf_counter() - begin
     return {
         "gaussians": len(gaussians), "width": width, "height": height, "steps": steps,
-        "capacity": trainer.capacity, "loss_first": losses[0], "loss_last": losses[-1],
+        "loss_first": losses[0], "loss_last": losses[-1],
         "falling_pairs": sum(a > b for a, b in itertools.pairwise(losses)), "ms_per_step": 1000 * seconds / steps,
         "peak_gib": torch.cuda.max_memory_allocated() / 2**30, "reserved_gib": torch.cuda.max_memory_reserved() / 2**30,
     }  # fmt: skip

@@ -22,7 +22,7 @@ from warpgs.kernels.tiles import bin_tiles
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.folder import choose_device
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import LossConfig, photometric_loss
+from warpgs.pipeline.train.loss import photometric_loss
 
 
 def stages(trainer: Trainer) -> tuple[list[dict], int]:
@@ -42,17 +42,16 @@ def stages(trainer: Trainer) -> tuple[list[dict], int]:
     rgb = blend(leaf, tiles, background, **size, rule=rule)[0][0]
     image = rgb.detach().requires_grad_()
     v_projected, v_rgb = torch.rand_like(projected), torch.rand_like(rgb)
-    loss = LossConfig()
 
     def backward_of(outputs, sources, upstream=None):
         return lambda: torch.autograd.grad(outputs, sources, upstream, retain_graph=True)
 
-    value = photometric_loss(image, target, None, loss)
+    value = photometric_loss(image, target, None)
     result = {
         "project forward": measure(run_project, device),
         "tiles": measure(lambda: bin_tiles(projected, counts, **size, rule=rule), device),
         "blend forward": measure(lambda: blend(leaf, tiles, background, **size, rule=rule), device),
-        "loss forward": measure(lambda: photometric_loss(image, target, None, loss), device),
+        "loss forward": measure(lambda: photometric_loss(image, target, None), device),
         "loss backward": measure(backward_of(value, [image]), device),
         "blend backward": measure(backward_of(rgb, [leaf], v_rgb), device),
         "project backward": measure(backward_of(projected, list(parts.parameters.values()), v_projected), device),

@@ -5,27 +5,31 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import torch
 
-from warpgs import rasterize
-from warpgs.pipeline.model.table import Optimizer, OptimizerConfig
+from warpgs.pipeline.model.table import Table
+from warpgs.pipeline.train.complexity import complexity_figures
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import LossConfig, photometric_loss
-from warpgs.pipeline.train.step import STEPS_PER_BATCH, StepBuffers, StepGraph, Views
-from warpgs.pipeline.train.strategies.holdout import complexity_figures, fit_class
-from warpgs.pipeline.train.trainer import Fit as Trainer
-from warpgs.pipeline.train.trainer import run
+from warpgs.pipeline.train.loss import LossConfig, built_in_terms
+from warpgs.pipeline.train.schedule import OptimizerConfig
+from warpgs.pipeline.train.step import MAX_BATCH, Learned, StepBuffers, StepGraphs, StepPlan, eager_renderer, step
+from warpgs.pipeline.train.strategies.base import Strategy
+from warpgs.pipeline.train.trainer import Trainer, run
+from warpgs.pipeline.train.views import ViewStack
 from warpgs.scene import Camera, Gaussians, PointCloud, View
 
 BLACK = (0.0, 0.0, 0.0)
+KIND = "image"
+"""Name of the only kind of view of `Steps`."""
 
 
 def make_trainer(
     views: list[View], points: PointCloud | None, config: FitConfig, device: torch.device, background=BLACK
 ) -> Trainer:
     """Return a trainer at step 0."""
-    return fit_class(config)(views, points, config, device, background)
+    return Trainer(views, points, config, device, background)
 
 
 def finish(trainer: Trainer) -> None:
@@ -39,18 +43,18 @@ def take_steps(trainer: Trainer, count: int) -> int:
     """Take at least ``count`` steps as a fit does, and return how many were taken."""
     done = 0
     while done < count:
-        done += len(trainer.buffers(count - done))
+        done += len(trainer.advance(count - done))
     return done
 
 
 def one_step(trainer: Trainer) -> None:
-    """Take one step from Python, nothing recorded."""
+    """Take one step as a fit does: on CUDA a graph, elsewhere from Python."""
     trainer.advance()
 
 
 def sort_along_curve(trainer: Trainer) -> None:
     """Put the Gaussians in Morton order."""
-    trainer.optimizer.sort_along_curve()
+    trainer.table.sort_along_curve()
 
 
 def model_bytes(trainer: Trainer) -> int:
@@ -60,17 +64,17 @@ def model_bytes(trainer: Trainer) -> int:
 
 def with_cap(config: FitConfig, most: int) -> FitConfig:
     """Return the settings with at most so many Gaussians."""
-    return dataclasses.replace(config, density=dataclasses.replace(config.density, max_gaussians=most))
+    return dataclasses.replace(config, max_gaussians=most)
 
 
 def with_strategy(config: FitConfig, name: str) -> FitConfig:
     """Return the settings with another density strategy."""
-    return dataclasses.replace(config, strategy=name)
+    return dataclasses.replace(config, strategy=name, strategy_config=None)
 
 
-def adaptive(config: FitConfig, on: bool) -> FitConfig:
-    """Return the settings with the size of the model judged on held-out blocks, or not."""
-    return dataclasses.replace(config, adaptive=on)
+def with_holdout(config: FitConfig) -> FitConfig:
+    """Return the settings with the size of the model decided by held-out blocks."""
+    return with_strategy(config, "holdout")
 
 
 def without_density(config: FitConfig) -> FitConfig:
@@ -96,78 +100,78 @@ class StepParts:
 
 def step_parts(trainer: Trainer) -> StepParts:
     """Return the inputs of a step on the first training view."""
-    view, parameters = trainer.views[0], trainer.optimizer.params
+    view, table, device = trainer.views[0], trainer.table, trainer.device
+    row = table.lr_row(trainer.lrs(trainer.step + 1), trainer.step + 1, trainer.config.optimizer.head_lrs)
+    lrs, going = torch.tensor(row, device=device), torch.zeros(1, dtype=torch.int32, device=device)
+    gradients = {name: torch.zeros_like(p) for name, p in table.params.items()}
+    parameters = table.gaussians.tensors()
+    return StepParts(
+        view.camera, view.image, parameters, trainer.background, trainer.config.rule,
+        lambda: table.adam_step(gradients, lrs, going),
+    )  # fmt: skip
 
-    def optimize():
-        for p in parameters.values():
-            p.grad = torch.zeros_like(p)
-        trainer.optimizer.step(0.5)
 
-    ordered = trainer.optimizer.gaussians.tensors()
-    return StepParts(view.camera, view.image, ordered, trainer.background, trainer.config.rule, optimize)
-
-
-class GraphedSteps:
-    """Training steps of given Gaussians on one image, recorded once and replayed as in a fit; CUDA only.
+class Steps:
+    """Training steps of given Gaussians on one image: image, L1 and SSIM, backward pass, Adam, as a fit takes them.
 
     Args:
-        gaussians: The start; trained in place of a copy.
+        gaussians: The start; a copy of it is trained.
         camera: A batch of one camera.
         target: Image, shape [H, W, 3].
         rule: Cut-offs of the rasterizer.
+        lr: Learning rate of all parameters; None for those of a fit in a scene of size 1.
     """
 
-    def __init__(self, gaussians: Gaussians, camera: Camera, target: torch.Tensor, rule: str):
+    def __init__(self, gaussians: Gaussians, camera: Camera, target: torch.Tensor, rule: str, lr: float | None = None):
         device = target.device
-        self.optimizer, self.buffers = Optimizer(gaussians, OptimizerConfig(), 1.0), StepBuffers(device)
-        views = Views(camera.viewmat, camera.K, target[None], None)
-        self.graph = StepGraph(
-            views, self.optimizer, None, self.buffers, degree=gaussians.sh_degree, rule=rule, loss=LossConfig(),
-            background=torch.zeros(3, device=device),
-        )  # fmt: skip
-        self._load(range(1, STEPS_PER_BATCH + 1))
-
-    @property
-    def capacity(self) -> int:
-        """Instances that a step may have."""
-        return self.graph.capacity
+        self.rule, self.lr, self.background = rule, lr, torch.zeros(3, device=device)
+        self.table = Table.of_gaussians(gaussians, {})
+        self.buffers = StepBuffers(device, 3 * len(self.table.params))
+        strategy = Strategy(SimpleNamespace(config=FitConfig()))  # of the base class: it changes nothing
+        self.learned = Learned(self.table, Table({}, {}, device, 1), strategy, None)
+        numbers = torch.zeros(1, dtype=torch.int64, device=device)
+        self.views = ViewStack(camera.viewmat, camera.K, target[None], None, {}, numbers)
+        self.plan = StepPlan(gaussians.sh_degree, False, tuple(built_in_terms(LossConfig())), None)
+        self.graphs = StepGraphs(device) if device.type == "cuda" else None
+        self._load(range(1, MAX_BATCH + 1))
 
     def _load(self, steps: range) -> None:
-        lrs, settings = [self.optimizer.schedule(0.0, k) for k in steps], [(0.0, k) for k in steps]
-        self.buffers.load([0] * len(steps), lrs, settings)
+        config = OptimizerConfig()
+        fixed = None if self.lr is None else dict.fromkeys(self.table.params, self.lr)
+        lrs, heads = (config.lrs(0.0, 1.0), config.head_lrs) if fixed is None else (fixed, {})
+        rows = [self.table.lr_row(lrs, k, heads) for k in steps]
+        self.buffers.load([0] * len(steps), rows, [(0.0, k, lrs["means"]) for k in steps])
+
+    def eager(self) -> None:
+        """Take the first step of a batch from Python, again and again: the same work each time."""
+        self.buffers.counter.zero_()
+        step(self.learned, self.views, self.buffers, self.plan, eager_renderer(self.rule, self.background, None))
+
+    def _graph(self) -> torch.cuda.CUDAGraph:
+        how = (self.learned, self.buffers, self.plan, self.rule, self.background, None)
+        return self.graphs.capture_all([KIND], {KIND: self.views}, *how)[0]
 
     def replay(self) -> None:
-        """Take the first step of a batch, again and again: the same work each time."""
+        """Take the first step of a batch as a CUDA graph, again and again; captured at the first call."""
+        graph = self._graph()
         self.buffers.counter.zero_()
-        self.graph.replay()
+        graph.replay()
 
     def train(self, steps: int) -> list[float]:
-        """Take steps one after the other and return their losses.
+        """Take steps one after the other as CUDA graphs and return their losses.
 
         Raises:
             RuntimeError: A loss is not finite, or the instances outgrew the capacity.
         """
         losses: list[float] = []
         while len(losses) < steps:
-            count = min(STEPS_PER_BATCH, steps - len(losses))
+            count = min(MAX_BATCH, steps - len(losses))
+            graph = self._graph()
             self._load(range(len(losses) + 1, len(losses) + count + 1))
             for _ in range(count):
-                self.graph.replay()
+                graph.replay()
             done, stop, history = self.buffers.result()
             if stop:
                 raise RuntimeError(f"training stopped after {len(losses) + done} steps with code {stop}; use fewer Gaussians")
             losses += [loss for loss, _ in history[:done]]
         return losses
-
-
-def eager_step(gaussians: Gaussians, camera: Camera, target: torch.Tensor, lr: float) -> Callable[[], None]:
-    """Return a training step from Python with the same learning rate for all parameters: image, loss, backward pass, Adam."""
-    lrs = {f"{n}_lr": lr for n in ("means", "quats", "scales", "opacities", "sh")}
-    optimizer, loss = Optimizer(gaussians, OptimizerConfig(means_lr_final=lr, **lrs), extent=1.0), LossConfig()
-
-    def step():
-        image = rasterize(optimizer.gaussians, camera).rgb
-        photometric_loss(image, target, None, loss).backward()
-        optimizer.step(0.5)
-
-    return step

@@ -144,7 +144,7 @@ def study(a: argparse.Namespace) -> list[tuple[str, Path]]:
     from warpgs.pipeline.study.study import StudyRequest, scene_name
 
     base = preset_variants([a.preset], a.steps)[a.preset]
-    variants = {"fixed": training.adaptive(base, False), "adaptive": training.adaptive(base, True)}
+    variants = {"fixed": base, "adaptive": training.with_holdout(base)}
     scenes = tuple(SceneRequest(s, a.split, a.downscale) for s in a.inputs)
     for line in run_study(StudyRequest(scenes, variants, a.seeds, a.out, a.device)):
         print(line)

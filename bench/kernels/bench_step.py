@@ -9,7 +9,6 @@ import torch
 from bench import inputs, peers, roofline, training
 from bench.harness import OURS, Task
 from bench.kernels.bench_render import costs
-from warpgs.scene import Camera
 
 AXES = ("count", "image", "degree", "threads")
 PROGRAMS = {OURS: ("step",), peers.GSPLAT_STEP: ("step",)}
@@ -31,8 +30,7 @@ def tasks(point, device, wanted):
     target = inputs.image(point.width, point.height, device)
 
     if wanted(OURS, "step"):
-        camera = Camera(batch.viewmat[0], batch.K[0], point.width, point.height)
-        yield Task(OURS, "step", training.eager_step(gaussians, camera, target, LR), cost(point, device))
+        yield Task(OURS, "step", training.Steps(gaussians, batch, target, "exact", LR).eager, cost(point, device))
 
     if wanted(peers.GSPLAT_STEP, "step"):
         adam = torch.optim.Adam(gaussians.tensors().values(), lr=LR, eps=1e-15, fused=True)

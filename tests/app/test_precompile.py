@@ -19,7 +19,7 @@ from warpgs.pipeline.train.schedule import PhaseConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig
-from warpgs.pipeline.train.trainer import Fit
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.runtime import interop
 
@@ -44,10 +44,10 @@ def test_a_fit_launches_nothing_else(device, recorded, monkeypatch):
         loss=LossConfig(depth_weight=0.1, depth_until=0.5),
         density=DensityConfig(start=2, every=2), phases=PhaseConfig(4, 6, every=2),
     )  # fmt: skip
-    fit = Fit(views, seeds(), config, device, priors=priors(views))
+    fit = Trainer(views, seeds(), config, device, priors=priors(views))
     while fit.step < 20:
-        fit.burst(100)
-    assert any(event["evicted"] for event in fit.events)
+        fit.advance(100)
+    assert any(event["evicted"] for event in fit.strategy.events)
     score(views[1], render_view(fit.gaussians, views[1], RasterizeOptions())[0])
     warmed = {(kind, k.module, block) for kind in ("cpu", "cuda") for k, block in fit_kernels(kind == "cuda")}
     assert len(launched) > 8 and launched <= warmed

@@ -22,7 +22,7 @@ from warpgs.kernels.functions import make_spans
 from warpgs.kernels.project import project
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.trainer import Fit
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.runtime import interop
 from warpgs.scene import Camera, Gaussians
@@ -250,7 +250,7 @@ def test_far_from_the_origin(tmp_path):
         scene = loaded(tmp_path, shift)
         assert np.allclose(scene.normalization.offset - shift, loaded(tmp_path, 0.0).normalization.offset, atol=1e-8)
         images.append(torch.stack([rasterize(gaussians, v.camera).rgb for v in scene.views]))
-        fit = Fit(list(scene.views), scene.points, config, torch.device("cpu"), (0.0, 0.0, 0.0))
+        fit = Trainer(list(scene.views), scene.points, config, torch.device("cpu"), (0.0, 0.0, 0.0))
         scores.append([fit.advance().loss for _ in range(30)][-1])
         write_ply(tmp_path / "model.ply", gaussians, scene.normalization)
         back = read_ply(tmp_path / "model.ply").means.double().numpy()

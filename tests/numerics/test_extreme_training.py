@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from warpgs.pipeline.model.layers import ProtectConfig
 
 from tests.gaussians import cloud
 from tests.reference.knn import mean_square_distances_reference
@@ -20,18 +21,16 @@ from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.ssim import differences, ssim
 from warpgs.pipeline.metrics.quantiles import quantiles
 from warpgs.pipeline.model.init import InitConfig, initial_gaussians, initial_points
-from warpgs.pipeline.model.layers import ProtectConfig
-from warpgs.pipeline.model.table import Optimizer, OptimizerConfig
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LossConfig, photometric_loss
-from warpgs.pipeline.train.schedule import PhaseConfig
+from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig, DensityStats, DensityUpdate, refine
 from warpgs.pipeline.train.strategies.holdout_blocks import HoldoutConfig
 from warpgs.pipeline.train.strategies.importance import ImportanceConfig, normalized
 from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig, geometry_gate, sample_pixels
-from warpgs.pipeline.train.trainer import Fit, run
+from warpgs.pipeline.train.trainer import Trainer, run
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Normalization, PointCloud, View
 
@@ -47,9 +46,9 @@ def gray(points) -> PointCloud:
     return PointCloud(points, np.full((len(points), 3), 0.5, np.float32))
 
 
-def taken(views, cloud_, device, steps: int = 3, **more) -> Fit:
+def taken(views, cloud_, device, steps: int = 3, **more) -> Trainer:
     """A fit after some steps, all of whose numbers are finite."""
-    fit = Fit(views, cloud_, FitConfig(steps=steps, init=POINTS, **more), device)
+    fit = Trainer(views, cloud_, FitConfig(steps=steps, init=POINTS, **more), device)
     for _ in range(steps):
         assert math.isfinite(fit.advance().loss)
     assert all(bool(torch.isfinite(t).all()) for t in fit.state()[0].values() if t.is_floating_point())
@@ -131,8 +130,8 @@ def test_cameras_without_extent(device, kind, source):
     views = [normalize_view(v, n) for v in views]
     density = DensityConfig(start=1, every=1, stop_fraction=1.0)
     init = InitConfig(source=source, random_count=60, max_sh_degree=0)
-    fit = Fit(views, points, FitConfig(steps=4, init=init, density=density), device)
-    assert 0 < fit.extent < math.inf and fit.optimizer.lrs(0.0)["means"] > 0
+    fit = Trainer(views, points, FitConfig(steps=4, init=init, density=density), device)
+    assert 0 < fit.extent < math.inf and fit.lrs(0.0)["means"] > 0
     # what stands before the near plane would never be drawn, and never be moved
     assert int(rasterize(fit.gaussians, fit.views[0].camera).visible.sum()) >= 20
     fit.reset_done = True  # size pruning is on
@@ -211,14 +210,14 @@ def bad_photos(value: float) -> list[View]:
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_one_bad_pixel_stops_the_fit_before_it_harms(device, value):
     """The step that looks at it is not taken, and the Gaussians are finite."""
-    fit = Fit(bad_photos(value), seeds(), FitConfig(steps=4, init=POINTS, cuda_graph=False), device)
+    fit = Trainer(bad_photos(value), seeds(), FitConfig(steps=4, init=POINTS, cuda_graph=False), device)
     with pytest.raises(NotFiniteError, match=r"loss became (nan|inf)"):
         for _ in range(4):
             fit.advance()
     assert all(bool(torch.isfinite(t).all()) for t in fit.gaussians.tensors().values())
 
 
-def poison(fit: Fit, name: str, where: str, value: float) -> None:
+def poison(fit: Trainer, name: str, where: str, value: float) -> None:
     """Put a value into the gradient of a tensor's first row from the next step on, or into the tensor itself."""
     if where == "gradient":
 
@@ -244,9 +243,9 @@ def test_what_is_no_number_is_never_saved(device, tmp_path, name, where, value):
     config = FitConfig(
         steps=6, init=POINTS, density=DensityConfig(start=100), checkpoint_every=2, checkpoint_seconds=0, cuda_graph=False
     )
-    fit, saved = Fit(photos(2), seeds(), config, device), []
+    fit, saved = Trainer(photos(2), seeds(), config, device), []
 
-    def save(current: Fit) -> None:
+    def save(current: Trainer) -> None:
         save_checkpoint(tmp_path, *current.state())
         saved.append(current.step)
 
@@ -396,7 +395,7 @@ def test_a_setting_is_refused_or_works(kind):
             except UsageError:
                 refused += 1
                 continue
-            fit = Fit(views, points, config, torch.device("cpu"), priors=known)
+            fit = Trainer(views, points, config, torch.device("cpu"), priors=known)
             for _ in range(2):
                 assert math.isfinite(fit.advance().loss), (field.name, value)
             fit.optimizer.cap_opacity(config.density.reset_opacity)
@@ -419,7 +418,7 @@ def test_views_of_which_nothing_counts(device):
     assert all(torch.equal(a, b) for a, b in zip(fit.gaussians.tensors().values(), first.tensors().values()))
     taken([hidden[0], views[1]], seeds(), device, steps=4)
     with pytest.raises(DataError, match="every pixel of the training views is masked out"):
-        Fit(hidden, None, FitConfig(init=InitConfig(source="random")), device)
+        Trainer(hidden, None, FitConfig(init=InitConfig(source="random")), device)
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.2, 1.0])

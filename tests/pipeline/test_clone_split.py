@@ -7,7 +7,7 @@ import torch
 
 from tests.gaussians import cloud
 from warpgs.errors import UsageError
-from warpgs.pipeline.model.table import Optimizer, OptimizerConfig
+from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig, DensityStats, DensityUpdate, refine
 from warpgs.scene import Gaussians
 
@@ -98,8 +98,8 @@ def test_optimizer_rows_follow():
     optimizer.apply(DensityUpdate(keep, added, torch.full((2,), -1)))
     after = optimizer.state()
     for name in added:
-        assert torch.equal(after[f"param.{name}"][:3], before[f"param.{name}"][keep])
-        assert torch.equal(after[f"param.{name}"][3:], added[name])
+        assert torch.equal(after[f"params.{name}"][:3], before[f"params.{name}"][keep])
+        assert torch.equal(after[f"params.{name}"][3:], added[name])
         for kind in ("mean", "square"):
             assert torch.equal(after[f"{kind}.{name}"][:3], before[f"{kind}.{name}"][keep])
             assert bool(before[f"{kind}.{name}"].any()) and not bool(after[f"{kind}.{name}"][3:].any())

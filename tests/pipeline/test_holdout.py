@@ -16,19 +16,19 @@ from warpgs.pipeline.train.config import PRESETS, FitConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.strategies.holdout import NEAR, AdaptiveFit, complexity_figures, complexity_summary, fit_class
 from warpgs.pipeline.train.strategies.holdout_blocks import HoldoutConfig
-from warpgs.pipeline.train.trainer import Fit
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.scene import PointCloud, View
 from warpgs.synthetic.demo import split_spec, write_demo
 
 CPU = torch.device("cpu")
 GROWING = FitConfig(
-    steps=60, sh_every=15, adaptive=True, init=InitConfig(source="points", max_sh_degree=1),
+    steps=60, sh_every=15, strategy="holdout", init=InitConfig(source="points", max_sh_degree=1),
     holdout=HoldoutConfig(levels=2, fraction=0.3, trim_db=0), density=DensityConfig(start=10, every=5, gradient=1e-5),
 )  # fmt: skip
 
 
-def advanced(config: FitConfig, steps: int) -> AdaptiveFit:
-    fit = AdaptiveFit(photos(4), seeds(), config, CPU)
+def advanced(config: FitConfig, steps: int) -> Trainer:
+    fit = Trainer(photos(4), seeds(), config, CPU)
     while fit.step < steps:
         fit.advance()
     return fit
@@ -36,18 +36,18 @@ def advanced(config: FitConfig, steps: int) -> AdaptiveFit:
 
 def finished(
     views: list[View], points: PointCloud | None = None, steps: int = PRESETS["quick"].steps, **holdout
-) -> AdaptiveFit:
+) -> Trainer:
     quick = dataclasses.replace(PRESETS["quick"], holdout=HoldoutConfig(**holdout))
     start = quick.init if points is None else dataclasses.replace(quick.init, source="points")
-    fit = AdaptiveFit(
-        views, points, dataclasses.replace(quick, steps=steps, adaptive=True, init=start), CPU, priors=priors(views)
+    fit = Trainer(
+        views, points, dataclasses.replace(quick, steps=steps, strategy="holdout", init=start), CPU, priors=priors(views)
     )
     while fit.step < steps:
         fit.advance()
     return fit
 
 
-def complexity(fit: Fit) -> dict:
+def complexity(fit: Trainer) -> dict:
     return complexity_figures(fit)["complexity"]
 
 
@@ -93,7 +93,7 @@ def test_trimmed_within_the_loss_and_everything_by_row_stays_aligned():
     tensors, _ = fit.state()
     by_row = [n for n in tensors if n.split(".")[0] in BY_ROW]
     assert len(by_row) == 15 + 2 + 2 + 3 and all(len(tensors[n]) == c["count"] for n in by_row)
-    assert tensors["param.sh"].shape[1] == 4 and bool((fit.optimizer.bounds.degree.diff() >= 0).all())
+    assert tensors["params.sh"].shape[1] == 4 and bool((fit.optimizer.bounds.degree.diff() >= 0).all())
     flat = fit.optimizer.bounds.degree == 0
     assert bool(flat.any()) and not bool(fit.gaussians.sh[flat, 1:].any())
     assert bool((fit.gaussians.log_scales >= fit.optimizer.bounds.floor[:, None] - 1e-6).all())
@@ -117,7 +117,7 @@ def test_what_a_fit_is_better_than_enough_goes_for_size():
 
 def test_a_trim_counts_on_half_of_what_training_mended_of_the_one_before():
     """Except the last, which nothing mends. Before it less goes the farther a fit is below enough, and far below nothing."""
-    fit = AdaptiveFit(photos(3), seeds(), with_trims(enough_db=30.0), CPU)
+    fit = Trainer(photos(3), seeds(), with_trims(enough_db=30.0), CPU)
     fit.step = 50
     assert fit._psnr_budget(30.0) == pytest.approx(0.1) and fit._psnr_budget(31.5) == pytest.approx(0.1 + 1.5)
     assert fit._psnr_budget(30.0 - NEAR / 2) == pytest.approx(0.05) and fit._psnr_budget(30.0 - NEAR) == 0 == fit._psnr_budget(
@@ -133,7 +133,7 @@ def test_a_trim_counts_on_half_of_what_training_mended_of_the_one_before():
 
 def test_of_a_trimmed_model_no_more_is_hidden_than_of_the_whole():
     """The number shown is that of the whole model with dropout, and all where fewer are left."""
-    fit = AdaptiveFit(photos(3), seeds(), dataclasses.replace(GROWING, dropout=0.5), CPU)
+    fit = Trainer(photos(3), seeds(), dataclasses.replace(GROWING, dropout=0.5), CPU)
     assert fit._settings(60) == (0.5, 60)
     fit.trims = [{"before": 100, "after": 80}]
     assert fit._settings(60)[0] == pytest.approx(1 - 0.5 / 0.8)
@@ -151,7 +151,7 @@ def test_continued_fit_equals_uninterrupted_one(tmp_path, at):
     stopped = advanced(config, at)
     assert 0 < len(stopped.trims) < len(straight.trims) or at < 50
     save_checkpoint(tmp_path, *stopped.state())
-    resumed = AdaptiveFit(photos(4), seeds(), config, CPU)
+    resumed = Trainer(photos(4), seeds(), config, CPU)
     resumed.load(*load_checkpoint(tmp_path))
     while resumed.step < 60:
         resumed.advance()
@@ -163,7 +163,7 @@ def test_continued_fit_equals_uninterrupted_one(tmp_path, at):
 def test_without_a_judge_it_is_the_plain_fit():
     """Too few blocks to tell anything: said so, and the same bits as with --no-adaptive."""
     config = dataclasses.replace(GROWING, steps=20, holdout=HoldoutConfig(fraction=0.001))
-    fit, plain = AdaptiveFit(photos(1), seeds(), config, CPU), Fit(photos(1), seeds(), config, CPU)
+    fit, plain = Trainer(photos(1), seeds(), config, CPU), Trainer(photos(1), seeds(), config, CPU)
     for _ in range(20):
         fit.advance()
         plain.advance()
@@ -178,7 +178,7 @@ def test_what_one_view_alone_sees_stays_coarse():
     away = [
         dataclasses.replace(v, camera=dataclasses.replace(v.camera, viewmat=v.camera.viewmat @ _turned())) for v in views[1:]
     ]
-    fit = AdaptiveFit([views[0], *away], seeds(), GROWING, CPU)
+    fit = Trainer([views[0], *away], seeds(), GROWING, CPU)
     for _ in range(31):
         fit.advance()
     assert fit.closed and len(fit.gaussians) <= len(seeds())

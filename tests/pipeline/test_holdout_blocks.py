@@ -19,7 +19,7 @@ from warpgs.pipeline.train.strategies.holdout_blocks import (
     hide,
     sample_blocks,
 )
-from warpgs.pipeline.train.strategies.importance_sampling import TrainingView
+from warpgs.pipeline.train.views import TrainingView
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 
 CPU = torch.device("cpu")

@@ -6,18 +6,18 @@ import itertools
 import numpy as np
 import pytest
 import torch
+from warpgs.pipeline.model.layers import COARSE, FINE, Layers, ProtectConfig
 
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig, initial_points
-from warpgs.pipeline.model.layers import COARSE, FINE, Layers, ProtectConfig
 from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig, DensityUpdate
 from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig, sample_view, sampling_event
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig
-from warpgs.pipeline.train.trainer import Fit
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.rasterize import RasterizeOptions
 
 CPU = torch.device("cpu")
@@ -31,9 +31,9 @@ CONFIG = FitConfig(
 )  # fmt: skip
 
 
-def fitted(config: FitConfig = CONFIG, steps: int | None = None, size: tuple[int, int] = (40, 32)) -> Fit:
+def fitted(config: FitConfig = CONFIG, steps: int | None = None, size: tuple[int, int] = (40, 32)) -> Trainer:
     views = photos(3, *size)
-    fit = Fit(views, seeds(), config, CPU, priors=priors(views))
+    fit = Trainer(views, seeds(), config, CPU, priors=priors(views))
     for _ in range(config.steps if steps is None else steps):
         fit.advance()
     return fit
@@ -82,16 +82,16 @@ def test_coarse_layer_is_stable_and_fine_layer_grows():
     """From phase 2 on coarse Gaussians are not added to; each step moves them a tenth as far; fine ones come and multiply."""
     fit = fitted(steps=8)
     before = fit.gaussians.means.clone()
-    coarse = int((~fit.layers.fine).sum())
-    assert len(fit.events) == 1 and fit.events[0]["step"] == 8 and fit.events[0]["added"] == int(fit.layers.fine.sum()) > 0
+    coarse = int((~fit.strategy.fine).sum())
+    assert len(fit.strategy.events) == 1 and fit.strategy.events[0]["step"] == 8 and fit.strategy.events[0]["added"] == int(fit.strategy.fine.sum()) > 0
     fit.advance()
     moved = (fit.gaussians.means - before).abs().amax(1)
-    lr = fit.optimizer.lrs(8 / 39)["means"]
-    assert float(moved[~fit.layers.fine].max()) < 0.11 * 3 * lr < float(moved[fit.layers.fine].max())
+    lr = fit.lrs(8 / 39)["means"]
+    assert float(moved[~fit.strategy.fine].max()) < 0.11 * 3 * lr < float(moved[fit.strategy.fine].max())
     while fit.step < 40:
         fit.advance()
-    assert int((~fit.layers.fine).sum()) <= coarse and int(fit.layers.fine.sum()) > fit.events[0]["added"]
-    assert [e["step"] for e in fit.events] == list(fit.phases.events)
+    assert int((~fit.strategy.fine).sum()) <= coarse and int(fit.strategy.fine.sum()) > fit.strategy.events[0]["added"]
+    assert [e["step"] for e in fit.strategy.events] == list(fit.phases.events)
 
 
 def test_phase_three_leaves_the_set_alone():
@@ -107,9 +107,9 @@ def test_phase_three_leaves_the_set_alone():
 def test_full_fine_layer_frees_its_least_contributors():
     """At the cap an event removes as many unprotected fine Gaussians as it adds; without unprotected ones it adds fewer."""
     fit = fitted(steps=8)
-    cap = len(fit.events) and int(fit.layers.fine.sum())
+    cap = len(fit.strategy.events) and int(fit.strategy.fine.sum())
     method = dataclasses.replace(
-        METHOD, sampler=dataclasses.replace(METHOD.sampler, max_fraction=cap / int((~fit.layers.fine).sum()))
+        METHOD, sampler=dataclasses.replace(METHOD.sampler, max_fraction=cap / int((~fit.strategy.fine).sum()))
     )
     arguments = {
         "room": 10_000, "rule": "exact", "background": torch.zeros(3), "generator": torch.Generator().manual_seed(0)
@@ -118,7 +118,7 @@ def test_full_fine_layer_frees_its_least_contributors():
     assert is_protected.evicted == 0 and len(is_protected.change.parents) == 0
     old = sampling_event(fit.gaussians, fit.layers, fit.views, method, step=500, **arguments)
     assert old.evicted == len(old.change.parents) == cap
-    assert bool((~fit.layers.fine)[old.change.keep].all())
+    assert bool((~fit.strategy.fine)[old.change.keep].all())
 
 
 def test_all_switch_combinations_run():
@@ -129,7 +129,7 @@ def test_all_switch_combinations_run():
         fit = fitted(dataclasses.replace(config, method=method), size=(32, 32))
         assert all(bool(torch.isfinite(t).all()) for t in fit.gaussians.tensors().values()), values
         # the first event fills the layer; the second finds no room among the protected
-        first, second = fit.events
+        first, second = fit.strategy.events
         assert first["added"] > 0 and first["evicted"] == 0, values
         assert (second["added"] > 0) == (second["evicted"] > 0) == (not method.pm), values
 
@@ -139,7 +139,7 @@ def test_continued_fit_with_all_parts_equals_uninterrupted_one(tmp_path):
     straight, broken = fitted(), fitted(steps=17)
     save_checkpoint(tmp_path, *broken.state())
     views = photos(3)
-    resumed = Fit(views, seeds(), CONFIG, CPU, priors=priors(views))
+    resumed = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
     resumed.load(*load_checkpoint(tmp_path))
     while resumed.step < 40:
         resumed.advance()
@@ -185,7 +185,7 @@ def test_fine_gaussians_stand_at_confirmed_depths(reliable):
 def test_unknown_semantics_leave_the_weights_to_the_others():
     """A view of which semantics say nothing is scored by the other two, whose weights sum to 1."""
     blank = [dataclasses.replace(p, boundary=p.boundary * 0, foreground=p.foreground * 0) for p in priors(photos(3))]
-    fit = Fit(photos(3), seeds(), CONFIG, CPU, priors=blank)
+    fit = Trainer(photos(3), seeds(), CONFIG, CPU, priors=blank)
     drawn, _ = sample_view(
         fit.gaussians, fit.views[0], 0, METHOD, RasterizeOptions(background=torch.zeros(3)), torch.Generator().manual_seed(0)
     )
@@ -195,8 +195,8 @@ def test_unknown_semantics_leave_the_weights_to_the_others():
 
 def test_dropout_falls_with_the_number_of_views():
     """Full up to `dropout_views` training views, then in proportion; it grows over the fit from 0."""
-    few = Fit(photos(3), seeds(), dataclasses.replace(CONFIG, method=MethodConfig()), CPU)
-    many = Fit(photos(6), seeds(), dataclasses.replace(CONFIG, method=MethodConfig()), CPU)
+    few = Trainer(photos(3), seeds(), dataclasses.replace(CONFIG, method=MethodConfig()), CPU)
+    many = Trainer(photos(6), seeds(), dataclasses.replace(CONFIG, method=MethodConfig()), CPU)
     assert few.dropout == pytest.approx(0.2) and many.dropout == pytest.approx(0.1)
     assert few._settings(1) == (0, 1) and few._settings(40) == (pytest.approx(0.2), 40)
 

@@ -11,11 +11,10 @@ from tests.scenes import photos, priors, seeds
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.train.config import PRESETS, FitConfig
-from warpgs.pipeline.train.half_resolution import halved
 from warpgs.pipeline.train.loss import FLAT, MIN_ALPHA, LossConfig, depth_disagreement, training_loss
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.importance_sampling import TrainingView
-from warpgs.pipeline.train.trainer import Fit
+from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.train.views import TrainingView, half_size
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Prior
 
@@ -114,7 +113,7 @@ def test_depth_term_hides_no_nan():
 def test_depth_term_reaches_the_gaussians():
     """The whole way from means to the term, in float64, against central differences along a random direction."""
     view, prior = photos(1)[0], priors(photos(1))[0]
-    fit = Fit([view], seeds(), dataclasses.replace(GUIDED, init=InitConfig(source="points", opacity=0.9)), CPU, priors=[prior])
+    fit = Trainer([view], seeds(), dataclasses.replace(GUIDED, init=InitConfig(source="points", opacity=0.9)), CPU, priors=[prior])
     tensors = {n: t.double() for n, t in fit.gaussians.tensors().items()}
     disparity = torch.as_tensor(prior.disparity, dtype=torch.float64)
 
@@ -140,15 +139,15 @@ def test_training_loss_adds_the_weighted_term():
     assert float(both - plain) == pytest.approx(0.25 * float(depth_disagreement(depth, alpha, disparity, mask)), abs=1e-6)
 
 
-def fitted(config: FitConfig, found: list[Prior] | None = None) -> Fit:
+def fitted(config: FitConfig, found: list[Prior] | None = None) -> Trainer:
     views = photos(3)
-    fit = Fit(views, seeds(), config, CPU, priors=priors(views) if found is None else found)
+    fit = Trainer(views, seeds(), config, CPU, priors=priors(views) if found is None else found)
     for _ in range(config.steps):
         fit.advance()
     return fit
 
 
-def agreement(fit: Fit, wanted: list[Prior]) -> float:
+def agreement(fit: Trainer, wanted: list[Prior]) -> float:
     """Mean correlation of a fit's depths with given disparities."""
     renders = [rasterize(fit.gaussians, v.camera) for v in fit.views]
     return float(np.mean([correlation(r.depth, r.alpha, torch.as_tensor(p.disparity), None) for r, p in zip(renders, wanted)]))
@@ -179,7 +178,7 @@ def test_fit_says_in_which_views_it_has_the_term():
     two = [*priors(photos(3))[:2], nothing[2]]
     short = dataclasses.replace(GUIDED, steps=1)
     assert any("depth term" in n and "2 of 3 views" in n for n in fitted(short, two).notes)
-    told = Fit(photos(3), seeds(), short, CPU).notes
+    told = Trainer(photos(3), seeds(), short, CPU).notes
     assert any("depth: none" in n for n in told) and any("0 of 3 views" in n and "--depth-model" in n for n in told)
     assert not any("depth" in n for n in fitted(dataclasses.replace(short, loss=LossConfig())).notes)
 
@@ -188,9 +187,9 @@ def test_half_size_views_keep_their_disparity():
     """Each pixel has the mean of what it covers."""
     view = photos(1)[0]
     depth_supervised = TrainingView.of(view, CPU).depth_supervised(priors([view])[0])
-    half = halved(depth_supervised)
+    half = half_size(depth_supervised)
     assert torch.allclose(half.disparity, depth_supervised.disparity.reshape(16, 2, 20, 2).mean((1, 3)), atol=1e-6)
-    assert halved(TrainingView.of(view, CPU)).disparity is None
+    assert half_size(TrainingView.of(view, CPU)).disparity is None
 
 
 @pytest.mark.parametrize(

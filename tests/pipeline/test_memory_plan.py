@@ -19,7 +19,7 @@ from warpgs.pipeline.train.schedule import PhaseConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig
-from warpgs.pipeline.train.trainer import Fit
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import View
 from warpgs.synthetic.demo import split_spec, write_demo
@@ -47,11 +47,11 @@ class Sizes(TorchDispatchMode):
         return result
 
 
-def instances(fit: Fit) -> int:
+def instances(fit: Trainer) -> int:
     return most_instances(fit.gaussians, [v.camera for v in fit.views], "exact")
 
 
-def measured(fit: Fit, steps: int) -> int:
+def measured(fit: Trainer, steps: int) -> int:
     """Bytes that the tensors of a fit take at the heaviest moment of some steps."""
     o = fit.optimizer
     views = (t for v in fit.views for t in vars(v).values() if isinstance(t, torch.Tensor))
@@ -66,7 +66,7 @@ def measured(fit: Fit, steps: int) -> int:
 @pytest.mark.parametrize("count", [60, 5000])
 def test_plan_covers_a_step_and_not_much_more(views, count):
     """From few Gaussians on many pixels to many on few, with and without masks."""
-    fit = Fit(views, seeds(count), STEADY, CPU)
+    fit = Trainer(views, seeds(count), STEADY, CPU)
     fit.advance()
     found = measured(fit, 2)
     planned = fit.layout.step(count, instances(fit))
@@ -77,7 +77,7 @@ def test_plan_covers_a_step_and_not_much_more(views, count):
 def test_plan_covers_the_depth_term(views):
     """A disparity a pixel that stays, and what a correlation and its gradient take."""
     config = dataclasses.replace(STEADY, loss=LossConfig(depth_weight=0.1))
-    fit = Fit(views, seeds(60), config, CPU, priors=priors(views))
+    fit = Trainer(views, seeds(60), config, CPU, priors=priors(views))
     fit.advance()
     found = measured(fit, 2)
     planned = fit.layout.step(60, instances(fit))
@@ -86,7 +86,7 @@ def test_plan_covers_the_depth_term(views):
 
 def test_plan_covers_density_events():
     """A set that doubles within a step: the heaviest moment is then the growing itself."""
-    fit = Fit(photos(2), seeds(4000), GROWING, CPU)
+    fit = Trainer(photos(2), seeds(4000), GROWING, CPU)
     fit.advance()
     found = measured(fit, 1)
     layout, after = fit.layout, len(fit.gaussians)
@@ -101,12 +101,12 @@ def test_plan_covers_sampling_events():
         events=True, hier=True, pm=False, sampler=SamplerConfig(fraction=0.01, min_alpha=0.05, max_fraction=0.2)
     )
     config = dataclasses.replace(STEADY, steps=40, method=method, phases=PhaseConfig(4, 6, every=2))
-    fit = Fit(views, seeds(1500), config, CPU, priors=priors(views))
+    fit = Trainer(views, seeds(1500), config, CPU, priors=priors(views))
     for _ in range(6):
         fit.advance()
     before = len(fit.gaussians)
     found, after = measured(fit, 4), len(fit.gaussians)
-    assert len(fit.events) > 2 and any(e["evicted"] for e in fit.events) and before <= after
+    assert len(fit.strategy.events) > 2 and any(e["evicted"] for e in fit.strategy.events) and before <= after
     planned = max(fit.layout.step(after, instances(fit)), fit.layout.held(after) + fit.layout.event(before, after))
     assert found <= planned <= 1.35 * found
 
@@ -115,10 +115,10 @@ def test_plan_covers_sampling_events():
 def test_plan_covers_bands(most):
     """The same for steps that draw in bands."""
     views = photos(2, 200, 150)
-    fit = Fit(views, seeds(800), STEADY, CPU)
+    fit = Trainer(views, seeds(800), STEADY, CPU)
     fit.advance()
     assert instances(fit) > most
-    fit.most = most
+    fit.max_instances = most
     found = measured(fit, 2)
     assert found <= fit.layout.step(800, most, banded=True) <= 1.3 * found
 
@@ -147,10 +147,10 @@ def test_fit_keeps_to_its_limit(tmp_path):
     config = dataclasses.replace(
         STEADY, steps=50, sh_every=25, density=DensityConfig(start=10, every=10, gradient=2e-5, max_gaussians=4000)
     )
-    free = Fit(views, seeds(1200), config, CPU)
+    free = Trainer(views, seeds(1200), config, CPU)
     whole = free.layout.step(1200, free.memory.instances)
     need = (whole + free.layout.smallest(1200)) // 2
-    limited = Fit(views, seeds(1200), dataclasses.replace(config, memory_limit=need), CPU)
+    limited = Trainer(views, seeds(1200), dataclasses.replace(config, memory_limit=need), CPU)
     said = limited.memory.sentence()
     assert limited.memory.cap < 4000 and f"at most {limited.memory.cap:,} Gaussians, not 4,000" in said and "bands" in said
     assert limited.memory.planned <= need and limited.memory.planned_at_cap <= need
@@ -162,7 +162,7 @@ def test_fit_keeps_to_its_limit(tmp_path):
     assert 1200 < len(limited.gaussians) <= limited.memory.cap
     ends = []
     for fit in (free, limited):
-        renders = [rasterize(fit.gaussians, v.camera, RasterizeOptions(max_instances=fit.most)).rgb for v in views]
+        renders = [rasterize(fit.gaussians, v.camera, RasterizeOptions(max_instances=fit.max_instances)).rgb for v in views]
         ends.append(np.mean([-10 * np.log10(np.mean((r.numpy() - v.image) ** 2)) for r, v in zip(renders, views)]))
     assert abs(ends[0] - ends[1]) < 1.0
 
@@ -199,14 +199,14 @@ def test_limit_holds_on_cuda(recorded):
     device = torch.device("cuda", 0)
     views = photos(4, 160, 120)
     config = dataclasses.replace(STEADY, steps=60, density=DensityConfig(start=10, every=10, gradient=2e-5, max_gaussians=4000))
-    free = Fit(views, seeds(1200), dataclasses.replace(config, cuda_graph=recorded), device)
+    free = Trainer(views, seeds(1200), dataclasses.replace(config, cuda_graph=recorded), device)
     most = 4 * free.memory.planned_at_cap if recorded else free.layout.smallest(1500)
     del free
     torch.cuda.synchronize()
     before = torch.cuda.memory_allocated(device)
-    fit = Fit(views, seeds(1200), dataclasses.replace(config, cuda_graph=recorded, memory_limit=most), device)
+    fit = Trainer(views, seeds(1200), dataclasses.replace(config, cuda_graph=recorded, memory_limit=most), device)
     assert bool(fit.layout.recordings) == recorded
     torch.cuda.reset_peak_memory_stats(device)
     while fit.step < 60:
-        fit.burst(100)
+        fit.advance(100)
     assert torch.cuda.max_memory_allocated(device) - before <= most

@@ -8,7 +8,7 @@ import torch
 from tests.gaussians import cloud
 from warpgs.pipeline.model.compress import drop_unused_sh, stored_degrees
 from warpgs.pipeline.model.parameter_bounds import FINEST, NONE, ParameterBounds, model_bytes, pack, truncated, unpack
-from warpgs.pipeline.model.table import Optimizer, OptimizerConfig
+from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityUpdate
 from warpgs.scene import Gaussians
 

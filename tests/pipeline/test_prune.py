@@ -20,10 +20,10 @@ from warpgs.pipeline.model.compress import (
     rows_of,
     stored_degrees,
 )
-from warpgs.pipeline.model.table import Optimizer, OptimizerConfig
 from warpgs.pipeline.runs.checkpoint import load_checkpoint
 from warpgs.pipeline.runs.folder import open_run
 from warpgs.pipeline.runs.prune import prune
+from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera
 from warpgs.synthetic.demo import split_spec, write_demo
@@ -91,7 +91,7 @@ def test_prune_keeps_its_promise(run, tmp_path, capsys):
     degrees = stored_degrees(small.sh)
     assert bool((degrees.diff() >= 0).all()), "not sorted by degree"
     tensors, _ = load_checkpoint(tmp_path / "small")
-    stored = sum(t.numel() * t.element_size() for n, t in tensors.items() if n.startswith("param."))
+    stored = sum(t.numel() * t.element_size() for n, t in tensors.items() if n.startswith("params."))
     assert stored == record["bytes"][1]
     ply = read_ply(tmp_path / "small" / "point_cloud.ply")
     assert len(ply) == len(small) and torch.equal(ply.sh, small.sh)

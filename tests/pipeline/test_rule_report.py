@@ -14,10 +14,9 @@ from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.rule_report import TILE, rule_report_of
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.half_resolution import halved
 from warpgs.pipeline.train.step import stack_views
-from warpgs.pipeline.train.strategies.importance_sampling import TrainingView
-from warpgs.pipeline.train.trainer import Fit
+from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.train.views import TrainingView, half_size
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Gaussians, View
 
@@ -90,7 +89,7 @@ def test_halved_views(size):
     mask = np.ones((height, width), bool)
     mask[0, -1] = False
     view = TrainingView.of(View("a", views(1, width, height)[0].camera, image, mask), CPU)
-    half = halved(view)
+    half = half_size(view)
     h, w = max(1, height // 2), max(1, width // 2)
     assert half.image.shape == (h, w, 3) and half.mask.shape == (h, w) and (half.camera.width, half.camera.height) == (w, h)
     if size == (40, 32):
@@ -104,7 +103,7 @@ def test_halved_views(size):
 def test_a_fit_starts_at_half_size_and_ends_whole(device):
     """The first steps see halved views; the share decides when; without it everything is as before."""
     config = FitConfig(steps=8, init=InitConfig(source="points"), half_resolution=0.5)
-    fit = Fit(photos(3), seeds(), config, device)
+    fit = Trainer(photos(3), seeds(), config, device)
     assert [fit._phase(s).halved for s in range(1, 9)] == [True] * 4 + [False] * 4
     sizes = []
     for _ in range(8):
@@ -116,7 +115,7 @@ def test_a_fit_starts_at_half_size_and_ends_whole(device):
         assert math.isfinite(report.loss)
     assert sizes == [20] * 4 + [40] * 4
     assert len(stack_views(fit.shown)[0]) == 2
-    plain = Fit(photos(3), seeds(), dataclasses.replace(config, half_resolution=0.0), device)
+    plain = Trainer(photos(3), seeds(), dataclasses.replace(config, half_resolution=0.0), device)
     assert plain.shown == plain.views
     with pytest.raises(UsageError, match="half-resolution"):
         dataclasses.replace(config, half_resolution=float("nan"))

@@ -14,7 +14,7 @@ from warpgs.pipeline.runs import sampling_report
 from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, pictured, sampling_report_of, view_sheet
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
-from warpgs.pipeline.train.trainer import Fit
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.report.contact_sheet import DOT, GAP, HEAD, MARGIN, TITLE_SIZE
 from warpgs.report.images import colored
 
@@ -27,7 +27,7 @@ def run(tmp_path_factory):
     """A finished fit with its folder, and the first event."""
     out, seen = tmp_path_factory.mktemp("run"), []
     views = photos(3)
-    fit = Fit(views, seeds(), CONFIG, CPU, priors=priors(views))
+    fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
     with images_kept(fit, NAMES, out):
         draw = fit.on_event
         fit.on_event = lambda step, event: (draw(step, event), seen.append((step, event)))
@@ -94,7 +94,7 @@ def test_figures_add_up(run):
         "draws": 3 * len(seen), "widened": sum(v.quantile < 0.6 for _, e in seen for v in e.views),
     }  # fmt: skip
     assert figures["events"]["added"] > 0 and sum(figures["layers"].values()) == len(fit.gaussians)
-    assert figures["layers"]["fine"] == int(fit.layers.fine.sum()) > 0
+    assert figures["layers"]["fine"] == int(fit.strategy.fine.sum()) > 0
 
 
 def test_story_follows_the_switches(run, tmp_path):
@@ -104,7 +104,7 @@ def test_story_follows_the_switches(run, tmp_path):
     assert "drawn at random" in story.words and "above its 0.6 quantile" in story.words and "rendered depth" in story.words
     assert [c for c, _ in story.images] == [f"sampling after step {s}" for s in sorted(pictured(fit.phases))]
     assert story.images[0][1] == next(iter(sorted((out / "sampling").iterdir()))).read_bytes()
-    assert dict(zip(*story.table))["sampling events"] == str(len(fit.events))
+    assert dict(zip(*story.table))["sampling events"] == str(len(fit.strategy.events))
     sampler = dataclasses.replace(METHOD.sampler, fraction=0.2, depth="consistent")
     method = dataclasses.replace(METHOD, agp=False, sampler=sampler)
     other = fitted(dataclasses.replace(CONFIG, method=method), steps=8)
@@ -120,8 +120,8 @@ def test_first_picture_outlives_a_continuation(run, tmp_path):
     """Stopped after the first event and continued: the same pictures, byte for byte, as of the fit that never stopped."""
     views = photos(3)
 
-    def go_on(until: int, begin=None) -> Fit:
-        fit = Fit(views, seeds(), CONFIG, CPU, priors=priors(views))
+    def go_on(until: int, begin=None) -> Trainer:
+        fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
         if begin is not None:
             fit.load(*begin)
         with images_kept(fit, NAMES, tmp_path):
@@ -139,7 +139,7 @@ def test_first_picture_outlives_a_continuation(run, tmp_path):
 def test_a_folder_that_cannot_be_made_is_said_before_the_first_step(tmp_path):
     """A file stands where it should be."""
     views = photos(3)
-    fit = Fit(views, seeds(), CONFIG, CPU, priors=priors(views))
+    fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
     (tmp_path / "sampling").write_text("in the way")
     with pytest.raises(ResourceError, match="sampling: cannot be made"), images_kept(fit, NAMES, tmp_path):
         pytest.fail("begun")
@@ -154,7 +154,7 @@ def test_a_picture_that_cannot_be_written_is_said(tmp_path, monkeypatch, until):
 
     monkeypatch.setattr(sampling_report, "write_bytes", full)
     views = photos(3)
-    fit = Fit(views, seeds(), CONFIG, CPU, priors=priors(views))
+    fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
     with pytest.raises(ResourceError, match="no space left"), images_kept(fit, NAMES, tmp_path):
         while fit.step < until:
             fit.advance()

@@ -13,7 +13,7 @@ from warpgs.pipeline.train import step
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LossConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.trainer import Fit, NotFiniteError
+from warpgs.pipeline.train.trainer import NotFiniteError, Trainer
 from warpgs.scene import View
 
 pytestmark = pytest.mark.cuda
@@ -24,13 +24,13 @@ BUSY = FitConfig(
 )  # fmt: skip
 
 
-def fitted(views: list[View], recorded: bool, config: FitConfig = BUSY) -> tuple[Fit, list]:
+def fitted(views: list[View], recorded: bool, config: FitConfig = BUSY) -> tuple[Trainer, list]:
     """A fit of all steps on CUDA, and its reports."""
     config = dataclasses.replace(config, cuda_graph=recorded)
-    fit = Fit(views, seeds(61), config, torch.device("cuda", 0), priors=priors(views))
+    fit = Trainer(views, seeds(61), config, torch.device("cuda", 0), priors=priors(views))
     reports = []
     while fit.step < config.steps:
-        reports += fit.burst(100)
+        reports += fit.advance(100)
     return fit, reports
 
 
@@ -73,7 +73,7 @@ def test_recordings_do_not_pile_up(monkeypatch):
     for _ in range(40):
         fit.graphs.clear()
         fit.step -= 1
-        fit.burst(1)
+        fit.advance(1)
         held.append(torch.cuda.memory_reserved())
     assert max(held[20:]) <= max(held[:10]) + 2**22
 
@@ -99,9 +99,9 @@ def test_loss_that_is_no_number_stops_before_it_harms():
     views = photos(4)
     bad = [*views[:3], View("bad", views[3].camera, np.full_like(views[3].image, np.nan))]
     config = dataclasses.replace(BUSY, density=DensityConfig(start=1000))
-    fit = Fit(bad, seeds(), config, torch.device("cuda", 0))
+    fit = Trainer(bad, seeds(), config, torch.device("cuda", 0))
     with pytest.raises(NotFiniteError, match="became nan"):
-        fit.burst(100)
+        fit.advance(100)
     assert fit.step < 4 and all(bool(torch.isfinite(t).all()) for t in fit.gaussians.tensors().values())
 
 

@@ -16,7 +16,7 @@ from warpgs.pipeline.train import setup
 from warpgs.pipeline.train import warmup as warmups
 from warpgs.pipeline.train.config import PRESETS
 from warpgs.pipeline.train.setup import prepare
-from warpgs.pipeline.train.trainer import Fit, run
+from warpgs.pipeline.train.trainer import Trainer, run
 from warpgs.pipeline.train.warmup import POINTS, STEPS, rehearsal, warm_up
 from warpgs.scene import ViewDepth
 
@@ -30,7 +30,7 @@ def test_every_part_of_a_fit_is_used(preset, monkeypatch):
     score = warmups.score
     monkeypatch.setattr(warmups, "score", lambda view, image: scored.append(score(view, image)))
     fit = warm_up(config, CPU)
-    assert fit.step == STEPS and len(fit.events) == config.method.events and len(fit.gaussians) > POINTS
+    assert fit.step == STEPS and len(fit.strategy.events) == config.method.events and len(fit.gaussians) > POINTS
     assert len(scored) == 1 and 0 < scored[0].psnr < 30 and not fit.graphs
 
 
@@ -131,7 +131,7 @@ def test_a_fit_is_the_same_after_a_rehearsal():
     fits = []
     for warmed_up in (False, True):
         with rehearsal(config, device if warmed_up else CPU) as ready:
-            fit = Fit(views, seeds(), config, device, priors=priors(views), ready=ready)
+            fit = Trainer(views, seeds(), config, device, priors=priors(views), ready=ready)
         run(fit, lambda _: None, lambda _: None, lambda: False)
         fits.append(fit.gaussians.tensors())
     assert all(torch.equal(fits[0][n], fits[1][n]) for n in fits[0])

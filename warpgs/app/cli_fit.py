@@ -6,11 +6,10 @@ from pathlib import Path
 
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.model.table import OptimizerConfig
 from warpgs.pipeline.runs.folder import FitRequest, SceneRequest, choose_device
 from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESETS, FitConfig
 from warpgs.pipeline.train.loss import LossConfig
-from warpgs.pipeline.train.schedule import PhaseConfig
+from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.strategies.holdout_blocks import HoldoutConfig
 from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
@@ -88,10 +87,10 @@ def _flags(base: FitConfig) -> type:
         """Most memory that the fit's tensors may take on its device while it takes steps, such as 2GiB or 800MB."""
         cuda_graph: bool = base.cuda_graph
         """On CUDA, record a step once and replay it: the same bytes in less time."""
-        adaptive: bool = base.adaptive
-        """Held-out blocks of the training views decide how many Gaussians there are and of which degree."""
-        max_gaussians: int = base.density.max_gaussians
-        """No more Gaussians than this, from the start on; the same as --density.max-gaussians."""
+        strategy: str = base.strategy
+        """Where Gaussians are added and removed."""
+        max_gaussians: int = base.max_gaussians
+        """No more Gaussians than this, from the start on."""
         holdout: HoldoutConfig = field(default_factory=lambda: base.holdout)
         init: InitConfig = field(default_factory=lambda: base.init)
         loss: LossConfig = field(default_factory=lambda: base.loss)
@@ -143,10 +142,8 @@ def fit(arguments: list[str], description: str) -> FitRequest:
         raise UsageError(f"--threads must be 0 or more, not {a.threads}")
     if a.threads:
         set_threads(a.threads)
-    rooms = {f.name: getattr(a, f.name) for f in dataclasses.fields(base)}
+    rooms = {f.name: getattr(a, f.name, getattr(base, f.name)) for f in dataclasses.fields(base)}
     notes = _choose(a, arguments, rooms)
-    if a.max_gaussians != base.density.max_gaussians:
-        rooms["density"] = dataclasses.replace(a.density, max_gaussians=a.max_gaussians)
     rooms["memory_limit"] = None if a.memory_limit is None else parse_bytes(a.memory_limit)
     if named is None:
         steps = "as many steps as the time allows" if a.time_budget else f"{a.steps} steps"

@@ -168,13 +168,46 @@ def adam_scheduled(
     param: torch.Tensor, grad: torch.Tensor, exp_avg: torch.Tensor, exp_avg_sq: torch.Tensor, lrs: torch.Tensor,
     skip: torch.Tensor, *, head: int, betas: tuple[float, float] = BETAS, eps: float = EPS,
 ) -> None:  # fmt: skip
-    """`adam_step` on CUDA in float32, with ``lrs`` [3] of `scheduled_rates`; nothing changes where ``skip`` [1] is not 0."""
+    """Take the step of `adam_step` in float32, with its learning rates in memory, so that CUDA can record it once.
+
+    Args:
+        param: Parameter, contiguous, shape [N, ...].
+        grad: Its gradient, same shape.
+        exp_avg: Running mean of the gradient, same shape, contiguous.
+        exp_avg_sq: Running mean of its square, same shape, contiguous.
+        lrs: What `scheduled_lrs` gives, float32, shape [3].
+        skip: Nothing changes where this is not 0, int32, shape [1].
+        head: How many numbers of a row take the first learning rate; 0 for none.
+        betas: Decay of the two running means.
+        eps: Added to the root.
+    """
+    if param.numel() == 0:
+        return
+    if param.device.type == "cpu":
+        if int(skip) == 0:
+            _update(param, grad, exp_avg, exp_avg_sq, lrs.tolist(), head, betas, eps)
+        return
     inputs = [
-        interop.view(grad.view(-1), wp.float32), param[0].numel(), head, interop.view(lrs, wp.float32),
+        interop.view(grad.contiguous().view(-1), wp.float32), param[0].numel(), head, interop.view(lrs, wp.float32),
         *betas, 1 - betas[0], 1 - betas[1], eps, interop.view(skip, wp.int32),
         *(interop.view(t.view(-1), wp.float32) for t in (param, exp_avg, exp_avg_sq)),
     ]  # fmt: skip
     interop.launch(make_scheduled_kernel(), -(-param.numel() // 4), inputs, param.device)
+
+
+def _update(param, grad, exp_avg, exp_avg_sq, lrs: list[float], head: int, betas: tuple[float, float], eps: float) -> None:
+    """Launch the generic kernel, which is that of a CPU and of float64."""
+    real, device = interop.real_of(param), param.device
+    length, lanes = (SEGMENT, LANES) if device.type == "cpu" else (1, 1)
+    flat = [interop.view(t.view(-1), real) for t in (param, exp_avg, exp_avg_sq)]
+    head_lr, lr, root_correction2 = lrs
+    with interop.stream_of(device):
+        inputs = [
+            interop.view(grad.contiguous().view(-1), real), length, param[0].numel(), head, head_lr, lr,
+            *betas, 1 - betas[0], 1 - betas[1], root_correction2, eps, *flat,
+        ]  # fmt: skip
+        kernel = make_kernel(real, head > 0, lanes)
+        interop.launch(kernel, -(-param.numel() // length), inputs, device, cost=max(1, length // 16))
 
 
 def adam_step(
@@ -216,24 +249,11 @@ def adam_step(
         raise ValueError(f"step counts from 1, not {step}")
     if param.numel() == 0:
         return
-    real, device = interop.real_of(param), param.device
-    if device.type == "cuda" and real is wp.float32:
+    lrs = scheduled_lrs(lr, step, betas, head_lr)
+    if param.is_cuda and param.dtype == torch.float32:
         # one kernel for this and for recorded steps, so that both give the same bits
-        lrs = torch.tensor(scheduled_lrs(lr, step, betas, head_lr), device=device)
-        skip = torch.zeros(1, dtype=torch.int32, device=device)
-        adam_scheduled(param, grad.contiguous(), exp_avg, exp_avg_sq, lrs, skip, betas=betas, eps=eps, head=head)
+        skip = torch.zeros(1, dtype=torch.int32, device=param.device)
+        on_device = torch.tensor(lrs, device=param.device)
+        adam_scheduled(param, grad, exp_avg, exp_avg_sq, on_device, skip, betas=betas, eps=eps, head=head)
         return
-    beta1, beta2 = betas
-    correction1, correction2 = 1 - beta1**step, 1 - beta2**step
-    row = param[0].numel()
-    length, lanes = (SEGMENT, LANES) if device.type == "cpu" else (1, 1)
-    flat = [interop.view(t.view(-1), real) for t in (param, exp_avg, exp_avg_sq)]
-    with interop.stream_of(device):
-        inputs = [
-            interop.view(grad.contiguous().view(-1), real), length, row, head,
-            (lr if head_lr is None else head_lr) / correction1, lr / correction1,
-            beta1, beta2, 1 - beta1, 1 - beta2, correction2**0.5, eps, *flat,
-        ]  # fmt: skip
-        interop.launch(
-            make_kernel(real, head > 0, lanes), -(-param.numel() // length), inputs, device, cost=max(1, length // 16)
-        )
+    _update(param, grad, exp_avg, exp_avg_sq, lrs, head, betas, eps)

@@ -10,7 +10,7 @@ import torch
 from warpgs.pipeline.model.coverage import Coverage, coverage, fisher
 from warpgs.pipeline.model.merge import Merges, merges
 from warpgs.pipeline.model.parameter_bounds import truncated
-from warpgs.pipeline.train.strategies.clone_split import DensityUpdate
+from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.scene import Camera, Gaussians
 

@@ -8,7 +8,7 @@ import torch
 
 from warpgs.kernels.knn import morton_codes
 from warpgs.kernels.sh import C0
-from warpgs.pipeline.train.strategies.clone_split import DensityUpdate
+from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.scene import Gaussians
 
 OPAQUE = 0.99

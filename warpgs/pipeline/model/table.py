@@ -1,197 +1,206 @@
-"""Parameters of a fit with their Adam moments, kept row by row in step when Gaussians come and go."""
+"""One table of what training learns: parameters, their Adam moments and named columns, one row each.
+
+A fit has a table of Gaussians. A second one, of its training views, has a row a view; it is empty unless a loss term asks for
+parameters of each view.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import torch
 
-from warpgs.errors import UsageError
-from warpgs.kernels.adam import adam_scheduled, adam_step, scheduled_lrs
+from warpgs.kernels.adam import adam_scheduled, scheduled_lrs
 from warpgs.kernels.knn import morton_codes
-from warpgs.pipeline.model.parameter_bounds import ParameterBounds
-from warpgs.pipeline.train.schedule import log_linear
-from warpgs.pipeline.train.strategies.clone_split import DensityUpdate
 from warpgs.scene import Gaussians
-
-MAX_LR = 1e6
-"""No rate is higher: far above what trains, far below what overflows within a fit."""
 
 
 @dataclass(frozen=True)
-class OptimizerConfig:
-    """Learning rates of the reference implementation of Kerbl et al. 2023, but for the scales."""
+class Column:
+    """What is known of each row beside its parameters."""
 
-    means_lr: float = 1.6e-4
-    """Of positions, times the scene's extent, at the start."""
-    means_lr_final: float = 1.6e-6
-    """The same at the last step; log-linear between."""
-    quats_lr: float = 1e-3
-    """Of rotations."""
-    scales_lr: float = 0.01
-    """Of log scales; 0.005 in the reference (docs/decisions/004-scale-rate.md)."""
-    scales_decay: float = 1.0
-    """Share of that rate which is left at the last step; log-linear from the beginning of phase 3, or of a fit without phases.
-    1 keeps it as it is."""
-    opacities_lr: float = 0.05
-    """Of opacity logits."""
-    sh_lr: float = 2.5e-3
-    """Of the constant colour coefficient."""
-    sh_rest_factor: float = 0.05
-    """Share of that for the other coefficients."""
-
-    def __post_init__(self):
-        for name, value in vars(self).items():
-            if not 0 < value <= MAX_LR:
-                raise UsageError(f"optimizer {name} must be positive and at most {MAX_LR:g}, not {value}")
+    fill: float
+    """Value of rows of which nothing is known."""
+    dtype: torch.dtype = torch.float32
+    """Type of the values."""
+    inherited: bool = True
+    """A row that grew from another takes its value; else it starts from ``fill``."""
 
 
-class Optimizer:
-    """Adam over the five tensors of a set of Gaussians."""
+@dataclass(frozen=True)
+class DensityUpdate:
+    """A change of the set of Gaussians: rows that stay, rows that are overwritten, rows that are appended."""
 
-    def __init__(self, gaussians: Gaussians, config: OptimizerConfig, extent: float, stable_start: float = 0.0):
-        """Begin with zero moments; ``stable_start`` in [0, 1) is the share of the fit after which the rate of scales falls."""
-        self.config, self.extent, self.stable_start = config, extent, stable_start
-        self.params = {n: t.detach().clone().contiguous().requires_grad_() for n, t in gaussians.tensors().items()}
-        self.means = {n: torch.zeros_like(t) for n, t in self.params.items()}
-        self.squares = {n: torch.zeros_like(t) for n, t in self.params.items()}
-        self.step_count = 0
-        self.bounds: ParameterBounds | None = None
-        """What parameters are held to after every step; None for nothing."""
+    keep: torch.Tensor
+    """Numbers of the surviving rows in ascending order, int64, shape [S]."""
+    added: Mapping[str, torch.Tensor]
+    """New rows of each parameter, shape [A, ...]; their moments start at zero."""
+    parents: torch.Tensor
+    """For each new row the number of the row it grew from, -1 for none, int64, shape [A]."""
+    columns: Mapping[str, float] = field(default_factory=dict)
+    """Values of columns for new rows without a parent, and of columns that are not inherited; the column's ``fill`` where
+    nothing is said."""
+    overwritten: torch.Tensor | None = None
+    """Numbers of rows, before the change, whose parameters are replaced and whose moments start again at zero, int64, shape
+    [R]; None for none."""
+    values: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    """Parameters of the overwritten rows, shape [R, ...]; a parameter that is not named stays as it is."""
+
+
+class Table:
+    """Parameters with Adam moments and columns, kept row by row in step."""
+
+    def __init__(self, params: Mapping[str, torch.Tensor], columns: Mapping[str, Column], device: torch.device, count: int):
+        """Begin with zero moments and filled columns.
+
+        Args:
+            params: Parameters by name, float32, shape [N, ...]; copied.
+            columns: Columns by name.
+            device: Where the table lives.
+            count: Number of rows N.
+        """
+        self.device = device
+        self.params = {n: t.detach().clone().contiguous().requires_grad_() for n, t in params.items()}
+        self.exp_avg = {n: torch.zeros_like(t) for n, t in self.params.items()}
+        self.exp_avg_sq = {n: torch.zeros_like(t) for n, t in self.params.items()}
+        self.kinds = dict(columns)
+        self.columns = {n: torch.full((count,), c.fill, dtype=c.dtype, device=device) for n, c in columns.items()}
+        self.count = count
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return self.count
+
+    @staticmethod
+    def of_gaussians(gaussians: Gaussians, columns: Mapping[str, Column]) -> Table:
+        """Return the table of a set of Gaussians."""
+        return Table(gaussians.tensors(), columns, gaussians.means.device, len(gaussians))
 
     @property
     def gaussians(self) -> Gaussians:
-        """The current parameters; they require gradients."""
+        """The current parameters as Gaussians; they require gradients."""
         return Gaussians(**self.params)
 
-    def lrs(self, progress: float) -> dict[str, float]:
-        """Learning rate of each tensor at a share [0, 1] of the fit."""
-        c = self.config
-        settled = (progress - self.stable_start) / (1 - self.stable_start)
-        return {
-            "means": self.extent * log_linear(c.means_lr, c.means_lr_final, progress),
-            "quats": c.quats_lr,
-            "log_scales": log_linear(c.scales_lr, c.scales_lr * c.scales_decay, settled),
-            "logit_opacities": c.opacities_lr,
-            "sh": c.sh_lr * c.sh_rest_factor,
-        }
+    def lr_row(self, lrs: Mapping[str, float], step: int, head_lrs: Mapping[str, float]) -> list[float]:
+        """Return what `adam_step` reads from memory at a step, 3 numbers a parameter, in order.
 
-    def step(self, progress: float, fraction: torch.Tensor | None = None) -> None:
-        """Update all parameters from their gradients, which are then cleared.
-
-        ``fraction`` [N]: the part of its step that each mean takes; None for all of it.
+        Args:
+            lrs: Learning rate of each parameter.
+            step: Number of the step, from 1.
+            head_lrs: Learning rate of the first 3 numbers of each row, for parameters where it differs.
         """
-        self.step_count += 1
-        before = None if fraction is None else self.params["means"].detach().clone()
-        for name, lr in self.lrs(progress).items():
-            param = self.params[name]
-            if param.grad is None:
-                continue
-            head = {"head": 3, "head_lr": self.config.sh_lr} if name == "sh" else {}
-            state = (param.detach(), param.grad, self.means[name], self.squares[name])
-            adam_step(*state, lr=lr, step=self.step_count, **head)
-            param.grad = None
-        self._hold_back(before, fraction)
-
-    def _hold_back(self, before: torch.Tensor | None, fraction: torch.Tensor | None) -> None:
-        """Take back a part of the last step of the means, whose size Adam makes independent of the gradient's; keep limits."""
-        if fraction is not None:
-            means = self.params["means"].detach()
-            means.copy_(torch.where(fraction[:, None] == 1, means, before + fraction[:, None] * (means - before)))
-        if self.bounds is not None:
-            self.bounds.enforce(self.params)
-
-    def schedule(self, progress: float, step: int) -> list[float]:
-        """Numbers that `step_scheduled` reads from memory: three for each tensor, in order."""
         row = []
-        for name, lr in self.lrs(progress).items():
-            row += scheduled_lrs(lr, step, head_lr=self.config.sh_lr if name == "sh" else None)
+        for name in self.params:
+            row += scheduled_lrs(lrs[name], step, head_lr=head_lrs.get(name))
         return row
 
-    def step_scheduled(
-        self, gradients: dict[str, torch.Tensor], lrs: torch.Tensor, skip: torch.Tensor, fraction: torch.Tensor | None = None
+    @torch.no_grad()
+    def adam_step(
+        self, gradients: Mapping[str, torch.Tensor], lrs: torch.Tensor, skip: torch.Tensor, factors: torch.Tensor | None = None
     ) -> None:
-        """`step` on CUDA with a row [15] of `schedule` in memory; nothing changes where ``skip`` [1] is not 0."""
-        before = None if fraction is None else self.params["means"].detach().clone()
-        for i, (name, gradient) in enumerate(gradients.items()):
-            state = (self.params[name].detach(), gradient, self.means[name], self.squares[name])
-            adam_scheduled(*state, lrs[3 * i : 3 * i + 3], skip, head=3 if name == "sh" else 0)
-        self._hold_back(before, fraction)
+        """Update all parameters; nothing changes where ``skip`` [1] is not 0.
 
-    def apply(self, change: DensityUpdate) -> None:
-        """Keep the named rows with their moments and append new rows with zero moments."""
-        for name in self.params:  # each old tensor is given up before the next is made
-            added = change.added[name].to(self.params[name].dtype)
-            self.params[name] = torch.cat([self.params[name].detach()[change.keep], added]).requires_grad_()
-            for moments in (self.means, self.squares):
-                moments[name] = torch.cat([moments[name][change.keep], torch.zeros_like(added)])
-        if self.bounds is not None:
-            self.bounds.apply(change)
+        Args:
+            gradients: Gradient of each parameter, in the order of the table.
+            lrs: A row of `lr_row`, float32, shape [3 P].
+            skip: 0, or why the step is not taken, int32, shape [1].
+            factors: Part of its step that each mean takes, shape [N]; None for all of it. Adam makes the size of a step
+                independent of the gradient's, so the part is taken of the step.
+        """
+        before = None if factors is None else self.params["means"].detach().clone()
+        for i, (name, gradient) in enumerate(gradients.items()):
+            state = (self.params[name].detach(), gradient, self.exp_avg[name], self.exp_avg_sq[name])
+            adam_scheduled(*state, lrs[3 * i : 3 * i + 3], skip, head=3 if name == "sh" else 0)
+        if factors is not None:
+            means = self.params["means"].detach()
+            means.copy_(torch.where(factors[:, None] == 1, means, before + factors[:, None] * (means - before)))
 
     @torch.no_grad()
-    def regroup(self, rows: Gaussians, into: torch.Tensor) -> None:
-        """Replace the set by one whose Gaussians each stand for some of the old; what moves with them moves on as they did.
+    def apply(self, update: DensityUpdate) -> None:
+        """Follow a change of the set: kept rows keep everything, new rows start with zero moments."""
+        if update.overwritten is not None:
+            self._overwrite(update.overwritten, update.values)
+        keep, parents = update.keep, update.parents
+        for name in self.params:  # each old tensor is given up before the next is made
+            added = update.added[name].to(self.params[name].dtype)
+            self.params[name] = torch.cat([self.params[name].detach()[keep], added]).requires_grad_()
+            for moments in (self.exp_avg, self.exp_avg_sq):
+                moments[name] = torch.cat([moments[name][keep], torch.zeros_like(added)])
+        for name, kind in self.kinds.items():
+            old = self.columns[name]
+            new = old.new_full((len(parents),), update.columns.get(name, kind.fill))
+            if kind.inherited and len(parents):
+                new = torch.where(parents >= 0, old[parents.clamp_min(0)], new)
+            self.columns[name] = torch.cat([old[keep], new])
+        self.count = len(keep) + len(parents)
+
+    def _overwrite(self, rows: torch.Tensor, values: Mapping[str, torch.Tensor]) -> None:
+        for name, value in values.items():
+            self.params[name].detach()[rows] = value.to(self.params[name].dtype)
+        for moments in (self.exp_avg, self.exp_avg_sq):
+            for t in moments.values():
+                t[rows] = 0
+
+    @torch.no_grad()
+    def reorder(self, order: torch.Tensor) -> None:
+        """Make row i what row ``order[i]`` was; ``order`` is int64, shape [N]."""
+        for group in (self.params, self.exp_avg, self.exp_avg_sq, self.columns):
+            for name in group:
+                group[name] = group[name].detach()[order]
+        for param in self.params.values():
+            param.requires_grad_()
+
+    def sort_along_curve(self) -> None:
+        """Put the Gaussians in Morton order, so that neighbours in space are neighbours in memory."""
+        self.reorder(torch.argsort(morton_codes(self.params["means"].detach()), stable=True))
+
+    @torch.no_grad()
+    def merge(self, rows: Gaussians, into: torch.Tensor) -> None:
+        """Replace the set by one whose Gaussians each stand for some of the old.
 
         First moments add up as the gradients do, second ones as if the gradients had all had one sign: a step is then rather
-        too short than too long. Summed in float64 on the CPU, where the order is the same every time. Limits are the caller's.
+        too short than too long. Summed in float64 on the CPU, where the order is the same every time. Columns are those of the
+        first of the old rows.
 
         Args:
             rows: The new set, M rows.
             into: Row of the new set that each old one went into, -1 for none, int64, shape [N].
         """
+        went, old = into >= 0, torch.arange(self.count, device=into.device)
+        first = old.new_full((len(rows),), self.count).scatter_reduce(0, into[went], old[went], "amin")
+        for name in self.columns:
+            self.columns[name] = self.columns[name][first]
         into = into.cpu()
-        old = torch.nonzero(into >= 0).squeeze(1)
+        sources = torch.nonzero(into >= 0).squeeze(1)
         for name, new in rows.tensors().items():
-            for moments, power in ((self.means, 1.0), (self.squares, 0.5)):
-                each = moments[name].double().cpu()[old] ** power
-                total = each.new_zeros(new.shape).index_add_(0, into[old], each)
+            for moments, power in ((self.exp_avg, 1.0), (self.exp_avg_sq, 0.5)):
+                each = moments[name].double().cpu()[sources] ** power
+                total = each.new_zeros(new.shape).index_add_(0, into[sources], each)
                 moments[name] = (total ** (1 / power)).to(moments[name])
             self.params[name] = new.detach().to(self.params[name].dtype).contiguous().requires_grad_()
+        self.count = len(rows)
 
-    @torch.no_grad()
-    def sort_along_curve(self) -> torch.Tensor:
-        """Put the Gaussians in Morton order, each with its moments, so that neighbours in space are neighbours in memory.
-
-        Returns:
-            The number that each row had before, int64, shape [N].
-        """
-        order = torch.argsort(morton_codes(self.params["means"].detach()), stable=True)
-        self.reorder(order)
-        return order
-
-    @torch.no_grad()
-    def reorder(self, order: torch.Tensor) -> None:
-        """Row i becomes what row ``order[i]`` was, with its moments and limits."""
-        for group in (self.params, self.means, self.squares):
-            for name in group:
-                group[name] = group[name].detach()[order]
-        for param in self.params.values():
-            param.requires_grad_()
-        if self.bounds is not None:
-            self.bounds.reorder(order)
-
-    def cap_opacity(self, opacity: float) -> None:
-        """Lower every opacity to at most this and forget the moments of all opacities (the classic reset)."""
+    def reset_opacities(self, opacity: float) -> None:
+        """Lower every opacity to at most this, in (0, 1), and forget the moments of all opacities (the classic reset)."""
         limit = math.log(opacity / (1 - opacity))  # in float64: the smallest float32 opacity would be 0
         self.params["logit_opacities"] = self.params["logit_opacities"].detach().clamp(max=limit).requires_grad_()
-        self.means["logit_opacities"].zero_()
-        self.squares["logit_opacities"].zero_()
+        self.exp_avg["logit_opacities"].zero_()
+        self.exp_avg_sq["logit_opacities"].zero_()
+
+    def _groups(self) -> dict[str, dict[str, torch.Tensor]]:
+        return {"params": self.params, "exp_avg": self.exp_avg, "exp_avg_sq": self.exp_avg_sq, "columns": self.columns}
 
     def state(self) -> dict[str, torch.Tensor]:
-        """Everything that a continued fit needs, by flat names."""
-        groups = (("param", self.params), ("mean", self.means), ("square", self.squares))
-        tensors = {f"{kind}.{n}": t.detach() for kind, group in groups for n, t in group.items()}
-        return tensors if self.bounds is None else tensors | self.bounds.state()
+        """Return everything by flat names, ``params.means`` for one, as a checkpoint stores it."""
+        return {f"{group}.{n}": t.detach() for group, tensors in self._groups().items() for n, t in tensors.items()}
 
-    def load(self, state: dict[str, torch.Tensor], step_count: int) -> None:
+    def load(self, state: Mapping[str, torch.Tensor]) -> None:
         """Take over what `state` gave."""
-        device = next(iter(self.params.values())).device
-        for kind, group in (("param", self.params), ("mean", self.means), ("square", self.squares)):
-            for name in group:
-                group[name] = state[f"{kind}.{name}"].to(device).contiguous()
-        for name, t in self.params.items():
-            self.params[name] = t.requires_grad_()
-        self.step_count = step_count
-        if self.bounds is not None:
-            self.bounds.load(state)
+        for group, tensors in self._groups().items():
+            for name in tensors:
+                tensors[name] = state[f"{group}.{name}"].to(self.device).contiguous()
+        for t in self.params.values():
+            t.requires_grad_()
+        self.count = len(next(iter(self.params.values()))) if self.params else self.count

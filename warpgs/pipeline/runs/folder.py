@@ -28,10 +28,10 @@ from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line, write_report
 from warpgs.pipeline.runs.rule_report import rule_report_of
 from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, sampling_report_of
+from warpgs.pipeline.train.complexity import complexity_figures, complexity_summary
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.strategies.holdout import complexity_figures, complexity_summary, fit_class
 from warpgs.pipeline.train.time_budget import within_budget
-from warpgs.pipeline.train.trainer import Fit, StepReport, run, train_views
+from warpgs.pipeline.train.trainer import StepReport, Trainer, run, train_views
 from warpgs.pipeline.train.warmup import rehearsal
 from warpgs.report.events import EventLog
 from warpgs.report.progress import Progress
@@ -201,7 +201,7 @@ def fit_scene(request: FitRequest) -> dict:
                 tensors, plain = load_checkpoint(out)
         c = request.config
         with rehearsal(c, device) as ready:
-            fit = fit_class(c)(train, scene.points, c, device, scene.background, ready=ready)
+            fit = Trainer(train, scene.points, c, device, scene.background, ready=ready)
         if device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(device)  # the steps' need is told, not the start's or an earlier fit's
     except WarpgsError:
@@ -225,10 +225,16 @@ def fit_scene(request: FitRequest) -> dict:
     trained = time.perf_counter() - began - setup
     peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(device)} if device.type == "cuda" else {}
     write_ply(out / "point_cloud.ply", drop_unused_sh(fit.gaussians), scene.normalization)
-    metrics = evaluate_run(out, fit.gaussians, train, test, request.config.rule, scene.background, lpips, fit.most)
+    metrics = evaluate_run(out, fit.gaussians, train, test, request.config.rule, scene.background, lpips, fit.max_instances)
     c = request.config
     trade = rule_report_of(
-        fit.gaussians, train, c.rule, scene.background, seed=c.seed, half_resolution=c.half_resolution, max_instances=fit.most
+        fit.gaussians,
+        train,
+        c.rule,
+        scene.background,
+        seed=c.seed,
+        half_resolution=c.half_resolution,
+        max_instances=fit.max_instances,
     )
     notes.append(trade["sentence"])
     print(f"  {notes[-1]}")
@@ -270,10 +276,10 @@ def _stop_signals():
             signal.signal(number, handler)
 
 
-def _train(fit: Fit, out: Path, notes: list[str]) -> None:
+def _train(fit: Trainer, out: Path, notes: list[str]) -> None:
     log = EventLog(out / "metrics.jsonl", fit.step)
 
-    def save(current: Fit) -> None:
+    def save(current: Trainer) -> None:
         log.flush()
         save_checkpoint(out, *current.state())
 
@@ -336,7 +342,7 @@ def open_run(folder: Path, device: torch.device) -> StoredRun:
     except (OSError, ValueError, KeyError, TypeError) as e:
         raise DataError(f"{path}: cannot be read ({e}); give a folder that `warpgs fit --out` filled") from e
     tensors, state = load_checkpoint(folder)
-    if "param.sh_packed" in tensors:
-        tensors["param.sh"] = unpack(tensors["param.sh_packed"], tensors["degrees"])
-    gaussians = Gaussians(**{n: tensors[f"param.{n}"].to(device) for n in Gaussians.__dataclass_fields__})
+    if "params.sh_packed" in tensors:
+        tensors["params.sh"] = unpack(tensors["params.sh_packed"], tensors["degrees"])
+    gaussians = Gaussians(**{n: tensors[f"params.{n}"].to(device) for n in Gaussians.__dataclass_fields__})
     return StoredRun(folder, record, gaussians, cameras, state["step"])

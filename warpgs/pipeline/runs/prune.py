@@ -22,8 +22,8 @@ from warpgs.pipeline.model.parameter_bounds import model_bytes, pack
 from warpgs.pipeline.runs.checkpoint import save_checkpoint
 from warpgs.pipeline.runs.folder import CONFIG, SceneRequest, choose_device, open_run, read_scene
 from warpgs.pipeline.runs.results import options_for
-from warpgs.pipeline.train.strategies.importance_sampling import TrainingView
 from warpgs.pipeline.train.trainer import train_views
+from warpgs.pipeline.train.views import TrainingView
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.scene import Gaussians, View
@@ -52,8 +52,8 @@ def _new_folder(folder: Path, out: Path | None) -> Path:
 def _write(out: Path, record: dict, made: compress.Pruned, step: int, normalization) -> None:
     """The new run folder, whole or not at all."""
     temporary = out.with_name(f".{out.name}.{secrets.token_hex(4)}.tmp")
-    tensors = {f"param.{n}": t for n, t in made.gaussians.tensors().items() if n != "sh"}
-    tensors |= {"param.sh_packed": pack(made.gaussians.sh, made.degrees), "degrees": made.degrees}
+    tensors = {f"params.{n}": t for n, t in made.gaussians.tensors().items() if n != "sh"}
+    tensors |= {"params.sh_packed": pack(made.gaussians.sh, made.degrees), "degrees": made.degrees}
     try:
         temporary.mkdir()
         write_json(temporary / CONFIG, record)

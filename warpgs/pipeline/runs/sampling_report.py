@@ -13,9 +13,15 @@ import numpy as np
 from warpgs.errors import ResourceError
 from warpgs.files import write_bytes
 from warpgs.pipeline.train.schedule import Phases
-from warpgs.pipeline.train.strategies.importance_sampling import Event, MethodConfig, SampledView, TrainingView
+from warpgs.pipeline.train.strategies.importance_sampling import (
+    Event,
+    ImportanceSampling,
+    MethodConfig,
+    SampledView,
+)
 from warpgs.pipeline.train.strategies.sampler import SUPPORT
-from warpgs.pipeline.train.trainer import Fit
+from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.train.views import TrainingView
 from warpgs.report.contact_sheet import Tile, contact_sheet
 from warpgs.report.images import png
 from warpgs.report.page import SamplingReport
@@ -100,7 +106,7 @@ def _on_host(drawn: SampledView) -> SampledView:
 
 
 @contextlib.contextmanager
-def images_kept(fit: Fit, names: list[str], out: Path) -> Iterator[None]:
+def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[None]:
     """Have a fit write pictures of some of its events into its run folder, ``sampling/STEP.png``, while it goes on.
 
     They are drawn by a thread of their own, which the end of the block waits for.
@@ -114,12 +120,13 @@ def images_kept(fit: Fit, names: list[str], out: Path) -> Iterator[None]:
         ResourceError: The folder cannot be made; or a picture could not be written, at the next event or the end of the block.
     """
     config, steps = fit.config.method, pictured(fit.phases)
-
-    if config.events:
-        try:
-            (out / FOLDER).mkdir(exist_ok=True)
-        except OSError as e:
-            raise ResourceError(f"{out / FOLDER}: cannot be made ({e.strerror}); make room there") from e
+    if not isinstance(fit.strategy, ImportanceSampling) or not config.events:
+        yield
+        return
+    try:
+        (out / FOLDER).mkdir(exist_ok=True)
+    except OSError as e:
+        raise ResourceError(f"{out / FOLDER}: cannot be made ({e.strerror}); make room there") from e
 
     def draw(step: int, views: list[TrainingView], kept: list[SampledView]) -> None:
         sheets = [view_sheet(names[d.view], step, v, fit.disparities[d.view], d, config) for v, d in zip(views, kept)]
@@ -138,16 +145,16 @@ def images_kept(fit: Fit, names: list[str], out: Path) -> Iterator[None]:
                 views = [dataclasses.replace(fit.views[d.view], image=fit.views[d.view].image.cpu()) for d in kept]
                 drawing.append(thread.submit(draw, step, views, kept))
 
-        fit.on_event = on_event
+        fit.strategy.on_event = on_event
         try:
             yield
         finally:
-            fit.on_event = None
+            fit.strategy.on_event = None
     for sheet in drawing:
         sheet.result()
 
 
-def event_figures(fit: Fit) -> dict:
+def event_figures(fit: Trainer) -> dict:
     """What the events of a fit amount to, and its two layers, for metrics.json.
 
     Returns:
@@ -155,18 +162,19 @@ def event_figures(fit: Fit) -> dict:
         gate was widened; ``layers``: Gaussians in the coarse and the fine one.
     """
     asked = _asked(fit.config.method)
-    quantiles = [q for e in fit.events for q in e["quantiles"]]
-    fine = int(fit.layers.fine.sum())
+    layered = isinstance(fit.strategy, ImportanceSampling)
+    events, fine = (fit.strategy.events, int(fit.strategy.fine.sum())) if layered else ([], 0)
+    quantiles = [q for e in events for q in e["quantiles"]]
     return {
         "events": {
-            "count": len(fit.events), **{k: sum(e[k] for e in fit.events) for k in ("added", "evicted")},
+            "count": len(events), **{k: sum(e[k] for e in events) for k in ("added", "evicted")},
             "draws": len(quantiles), "widened": sum(q < asked for q in quantiles),
         },
         "layers": {"coarse": len(fit.gaussians) - fine, "fine": fine},
     }  # fmt: skip
 
 
-def sampling_report_of(fit: Fit, out: Path) -> SamplingReport | None:
+def sampling_report_of(fit: Trainer, out: Path) -> SamplingReport | None:
     """What the report of a finished fit says of its sampling events; None where there were none."""
     method, figures = fit.config.method, event_figures(fit)
     events, layers = figures["events"], figures["layers"]

@@ -1,4 +1,4 @@
-"""Everything that decides a fit, composed of the dataclasses that live beside the code which reads them."""
+"""All settings of a fit, composed of the dataclasses that live beside the code which reads them; and the presets."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import hashlib
 import json
 import typing
 from dataclasses import dataclass, field
+from typing import Any
 
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.model.table import OptimizerConfig
-from warpgs.pipeline.train.loss import LossConfig
-from warpgs.pipeline.train.schedule import PhaseConfig
+from warpgs.pipeline.train.loss import LOSS_TERMS, LossConfig, LossTerm
+from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
+from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.strategies.holdout_blocks import HoldoutConfig
 from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
@@ -34,7 +35,7 @@ class FitConfig:
     rule: str = "exact"
     """Cut-offs of the rasterizer: exact, balanced, fast, gsplat or inria."""
     half_resolution: float = 0.0
-    """Share of the steps, from the first, in which views are fitted at half their size (docs/trade.md)."""
+    """Fraction of the steps, from the first, in which views are fitted at half their size (docs/trade.md)."""
     sh_every: int = 1000
     """Steps after which the spherical-harmonics degree in use rises by one."""
     dropout: float = 0.0
@@ -51,8 +52,16 @@ class FitConfig:
     stops where a step would not fit, and pictures are drawn in bands where a whole one would not."""
     cuda_graph: bool = True
     """On CUDA, record a step once and replay it; the same kernels and the same bytes as without, in less time."""
-    adaptive: bool = False
-    """Held-out blocks of the training views decide how many Gaussians there are and of which degree (docs/complexity.md)."""
+    max_gaussians: int = 1_000_000
+    """No more Gaussians than this, from the start on."""
+    strategy: str = "clone_split"
+    """Where Gaussians are added and removed: clone_split, importance_sampling, holdout (held-out blocks of the training views
+    decide how many there are and of which degree, docs/complexity.md), mcmc, or module:Class of your own."""
+    strategy_config: Any = None
+    """Settings of the strategy's own, its ``Config``; None for their defaults. Those of clone_split, importance_sampling and
+    holdout are the groups below."""
+    loss_terms: tuple[LossTerm, ...] = ()
+    """Terms that the loss has beside those of ``loss``."""
     holdout: HoldoutConfig = field(default_factory=HoldoutConfig)
     init: InitConfig = field(default_factory=InitConfig)
     loss: LossConfig = field(default_factory=LossConfig)
@@ -63,7 +72,7 @@ class FitConfig:
     priors: PriorConfig = field(default_factory=PriorConfig)
 
     def __post_init__(self):
-        for name in ("steps", "sh_every", "checkpoint_every", "dropout_views"):
+        for name in ("steps", "sh_every", "checkpoint_every", "dropout_views", "max_gaussians"):
             if getattr(self, name) < 1:
                 raise UsageError(f"{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
         if not 0 <= self.seed < 2**31:
@@ -78,26 +87,42 @@ class FitConfig:
             raise UsageError(f"dropout must lie in [0, 1), not {self.dropout}")
         if self.rule not in RULES:
             raise UsageError(f"rule {self.rule!r} is not one of {', '.join(RULES)}")
+        own = None if ":" in self.strategy else find_strategy(self.strategy).Config
+        if own is not None and self.strategy_config is None:
+            object.__setattr__(self, "strategy_config", own())
 
     def to_json(self) -> dict:
-        """Nested plain values, as stored in a run folder."""
-        return dataclasses.asdict(self)
+        """Return nested plain values, as stored in a run folder."""
+        terms = [{"name": t.name, **dataclasses.asdict(t)} for t in self.loss_terms]
+        return dataclasses.asdict(dataclasses.replace(self, loss_terms=())) | {"loss_terms": terms}
 
     @staticmethod
     def from_json(values: dict) -> FitConfig:
-        """The configuration that `to_json` stored; UsageError where a field is unknown."""
+        """Return the configuration that `to_json` stored.
+
+        Raises:
+            UsageError: A field is unknown, or a class of the user's own was not loaded in this process.
+        """
         try:
-            return _compose(FitConfig, values)
+            values = dict(values)
+            terms = tuple(_term(dict(t)) for t in values.pop("loss_terms"))
+            own = values.pop("strategy_config")
+            kind = find_strategy(values["strategy"]).Config
+            return _compose(FitConfig, values | {"loss_terms": terms, "strategy_config": own and kind(**own)})
         except (TypeError, KeyError) as e:
             raise UsageError(f"the stored configuration is of another version of warpgs ({e})") from e
 
     def fingerprint(self) -> str:
-        """First 12 hexadecimal digits of the SHA-256 of the settings."""
+        """Return the first 12 hexadecimal digits of the SHA-256 of the settings."""
         return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:12]
 
 
+def _term(values: dict) -> LossTerm:
+    return LOSS_TERMS.find(values.pop("name"))(**values)
+
+
 def _compose(kind: type, values: dict):
-    """A settings dataclass from nested plain values; its fields that are dataclasses are composed in turn."""
+    """Return a settings dataclass from nested plain values; its fields that are dataclasses are composed in turn."""
     kinds = typing.get_type_hints(kind)
     return kind(**{k: _compose(kinds[k], v) if dataclasses.is_dataclass(kinds[k]) else v for k, v in values.items()})
 
@@ -108,7 +133,7 @@ _SPARSE = FitConfig(
     optimizer=OptimizerConfig(scales_lr=0.1, scales_decay=0.1), density=DensityConfig(gradient=5e-4),
 )  # fmt: skip
 _PAPER = dataclasses.replace(
-    _SPARSE, preset="paper",
+    _SPARSE, preset="paper", strategy="importance_sampling",
     method=MethodConfig(
         events=True, hier=True,
         sampler=SamplerConfig(depth="consistent", fraction=0.02, footprint=3.0, gate_quantile=0.0, max_fraction=2.0),
@@ -130,6 +155,10 @@ PRESETS: dict[str, FitConfig] = {
     ),
     "strong-3dgs": _SPARSE,
     "3dgs": FitConfig(),
+    "mcmc": FitConfig(
+        preset="mcmc", strategy="mcmc", init=InitConfig(opacity=0.5, scale_factor=0.1),
+        optimizer=OptimizerConfig(scales_lr=0.005),
+    ),
     "nexusgs": _NEXUS,
     "dropgaussian": FitConfig(
         preset="dropgaussian", steps=10_000, dropout=0.2, optimizer=OptimizerConfig(scales_lr=0.005),
@@ -141,13 +170,14 @@ PRESETS: dict[str, FitConfig] = {
         density=DensityConfig(gradient=5e-4, stop_fraction=1.0, reset_every=3000, reset_opacity=0.05, prune_size=0),
     ),
     "paper-literal": dataclasses.replace(
-        _NEXUS, preset="paper-literal", steps=30_000, phases=PhaseConfig(coarse=2000, stable=3000),
-        method=MethodConfig(events=True, hier=True),
+        _NEXUS, preset="paper-literal", strategy="importance_sampling", steps=30_000,
+        phases=PhaseConfig(coarse=2000, stable=3000), method=MethodConfig(events=True, hier=True),
     ),
 }  # fmt: skip
 """paper: the method, with the constants of docs/decisions/008-method.md. quick: the same in a fifth of the steps; balanced: in
 two fifths, the first at half size (docs/trade.md). strong-3dgs: the start, degree, rates, dropout and schedule of ``paper``,
-none of its parts. 3dgs: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few. nexusgs: Zheng et al.
+none of its parts. 3dgs: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few.
+mcmc: Kheradmand et al. 2024, from the same points. nexusgs: Zheng et al.
 2025, a start from flow with every pixel, and its resets. dropgaussian: Park et al. 2025. fsgs: our trainer with
 the depth term, rates, threshold and resets of Zhu et al. 2024, without their unpooling and unseen views, from our own sweep.
 paper-literal: the paper on ``nexusgs``, with what it leaves open as first proposed."""

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 
 from warpgs.errors import UsageError
 from warpgs.kernels.ssim import differences, ssim
+from warpgs.pipeline.train.views import TrainingView
+from warpgs.plugins import Registry
+from warpgs.scene import Gaussians, Prior, Render
 
 MIN_ALPHA = 0.5
 """Depth counts where the picture is more opaque than this: elsewhere the background has the larger share."""
@@ -44,19 +49,21 @@ def _weights(fraction: float, count: int, dtype: torch.dtype, device: torch.devi
         return torch.tensor([fraction / count, (1 - fraction) / count], dtype=dtype, device=device)
 
 
-def photometric_loss(rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None, config: LossConfig) -> torch.Tensor:
-    """Loss of a rendered image.
+def photometric_loss(
+    rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None, ssim_weight: float = 0.2
+) -> torch.Tensor:
+    """Return the loss of a rendered image: (1 - lambda) L1 + lambda (1 - SSIM).
 
     Args:
         rgb: Rendered colours, shape [H, W, 3].
         target: Photographed colours in [0, 1], shape [H, W, 3].
         mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count. Masked pixels are black to the window.
-        config: Weights.
+        ssim_weight: lambda, in [0, 1].
 
     Returns:
         The loss, shape []; 0 where no pixel counts.
     """
-    fraction = config.ssim_weight
+    fraction = ssim_weight
     if mask is None and fraction > 0:
         sums = differences(rgb, target)
         # a product and a sum, where terms one by one would be a dozen kernels on a GPU
@@ -102,27 +109,104 @@ def depth_disagreement(
     return torch.where(flat, 0, 1 - (a * b).sum() / pixels / spread)
 
 
-def training_loss(
-    images: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
-    target: torch.Tensor,
-    mask: torch.Tensor | None,
-    disparity: torch.Tensor | None,
-    config: LossConfig,
-) -> torch.Tensor:
-    """What a step minimises, shape []: `photometric_loss` and, where a disparity is given, the weighted depth term.
+@dataclass(frozen=True)
+class Target:
+    """What a step compares its render with."""
 
-    ``images`` are colour, alpha and depth; the rest is as in `photometric_loss` and `depth_disagreement`.
-    """
-    rgb, alpha, depth = images
-    loss = photometric_loss(rgb, target, mask, config)
-    if disparity is None:
-        return loss
-    return loss + config.depth_weight * depth_disagreement(depth, alpha, disparity, mask)
+    image: torch.Tensor
+    """Colours in [0, 1], shape [H, W, 3]."""
+    mask: torch.Tensor | None
+    """1 where a pixel counts, else 0, shape [H, W]; None where all count."""
+    maps: Mapping[str, torch.Tensor]
+    """What loss terms asked for (`LossTerm.needs`), by name."""
+    params: Mapping[str, torch.Tensor]
+    """The view's own parameters (`LossTerm.view_parameters`), by name, shape [...]; differentiable."""
 
 
-def masked_mse(rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
-    """Mean squared error of a rendered image clamped to [0, 1], over the pixels that count; shapes as in `photometric_loss`."""
-    rgb = rgb.clamp(0, 1)
-    if mask is None:
-        return torch.nn.functional.mse_loss(rgb, target)
-    return ((rgb - target) ** 2 * mask[..., None]).sum() / (3 * mask.sum().clamp_min(1))
+@dataclass(frozen=True)
+class ViewParameter:
+    """A parameter that each training view has for itself, such as an exposure."""
+
+    initial: tuple[float, ...]
+    """Its first value, the same for all views."""
+    lr: float
+    """Learning rate."""
+
+
+@dataclass(frozen=True)
+class LossTerm:
+    """One term of the loss. A term of your own is a frozen dataclass that derives from this; its fields are its settings."""
+
+    name: ClassVar[str] = ""
+    needs_priors: ClassVar[bool] = False
+    """Whether `needs` reads the priors of the views, which then are found before the fit."""
+
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+        """Return the maps of a view that the term compares with, by name, each of shape [H, W] or [H, W, C]."""
+        return {}
+
+    def view_parameters(self) -> dict[str, ViewParameter]:
+        """Return the parameters that the term has each view learn, by name."""
+        return {}
+
+    def active(self, step: int, steps: int) -> bool:
+        """Return whether a step, from 1 to ``steps``, has the term."""
+        return True
+
+    def __call__(self, render: Render, target: Target, gaussians: Gaussians) -> torch.Tensor:
+        """Return the term's value, shape [], differentiable; it must not read back from the device.
+
+        Args:
+            render: The render of the step's view: ``rgb`` [H, W, 3], ``alpha`` and ``depth`` [H, W].
+            target: What to compare it with.
+            gaussians: The Gaussians, parameters as stored.
+        """
+        raise TypeError(f"{type(self).__name__} must define __call__(render, target, gaussians)")
+
+
+LOSS_TERMS = Registry("loss term", LossTerm, __name__)
+"""Loss terms by name."""
+register = LOSS_TERMS.register
+
+
+@register("photometric")
+@dataclass(frozen=True)
+class Photometric(LossTerm):
+    """The photometric loss; every fit has it."""
+
+    ssim_weight: float = 0.2
+    """Fraction lambda of the structural term, in [0, 1]."""
+
+    def __call__(self, render: Render, target: Target, gaussians: Gaussians) -> torch.Tensor:
+        """See `photometric_loss`."""
+        return photometric_loss(render.rgb, target.image, target.mask, self.ssim_weight)
+
+
+@register("depth_correlation")
+@dataclass(frozen=True)
+class DepthCorrelation(LossTerm):
+    """The weighted depth term of `LossConfig`."""
+
+    needs_priors: ClassVar[bool] = True
+    weight: float = 0.05
+    """Weight of the term."""
+    until: float = 0.95
+    """Fraction of the steps, from the first, that have the term."""
+
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+        """Return the disparity of the view's prior."""
+        return {"disparity": torch.as_tensor(prior.disparity, dtype=torch.float32, device=view.image.device)}
+
+    def active(self, step: int, steps: int) -> bool:
+        """Return whether the step is one of the first ``until`` of all."""
+        return step <= self.until * steps
+
+    def __call__(self, render: Render, target: Target, gaussians: Gaussians) -> torch.Tensor:
+        """See `depth_disagreement`."""
+        return self.weight * depth_disagreement(render.depth, render.alpha, target.maps["disparity"], target.mask)
+
+
+def built_in_terms(config: LossConfig) -> tuple[LossTerm, ...]:
+    """Return the terms that the settings ask for."""
+    depth = (DepthCorrelation(config.depth_weight, config.depth_until),) if config.depth_weight > 0 else ()
+    return (Photometric(config.ssim_weight), *depth)

@@ -1,4 +1,4 @@
-"""How learning rates and the spherical-harmonics degree change over a fit, and which phases it has."""
+"""Learning rates, spherical-harmonics degree and phases over a fit."""
 
 from __future__ import annotations
 
@@ -17,6 +17,60 @@ def log_linear(start: float, end: float, progress: float) -> float:
 def sh_degree(step: int, every: int, highest: int) -> int:
     """Degree in use at a step counted from 1: one more after every ``every`` steps, up to ``highest``."""
     return min(highest, (step - 1) // every)
+
+
+MAX_LR = 1e6
+"""Largest learning rate: far above what trains, far below what overflows within a fit."""
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """Learning rates of the reference implementation of Kerbl et al. 2023, but for the scales."""
+
+    means_lr: float = 1.6e-4
+    """Learning rate of the means, times the scene's extent, at the start."""
+    means_lr_final: float = 1.6e-6
+    """The same at the last step; log-linear between."""
+    quats_lr: float = 1e-3
+    """Learning rate of the rotations."""
+    scales_lr: float = 0.01
+    """Learning rate of the log scales; 0.005 in the reference (docs/decisions/004-scale-rate.md)."""
+    scales_decay: float = 1.0
+    """Fraction of that learning rate which is left at the last step; log-linear from the beginning of phase 3, or of a fit
+    without phases. 1 keeps it as it is."""
+    opacities_lr: float = 0.05
+    """Learning rate of the opacity logits."""
+    sh_lr: float = 2.5e-3
+    """Learning rate of the constant colour coefficient."""
+    sh_rest_factor: float = 0.05
+    """Fraction of that for the other coefficients."""
+
+    def __post_init__(self):
+        for name, value in vars(self).items():
+            if not 0 < value <= MAX_LR:
+                raise UsageError(f"optimizer {name} must be positive and at most {MAX_LR:g}, not {value}")
+
+    def lrs(self, progress: float, extent: float, stable_start: float = 0.0) -> dict[str, float]:
+        """Return the learning rate of each parameter.
+
+        Args:
+            progress: Fraction of the fit, in [0, 1].
+            extent: Size of the scene [u], which the rate of the means is multiplied by.
+            stable_start: Fraction of the fit, in [0, 1), after which the rate of the scales falls.
+        """
+        stable = (progress - stable_start) / (1 - stable_start)
+        return {
+            "means": extent * log_linear(self.means_lr, self.means_lr_final, progress),
+            "quats": self.quats_lr,
+            "log_scales": log_linear(self.scales_lr, self.scales_lr * self.scales_decay, stable),
+            "logit_opacities": self.opacities_lr,
+            "sh": self.sh_lr * self.sh_rest_factor,
+        }
+
+    @property
+    def head_lrs(self) -> dict[str, float]:
+        """Learning rate of the first 3 numbers of a row, where it differs from the others'."""
+        return {"sh": self.sh_lr}
 
 
 @dataclass(frozen=True)
@@ -50,22 +104,6 @@ class Phases:
     """Steps done when phase 3 begins."""
     events: tuple[int, ...]
     """Steps done when fine Gaussians are sampled, ascending; the first is ``refine``, or 1 where that is 0."""
-
-
-@dataclass(frozen=True)
-class Phase:
-    """What a step does beyond rendering, comparing and updating; steps of one phase can share a recording."""
-
-    degree: int
-    """Spherical-harmonics degree in use."""
-    densifying: bool
-    """Gradients are gathered, and the set is refined now and then."""
-    layered: bool
-    """The coarse layer is kept stable."""
-    halved: bool
-    """Views are half their size."""
-    depth_supervised: bool
-    """The loss has its depth term."""
 
 
 def plan_phases(config: PhaseConfig, steps: int) -> Phases:

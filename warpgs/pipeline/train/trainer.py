@@ -1,4 +1,4 @@
-"""The fit: from views and points to Gaussians, one step a view."""
+"""The training loop: from views and points to Gaussians, one view a step."""
 
 from __future__ import annotations
 
@@ -12,29 +12,28 @@ import numpy as np
 import torch
 
 from warpgs.errors import DataError, NotFiniteError
-from warpgs.kernels.dropout import opacity_dropout
+from warpgs.kernels.step_buffers import NOT_FINITE
 from warpgs.kernels.tiles import available_bytes
 from warpgs.pipeline.model.init import initial_gaussians, scene_extent
-from warpgs.pipeline.model.layers import COARSE, FINE, NOT_SAMPLED, Layers
-from warpgs.pipeline.model.table import Optimizer
+from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.half_resolution import halved
-from warpgs.pipeline.train.loss import masked_mse, training_loss
+from warpgs.pipeline.train.loss import built_in_terms
 from warpgs.pipeline.train.memory_plan import layout_of, most_instances, plan
-from warpgs.pipeline.train.schedule import Phase, plan_phases, sh_degree
-from warpgs.pipeline.train.setup import prepare
+from warpgs.pipeline.train.schedule import plan_phases
+from warpgs.pipeline.train.setup import prepare, prepared_views
 from warpgs.pipeline.train.step import (
     CAPACITY_FACTOR,
-    NOT_FINITE,
-    STEPS_PER_BATCH,
+    MAX_BATCH,
+    Learned,
     OverLimitError,
     StepBuffers,
-    StepGraph,
-    stack_views,
+    StepGraphs,
+    StepPlan,
+    eager_renderer,
+    step,
 )
-from warpgs.pipeline.train.strategies.clone_split import DensityStats, DensityUpdate, refine
-from warpgs.pipeline.train.strategies.importance_sampling import Event, TrainingView, depth_supervised_views, sampling_event
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.pipeline.train.strategies.base import find_strategy
+from warpgs.pipeline.train.views import TrainingView, half_size, stack_views
 from warpgs.scene import Gaussians, PointCloud, Prior, Scene, View
 
 
@@ -49,12 +48,12 @@ class StepReport:
     psnr: float
     """PSNR on the step's view before the update [dB]."""
     count: int
-    """Number of Gaussians."""
+    """Number of Gaussians after the step."""
     seconds: float
     """Wall time of the step [s]."""
 
 
-class Fit:
+class Trainer:
     """The state of one fit: everything that changes from step to step, and nothing else."""
 
     def __init__(
@@ -70,330 +69,232 @@ class Fit:
             config: Settings.
             device: Where to work.
             background: Colour behind the scene.
-            priors: What is believed of each view; None to find out where sampling or the depth term asks for it.
+            priors: What is believed of each view; None to find out where sampling or a loss term asks for it.
             ready: Called before the device is used.
 
         Raises:
             DataError: There is nothing to start from.
-            UsageError: The memory limit is below what the smallest step needs.
+            UsageError: The memory limit is below what the smallest step needs, or a plug-in is not there.
         """
         if not train:
             raise DataError("there is no training view; name at least one in --split")
         self.config, self.device = config, device
         self.generator = torch.Generator().manual_seed(config.seed)
-        random = np.random.default_rng(config.seed)
-        made = prepare(train, points, config, random, device, priors, ready)
-        cloud, self.notes = made.start.cloud, made.notes
-        self.extent = scene_extent([v.camera for v in train], cloud)
-        self.background = torch.tensor(background, dtype=torch.float32, device=device)
-        self.phases = plan_phases(config.phases, config.steps)
-        stable_start = self.phases.stable_start / config.steps if self.phases.stable_start < config.steps else 0.0
-        gaussians = initial_gaussians(cloud, config.init, self.extent, device)
-        self.optimizer = Optimizer(gaussians, config.optimizer, self.extent, stable_start)
-        self.stats, self.layers = DensityStats(len(cloud), device), Layers(len(cloud), device)
-        self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
-        self.events: list[dict] = []
-        self.step, self.reset_done, self.order = 0, False, []
-        self.on_event: Callable[[int, Event], None] | None = None
-        self.graphs: dict[tuple, StepGraph] = {}
-        self.views = [TrainingView.of(v, device) for v in train]
-        if config.method.events:
-            self.disparities = [p.disparity for p in made.priors]
-            """Relative inverse depth of each view in [0, 1], [H, W]: only pictures of events show it."""
-            depths = made.start.depths or [None] * len(train)
-            self.views = [v.scored(p, d, config.method) for v, p, d in zip(self.views, made.priors, depths, strict=True)]
-        if config.loss.depth_weight > 0:
-            self.views, note = depth_supervised_views(self.views, made.priors)
-            self.notes.append(note)
+        made = prepare(train, points, config, np.random.default_rng(config.seed), device, priors, ready)
+        self.notes: list[str] = made.notes
+        """What was chosen for the user before the first step."""
         self.messages: list[str] = []
         """What the user must know of and was not told yet."""
-        self._plan()
+        cloud = made.start.cloud
+        self.extent = scene_extent([v.camera for v in train], cloud)
+        """Size of the scene [u]."""
+        self.background = torch.tensor(background, dtype=torch.float32, device=device)
+        self.phases = plan_phases(config.phases, config.steps)
+        self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
+        """Dropout probability at the last step."""
+        self.terms = (*built_in_terms(config.loss), *config.loss_terms)
+        self.step, self.order = 0, []
+
+        self.strategy = find_strategy(config.strategy)(self)
+        self.table = Table.of_gaussians(initial_gaussians(cloud, config.init, self.extent, device), self.strategy.columns())
+        own = {n: p for term in self.terms for n, p in term.view_parameters().items()}
+        first = {n: torch.tensor(p.initial, dtype=torch.float32, device=device).repeat(len(train), 1) for n, p in own.items()}
+        self.view_table = Table(first, {}, device, len(train))
+        self.view_lrs = {n: p.lr for n, p in own.items()}
+        self.graphs = StepGraphs(device) if device.type == "cuda" else None
+        self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(first)))
+        seed = config.seed if self.dropout > 0 else None
+        self.learned = Learned(self.table, self.view_table, self.strategy, seed)
+        views, self.disparities = prepared_views(train, made, config, self.terms, device)
+        self.set_views(views)
+        self.strategy.setup()
 
     @property
     def gaussians(self) -> Gaussians:
         """The current Gaussians, detached."""
-        return Gaussians(**{n: t.detach() for n, t in self.optimizer.params.items()})
+        return Gaussians(**{n: t.detach() for n, t in self.table.params.items()})
+
+    @property
+    def capacity(self) -> int:
+        """Number of Gaussians that the settings and the memory limit allow."""
+        return min(self.config.max_gaussians, self.memory.cap)
+
+    def progress(self, step: int) -> float:
+        """Return the fraction of the fit that is done before a step, in [0, 1]."""
+        return (step - 1) / max(1, self.config.steps - 1)
+
+    def plan_of(self, step: int) -> StepPlan:
+        """Return what a step does."""
+        c = self.config
+        terms = tuple(t for t in self.terms if t.active(step, c.steps))
+        return StepPlan(self.strategy.sh_degree(step), step <= c.half_resolution * c.steps, terms, self.strategy.phase(step))
 
     def next_view(self) -> int:
-        """Views come in random order, each once before any comes again."""
+        """Return the number of the next view; they come in random order, each once before any comes again."""
         if not self.order:
             self.order = torch.randperm(len(self.views), generator=self.generator).tolist()
         return self.order.pop()
 
-    def advance(self) -> StepReport:
-        """Render a view, compare it, update the Gaussians, and change the set when it is time.
+    def advance(self, limit: int = 1) -> list[StepReport]:
+        """Take up to ``limit`` steps: render a view, compare it, update, and change the set of Gaussians when it is time.
 
-        Raises:
-            NotFiniteError: The loss is not finite; the Gaussians are as before the step.
-        """
-        begin = time.perf_counter()
-        self.step += 1
-        c, phase = self.config, self._phase(self.step)
-        view = self.shown[self.next_view() + phase.halved * len(self.views)]
-        factors = None
-        if self.dropout > 0:
-            settings = torch.tensor(self._settings(self.step), dtype=torch.float32, device=self.device)
-            factors = opacity_dropout(len(self.optimizer.gaussians), settings, c.seed)
-        options = RasterizeOptions(
-            rule=c.rule,
-            sh_degree=phase.degree,
-            background=self.background,
-            opacity_factors=factors,
-            max_instances=self.most,
-            record=False,  # it would make room for more than was planned
-        )
-        render = rasterize(self.optimizer.gaussians, view.camera, options)
-        render.projected.retain_grad()
-        disparity = view.disparity if phase.depth_supervised else None
-        loss = training_loss((render.rgb, render.alpha, render.depth), view.image, view.mask, disparity, c.loss)
-        loss.backward()
-        value = loss.item()
-        if not math.isfinite(value):
-            raise NotFiniteError(f"the loss became {value} at step {self.step}; the last checkpoint is the state before")
-
-        if phase.densifying:
-            self.stats.add(render)
-        self.optimizer.step(self._progress(self.step), self._fraction(phase))
-        if self._protects:
-            self.layers.clamp_min_opacity(self.optimizer.params["logit_opacities"].detach(), self.step, c.method.protect)
-        with torch.no_grad():
-            psnr = -10 * math.log10(max(masked_mse(render.rgb, view.image, view.mask).item(), 1e-12))
-        del render, loss  # their graph holds the parameters, which are about to be replaced
-        self._change_set(phase)
-        return StepReport(self.step, value, psnr, len(self.optimizer.gaussians), time.perf_counter() - begin)
-
-    def buffers(self, limit: int) -> list[StepReport]:
-        """Take several steps: on CUDA as recorded graphs, which read nothing back in between; elsewhere one as `advance` does.
-
-        Ends before anything that needs the host: a change of the set of Gaussians or of the degree, or ``limit`` steps.
+        On CUDA steps are replayed as graphs, several at a time, and end before anything that needs the host; elsewhere, and
+        where a memory limit leaves no capacity for graphs, one step is taken.
 
         Raises:
             NotFiniteError: A loss is not finite; the Gaussians are as before that step.
             ResourceError: The instances would not fit into memory.
         """
-        if not self.layout.recordings:
-            return [self.advance()]
-        begin = time.perf_counter()
-        c, first = self.config, self.step + 1
-        phase, count = self._phase(first), 1
-        while (
-            count < min(limit, STEPS_PER_BATCH, c.steps - self.step)
-            and self._phase(first + count) == phase
-            and not self._changes_after(first + count - 1)
-        ):
-            count += 1
+        begin, first = time.perf_counter(), self.step + 1
+        plan, count = self.plan_of(first), 1
+        if self.layout.recordings:
+            while (
+                count < min(limit, MAX_BATCH, self.config.steps - self.step)
+                and self.plan_of(first + count) == plan
+                and not self.strategy.due(first + count - 1)
+            ):
+                count += 1
         chosen = [self.next_view() for _ in range(count)]
-        places = [self.places[i + phase.halved * len(self.views)] for i in chosen]
-        try:
-            graphs = [self._graph(kind, phase) for kind, _ in places]
-        except OverLimitError as e:
-            self.order += reversed(chosen)
-            self.graphs.clear()
-            self.layout = dataclasses.replace(self.layout, recordings=0)
-            self._count_changed()
-            self.messages.append(f"memory: steps are taken one by one from here on, because {e}")
-            return [self.advance()]
+        places = [self.places[i + plan.half_size * len(self.views)] for i in chosen]
         steps = range(first, first + count)
-        lrs = [self.optimizer.schedule(self._progress(s), s) for s in steps]
-        self.work.load([row for _, row in places], lrs, [self._settings(s) for s in steps])
-        for graph in graphs:
-            graph.replay()
-        done, stop, history = self.work.result()
+        self.buffers.load([row for _, row in places], [self._lr_row(s) for s in steps], [self._settings(s) for s in steps])
+        if not self._take(places, plan):
+            self.order += reversed(chosen)
+            return self.advance()
+        done, stop, history = self.buffers.result()
         self.order += reversed(chosen[done:])  # views of steps that were not taken come again
         self.step += done
-        self.optimizer.step_count += done
         if stop == NOT_FINITE:
             raise NotFiniteError(
                 f"the loss became {history[done][0]} at step {self.step + 1}; the last checkpoint is the state before"
             )
         if stop:
-            self.graphs.clear()  # recorded anew with more room
-        counts = [len(self.optimizer.gaussians)] * done
+            self.graphs.clear()  # captured anew with more capacity
+        counts = [len(self.table)] * done
         if done == count:
-            self._change_set(phase)
-            counts[-1] = len(self.optimizer.gaussians)
+            self._update()
+            counts[-1] = len(self.table)
         seconds = (time.perf_counter() - begin) / max(1, done)
         return [
             StepReport(first + k, loss, -10 * math.log10(max(mse, 1e-12)), counts[k], seconds)
             for k, (loss, mse) in enumerate(history[:done])
         ]
 
-    def _progress(self, step: int) -> float:
-        return (step - 1) / max(1, self.config.steps - 1)
+    def _take(self, places: list[tuple[tuple, int]], plan: StepPlan) -> bool:
+        """Take steps with views at these places; False, and nothing taken, where graphs turned out to need too much memory."""
+        if not self.layout.recordings:
+            render = eager_renderer(self.config.rule, self.background, self.max_instances)
+            for kind, _ in places:
+                step(self.learned, self.stacks[kind], self.buffers, plan, render)
+            return True
+        how = (self.learned, self.buffers, plan, self.config.rule, self.background, self.max_instances)
+        try:
+            graphs = self.graphs.capture_all([kind for kind, _ in places], self.stacks, *how)
+        except OverLimitError as e:
+            self.graphs.clear()
+            self.layout = dataclasses.replace(self.layout, recordings=0)
+            self.count_changed()
+            self.messages.append(f"memory: steps are taken one by one from here on, because {e}")
+            return False
+        for graph in graphs:
+            graph.replay()
+        return True
 
-    def _settings(self, step: int) -> tuple[float, int]:
-        """Dropout probability and number of a step."""
-        return self.dropout * self._progress(step), step
+    def _lr_row(self, step: int) -> list[float]:
+        c = self.config.optimizer
+        row = self.table.lr_row(self.lrs(step), step, c.head_lrs)
+        return row + self.view_table.lr_row(self.view_lrs, step, {})
 
-    def _phase(self, step: int) -> Phase:
+    def lrs(self, step: int) -> dict[str, float]:
+        """Return the learning rate of each parameter of the Gaussians at a step."""
+        c, phases = self.config, self.phases
+        stable_start = phases.stable_start / c.steps if phases.stable_start < c.steps else 0.0
+        return c.optimizer.lrs(self.progress(step), self.extent, stable_start)
+
+    def _settings(self, step: int) -> tuple[float, float, float]:
+        return self.strategy.dropout(step), step, self.lrs(step)["means"]
+
+    def _update(self) -> None:
+        """Have the strategy change the set of Gaussians after the step that was just taken, where it is time."""
+        if not self.strategy.due(self.step):
+            return
+        self._forget_graphs()
+        with torch.no_grad():
+            for change in self.strategy.update(self.step):
+                self.table.apply(change)
+                self.count_changed()
+
+    def _forget_graphs(self) -> None:
+        if self.graphs is not None:
+            self.graphs.clear()
+
+    def set_views(self, views: list[TrainingView]) -> None:
+        """Train on these views from here on, and plan the memory that steps need."""
         c = self.config
-        layered = c.method.hier and c.method.events and step > self.phases.refine
-        half = step <= c.half_resolution * c.steps
-        depth_supervised = c.loss.depth_weight > 0 and step <= c.loss.depth_until * c.steps
-        return Phase(
-            sh_degree(step, c.sh_every, c.init.max_sh_degree), step <= self._densify_until, layered, half, depth_supervised
-        )
-
-    @property
-    def _densify_until(self) -> int:
-        c = self.config
-        return self.phases.stable_start if c.phases.coarse + c.phases.stable > 0 else c.density.times(c.steps)[2]
-
-    @property
-    def _room_for(self) -> int:
-        """Number of Gaussians that the settings and the memory limit allow."""
-        return min(self.config.density.max_gaussians, self.memory.cap)
-
-    @property
-    def _protects(self) -> bool:
-        return self.config.method.events and self.config.method.pm
-
-    def _fraction(self, phase: Phase) -> torch.Tensor | None:
-        """Part of its step that each mean takes."""
-        if not phase.layered:
-            return None
-        return torch.where(self.layers.fine, 1.0, self.config.method.coarse_lr_factor)
-
-    def _graph(self, kind: tuple[int, int, bool], phase: Phase) -> StepGraph:
-        key = (kind, phase)
-        if key not in self.graphs:
-            c, views = self.config, self.stacks[kind]
-            views = views if phase.depth_supervised else dataclasses.replace(views, disparities=None)
-            self.graphs = {k: g for k, g in self.graphs.items() if k[1:] == key[1:]}
-            self.graphs[key] = StepGraph(
-                views, self.optimizer, self.stats if phase.densifying else None, self.work,
-                degree=phase.degree, rule=c.rule, loss=c.loss, background=self.background,
-                dropout_seed=c.seed if self.dropout > 0 else None, fraction=self._fraction(phase),
-                protected=(self.layers, c.method.protect) if self._protects else None, most=self.most,
-            )  # fmt: skip
-        return self.graphs[key]
-
-    def _plan(self) -> None:
-        """Foretell the memory that steps need, and decide how they are taken."""
-        c = self.config
-        self.shown = self.views + [halved(v) for v in self.views if c.half_resolution > 0]
-        cameras, masked = [v.camera for v in self.shown], [v.mask is not None for v in self.shown]
+        self._forget_graphs()
+        shown = [*views, *(half_size(v) for v in views if c.half_resolution > 0)]
+        shown, self.stacks, self.places = stack_views(shown, len(views))
+        self.views = shown[: len(views)]
+        cameras, masked = [v.camera for v in shown], [v.mask is not None for v in shown]
         layout = layout_of(
-            self.gaussians, cameras, masked, scored=c.method.events, recorded=c.cuda_graph,
+            self.gaussians, cameras, masked, scored=type(self.strategy).samples(c), recorded=c.cuda_graph,
             depth_supervised=c.loss.depth_weight > 0,
         )  # fmt: skip
         self.memory, self.layout = plan(
-            layout, count=len(self.optimizer.gaussians), instances=most_instances(self.gaussians, cameras, c.rule),
-            most=c.density.max_gaussians, limit=c.memory_limit, available=available_bytes(self.device),
-            capacity_factor=CAPACITY_FACTOR,
+            layout, count=len(self.table), instances=most_instances(self.gaussians, cameras, c.rule), most=c.max_gaussians,
+            limit=c.memory_limit, available=available_bytes(self.device), capacity_factor=CAPACITY_FACTOR,
         )  # fmt: skip
-        self._count_changed()
-        if self.layout.recordings:
-            self.work, (self.stacks, self.places) = StepBuffers(self.device), stack_views(self.shown)
+        self.count_changed()
 
-    def _count_changed(self) -> None:
-        """Set how many instances a step may have at a time: None where there is no limit."""
+    def count_changed(self) -> None:
+        """Set how many instances a step may have at a time, None for no limit: it depends on the number of Gaussians."""
         limit = self.config.memory_limit
-        self.most = None if limit is None else self.layout.most_instances(len(self.optimizer.gaussians), limit)
-
-    def _samples_after(self, step: int) -> bool:
-        return self.config.method.events and step in self.phases.events
-
-    def _changes_after(self, step: int) -> bool:
-        return any(self.config.density.due(step, self.config.steps, self._densify_until)) or self._samples_after(step)
-
-    def _change_set(self, phase: Phase) -> None:
-        """Whatever changes the set of Gaussians after the step that was just taken: refinement, reset, sampling."""
-        refines, resets = self.config.density.due(self.step, self.config.steps, self._densify_until)
-        if refines:
-            self._refine(phase)
-        if resets:
-            self.graphs.clear()
-            self.optimizer.cap_opacity(self.config.density.reset_opacity)
-            self.reset_done = True
-        if self._samples_after(self.step):
-            self._sample()
-
-    def _refine(self, phase: Phase) -> None:
-        c = self.config
-        density = dataclasses.replace(c.density, max_gaussians=self._room_for)
-        change = refine(
-            self.gaussians, self.stats, density, extent=self.extent, after_reset=self.reset_done, generator=self.generator,
-            growing=self.layers.fine if phase.layered else None,
-            protected=self.layers.is_protected(self.step, c.method.protect) if self._protects else None,
-        )  # fmt: skip
-        self._apply(change, COARSE, NOT_SAMPLED)
-        if c.density.morton_order:
-            self.layers.reorder(self.optimizer.sort_along_curve())
-        self.stats = DensityStats(len(self.optimizer.gaussians), self.device)
-
-    def _sample(self) -> None:
-        """Add fine Gaussians (docs/decisions/008-method.md)."""
-        c = self.config
-        event = sampling_event(
-            self.gaussians, self.layers, self.views, c.method, step=self.step, rule=c.rule, background=self.background,
-            capacity=self._room_for - len(self.optimizer.gaussians), generator=self.generator, max_instances=self.most,
-        )  # fmt: skip
-        self._apply(event.change, FINE, self.step)
-        self.events.append({
-            "step": self.step, "added": len(event.change.parents), "evicted": event.evicted,
-            "quantiles": [v.quantile for v in event.views],
-        })  # fmt: skip
-        if self.on_event is not None:
-            self.on_event(self.step, event)
-
-    def _apply(self, change: DensityUpdate, level: int, created_step: int) -> None:
-        """Follow a change of the set with all that goes by row."""
-        self.graphs.clear()
-        self.optimizer.apply(change)
-        self.layers.apply(change, level=level, created_step=created_step)
-        self.stats.apply(change)
-        self._count_changed()
+        self.max_instances = None if limit is None else self.layout.most_instances(len(self.table), limit)
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict]:
-        """Tensors and plain values from which the fit goes on as if it had never stopped."""
-        tensors = {
-            **self.optimizer.state(),
-            **self.stats.state(),
-            **self.layers.state(),
-            "generator": self.generator.get_state(),
-        }
+        """Return tensors and plain values from which the fit goes on as if it had never stopped."""
+        tensors, strategy = self.strategy.state()
+        views = {f"views.{n}": t for n, t in self.view_table.state().items()}
+        tensors = {**self.table.state(), **views, **tensors, "generator": self.generator.get_state()}
         plain = {
-            "step": self.step, "order": self.order, "reset_done": self.reset_done, "extent": self.extent,
-            "notes": self.notes, "events": self.events, "config": self.config.to_json(),
+            "step": self.step, "order": self.order, "extent": self.extent, "notes": self.notes,
+            "config": self.config.to_json(), "strategy": strategy,
         }  # fmt: skip
         return tensors, plain
 
     def load(self, tensors: dict[str, torch.Tensor], plain: dict) -> None:
         """Take over what `state` gave."""
-        self.step, self.order, self.reset_done = plain["step"], list(plain["order"]), plain["reset_done"]
+        self.step, self.order = plain["step"], list(plain["order"])
         self.extent, self.notes = plain["extent"], plain["notes"]
-        self.optimizer.extent = self.extent
-        self.optimizer.load(tensors, self.step)
-        self.stats = DensityStats(len(self.optimizer.gaussians), self.device)
-        self.stats.load(tensors)
-        self.layers.load(tensors)
-        self.events = plain["events"]
-        self.graphs.clear()
-        self._plan()
+        self.table.load(tensors)
+        self.view_table.load({n.removeprefix("views."): t for n, t in tensors.items() if n.startswith("views.")})
+        self.strategy.load(tensors, plain["strategy"])
+        self.set_views(self.views)
         self.generator.set_state(tensors["generator"])
 
 
 def train_views(scene: Scene, names: tuple[str, ...]) -> list[View]:
-    """The named views of a scene, in the order named."""
+    """Return the named views of a scene, in the order named."""
     return [scene.view(n) for n in names]
 
 
-def run(fit: Fit, on_step: Callable[[StepReport], None], save: Callable[[Fit], None], stopped: Callable[[], bool]) -> None:
+def run(
+    trainer: Trainer, on_step: Callable[[StepReport], None], save: Callable[[Trainer], None], stopped: Callable[[], bool]
+) -> None:
     """Take all remaining steps, reporting each and saving now and then and at the end.
 
     Raises:
         NotFiniteError: The loss or, when it is to be saved, a number of the state is not finite; nothing of it is saved.
         KeyboardInterrupt: ``stopped`` said so after a step; the state after it is saved.
     """
-    every, saved = fit.config.checkpoint_every, time.monotonic()
-    while fit.step < fit.config.steps:
-        for report in fit.buffers(every - fit.step % every):
+    every, saved = trainer.config.checkpoint_every, time.monotonic()
+    while trainer.step < trainer.config.steps:
+        for report in trainer.advance(every - trainer.step % every):
             on_step(report)
         stop = stopped()
-        due = fit.step % every == 0 and time.monotonic() - saved >= fit.config.checkpoint_seconds
-        if stop or due or fit.step == fit.config.steps:
-            save(fit)
+        due = trainer.step % every == 0 and time.monotonic() - saved >= trainer.config.checkpoint_seconds
+        if stop or due or trainer.step == trainer.config.steps:
+            save(trainer)
             saved = time.monotonic()
         if stop:
             raise KeyboardInterrupt

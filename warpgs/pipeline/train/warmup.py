@@ -17,10 +17,10 @@ import torch
 
 from warpgs.pipeline.metrics.evaluate import render_view, score
 from warpgs.pipeline.model.init import sweeps
-from warpgs.pipeline.runs.results import options_for
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.trainer import Fit, run
+from warpgs.pipeline.train.trainer import Trainer, run
 from warpgs.priors.sweep import SweepConfig, sweep_depths
+from warpgs.render.rasterize import RasterizeOptions
 from warpgs.scene import Camera, PointCloud, Prior, View
 
 STEPS = 3
@@ -39,7 +39,7 @@ def _views(generator: np.random.Generator) -> list[View]:
     return [View(f"{i}", c, generator.random((SIDE, SIDE, 3), np.float32)) for i, c in enumerate(cameras)]
 
 
-def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool] = lambda: False) -> Fit:
+def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool] = lambda: False) -> Trainer:
     """Fit noise in two small views with the same settings, refinement and sampling included, and score one.
 
     Args:
@@ -65,10 +65,11 @@ def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool]
     black = (0.0, 0.0, 0.0)
     if sweeps(config.init, len(views)) and config.memory_limit is None:
         sweep_depths(views, [(2, 4)] * len(views), SweepConfig(max_planes=PLANES), device)
-    fit = Fit(views, cloud, small, device, black, [Prior(*maps, "noise", "noise") for _ in views])
+    fit = Trainer(views, cloud, small, device, black, [Prior(*maps, "noise", "noise") for _ in views])
     run(fit, lambda _: None, lambda _: None, stopped)
-    score(views[0], render_view(fit.gaussians, views[0], options_for(small.rule, black, fit.gaussians))[0])
-    fit.graphs.clear()  # recordings and fit refer to each other, which would keep their memory
+    score(views[0], render_view(fit.gaussians, views[0], RasterizeOptions(rule=small.rule, background=fit.background))[0])
+    if fit.graphs is not None:
+        fit.graphs.clear()  # graphs and trainer refer to each other, which would keep their memory
     return fit
 
 

@@ -1,13 +1,16 @@
-"""Where Gaussians are added and removed during a fit: clone, split, prune (Kerbl et al. 2023, section 5.2)."""
+"""Clone, split and prune (Kerbl et al. 2023, section 5.2)."""
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
 
 from warpgs.errors import UsageError
-from warpgs.scene import Gaussians, Render
+from warpgs.pipeline.model.table import Column, DensityUpdate
+from warpgs.pipeline.train.strategies.base import Strategy, register
+from warpgs.scene import Gaussians
 
 RESET_FREE_STEPS = 500
 """Steps before the set is left alone in which no opacity is reset any more: what is transparent then stays so."""
@@ -39,13 +42,11 @@ class DensityConfig:
     """Largest opacity after a reset."""
     morton_order: bool = True
     """Whether the Gaussians are sorted along a Morton curve after each event (docs/decisions/009-morton-order.md)."""
-    max_gaussians: int = 1_000_000
-    """No more Gaussians than this, from the start on."""
 
     def __post_init__(self):
-        if self.every < 1 or self.start < 0 or self.reset_every < 0 or self.max_gaussians < 1:
-            raise UsageError("density: every and max gaussians must be at least 1, start and reset every at least 0")
-        for name in ("stop_share", "prune_opacity"):
+        if self.every < 1 or self.start < 0 or self.reset_every < 0:
+            raise UsageError("density: every must be at least 1, start and reset every at least 0")
+        for name in ("stop_fraction", "prune_opacity"):
             if not 0 <= getattr(self, name) <= 1:
                 raise UsageError(f"density {name.replace('_', ' ')} {getattr(self, name)} must lie between 0 and 1")
         for name in ("gradient", "clone_size", "prune_size"):
@@ -65,55 +66,6 @@ class DensityConfig:
         return refines, self.reset_every > 0 and step <= until - RESET_FREE_STEPS and step % self.reset_every == 0
 
 
-@dataclass(frozen=True)
-class DensityUpdate:
-    """Which rows stay, and what is appended after them."""
-
-    keep: torch.Tensor
-    """Numbers of the surviving rows in ascending order, int64, shape [S]."""
-    added: dict[str, torch.Tensor]
-    """New rows of each of the five tensors."""
-    parents: torch.Tensor
-    """For each new row the number of the row it grew from, -1 for none, int64, shape [A]."""
-
-
-class DensityStats:
-    """What the backward passes since the last event said of each Gaussian."""
-
-    def __init__(self, count: int, device: torch.device):
-        self.gradient = torch.zeros(count, device=device)
-        """Sum of the norms of the gradient of the projected mean, in half image sizes, shape [N]."""
-        self.seen = torch.zeros(count, device=device)
-        """Number of images in which the Gaussian was visible, shape [N]."""
-
-    def add(self, render: Render) -> None:
-        """Take in one backward pass; ``render.splats`` must have retained its gradient."""
-        height, width = render.alpha.shape[-2:]
-        self.add_gradient(render.projected.grad, render.visible, width, height)
-
-    def add_gradient(self, v_projected: torch.Tensor, visible: torch.Tensor, width: int, height: int, weight=1) -> None:
-        """The same from the gradient of the records [C, N, 12] and visibility [C, N]; ``weight`` 0 takes in nothing."""
-        # a product with a tensor of the two sizes would copy them to the device, which a recorded step must not
-        norms = torch.hypot(v_projected[..., 0] * (0.5 * width), v_projected[..., 1] * (0.5 * height))
-        self.gradient += torch.where(visible, norms, 0).sum(0) * weight
-        self.seen += visible.sum(0) * weight
-
-    def apply(self, change: DensityUpdate) -> None:
-        """Keep what is known of the rows that stay; nothing is known of new ones."""
-        fresh = torch.zeros(len(change.parents), device=self.seen.device)
-        self.gradient = torch.cat([self.gradient[change.keep], fresh])
-        self.seen = torch.cat([self.seen[change.keep], fresh])
-
-    def state(self) -> dict[str, torch.Tensor]:
-        """Both tensors by name, for the checkpoint."""
-        return {"density.gradient": self.gradient, "density.seen": self.seen}
-
-    def load(self, state: dict[str, torch.Tensor]) -> None:
-        """Take over what `state` gave."""
-        self.gradient = state["density.gradient"].to(self.gradient.device)
-        self.seen = state["density.seen"].to(self.seen.device)
-
-
 def _split(gaussians: dict[str, torch.Tensor], ids: torch.Tensor, generator: torch.Generator) -> dict[str, torch.Tensor]:
     """Two children for each: drawn from the parent's own distribution, 1.6 times smaller (Kerbl et al. 2023)."""
     pair = ids.repeat(2)
@@ -129,10 +81,11 @@ def _split(gaussians: dict[str, torch.Tensor], ids: torch.Tensor, generator: tor
 
 def refine(
     gaussians: Gaussians,
-    stats: DensityStats,
+    pull: torch.Tensor,
     config: DensityConfig,
     *,
     extent: float,
+    capacity: int,
     after_reset: bool,
     generator: torch.Generator,
     growing: torch.Tensor | None = None,
@@ -142,9 +95,10 @@ def refine(
 
     Args:
         gaussians: The current set, N rows.
-        stats: What the images said since the last event.
+        pull: Mean norm of the gradient of each projected mean, in half image sizes, shape [N].
         config: Thresholds.
         extent: Size of the scene [u].
+        capacity: Gaussians that there may be.
         after_reset: An opacity reset has happened, so size pruning is on.
         generator: CPU generator for the children's positions; the same numbers on every device.
         growing: Gaussians that may be cloned and split, bool, shape [N]; None for all.
@@ -157,14 +111,13 @@ def refine(
         tensors = {n: t.detach() for n, t in gaussians.tensors().items()}
         scales = tensors["log_scales"].exp().amax(1)
         opacities = tensors["logit_opacities"].sigmoid()
-        pull = stats.gradient / stats.seen.clamp_min(1)
         grows = pull > config.gradient
         if growing is not None:
             grows &= growing
             pull = torch.where(growing, pull, 0)
-        room = max(0, config.max_gaussians - len(gaussians))
-        if int(grows.sum()) > room:
-            strongest = torch.topk(pull, room).indices
+        free = max(0, capacity - len(gaussians))
+        if int(grows.sum()) > free:
+            strongest = torch.topk(pull, free).indices
             grows = torch.zeros_like(grows).index_fill(0, strongest, True) & grows
         small = scales <= config.clone_size * extent
         faint = ~(opacities >= config.prune_opacity)
@@ -183,3 +136,82 @@ def refine(
         children = _split(tensors, split, generator)
         added = {n: torch.cat([t[cloned], children[n]]) for n, t in tensors.items()}
         return DensityUpdate(torch.nonzero(~remove).squeeze(1), added, torch.cat([cloned, split.repeat(2)]))
+
+
+@register("clone_split")
+class CloneSplit(Strategy):
+    """Clones and splits where images pull at a projected mean, prunes the transparent and the huge."""
+
+    def __init__(self, trainer):
+        """See `Strategy`."""
+        super().__init__(trainer)
+        self.was_reset = False
+        """Whether opacities were reset, after which huge Gaussians are removed."""
+
+    def columns(self) -> Mapping[str, Column]:
+        """See `Strategy`."""
+        return {"grad_sum": Column(0.0, inherited=False), "seen_count": Column(0.0, inherited=False)}
+
+    @property
+    def densify_until(self) -> int:
+        """Last step after which the set may be refined."""
+        c, phases = self.trainer.config, self.trainer.phases
+        return phases.stable_start if c.phases.coarse + c.phases.stable > 0 else c.density.times(c.steps)[2]
+
+    def phase(self, step: int) -> Hashable:
+        """Return whether gradients are gathered."""
+        return step <= self.densify_until
+
+    def after_backward(self, phase, v_projected, visible, size, going):
+        """Add the norm of each projected mean's gradient, in half image sizes, to its sum, and count the views that see it."""
+        if not phase:
+            return
+        # a product with a tensor of the two sizes would copy them to the device, which a recorded step must not
+        norms = torch.hypot(v_projected[..., 0] * (0.5 * size[0]), v_projected[..., 1] * (0.5 * size[1]))
+        columns = self.trainer.table.columns
+        columns["grad_sum"] += torch.where(visible, norms, 0).sum(0) * going
+        columns["seen_count"] += visible.sum(0) * going
+
+    def _due(self, step: int) -> tuple[bool, bool]:
+        return self.trainer.config.density.due(step, self.trainer.config.steps, self.densify_until)
+
+    def due(self, step: int) -> bool:
+        """Return whether the set is refined or opacities are reset after a step."""
+        return any(self._due(step))
+
+    def update(self, step: int) -> Iterator[DensityUpdate]:
+        """Refine, then reset opacities, where it is time for either."""
+        refines, resets = self._due(step)
+        if refines:
+            yield from self.refine(step)
+        if resets:
+            self.trainer.table.reset_opacities(self.trainer.config.density.reset_opacity)
+            self.was_reset = True
+
+    def refine(
+        self, step: int, growing: torch.Tensor | None = None, protected: torch.Tensor | None = None
+    ) -> Iterator[DensityUpdate]:
+        """Yield the refinement, then sort the Gaussians and forget what was gathered; arguments as in `refine`."""
+        t = self.trainer
+        columns, c = t.table.columns, t.config.density
+        pull = columns["grad_sum"] / columns["seen_count"].clamp_min(1)
+        yield refine(
+            t.gaussians, pull, c, extent=t.extent, capacity=t.capacity, after_reset=self.was_reset, generator=t.generator,
+            growing=growing, protected=protected,
+        )  # fmt: skip
+        if c.morton_order:
+            t.table.sort_along_curve()
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin to gather gradients anew."""
+        for name in ("grad_sum", "seen_count"):
+            self.trainer.table.columns[name].zero_()
+
+    def state(self) -> tuple[dict[str, torch.Tensor], dict]:
+        """Return whether opacities were reset."""
+        return {}, {"was_reset": self.was_reset}
+
+    def load(self, tensors, plain):
+        """Take over what `state` gave."""
+        self.was_reset = plain["was_reset"]

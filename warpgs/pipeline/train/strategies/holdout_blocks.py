@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from warpgs.errors import UsageError
-from warpgs.pipeline.train.strategies.importance_sampling import TrainingView
+from warpgs.pipeline.train.views import TrainingView
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Gaussians
 
@@ -20,12 +20,12 @@ FLOOR = (2 / 255) ** 2
 SIDES = 16, 32
 """Least and largest side of a block [px]; between them a sixteenth of the picture's shorter side. In pictures of which an
 eighth is less than the least, it is that eighth."""
-AT_MOST = 3
+MAX_COST_FACTOR = 3
 """What is lost within the noise may be this many times what is allowed."""
 MIN_BLOCKS = 12
 """With fewer blocks over all views there is no telling a gain from noise."""
 MAX_FRACTION = 0.1
-"""Small pictures hold out more than was asked for, up to this share, where it takes that to have `FEWEST` blocks."""
+"""Small pictures hold out more than was asked for, up to this share, where it takes that to have `MIN_BLOCKS` blocks."""
 
 
 @dataclass(frozen=True)
@@ -58,12 +58,12 @@ class HoldoutConfig:
 
     def __post_init__(self):
         if not 0 < self.fraction <= 0.5:
-            raise UsageError(f"judge share {self.fraction} must lie above 0 and be at most 0.5")
+            raise UsageError(f"holdout fraction {self.fraction} must lie above 0 and be at most 0.5")
         if self.levels < 1 or self.trims < 1:
-            raise UsageError(f"judge: levels {self.levels} and trims {self.trims} must be at least 1")
+            raise UsageError(f"holdout: levels {self.levels} and trims {self.trims} must be at least 1")
         for name in ("noise", "least_db", "keep_db", "trim_db", "enough_db"):
             if not 0 <= getattr(self, name) < math.inf:
-                raise UsageError(f"judge {name.replace('_', '-')} must be 0 or more and finite, not {getattr(self, name)}")
+                raise UsageError(f"holdout {name.replace('_', '-')} must be 0 or more and finite, not {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Blocks:
 def sample_blocks(views: list[TrainingView], fraction: float, seed: int) -> list[Blocks]:
     """Squares of a random grid in every view, about ``fraction`` of its pixels; more than half of each counts by the mask.
 
-    In small pictures it is more: see `MOST_SHARE`.
+    In small pictures it is more: see `MAX_FRACTION`.
     """
     found = []
     for number, view in enumerate(views):
@@ -169,11 +169,11 @@ class Gain:
         return not self.mean + noises * self.noise >= least
 
     def cost_below(self, allowed: float, noises: float) -> bool:
-        """Whether no more was lost than ``allowed`` [dB], or than the noise of the difference up to `AT_MOST` times that.
+        """Return whether no more was lost than ``allowed`` [dB], or than the noise up to `MAX_COST_FACTOR` times that.
 
         Without the bound few blocks would excuse anything: a large loss differs much from block to block.
         """
-        return -self.mean <= max(allowed, min(noises * self.noise, AT_MOST * allowed))
+        return -self.mean <= max(allowed, min(noises * self.noise, MAX_COST_FACTOR * allowed))
 
 
 def gain(before: torch.Tensor, after: torch.Tensor) -> Gain:
