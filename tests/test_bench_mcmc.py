@@ -60,13 +60,13 @@ def first(count: int) -> Gaussians:
 def test_gsplat_is_trained_as_its_example_trainer_does(gsplat):
     """Settings of the strategy, degree by step, rate of the means from its start to a hundredth; the loss falls."""
     views = photos(3)
-    s = gsplat_trainer.Settings(steps=30, cap=123, sh_every=10)
+    s = gsplat_trainer.Settings(steps=12, cap=123, sh_every=4)
     params = gsplat_trainer.train(views, first(200), s, seed=1, scale=2.0, size=3.0)
     assert gsplat.strategies == [
-        {"cap_max": 123, "noise_lr": 5e5, "refine_start_iter": 500, "refine_stop_iter": 25, "refine_every": 100}
+        {"cap_max": 123, "noise_lr": 5e5, "refine_start_iter": 500, "refine_stop_iter": 10, "refine_every": 100}
     ]
-    assert gsplat.degrees == [0] * 10 + [1] * 10 + [2] * 10
-    wanted = [3.0 * 1.6e-4 * 0.01 ** ((k + 1) / 30) for k in range(30)]
+    assert gsplat.degrees == [0] * 4 + [1] * 4 + [2] * 4
+    wanted = [3.0 * 1.6e-4 * 0.01 ** ((k + 1) / 12) for k in range(12)]
     assert gsplat.lrs == pytest.approx(wanted)
     again = gsplat_trainer.start(2 * first(200).means, torch.full((200, 3), 0.5), s)
     before, after = (

@@ -36,16 +36,17 @@ def _stored(path: Path, fresh: dict) -> dict:
     if not path.is_file():
         return fresh
     found = result_file.read(path)
-    same = ("kind", "size", "scene", "device")
-    if any(found.get(k) != fresh.get(k) for k in same):
-        raise SystemExit(f"{path} holds another measurement ({[found.get(k) for k in same]}); choose another --out")
+    same = ("kind", "size", "scene")
+    held, wanted = ([*(r.get(k) for k in same), r["machine"]["device"]] for r in (found, fresh))
+    if held != wanted:
+        raise SystemExit(f"{path} holds another measurement ({held}); choose another --out")
     return found
 
 
 def kernel_chart(done: dict) -> str:
     """Time of a picture with its gradients against its mean error, a panel for each scene."""
     panels = []
-    what = "processor time of a picture with gradients" if done["device"] == "cpu" else "picture with gradients"
+    what = "processor time of a picture with gradients" if done["machine"]["device"] == "cpu" else "picture with gradients"
     for name, scene in done["scenes"].items():
         points = tuple(
             pareto.Point(r["setting"], r["knob"], r["both_ms"], max(r["mean"], 1e-9), preset=r["preset"])
@@ -113,7 +114,7 @@ def kernel(a: argparse.Namespace) -> None:
         write_json(a.out, {m.name: measure_scene(m, a.repeats, [fast])[0] for m in (make() for make in makers)})
         return
     facts = {
-        "kind": "kernel", "size": [a.width, height, a.count, a.seed], "scene": str(a.run and a.run.name), "device": device.type,
+        "kind": "kernel", "size": [a.width, height, a.count, a.seed], "scene": str(a.run and a.run.name),
         "repeats": a.repeats, "scenes": {},
     }  # fmt: skip
     fresh = result_file.result("time of a render and its gradients against their error, for every setting", device, [], **facts)
@@ -129,7 +130,7 @@ def kernel(a: argparse.Namespace) -> None:
 
 def outcome_chart(done: dict, lines: list[dict]) -> str:
     """Time of a fit against the scores of held-out views, with the spread over seeds."""
-    label = "processor time of the fit [s]" if done["device"] == "cpu" else "wall time of the fit [s]"
+    label = "processor time of the fit [s]" if done["machine"]["device"] == "cpu" else "wall time of the fit [s]"
     panels = []
     for key, words in (("psnr", "held-out PSNR [dB]"), ("ssim", "held-out SSIM")):
         points = tuple(pareto.Point(r["trial"], r["knob"], r["seconds"], r[key], r[f"{key}_sd"], r["preset"]) for r in lines)
@@ -142,7 +143,7 @@ def outcome_chart(done: dict, lines: list[dict]) -> str:
 
 def write_outcome(path: Path, done: dict) -> None:
     """Write result and chart."""
-    done["summary"] = summary(done["rows"], "cpu_seconds" if done["device"] == "cpu" else "seconds")
+    done["summary"] = summary(done["rows"], "cpu_seconds" if done["machine"]["device"] == "cpu" else "seconds")
     result_file.write(path, done)
     write_text(path.with_suffix(".svg"), outcome_chart(done, done["summary"]))
 
@@ -155,7 +156,7 @@ def outcome(a: argparse.Namespace) -> None:
     camera = scene.views[0].camera
     chosen = [t for t in trials() if a.only is None or t.name in a.only.split(",")]
     facts = {
-        "kind": "outcome", "size": [a.split, a.downscale], "scene": Path(a.scene).name, "device": device.type,
+        "kind": "outcome", "size": [a.split, a.downscale], "scene": Path(a.scene).name,
         "resolution": f"{camera.width} x {camera.height} px",
     }  # fmt: skip
     fresh = result_file.result("time of whole fits against scores of held-out views", device, [], **facts)
