@@ -27,7 +27,7 @@ def _machine(stem: str, result: dict) -> str:
 
 
 def budget_text(results: dict[str, dict]) -> str:
-    """Two tables a machine: pictures and gradients."""
+    """Two tables a machine: images and gradients."""
     parts = []
     for stem, result in results.items():
         images, gradients = [], []
@@ -49,7 +49,7 @@ def budget_text(results: dict[str, dict]) -> str:
                 str(sum(e["wrong zeros"] for e in v.values())),
             ])  # fmt: skip
         kept = "Every line is kept." if not result["broken"] else "Broken: " + "; ".join(result["broken"]) + "."
-        head = ["pictures", "mean E", "max E", "allowed", "max P32", "max E depth", "mean A", "max A", "band", "flips"]
+        head = ["images", "mean E", "max E", "allowed", "max P32", "max E depth", "mean A", "max A", "band", "flips"]
         parts += [f"{_machine(stem, result)} {kept}\n", _table(head, images)]
         head = ["gradients", "relative L2", "1 - cosine", "bias", "max E", "max P32", "max A", "wrong zeros"]
         parts.append(_table(head, gradients))
@@ -68,8 +68,8 @@ def needles_text(results: dict[str, dict]) -> str:
                 line += [" / ".join(_e(e[n][k]) for k in ("max", "mean")) for n in ("factor", *peers)]
                 line.append(f"{min(e[n]['max'] / e['factor']['max'] for n in peers):,.0f}")
             rows.append(line)
-        head = ["length [px]", "weight: factor", "conic", "plain", "times", "picture: factor", "conic", "plain", "times"]
-        of = f"Max / mean over {result['needles']} needles (weight) and {result['images']} (picture, gradient)."
+        head = ["length [px]", "weight: factor", "conic", "plain", "times", "image: factor", "conic", "plain", "times"]
+        of = f"Max / mean over {result['needles']} needles (weight) and {result['images']} (image, gradient)."
         parts += [f"{_machine(stem, result)} {of}\n", _table([*head, "gradient: factor", "plain", "times"], rows)]
     return "\n".join(parts)
 

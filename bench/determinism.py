@@ -36,7 +36,7 @@ def gradients_of(g: Gaussians, cam: Camera, *, deterministic: bool) -> list[torc
 
 
 def ulps(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """How many float32 numbers lie between the entries of two tensors, int64."""
+    """Return the number of float32 values between the entries of two tensors, int64."""
 
     def ordered(t: torch.Tensor) -> torch.Tensor:
         bits = t.contiguous().view(torch.int32).long()
@@ -46,7 +46,7 @@ def ulps(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def atomic_spread(g: Gaussians, cam: Camera, repeats: int) -> dict[str, dict]:
-    """How far the gradients of repeated atomic sums lie from the ordered ones, by parameter.
+    """Return the distance of the gradients of repeated atomic sums from the ordered ones, by parameter.
 
     ``rel_l2``: largest relative L2 distance of a repeat from the ordered sum. ``max_ulp``: largest distance of an entry that
     is at least a thousandth of its tensor's largest, in units in the last place. ``repeats_that_differ``: how many repeats

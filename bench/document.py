@@ -165,7 +165,7 @@ def exponent_table(rows: list[dict]) -> str:
 
 
 def skipped_table(skipped: list[dict]) -> str:
-    """What was not measured, and why."""
+    """Return a table of the tasks not measured, with the reasons."""
     columns = _columns(skipped)
     body = [[s["op"], s["program"], s["direction"], *_sizes(s, columns), s["reason"]] for s in skipped]
     return table(["op", "program", "direction", *columns, "reason"], body)
@@ -180,13 +180,13 @@ def _lines(series: list[Series], name) -> tuple[Line, ...]:
 
 
 def charts(title: str, rows: list[dict]) -> dict[str, str]:
-    """Charts of one machine by the end of their names: over N, over pixels, and of the whole picture and step."""
+    """Charts of one machine by the end of their names: over N, over pixels, and of the whole image and step."""
 
     def op_name(s: Series) -> str:
         return s.op if s.program == OURS else s.program
 
     def whole_name(s: Series) -> str:
-        own = {"forward": "picture", "both": "picture + gradients", "step": "training step"}[s.direction]
+        own = {"forward": "image", "both": "image + gradients", "step": "training step"}[s.direction]
         return own if s.program == OURS else {"forward": s.program, "both": f"{s.program} + gr."}.get(s.direction, s.program)
 
     whole = ("render", "step")

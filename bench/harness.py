@@ -40,14 +40,14 @@ class Task:
     """One thing to time, inputs loaded."""
 
     program: str
-    """Whose code runs: warpgs, or a peer."""
+    """Name of the program: warpgs, or a peer."""
     direction: str
     """forward, backward, both (one after the other) or step."""
     run: Callable[[], object]
     cost: Cost | None = None
     """The least it has to do, where that is known."""
     facts: dict = field(default_factory=dict)
-    """What else belongs in the row, such as the number of instances."""
+    """Other entries of the row, such as the number of instances."""
 
 
 def _drain(device: torch.device) -> None:

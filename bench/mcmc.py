@@ -39,7 +39,7 @@ PROGRAMS = (BASE, OURS, PEER, PEER_OWN)
 
 @dataclass(frozen=True)
 class Study:
-    """What all programs are given."""
+    """Inputs that all programs share."""
 
     scene: Scene
     train: list[View]

@@ -28,7 +28,7 @@ from warpgs.runtime import interop
 WHAT = "every op, the whole image and a training step, forward and backward, over sizes"
 OPS = ("project", "sh", "tiles", "blend", "ssim", "adam", "step_buffers", "dropout", "knn", "scanlines", "render", "step")
 FAILURES = (ResourceError, RuntimeError, MemoryError)
-"""What running out of memory looks like, in our code, torch's and Warp's; one failure must not cost the other results."""
+"""Errors of running out of memory, in our code, torch's and Warp's; one failure must not cost the other results."""
 
 
 class Bench:
@@ -130,7 +130,7 @@ class Bench:
                 self.rows[self.rows.index(before[_key(row)])] = row
 
     def open(self, op: str, sizes: dict) -> bool:
-        """Whether an op at some sizes has no row yet, or one during which other programs kept the cores busy."""
+        """Return whether an op at some sizes has no row yet, or one during which other programs kept the cores busy."""
         own = [r for r in self.rows if r["op"] == op and {s: r[s] for s in SIZES if s in r} == sizes]
         return not own or any(r.get("others_cores", 0.0) > DISTURBED for r in own)
 

@@ -20,7 +20,7 @@ LIMITS = {"image_mean": 1e-5, "image_fraction_below_1e-4": 0.9999, "rel_l2": 1e-
 
 
 def peer(gaussians, camera, degree: int) -> torch.Tensor:
-    """The same picture by gsplat, activations applied outside as its interface asks."""
+    """The same image by gsplat, activations applied outside as its interface asks."""
     from gsplat import rasterization
 
     rgb, _, _ = rasterization(
@@ -60,7 +60,7 @@ def compare(path: str, degree: int, width: int, height: int) -> dict:
 
 
 def passes(row: dict) -> bool:
-    """Whether every figure of a row keeps its limit."""
+    """Return whether every figure of a row keeps its limit."""
     gradients = row["gradients"].values()
     return (
         row["image_mean"] < LIMITS["image_mean"]

@@ -81,7 +81,7 @@ def points(axes: tuple[str, ...], device: torch.device, tiny: bool) -> list[Poin
 
 
 def load(p: Point) -> float:
-    """How heavy a point is beside the base point, roughly: Gaussians with their colours, and pixels, count alike."""
+    """Return the weight of a point beside the base point, roughly: Gaussians with their colours, and pixels, count alike."""
     return p.cameras * (p.count / BASE.count * (0.5 + (p.degree + 1) ** 2 / 32) + p.pixels / BASE.pixels)
 
 

@@ -69,7 +69,7 @@ def memory_bytes(rows: list[dict], op: str, program: str, direction: str, point:
 def reason_to_skip(
     rows: list[dict], op: str, program: str, direction: str, point: Point, sizes: dict, free: float
 ) -> str | None:
-    """Why a task should not run, or None."""
+    """Return why a task should not run, or None."""
     predicted = time_ms(rows, op, program, direction, sizes)
     if predicted is not None and predicted > LIMIT_MS:
         return f"predicted {predicted / 1000:.2g} s a repeat, above {LIMIT_MS / 1000:g} s"

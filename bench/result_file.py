@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FOLDER = ROOT / "bench/results"
 """The latest result of each measurement, named ``KIND_MACHINE.json``; the commit stands inside."""
 KEYS = ("what", "command", "commit", "date", "machine", "versions", "rows")
-"""What every result holds, in this order; ``commit`` and ``date`` are None where nobody kept them."""
+"""Keys that every result holds, in this order; ``commit`` and ``date`` are None where nobody kept them."""
 
 
 def command_line() -> str:

@@ -28,7 +28,7 @@ MAX_LINES, MAX_POSITIONAL = 60, 8
 FRAGMENTS = ("What", "How", "Whether", "That", "Those", "Of", "Where", "Which", "Who", "Whose", "Why", "When", "Until")
 """First words of a docstring that make it a clause without a verb of its own."""
 NAMED = 20
-"""How many offenders are listed by name at most."""
+"""Most offenders that are listed by name."""
 
 
 def _git(*words: str) -> bytes:

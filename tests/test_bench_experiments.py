@@ -188,8 +188,8 @@ def test_errors_of_a_scene_are_what_the_settings_leave_out(device, monkeypatch):
 def test_fog_is_lost_under_the_cut():
     """The layers are 98 % opaque without a cut and nothing under `exact`."""
     fog = next(f for f in (m() for m in scenes(CPU, 16, 12, 300, None, 0)) if f.name == "fog")
-    assert float(Setting("t", "t", UNCUT).draw(fog.gaussians, fog.camera).mean()) > 0.4
-    assert float(Setting("e", "e").draw(fog.gaussians, fog.camera).max()) == 0
+    assert float(Setting("t", "t", UNCUT).render(fog.gaussians, fog.camera).mean()) > 0.4
+    assert float(Setting("e", "e").render(fog.gaussians, fog.camera).max()) == 0
 
 
 def test_an_interrupted_kernel_run_goes_on(tmp_path, monkeypatch, capsys):

@@ -34,7 +34,7 @@ REPEATS, WARM_UP = 30, 5
 TOLERANCE = 1e-5
 """Relative distance (L2) between the gradients of two kernels up to which they agree, for every one of the values."""
 STATES = -5
-"""Where the backward kernels take the states, among their arguments."""
+"""Place of the states among the arguments of the backward kernels."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Launch:
 
 
 def put_off(work: Callable, *inputs) -> tuple[object, list[Launch]]:
-    """What a function of the product returns, with its memory not written yet, and the launches that would write it."""
+    """Return the result of a function of the product, its memory not written yet, and the launches that would write it."""
     launches = []
 
     def note(kernel, count, arguments, device, **how):
@@ -64,7 +64,7 @@ def put_off(work: Callable, *inputs) -> tuple[object, list[Launch]]:
 
 
 class Case:
-    """One picture: forward launches by distance of states, the product's backward launch, and its variants.
+    """One image: forward launches by distance of states, the product's backward launch, and its variants.
 
     A variant is the product's kernel with another size of chunk, or one by buckets.
 
@@ -128,18 +128,18 @@ class Case:
         return result
 
     def works(self) -> dict[str, Launch]:
-        """What is timed."""
+        """Return the launches that are timed, by name."""
         forward = {f"forward, states at {size}": launch for size, launch in self.forward.items()}
         return forward | {self.name: self.backward} | self.variants
 
 
 def distance(found: torch.Tensor, wanted: torch.Tensor) -> float:
-    """Of two tensors, relative to the second, L2; NaN if any entry is."""
+    """Return the L2 distance of two tensors relative to the second; NaN if any entry is."""
     return float(torch.linalg.vector_norm(found.double() - wanted.double()) / torch.linalg.vector_norm(wanted.double()))
 
 
 def agrees(row: dict) -> bool:
-    """Whether all distances are within the tolerance; NaN is not."""
+    """Return whether all distances are within the tolerance; NaN is not."""
     return all(d <= TOLERANCE for errors in row["disagreement"].values() for d in errors.values())
 
 
@@ -159,7 +159,7 @@ def times_in_turn(works: dict[str, Callable], repeats: int) -> dict[str, dict]:
 
 
 def case_of(gaussians: Gaussians, camera: Camera, rule: Rule, with_depth: bool) -> Case:
-    """The picture of a batch of cameras, with random gradients of it."""
+    """The image of a batch of cameras, with random gradients of it."""
     size = {"width": camera.width, "height": camera.height}
     with torch.no_grad():
         tensors = gaussians.tensors().values()

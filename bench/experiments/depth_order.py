@@ -35,13 +35,13 @@ MIN_ALPHA = 0.5
 
 @dataclass(frozen=True)
 class Order:
-    """How well one view's depths are ordered."""
+    """Agreement of one view's depths with the points in order."""
 
     name: str
     points: int
     """Points that the view sees."""
     drawn: int
-    """Those of them on which something is drawn."""
+    """Number of those points on which something is rendered."""
     correlation: float
     """Spearman's rank correlation, in [-1, 1]; NaN where fewer than 10 points are drawn, or depth is constant."""
 
@@ -53,20 +53,20 @@ def depth_order(name: str, depth: np.ndarray, alpha: np.ndarray, camera: Camera,
         name: Of the view.
         depth: Rendered z-depth, any unit, shape [H, W].
         alpha: Rendered opacity, shape [H, W].
-        camera: Of the view in the points' coordinates, any size of the same picture.
+        camera: Of the view in the points' coordinates, any size of the same image.
         seen: Points whose track holds the view.
     """
     from scipy.stats import spearmanr
 
     inside = geometry.in_image(camera, seen.points)
-    pixels, truth = geometry.project_points(camera, seen.points[inside])
+    pixels, wanted = geometry.project_points(camera, seen.points[inside])
     height, width = depth.shape
     columns, rows = np.floor(pixels * (np.array([width, height]) / [camera.width, camera.height])).astype(int).T
     drawn = (alpha[rows, columns] > MIN_ALPHA) & (depth[rows, columns] > 0)
-    found, truth = depth[rows, columns][drawn], truth[drawn]
+    found, wanted = depth[rows, columns][drawn], wanted[drawn]
     correlation = float("nan")
-    if len(found) >= MIN_POINTS and np.ptp(found) > 0 and np.ptp(truth) > 0:
-        correlation = float(spearmanr(found, truth).statistic)
+    if len(found) >= MIN_POINTS and np.ptp(found) > 0 and np.ptp(wanted) > 0:
+        correlation = float(spearmanr(found, wanted).statistic)
     return Order(name, int(inside.sum()), len(found), correlation)
 
 

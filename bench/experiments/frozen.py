@@ -64,7 +64,7 @@ def generated(count: int, seed: int) -> Gaussians:
 
 
 def needles(count: int, seed: int) -> Gaussians:
-    """Long axes of 30 to 300 px in a picture 500 px wide, the others far below a pixel."""
+    """Long axes of 30 to 300 px in an image 500 px wide, the others far below a pixel."""
     g = torch.Generator().manual_seed(seed)
     means = (_uniform(g, count, 3) - 0.5) * torch.tensor([4.0, 3.0, 1.0]) + torch.tensor([0.0, 0, 4.0])
     long = torch.log(0.26 * 10 ** _uniform(g, count))
@@ -73,7 +73,7 @@ def needles(count: int, seed: int) -> Gaussians:
 
 
 def fog(layers: int, seed: int) -> Gaussians:
-    """Layers that fill the picture, each of alpha 0.0039, just below 1/255: 98 % opaque together, nothing after the cut."""
+    """Layers that fill the image, each of alpha 0.0039, just below 1/255: 98 % opaque together, nothing after the cut."""
     g = torch.Generator().manual_seed(seed)
     means = torch.zeros(layers, 3, dtype=torch.float64)
     means[:, 2] = torch.linspace(2, 6, layers, dtype=torch.float64)
@@ -108,7 +108,7 @@ FAR = 1000.0
 def scenes(
     device: torch.device, width: int, height: int, count: int, run: Path | None, seed: int
 ) -> list[Callable[[], Frozen]]:
-    """What makes each scene; ``run`` is a folder that a fit filled, whose first view then is the first scene."""
+    """Return a maker for each scene; ``run`` is a folder that a fit filled, whose first view then is the first scene."""
     camera = inputs.camera(width, height, torch.device("cpu"))
     camera = Camera(camera.viewmat[0].double().numpy(), camera.K[0].double().numpy(), width, height)
 

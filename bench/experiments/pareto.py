@@ -16,7 +16,7 @@ are, on a linear axis, values that fall behind the worst of front and presets by
 BEHIND = 2.0
 FEW = 2
 HEAD, LEGEND = 40, 22
-"""Room for the title and for the line that explains the colours [px]."""
+"""Height of the title and for the line that explains the colours [px]."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Point:
 
     name: str
     knob: str
-    """What was turned, by which it is coloured."""
+    """Name of the setting that was changed, by which it is coloured."""
     cost: float
     """Positive; less is better."""
     value: float
@@ -41,12 +41,12 @@ class Panel:
 
     title: str
     what: str
-    """What is shown, in a line."""
+    """One line on the content."""
     x_label: str
     y_label: str
     points: tuple[Point, ...]
     upwards: bool = False
-    """Whether more is better."""
+    """True where more is better."""
     log_y: bool = True
 
 
@@ -75,10 +75,17 @@ def _behind(point: Point, panel: Panel, best: Sequence[Point]) -> bool:
         return False
     values = [p.value for p in panel.points if p in best or p.preset]
     low, high = min(values), max(values)
-    room = BEHIND * (high - low)
-    if room == 0:
+    margin = BEHIND * (high - low)
+    if margin == 0:
         return False
-    return point.value < low - room if panel.upwards else point.value > high + room
+    return point.value < low - margin if panel.upwards else point.value > high + margin
+
+
+def _mark(point: Point, x: float, y: float, color: str, filled: bool) -> str:
+    style = f'fill="{color if filled else "#ffffff"}" stroke="{color}" stroke-width="1.8"'
+    if point.preset:
+        return f'<rect x="{x - 5:.1f}" y="{y - 5:.1f}" width="10" height="10" {style}/>'
+    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" {style}/>'
 
 
 def _panel(panel: Panel, left: float, top: float, colors: dict[str, str]) -> list[str]:
@@ -129,16 +136,10 @@ def _panel(panel: Panel, left: float, top: float, colors: dict[str, str]) -> lis
     out.append(f'<path d="{path}" fill="none" stroke="#999999" stroke-width="1.5"/>')
     labelled = [p for p in points if p.preset or p in best]
     for p in sorted(points, key=lambda p: p.preset):
-        color, x, y = colors[p.knob], px(p.cost), py(p.value)
-        fill = color if p in best else "#ffffff"
         if p.bar > 0:
-            ends = f"M{x:.1f} {py(p.value - p.bar):.1f}V{py(p.value + p.bar):.1f}"
-            out.append(f'<path d="{ends}" stroke="{color}" stroke-opacity="0.5"/>')
-        style = f'fill="{fill}" stroke="{color}" stroke-width="1.8"'
-        if p.preset:
-            out.append(f'<rect x="{x - 5:.1f}" y="{y - 5:.1f}" width="10" height="10" {style}/>')
-        else:
-            out.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" {style}/>')
+            ends = f"M{px(p.cost):.1f} {py(p.value - p.bar):.1f}V{py(p.value + p.bar):.1f}"
+            out.append(f'<path d="{ends}" stroke="{colors[p.knob]}" stroke-opacity="0.5"/>')
+        out.append(_mark(p, px(p.cost), py(p.value), colors[p.knob], p in best))
     edge = left + PLOT_WIDTH + 8
     for p, y in zip(labelled, spread([py(p.value) for p in labelled], 12, top, bottom)):
         thread = f"M{px(p.cost) + 6:.1f} {py(p.value):.1f}L{edge - 2:.1f} {y:.1f}"

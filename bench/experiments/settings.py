@@ -16,7 +16,7 @@ from warpgs.scene import Camera, Gaussians
 
 EXACT = RULES["exact"]
 UNCUT = dataclasses.replace(EXACT, name="uncut", alpha_cut=0.0, transmittance_stop=0.0)
-"""Nothing left out: in float64 the truth of the model."""
+"""Nothing left out: in float64 the reference of the model."""
 CUTS = (0.0, 0.25, 2.0, 4.0, 8.0)
 """Values of the alpha cut beside 1 [1/255]."""
 STOPS = (1e-5, 1e-3, 1e-2, 1e-1)
@@ -45,11 +45,11 @@ class Setting:
 
     @property
     def simulated(self) -> bool:
-        """Whether its error is real and its time is not."""
+        """True where the error is real and the time is not."""
         return self.half or self.stale > 0
 
     def instances(self, gaussians: Gaussians, camera: Camera) -> int:
-        """(Gaussian, tile) instances of a picture."""
+        """(Gaussian, tile) instances of an image."""
         like, size = gaussians.means, {"width": camera.width, "height": camera.height}
         view, K = (torch.as_tensor(t, dtype=like.dtype, device=like.device)[None] for t in (camera.viewmat, camera.K))
         with torch.no_grad():
@@ -57,7 +57,7 @@ class Setting:
             counts = project(*tensors, view, K, **size, degree=0, rule=self.rule, tile_size=self.tile_size)[1]
         return int(counts.sum())
 
-    def draw(
+    def render(
         self, gaussians: Gaussians, camera: Camera, max_instances: int | None = None, capacity: int | None = None
     ) -> torch.Tensor:
         """Colours, shape [H, W, 3]; bounds as in `RasterizeOptions`."""

@@ -32,7 +32,7 @@ from warpgs.runtime.interop import set_threads
 
 
 def _stored(path: Path, fresh: dict) -> dict:
-    """What an earlier run left, if it was of the same kind and size."""
+    """Return the result of an earlier run of the same kind and size, else a fresh one."""
     if not path.is_file():
         return fresh
     found = result_file.read(path)
@@ -44,9 +44,9 @@ def _stored(path: Path, fresh: dict) -> dict:
 
 
 def kernel_chart(done: dict) -> str:
-    """Time of a picture with its gradients against its mean error, a panel for each scene."""
+    """Time of an image with its gradients against its mean error, a panel for each scene."""
     panels = []
-    what = "processor time of a picture with gradients" if done["machine"]["device"] == "cpu" else "picture with gradients"
+    what = "processor time of an image with gradients" if done["machine"]["device"] == "cpu" else "image with gradients"
     for name, scene in done["scenes"].items():
         points = tuple(
             pareto.Point(r["setting"], r["knob"], r["both_ms"], max(r["mean"], 1e-9), preset=r["preset"])

@@ -19,10 +19,10 @@ from warpgs.scene import Camera, Gaussians
 
 VISIBLE = 0.5 / 255
 """Half of what an 8-bit channel resolves."""
-TRUTH_INSTANCES = 8_000_000
-"""Of the truth's pictures at a time: without a cut every Gaussian is in every tile."""
-TRUTH_NS = {"cpu": 60.0, "cuda": 3.0}
-"""Time for a Gaussian and a pixel of the truth with gradients, by which the run is foretold [ns]: measured on 2 cores of a
+REFERENCE_INSTANCES = 8_000_000
+"""Instances of the reference at a time: without a cut every Gaussian is in every tile."""
+REFERENCE_NS = {"cpu": 60.0, "cuda": 3.0}
+"""Time for a Gaussian and a pixel of the reference with gradients, by which the run is foretold [ns]: measured on 2 cores of a
 shared machine; on CUDA a guess on the safe side."""
 LIMIT_MS = 2000.0
 """A setting that takes longer is left without times: an error is all that it can win by."""
@@ -33,20 +33,20 @@ def _leaves(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
 
 
 def _upstream(height: int, width: int) -> torch.Tensor:
-    """Gradient of the picture that all are given, shape [H, W, 3], of either sign."""
+    """Gradient of the image that all are given, shape [H, W, 3], of either sign."""
     return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 0.5
 
 
-def truth(scene: Frozen) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+def reference(scene: Frozen) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """Colours and gradients in float64 with nothing left out."""
     g = _leaves(scene.gaussians, torch.float64)
-    rgb = Setting("truth", "truth", UNCUT).draw(g, scene.camera, TRUTH_INSTANCES)
+    rgb = Setting("reference", "reference", UNCUT).render(g, scene.camera, REFERENCE_INSTANCES)
     gradients = torch.autograd.grad(rgb, list(g.tensors().values()), _upstream(*rgb.shape[:2]).to(rgb))
     return rgb.detach(), dict(zip(g.tensors(), gradients))
 
 
 def image_errors(found: torch.Tensor, wanted: torch.Tensor) -> dict[str, float]:
-    """Of colours [H, W, 3] in [0, 1]: largest, mean, p99.9, PSNR [dB], and the share of pixels that are visibly off."""
+    """Return errors of colours [H, W, 3] in [0, 1]: largest, mean, p99.9, PSNR [dB], fraction of pixels visibly off."""
     error = (found.double() - wanted.double()).abs()
     square = float((error**2).mean())
     return {
@@ -74,28 +74,28 @@ def gradient_errors(found: dict[str, torch.Tensor], wanted: dict[str, torch.Tens
 
 
 def predicted_seconds(scene: Frozen, repeats: int) -> float:
-    """What a scene takes, for the user: the truth, and all settings at 50 ns a Gaussian each but at least 20 ms a repeat."""
+    """Return the predicted time [s]: the reference, and each setting at 50 ns a Gaussian, at least 20 ms a repeat."""
     kind = scene.gaussians.means.device.type
     pairs = len(scene.gaussians) * scene.camera.width * scene.camera.height
     uncut = 2 * pairs * 3e-9 if kind == "cpu" else pairs * 1e-10
     drawing = 0.06 if kind == "cpu" else 0.005
-    return pairs * TRUTH_NS[kind] * 1e-9 + (repeats + 5) * (uncut + 25 * drawing)
+    return pairs * REFERENCE_NS[kind] * 1e-9 + (repeats + 5) * (uncut + 25 * drawing)
 
 
 def _works(s: Setting, leaves: Gaussians, camera: Camera, upstream: torch.Tensor) -> list[Callable[[], object]]:
-    """A picture, and a picture with its gradients; on CUDA recorded, as fits take them: at these sizes the host is slower."""
+    """An image, and an image with its gradients; on CUDA recorded, as fits take them: at these sizes the host is slower."""
     inputs, cuda = list(leaves.tensors().values()), leaves.means.is_cuda and not s.simulated
-    room = {}
+    bounds = {}
     if cuda:  # nothing that is recorded may look at the device or copy from the host
         matrices = (torch.as_tensor(t, dtype=torch.float32, device=leaves.means.device) for t in (camera.viewmat, camera.K))
         camera = Camera(*matrices, camera.width, camera.height)
-        room = {"capacity": max(1, s.instances(leaves, camera))}
+        bounds = {"capacity": max(1, s.instances(leaves, camera))}
 
     def forward():
-        return s.draw(leaves, camera, **room)
+        return s.render(leaves, camera, **bounds)
 
     def both():
-        return torch.autograd.grad(s.draw(leaves, camera, **room), inputs, upstream)
+        return torch.autograd.grad(s.render(leaves, camera, **bounds), inputs, upstream)
 
     return [recorded(forward), recorded(both)] if cuda else [forward, both]
 
@@ -103,13 +103,13 @@ def _works(s: Setting, leaves: Gaussians, camera: Camera, upstream: torch.Tensor
 def measure_scene(scene: Frozen, repeats: int, chosen: list[Setting] | None = None) -> list[dict]:
     """A row for each setting of one scene."""
     g, device = scene.gaussians, scene.gaussians.means.device
-    wanted, wanted_gradients = truth(scene)
+    wanted, wanted_gradients = reference(scene)
     upstream = _upstream(scene.camera.height, scene.camera.width).to(device, torch.float32)
     rows, works, exact = [], [], None
     for s in settings(g.sh_degree, device.type == "cuda") if chosen is None else chosen:
         leaves = _leaves(g, torch.float32)
         inputs = list(leaves.tensors().values())
-        rgb = s.draw(leaves, scene.camera)
+        rgb = s.render(leaves, scene.camera)
         gradients = dict(zip(leaves.tensors(), torch.autograd.grad(rgb, inputs, upstream, retain_graph=True)))
         errors = image_errors(rgb.detach(), wanted) | gradient_errors(gradients, wanted_gradients)
         exact = rgb.detach() if exact is None else exact  # the first setting
