@@ -58,16 +58,6 @@ def project(count: int, cameras: int, degree: int) -> tuple[Cost, Cost]:
     return forward, Cost(2 * parameters + 2 * records, views * (700 + 18 * coefficients))
 
 
-def sh(count: int, degree: int) -> tuple[Cost, Cost]:
-    """Forward: coefficients and directions in, colours out. Backward: those and a colour gradient in, two gradients out."""
-    coefficients = (degree + 1) ** 2
-    numbers = 3 * coefficients
-    return (
-        Cost(REAL * count * (numbers + 6), count * (6 * coefficients + 40)),
-        Cost(REAL * count * (2 * numbers + 9), count * (18 * coefficients + 100)),
-    )
-
-
 def tiles(count: int, cameras: int, instances: int, tiles_in_all: int) -> Cost:
     """Records read twice; a sort of (32-bit depth, number) pairs; instances emitted; a sort of (tile, slot) pairs; ids out.
 
