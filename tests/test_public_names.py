@@ -25,7 +25,7 @@ def test_dir_lists_the_public_names_and_nothing_else():
 def test_every_public_name_is_there_and_documented(name):
     """It loads, and its own docstring says what it is."""
     value = getattr(warpgs, name)
-    assert value is getattr(importlib.import_module(warpgs._HOME[name]), name)
+    assert value is getattr(importlib.import_module(warpgs._HOMES[name]), name)
     assert name.isupper() or value.__doc__
 
 
@@ -34,7 +34,7 @@ def test_type_checkers_see_the_same_names():
     tree = ast.parse((ROOT / "__init__.py").read_text("utf-8"))
     (block,) = (n for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING")
     seen = {a.name: n.module for n in block.body if isinstance(n, ast.ImportFrom) for a in n.names}
-    assert seen == warpgs._HOME and set(seen) == set(warpgs.__all__)
+    assert seen == warpgs._HOMES and set(seen) == set(warpgs.__all__)
     assert (ROOT / "py.typed").is_file()
 
 

@@ -27,6 +27,7 @@ __all__ = [
     "Normalization",
     "PointCloud",
     "RasterizeOptions",
+    "Reader",
     "Render",
     "Scene",
     "StepReport",
@@ -51,6 +52,7 @@ __all__ = [
 if TYPE_CHECKING:
     from warpgs.export.ply import read_ply, write_ply
     from warpgs.io.load import load_scene
+    from warpgs.io.readers import Reader
     from warpgs.pipeline.metrics.evaluate import ViewMetrics, evaluate
     from warpgs.pipeline.runs.fit import FitResult, fit
     from warpgs.pipeline.runs.folder import StoredRun, open_run
@@ -65,11 +67,12 @@ if TYPE_CHECKING:
     from warpgs.render.rule_costs import select_rule
     from warpgs.scene import Camera, Gaussians, Normalization, PointCloud, Render, Scene, View
 
-_HOME = {
+_HOMES = {
     name: module
     for module, names in {
         "warpgs.export.ply": ("read_ply", "write_ply"),
         "warpgs.io.load": ("load_scene",),
+        "warpgs.io.readers": ("Reader",),
         "warpgs.pipeline.metrics.evaluate": ("ViewMetrics", "evaluate"),
         "warpgs.pipeline.runs.fit": ("FitResult", "fit"),
         "warpgs.pipeline.runs.folder": ("StoredRun", "open_run"),
@@ -91,11 +94,11 @@ _HOME = {
 
 def __getattr__(name: str) -> object:
     """Import a public name on first use."""
-    if name not in _HOME:
+    if name not in _HOMES:
         raise AttributeError(f"module 'warpgs' has no attribute {name!r}")
     import importlib
 
-    return getattr(importlib.import_module(_HOME[name]), name)
+    return getattr(importlib.import_module(_HOMES[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -3,9 +3,9 @@
 import os
 import sys
 
-# `python -m` puts the current folder first on the import path, the command `warpgs` does not: a file there named like a module
-# must not be imported in its place, and plug-ins are found where their user put them on purpose (PYTHONPATH, or FILE.py:Class)
-if not sys.flags.safe_path and sys.path and sys.path[0] in ("", os.getcwd()):
+# `python -m` looks for modules in the current folder first, `warpgs` does not: a scene folder may hold a numpy.py. What Python
+# itself imports before this line cannot be helped here; `python -P -m warpgs` helps it.
+if sys.path and sys.path[0] in ("", os.getcwd()) and not sys.flags.safe_path:
     del sys.path[0]
 
 from warpgs.app.cli import main

@@ -1,4 +1,4 @@
-"""Time of the path costs of a picture's depth planes, beside numpy, which a fit on a CPU uses."""
+"""Time of the path costs of an image's depth planes, beside numpy, which a fit on a CPU uses."""
 
 import numpy as np
 import torch
@@ -6,7 +6,8 @@ import torch
 from bench import inputs, roofline
 from bench.harness import OURS, Task
 from warpgs.kernels.scanlines import scanline_costs
-from warpgs.priors.sweep import UNIT, path_costs
+from warpgs.priors.sweep_cpu import path_costs
+from warpgs.priors.sweep_planes import UNIT
 
 AXES = ("image",)
 NUMPY = "numpy"

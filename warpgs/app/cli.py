@@ -77,11 +77,13 @@ def _eval(arguments: list[str]) -> int:
         """auto, cpu or cuda."""
         lpips_weights: Path | None = None
         """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
+        reader: str | None = None
+        """Reader from outside warpgs, as `warpgs fit --reader` was given it."""
 
     a = _parse(Eval, "eval", arguments)
     from warpgs.pipeline.runs.commands import evaluate
 
-    for line in evaluate(a.run, a.device, a.lpips_weights):
+    for line in evaluate(a.run, a.device, a.lpips_weights, a.reader):
         print(line)
     return 0
 
@@ -141,11 +143,13 @@ def _prune(arguments: list[str]) -> int:
         """Run folder to write; RUN-pruned where not given; must not exist yet."""
         device: str = "auto"
         """auto, cpu or cuda."""
+        reader: str | None = None
+        """Reader from outside warpgs, as `warpgs fit --reader` was given it."""
 
     a = _parse(Prune, "prune", arguments)
     from warpgs.pipeline.runs.prune import prune
 
-    for line in prune(a.run, a.keep_psnr, a.out, a.device):
+    for line in prune(a.run, a.keep_psnr, a.out, a.device, a.reader):
         print(line)
     return 0
 
@@ -316,10 +320,16 @@ def _internal_error(error: Exception, arguments: list[str]) -> int:
     import tempfile
     import traceback
 
-    with tempfile.NamedTemporaryFile("w", prefix="warpgs-error-", suffix=".txt", delete=False) as f:
-        f.write(f"warpgs {__version__} {' '.join(arguments)}\n\n{''.join(traceback.format_exception(error))}")
+    details = f"warpgs {__version__} {' '.join(arguments)}\n\n{''.join(traceback.format_exception(error))}"
+    try:
+        with tempfile.NamedTemporaryFile("w", prefix="warpgs-error-", suffix=".txt", delete=False, encoding="utf-8") as f:
+            f.write(details)
+        where = f"in {f.name}"
+    except OSError:  # no folder can be written
+        print(details, file=sys.stderr)
+        where = "above"
     print(
-        f"warpgs: internal error, {type(error).__name__}: {error}. This is a defect of warpgs; the details are in {f.name}, "
+        f"warpgs: internal error, {type(error).__name__}: {error}. This is a defect of warpgs; the details are {where}, "
         "please report them",
         file=sys.stderr,
     )

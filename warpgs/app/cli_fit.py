@@ -13,6 +13,7 @@ from typing import Annotated, Any
 
 from warpgs.app.flags import flags_of, settings_of, word_after
 from warpgs.errors import UsageError, WarpgsError
+from warpgs.io.readers import READERS
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device
 from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESETS, FitConfig
 from warpgs.pipeline.train.loss import LOSS_TERMS
@@ -38,6 +39,8 @@ def _request_type() -> type:
         """llff:K, mip360:K, dtu:3|6|9, blender:8, every:N, all, or train=NAMES;test=NAMES."""
         downscale: int = 1
         """Factor by which both image sides shrink."""
+        reader: str | None = None
+        """Name of the scene's format, or a reader of your own: module:Class or path/to/file.py:Class."""
         device: str = "auto"
         """auto, cpu or cuda."""
         threads: int = 0
@@ -200,6 +203,8 @@ def fit(arguments: list[str], description: str) -> FitRequest:
     base, kind = _preset(arguments)
     terms = _terms(arguments, base)
     a: Any = tyro.cli(_flags(base, terms), args=arguments, prog="warpgs fit", description=description)
+    if a.reader is not None:
+        _load(READERS, a.reader)
     if a.threads < 0:
         raise UsageError(f"--threads must be 0 or more, not {a.threads}")
     if a.threads:
@@ -209,5 +214,5 @@ def fit(arguments: list[str], description: str) -> FitRequest:
         steps = "as many steps as the time allows" if a.time_budget else f"{config.steps} steps"
         print(f"preset {base.preset}, as usual on {kind}, {steps}; the time left stands in the line of progress")
     masks = None if a.score_masks is None else str(a.score_masks.resolve())
-    scene = SceneRequest(str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.invert_masks, masks)
+    scene = SceneRequest(str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.invert_masks, masks, a.reader)
     return FitRequest(scene, a.out, config, a.device, a.resume, a.lpips_weights, a.time_budget, notes)

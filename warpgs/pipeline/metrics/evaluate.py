@@ -11,6 +11,7 @@ import torch
 
 from warpgs.kernels.ssim import ssim
 from warpgs.pipeline.metrics.lpips import Lpips
+from warpgs.pipeline.metrics.psnr import psnr
 from warpgs.pipeline.metrics.region import scored_region
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Gaussians, View
@@ -56,18 +57,6 @@ def to_8_bit(image: np.ndarray) -> np.ndarray:
     return levels / 255
 
 
-def psnr(image: np.ndarray, target: np.ndarray, region: np.ndarray | None = None) -> float:
-    """Return the peak signal-to-noise ratio [dB] of two images in [0, 1], over all channels of the pixels in ``region`` [H, W].
-
-    The two images have one shape; equal ones have an infinite ratio.
-    """
-    difference = image.astype(np.float64) - target
-    if region is not None:
-        difference = difference[region]
-    mse = float((difference**2).mean())
-    return float("inf") if mse == 0 else -10 * float(np.log10(mse))
-
-
 def over_white(image: np.ndarray, region: np.ndarray) -> np.ndarray:
     """Return the image [H, W, 3] with white where ``region`` [H, W] is False."""
     return np.where(region[..., None], image, np.float32(1))
@@ -88,7 +77,7 @@ def score(view: View, image: np.ndarray, lpips: Lpips | None = None) -> ViewMetr
         image, target = over_white(image, region), over_white(target, region)
     similarity = float(ssim(torch.from_numpy(image), torch.from_numpy(target)).mean())
     if min(image.shape[:2]) >= SSIM_WINDOW:
-        cropped = structural_similarity(
+        cropped = structural_similarity(  # type: ignore[no-untyped-call]
             image, target, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1, channel_axis=-1
         )
     else:

@@ -313,11 +313,10 @@ def initial_gaussians(cloud: PointCloud, config: InitConfig, extent: float, devi
     sh[:, 0] = (colors - 0.5) / C0
     quats = points.new_zeros(count, 4)
     quats[:, 0] = 1
-    logit = float(np.log(config.opacity / (1 - config.opacity)))
     return Gaussians(
         means=points,
         quats=quats,
         log_scales=scales.log()[:, None].repeat(1, 3),
-        logit_opacities=points.new_full((count,), logit),
+        logit_opacities=points.new_full((count,), geometry.logit(config.opacity)),
         sh=sh,
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from warpgs.errors import UsageError
@@ -49,5 +51,5 @@ def camera_path(kind: str, cameras: list[Camera], depth: float, frames: int) -> 
         if kind == "spiral":
             angle, radius, push = 4 * np.pi * t, np.sin(np.pi * t), 0.15 * depth * np.sin(2 * np.pi * t)
         eye = center + radius * (spans[0] * np.cos(angle) * side + spans[1] * np.sin(angle) * up) + push * forward
-        result.append(Camera(look_at(eye, target, up), cameras[0].K, cameras[0].width, cameras[0].height))
+        result.append(replace(cameras[0], viewmat=look_at(eye, target, up)))
     return result

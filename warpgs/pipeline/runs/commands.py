@@ -21,20 +21,24 @@ from warpgs.pipeline.train.trainer import train_views
 from warpgs.scene import Scene, View
 
 
-def scene_of(stored: StoredRun) -> tuple[Scene, list[View], list[View]]:
+def scene_of(stored: StoredRun, reader: str | None = None) -> tuple[Scene, list[View], list[View]]:
     """Read the scene that a run was fitted to; returns it with its training and its held-out views.
+
+    Args:
+        stored: The run.
+        reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
 
     Raises:
         DataError: The scene is gone, or its images or cameras have changed since the fit.
     """
-    scene, _, _ = read_scene(stored.scene_request())
+    scene, _, _ = read_scene(stored.scene_request(reader))
     if scene.fingerprint != stored.record["fingerprint"]:
         raise DataError(f"{scene.path}: its images or cameras are not those that {stored.folder} was fitted to; restore them")
     split = Split(stored.train, stored.test)
     return scene, train_views(scene, split.train), train_views(scene, split.test)
 
 
-def evaluate(folder: Path, device_name: str, lpips_weights: Path | None = None) -> list[str]:
+def evaluate(folder: Path, device_name: str, lpips_weights: Path | None = None, reader: str | None = None) -> list[str]:
     """Score a run on its held-out views and render them again; returns lines for the user.
 
     The scores go to eval.json beside metrics.json, which stays as the fit wrote it.
@@ -43,6 +47,7 @@ def evaluate(folder: Path, device_name: str, lpips_weights: Path | None = None) 
         folder: The run folder.
         device_name: auto, cpu or cuda.
         lpips_weights: File of `warpgs convert-lpips`; without one LPIPS is not measured.
+        reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
 
     Raises:
         DataError: The folder is no run, its scene is gone, the scene's data have changed since the fit, or the weights are
@@ -51,8 +56,8 @@ def evaluate(folder: Path, device_name: str, lpips_weights: Path | None = None) 
     device, _ = choose_device(device_name)
     lpips = None if lpips_weights is None else load_lpips(lpips_weights, device)
     stored = open_run(folder, device)
-    scene, train, test = scene_of(stored)
-    request = stored.scene_request()
+    scene, train, test = scene_of(stored, reader)
+    request = stored.scene_request(reader)
     metrics = evaluate_run(folder, stored.gaussians(), train, test, stored.rule, stored.background, lpips)
     metrics |= {
         "protocol": protocol_of(scene, request.split, request.downscale, train, test),

@@ -60,7 +60,7 @@ def prepare_folder(out: Path, resume: bool) -> None:
 
 
 def _camera_values(camera: Camera) -> dict[str, Any]:
-    return {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": camera.width, "height": camera.height}
+    return {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in vars(camera).items()}
 
 
 def record_of(
@@ -145,18 +145,28 @@ class StoredRun(FittedModel):
     record: dict[str, Any]
     """Contents of its config.json."""
 
-    def scene_request(self) -> SceneRequest:
+    def scene_request(self, reader: str | None = None) -> SceneRequest:
         """Return the scene that was fitted, as it was read.
+
+        Args:
+            reader: A reader from outside warpgs, which must be named again: a run folder never decides which code is loaded.
 
         Raises:
             DataError: The scene was passed from Python and lies in no folder.
+            UsageError: The scene was read with another reader from outside warpgs.
         """
         if self.record["scene"]["path"] is None:
             raise DataError(
                 f"{self.folder}: its scene was passed from Python, so there is no folder to read it from; score the model "
                 "there with warpgs.evaluate"
             )
-        return SceneRequest(**self.record["scene"])
+        request = SceneRequest(**self.record["scene"])
+        if request.reader is not None and ":" in request.reader and reader != request.reader:
+            raise UsageError(
+                f"{self.folder}: its scene was read with {request.reader}, code from outside warpgs. A run folder never "
+                f"decides which code is loaded: name it again with --reader {request.reader}"
+            )
+        return request
 
 
 def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredRun:
@@ -174,9 +184,7 @@ def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredR
     where, _ = choose_device(device)
     record = read_record(folder)
     try:
-        cameras = {
-            n: Camera(np.array(c["viewmat"]), np.array(c["K"]), c["width"], c["height"]) for n, c in record["cameras"].items()
-        }
+        cameras = {n: Camera(**(c | {k: np.array(c[k]) for k in ("viewmat", "K")})) for n, c in record["cameras"].items()}
         n = record["normalization"]
         normalization = Normalization(np.array(n["offset"]), n["scale"])
         train, test = tuple(record["train"]), tuple(record["test"])

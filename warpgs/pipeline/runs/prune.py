@@ -16,7 +16,8 @@ import torch
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
-from warpgs.pipeline.metrics.evaluate import psnr, render_view, to_8_bit
+from warpgs.pipeline.metrics.evaluate import render_view, to_8_bit
+from warpgs.pipeline.metrics.psnr import psnr
 from warpgs.pipeline.metrics.region import scored_region
 from warpgs.pipeline.model import compress
 from warpgs.pipeline.model.parameter_bounds import model_bytes, pack
@@ -68,7 +69,7 @@ def _write(out: Path, record: dict[str, Any], made: compress.Pruned, step: int, 
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str) -> list[str]:
+def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str, reader: str | None = None) -> list[str]:
     """Shrink a run's model so that the mean PSNR over its training views falls by no more than ``keep_psnr`` [dB].
 
     The new folder holds config.json, a checkpoint that stores each Gaussian's real degree, and the PLY file; `warpgs eval`,
@@ -79,6 +80,7 @@ def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str) ->
         keep_psnr: Allowed loss, above 0.
         out: Folder to write; None for the run's name with ``-pruned``.
         device_name: auto, cpu or cuda.
+        reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
 
     Returns:
         Lines for the user.
@@ -93,7 +95,7 @@ def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str) ->
     device, _ = choose_device(device_name)
     stored = open_run(folder, device)
     out = _new_folder(folder, out)
-    _, train, test = scene_of(stored)
+    _, train, test = scene_of(stored, reader)
     before, options = stored.gaussians(), stored.options()
     made = _pruned(stored, train, options, keep_psnr)
 

@@ -32,6 +32,8 @@ class SceneRequest:
     """White in a mask removes a pixel."""
     score_masks: str | None = None
     """Folder of object masks for scoring, matched by image id; None for the scene's own `idrmasks`, if any."""
+    reader: str | None = None
+    """Name of the reader, ``module:Class`` or ``path/to/file.py:Class``; None to ask every built-in reader."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
 def read_scene(request: SceneRequest) -> tuple[Scene, Split, list[str]]:
     """Load a scene and split its views; returns both with the notes for the user."""
     scene = load_scene(
-        request.path, downscale=request.downscale, strict=request.strict,
+        request.path, reader=request.reader, downscale=request.downscale, strict=request.strict,
         allow_outside=request.allow_outside, invert_masks=request.invert_masks, score_masks=request.score_masks,
     )  # fmt: skip
     split, notes = choose_split(scene, request.split)

@@ -71,7 +71,7 @@ class FitConfig:
     method: MethodConfig = field(default_factory=MethodConfig)
     priors: PriorConfig = field(default_factory=PriorConfig)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("steps", "sh_every", "checkpoint_every", "dropout_views", "max_gaussians"):
             if getattr(self, name) < 1:
                 raise UsageError(f"{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
@@ -91,13 +91,13 @@ class FitConfig:
         if own is not None and self.strategy_config is None:
             object.__setattr__(self, "strategy_config", own())
 
-    def to_json(self) -> dict:
+    def to_json(self) -> dict[str, Any]:
         """Return nested plain values, as stored in a run folder."""
         terms = [{"name": t.name, **dataclasses.asdict(t)} for t in self.loss_terms]
         return dataclasses.asdict(dataclasses.replace(self, loss_terms=())) | {"loss_terms": terms}
 
     @staticmethod
-    def from_json(values: dict) -> FitConfig:
+    def from_json(values: dict[str, Any]) -> FitConfig:
         """Return the configuration that `to_json` stored.
 
         Raises:
@@ -108,7 +108,9 @@ class FitConfig:
             terms = tuple(_term(dict(t)) for t in values.pop("loss_terms"))
             own = values.pop("strategy_config")
             kind = find_strategy(values["strategy"]).Config
-            return _compose(FitConfig, values | {"loss_terms": terms, "strategy_config": own and kind(**own)})
+            own = kind(**own) if kind is not None and own else own
+            config: FitConfig = _compose(FitConfig, values | {"loss_terms": terms, "strategy_config": own})
+            return config
         except (TypeError, KeyError) as e:
             raise UsageError(f"the stored configuration is of another version of warpgs ({e})") from e
 
@@ -117,11 +119,11 @@ class FitConfig:
         return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:12]
 
 
-def _term(values: dict) -> LossTerm:
+def _term(values: dict[str, Any]) -> LossTerm:
     return LOSS_TERMS.find(values.pop("name"))(**values)
 
 
-def _compose(kind: type, values: dict):
+def _compose(kind: type, values: dict[str, Any]) -> Any:
     """Return a settings dataclass from nested plain values; its fields that are dataclasses are composed in turn."""
     kinds = typing.get_type_hints(kind)
     return kind(**{k: _compose(kinds[k], v) if dataclasses.is_dataclass(kinds[k]) else v for k, v in values.items()})
