@@ -1,6 +1,6 @@
 """Optimise Gaussians until they look like an image: the rasterizer, a loss and torch's Adam.
 
-    python examples/01_fit_image.py --image photo.jpg --out fitted.png
+    python examples/01_fit_image.py --image image.jpg --out fitted.png
 
 Without --image a pattern of coloured rings is fitted. Prints the PSNR before and after; writes the target beside the result.
 """
@@ -53,9 +53,9 @@ def main(arguments: list[str] | None = None) -> float:
     if a.image is None:
         target = rings(a.size)
     else:
-        photo = Image.open(a.image).convert("RGB")
-        photo.thumbnail((a.size, a.size))
-        target = torch.from_numpy(np.asarray(photo, np.float32) / 255)
+        image = Image.open(a.image).convert("RGB")
+        image.thumbnail((a.size, a.size))
+        target = torch.from_numpy(np.asarray(image, np.float32) / 255)
     height, width, _ = target.shape
     side = max(width, height)  # focal length such that the plane of the Gaussians spans the longer side
     K = torch.tensor([[side, 0, width / 2], [0, side, height / 2], [0, 0, 1.0]])

@@ -22,9 +22,10 @@ from warpgs.pipeline.train.loss import Target, register
 
 
 def roughness(depth: torch.Tensor, alpha: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
-    """Return the mean step of inverse depth between neighbours, where both are covered, weighted down at edges of the image.
+    """Return the mean step of inverse depth between covered neighbours, weighted down at edges of the image, shape [].
 
-    The steps are relative to the mean inverse depth, so that the unit of length does not matter (Godard et al. 2017, eq. 5).
+    The steps are relative to the mean inverse depth, so that the unit of length does not matter (Godard et al. 2017,
+    eq. 5). ``depth`` and ``alpha`` have shape [H, W], ``image`` [H, W, 3].
     """
     covered = alpha > 0.5
     inverse = torch.where(covered, 1 / torch.where(covered, depth, 1), 0)

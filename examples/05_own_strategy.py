@@ -49,7 +49,10 @@ class Sprout(warpgs.Strategy):
     def after_backward(
         self, phase: Hashable, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int], going: torch.Tensor
     ) -> None:
-        """Add up the gradients of the projected means. This is part of a step, which on CUDA is recorded: tensors alone."""
+        """Add the gradient norms of the projected means, ``v_projected`` [1, N, 12], to their sums.
+
+        This is part of a step, which on CUDA is recorded as a graph: it works on tensors alone.
+        """
         norms = v_projected[0, :, :2].norm(dim=1)
         self.trainer.table.columns["pull"] += torch.where(visible[0], norms, 0) * going
 

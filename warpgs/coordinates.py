@@ -20,7 +20,11 @@ UNITS = ("scene", "file")
 
 
 def check_units(units: str) -> None:
-    """Raise a UsageError where ``units`` names neither of the two systems."""
+    """Check that ``units`` names one of the two systems.
+
+    Raises:
+        UsageError: It does not.
+    """
     if units not in UNITS:
         raise UsageError(f"units {units!r} is not one of {', '.join(UNITS)}")
 

@@ -20,6 +20,7 @@ BASE = ["scene", "--out", "run", "--device", "cpu"]
 PLUG_INS = '''
 from dataclasses import dataclass
 
+import warpgs.io.readers as readers
 import warpgs.pipeline.train.loss as loss
 import warpgs.pipeline.train.strategies.base as base
 
@@ -29,6 +30,14 @@ class Settings:
     rate: float = 0.5
     """Rate of nothing,
     on two lines."""
+
+
+class Folder(readers.Reader):
+    def probe(self, folder):
+        return readers.Probe("everything")
+
+    def read(self, folder, options):
+        return readers.READERS.find("colmap")().read(folder, options)
 
 
 class SlowGrowth(base.Strategy):
@@ -140,7 +149,7 @@ def plugged(tmp_path_factory):
         "--loss-terms",
         f"{folder}/mine.py:Opaque",
     ]
-    assert main([*command, *named]) == 0
+    assert main([*command, *named, "--reader", f"{folder}/mine.py:Folder"]) == 0
     return folder, command, named
 
 
@@ -158,7 +167,7 @@ def test_settings_of_plug_ins_reach_the_run(plugged, capsys):
 
 
 def test_a_run_folder_never_decides_what_code_is_loaded(plugged):
-    """In a new process: eval needs no code; --resume asks for strategy and term by name, and goes on once they are named."""
+    """In a new process: eval asks for the reader by name, --resume for strategy and term, and go on once they are named."""
     folder, command, named = plugged
     probe = (
         "import sys\nfrom warpgs.app.cli import main\ncode = main(sys.argv[1:])\n"
@@ -168,8 +177,10 @@ def test_a_run_folder_never_decides_what_code_is_loaded(plugged):
     def run(*arguments):
         return subprocess.run([sys.executable, "-c", probe, *arguments], capture_output=True, text=True, check=False)
 
+    reader = f"{folder}/mine.py:Folder"
     done = run("eval", str(folder / "run"), "--device", "cpu")
-    assert done.returncode == 0 and "loaded []" in done.stdout
+    assert done.returncode == 2 and "loaded []" in done.stdout and f"--reader {reader}" in done.stderr
+    assert run("eval", str(folder / "run"), "--device", "cpu", "--reader", reader).returncode == 0
     done = run(*command, "--resume")
     assert done.returncode == 2 and "loaded []" in done.stdout and f"--strategy {named[1]}" in done.stderr
     done = run(*command, "--resume", *named[:4])

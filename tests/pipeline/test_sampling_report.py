@@ -1,4 +1,4 @@
-"""Pictures and figures of sampling events: they show what the event saw, and say what it did."""
+"""Images and figures of sampling events: they show what the event saw, and say what it did."""
 
 import dataclasses
 
@@ -7,19 +7,39 @@ import numpy as np
 import pytest
 import torch
 
-from tests.pipeline.test_importance_sampling import CONFIG, METHOD, fitted
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import ResourceError
+from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs import sampling_report
 from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, sampling_report_of, shown_steps, view_sheet
+from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig, ProtectConfig
+from warpgs.pipeline.train.strategies.sampler import SamplerConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.report.contact_sheet import DOT, GAP, HEAD, MARGIN, TITLE_SIZE
 from warpgs.report.images import colored
 
 CPU = torch.device("cpu")
 NAMES = ["00.png", "01.png", "02.png"]
+METHOD = MethodConfig(
+    events=True, hier=True, sampler=SamplerConfig(fraction=0.01, min_alpha=0.05), protect=ProtectConfig(steps=10)
+)
+CONFIG = FitConfig(
+    steps=40, sh_every=10, dropout=0.2, init=InitConfig(source="points", max_sh_degree=1), strategy="importance_sampling",
+    density=DensityConfig(start=2, every=8, gradient=1e-5), phases=PhaseConfig(8, 12, every=5), method=METHOD,
+)  # fmt: skip
+
+
+def fitted(config: FitConfig, steps: int) -> Trainer:
+    """Some steps of a fit of three views."""
+    views = photos(3)
+    fit = Trainer(views, seeds(), config, CPU, priors=priors(views))
+    for _ in range(steps):
+        fit.advance()
+    return fit
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +49,8 @@ def run(tmp_path_factory):
     views = photos(3)
     fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
     with images_kept(fit, NAMES, out):
-        draw = fit.on_event
-        fit.on_event = lambda step, event: (draw(step, event), seen.append((step, event)))
+        draw = fit.strategy.on_event
+        fit.strategy.on_event = lambda step, event: (draw(step, event), seen.append((step, event)))
         while fit.step < CONFIG.steps:
             fit.advance()
     return fit, out, seen
@@ -158,4 +178,4 @@ def test_a_picture_that_cannot_be_written_is_said(tmp_path, monkeypatch, until):
     with pytest.raises(ResourceError, match="no space left"), images_kept(fit, NAMES, tmp_path):
         while fit.step < until:
             fit.advance()
-    assert fit.on_event is None and (fit.step == 10) == (until == 10)
+    assert fit.strategy.on_event is None and (fit.step == 10) == (until == 10)

@@ -98,7 +98,7 @@ def _render(arguments: list[str]) -> int:
         path: str = "views"
         """views (every view of the scene), orbit or spiral."""
         out: Path | None = None
-        """Folder for the pictures and the film; RUN/path-PATH where not given."""
+        """Folder for the images and the film; RUN/path-PATH where not given."""
         frames: int = 90
         """Number of frames of an orbit or a spiral."""
         fps: int = 30

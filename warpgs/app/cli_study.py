@@ -48,7 +48,7 @@ def _study(a, variants: dict, marks: dict) -> int:
 
 
 def compare(arguments: list[str], description: str) -> int:
-    """Presets against each other."""
+    """Run `warpgs compare`: presets against each other."""
     from warpgs.pipeline.train.config import PRESETS
 
     base = _flags()
@@ -66,7 +66,7 @@ def compare(arguments: list[str], description: str) -> int:
 
 
 def ablate(arguments: list[str], description: str) -> int:
-    """One preset with its parts off one at a time."""
+    """Run `warpgs ablate`: one preset with its parts off one at a time."""
     from warpgs.pipeline.train.config import PRESETS
 
     base = _flags()

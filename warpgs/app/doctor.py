@@ -1,4 +1,4 @@
-"""What this machine can do for a fit, what it lacks, and how to get that."""
+"""Report on this machine: parts that a fit needs, those that are missing, and how to get them."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ class Finding:
     """One thing that was looked at."""
 
     topic: str
-    """What, in a word or two: unique within a report."""
+    """Subject in a word or two, unique within a report."""
     status: Literal["ok", "missing", "note"]
     """``missing`` where something does not work; ``note`` where all works, only slower or with less."""
     detail: str
-    """What was found."""
+    """Observation, in words."""
     remedy: str = ""
-    """How to get it; never empty where the status is ``missing``."""
+    """Way to get it; never empty where the status is ``missing``."""
     required: bool = False
-    """Whether a fit needs it."""
+    """True where a fit needs it."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +47,13 @@ class Package:
     """A package that warpgs uses."""
 
     distribution: str
-    """Its name in the package index."""
+    """Name in the package index."""
     module: str
-    """What to import."""
+    """Module to import."""
     required: bool
-    """Whether a fit needs it."""
+    """True where a fit needs it."""
     use: str
-    """What is lost without it."""
+    """Part that is lost without it."""
 
 
 PACKAGES = (
@@ -225,7 +225,7 @@ def _kernel_cache() -> Iterable[Finding]:
         yield Finding(topic, MISSING, str(e), "set WARP_CACHE_PATH or TMPDIR to a folder that you may write to", True)
         return
     except Exception as e:
-        yield Finding(topic, MISSING, _reason(e), "mend warp-lang first", True)
+        yield Finding(topic, MISSING, _reason(e), "fix warp-lang first", True)
         return
     if refused:
         remedy = "set WARP_CACHE_PATH to a folder that you, and nobody else, may write to"

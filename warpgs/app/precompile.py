@@ -38,7 +38,7 @@ THREADS = 256
 
 
 def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
-    """A kernel of each module that a fit on such a device launches, with the size of the blocks that it is launched in.
+    """Return a kernel of each module that a fit on such a device launches, with the size of the blocks of its launches.
 
     On CUDA a module is compiled once for each size. Scores are computed on the CPU wherever the fit ran.
     """

@@ -1,4 +1,4 @@
-"""LPIPS, the distance of two pictures in the features of a classifier (Zhang et al. 2018), from weights the user names."""
+"""LPIPS, the distance of two images in the features of a classifier (Zhang et al. 2018), from weights the user names."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from warpgs.pipeline.metrics.lpips_weights import Net, read_lpips
 
 MODES = ("legacy", "standard")
 """legacy: colours go in as they are, in [0, 1], as the evaluation code of Kerbl et al. 2023 and all that build on it do;
-standard: rescaled to [-1, 1], as Zhang et al. 2018 trained the heads. The same pictures score differently."""
+standard: rescaled to [-1, 1], as Zhang et al. 2018 trained the heads. The same images score differently."""
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """ImageNet's mean and deviation of colours in [-1, 1] (PerceptualSimilarity, scaling layer)."""
 NORM_FLOOR = 1e-10
@@ -29,9 +29,9 @@ class Lpips:
     net: Net
     tensors: dict[str, torch.Tensor]
     version: str
-    """Of the heads: 0.0, 0.1, or unknown."""
+    """Version of the heads: 0.0, 0.1, or unknown."""
     sha256: str
-    """Of the file that the weights came from."""
+    """SHA-256 of the file that the weights came from, hexadecimal."""
 
     def _features(self, images: torch.Tensor) -> Iterator[torch.Tensor]:
         """Compared activations of images [2, 3, H, W], each of unit length along its channels."""
@@ -47,7 +47,7 @@ class Lpips:
 
     @torch.no_grad()
     def distance(self, image: np.ndarray, target: np.ndarray, mode: str) -> float:
-        """LPIPS of two images [H, W, 3] in [0, 1]; NaN where they are too small for the network. 0 for equal ones."""
+        """Return LPIPS of two images [H, W, 3] in [0, 1]: 0 for equal ones; NaN where they are too small for the network."""
         if min(image.shape[:2]) < self.net.smallest:
             return math.nan
         device = self.tensors["lin0.model.1.weight"].device
@@ -64,18 +64,18 @@ class Lpips:
         return total
 
     def measure(self, image: np.ndarray, target: np.ndarray) -> dict[str, float]:
-        """The distance in every mode, by the names of `variants`."""
+        """Return the distance of two images [H, W, 3] in [0, 1] in every mode, by the names of `variants`."""
         return {f"lpips_{self.net.name}_{mode}": self.distance(image, target, mode) for mode in MODES}
 
     def variants(self) -> dict[str, str]:
-        """What each figure is, for result files and reports."""
+        """Return the definition of each score, for result files and reports."""
         base = f"{self.net.title}, heads {self.version}, weights SHA-256 {self.sha256[:12]}, inputs in "
         inputs = {"legacy": "[0, 1] (un-rescaled, as in the code of 3D Gaussian splatting)", "standard": "[-1, 1]"}
         return {f"lpips_{self.net.name}_{mode}": base + inputs[mode] for mode in MODES}
 
 
 def load_lpips(path: Path, device: torch.device) -> Lpips:
-    """LPIPS with the weights of a file that `warpgs convert-lpips` wrote.
+    """Load LPIPS with the weights of a file that `warpgs convert-lpips` wrote.
 
     Raises:
         DataError: The file is missing, damaged, or of another kind.

@@ -1,4 +1,4 @@
-"""Weights of LPIPS: the two networks, the one-time conversion of published files, and reading what it wrote."""
+"""Weights of LPIPS: the two networks, the one-time conversion of published files, and reading the result."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class Net:
     name: str
     """vgg or alex."""
     title: str
-    """As papers write it."""
+    """Name as papers write it."""
     layers: tuple[tuple[Any, ...], ...]
-    """In order: ("conv", number, inputs, outputs, kernel, stride, padding), ("tap",) after a rectified convolution that is
-    compared, or ("pool", kernel, stride)."""
+    """Layers in order: ("conv", number, inputs, outputs, kernel, stride, padding), ("tap",) after a rectified convolution that
+    is compared, or ("pool", kernel, stride)."""
     smallest: int
     """Shortest image side that leaves the last compared layer a pixel [px]."""
     published: str
@@ -39,7 +39,7 @@ class Net:
         return tuple(layer[3] for layer, after in pairs if after == ("tap",))
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Names of all tensors of a converted file with their shapes."""
+        """Return the names of all tensors of a converted file with their shapes."""
         found: dict[str, tuple[int, ...]] = {}
         for layer in self.layers:
             if layer[0] == "conv":
@@ -172,7 +172,8 @@ def read_lpips(path: Path) -> tuple[Net, dict[str, torch.Tensor], dict[str, str]
     """Read a converted file.
 
     Returns:
-        The network, its tensors by name (float32, CPU), and the header with the file's own SHA-256 as "sha256".
+        The network, its tensors by name (float32, CPU, shapes [...] as in `Net.shapes`), and the header with the file's own
+        SHA-256 as "sha256".
 
     Raises:
         DataError: The file is missing, damaged, or was not written by `convert_lpips`.

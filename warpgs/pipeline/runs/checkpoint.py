@@ -74,7 +74,7 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, An
     """Read a checkpoint back.
 
     Returns:
-        Tensors on the CPU, and the state.
+        Tensors by name on the CPU, shapes [...] as they were saved, and the state.
 
     Raises:
         DataError: There is none, or it is not whole: truncated, altered, or of another format.

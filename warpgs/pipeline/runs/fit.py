@@ -132,7 +132,8 @@ def fit(
         verbose: Whether to print.
 
     Raises:
-        WarpgsError: Anything that a user can fix; before the first step wherever it can be known by then.
+        UsageError: Settings, a preset or a split cannot be, ``out`` holds something already, or ``resume`` comes without it.
+        WarpgsError: Anything else that a user can fix; before the first step wherever it can be known by then.
     """
     out = None if out is None else Path(out)
     if resume and out is None:

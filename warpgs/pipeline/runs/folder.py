@@ -103,7 +103,11 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 
 def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
-    """Raise a UsageError unless a continued run is the same run: same data, views, settings and kind of device."""
+    """Check that a continued run is the same run: same data, views, settings and kind of device.
+
+    Raises:
+        UsageError: It is another, or code of the user's own is not named again.
+    """
     if "pruned" in stored:
         raise UsageError(
             f"--resume: {out} is a pruned model without the state of its fit; continue the run it came from, "

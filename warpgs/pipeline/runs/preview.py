@@ -56,7 +56,9 @@ def show_priors(request: SceneRequest, config: PriorConfig, source: str, out: Pa
         threads: CPU threads of the networks; 0 for as many as there are cores.
 
     Raises:
-        WarpgsError: The scene, a model or the folder is not what it must be.
+        DataError: The scene or a network's file is not what it must be.
+        ResourceError: The folder cannot be written.
+        UsageError: The source or the split is unknown.
     """
     if source not in SOURCES:
         raise UsageError(f"source {source!r} is not one of {', '.join(SOURCES)}")

@@ -45,7 +45,7 @@ class StudyRequest:
     variants: dict[str, FitConfig]
     """Settings by name; the others are compared with the first. The seed is set by the study."""
     seeds: int
-    """Runs of each variant on each scene, seeds 0, 1, ..."""
+    """Number of runs of each variant on each scene, with seeds from 0 on."""
     out: Path
     """Folder of the study; each run lies in SCENE/VARIANT/SEED below it."""
     device: str = "auto"
@@ -85,7 +85,7 @@ class Place:
     split: Split
     """Views to fit and those held out."""
     test: list[View]
-    """Its held-out views."""
+    """Held-out views."""
 
 
 Runs = dict[tuple[str, str, int], Outcome]
