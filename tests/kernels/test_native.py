@@ -48,7 +48,7 @@ def small_kernels() -> SimpleNamespace:
         native.source("blend_common.cu", **numbers)
         + """
         Splat s;
-        s.load(splats.data, i);
+        s.load(projected.data, i);
         s.rescale();
         return s.touches(corners.data[2 * i], corners.data[2 * i + 1], limit_of(s.b.y, cut));
         """
