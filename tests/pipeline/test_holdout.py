@@ -140,7 +140,7 @@ def test_of_a_trimmed_model_no_more_is_hidden_than_of_the_whole():
 
 @pytest.mark.parametrize("at", [17, 24, 50])
 def test_continued_fit_equals_uninterrupted_one(tmp_path, at):
-    """Saved before blocks are measured, between two measurements, or between trims: the same bits and the same story at the end."""
+    """Saved before blocks are measured, between two measurements, or between trims: the same bits and story at the end."""
     config = dataclasses.replace(
         GROWING, dropout=0.3, holdout=dataclasses.replace(GROWING.holdout, trim_db=0.2, enough_db=20.0)
     )
