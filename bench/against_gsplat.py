@@ -22,9 +22,8 @@ from bench.harness import recorded
 from warpgs import RasterizeOptions, rasterize
 from warpgs.constants import RULES
 from warpgs.kernels.project import project
-from warpgs.pipeline.model.table import Table
-from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.loss import LossConfig
+from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.step import STEPS_PER_BATCH, StepBuffers, StepGraph, Views
 from warpgs.render.graphed import CALLS, recorder
 from warpgs.scene import Camera, Gaussians

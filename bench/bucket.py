@@ -23,6 +23,7 @@ from bench.garden import garden_inputs
 from bench.kernels.bucket import SIZES, VALUES, make_backward
 from warpgs.constants import RULES, Rule
 from warpgs.kernels import blend_cuda
+from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import Tiles, bin_tiles
 from warpgs.runtime import interop
@@ -50,7 +51,7 @@ class Launch:
         interop.launch(self.kernel, self.count, self.inputs, self.device, **self.how)
 
 
-def put_off(work: Callable, *inputs) -> tuple[object, list[Launch]]:
+def put_off(work: Callable, *inputs, **options) -> tuple[object, list[Launch]]:
     """What a function of the product returns, with its memory not written yet, and the launches that would write it."""
     launches = []
 
@@ -58,7 +59,7 @@ def put_off(work: Callable, *inputs) -> tuple[object, list[Launch]]:
         launches.append(Launch(kernel, count, arguments, device, how))
 
     with mock.patch.object(interop, "launch", note):
-        result = work(*inputs)
+        result = work(*inputs, **options)
     return result, launches
 
 
@@ -77,20 +78,21 @@ class Case:
     """
 
     def __init__(self, projected: torch.Tensor, tiles: Tiles, width: int, height: int, rule: Rule, upstream: tuple):
-        how = (projected, tiles, torch.full((len(projected), 3), 0.3, device=projected.device), (0, 0), width, height, rule)
+        backgrounds = torch.full((len(projected), 3), 0.3, device=projected.device)
+        how = (projected, tiles, backgrounds, BlendSettings((0, 0), width, height, rule))
         chunk = blend_cuda.chunk_of(tiles, True)
         self.chunk, self.instances, self.tiles = chunk, len(tiles.slots), tiles
         self.values = 9 if upstream[1] is None else VALUES
         self.forward, states = {}, {}
         for size in SIZES:
             with mock.patch.object(blend_cuda, "chunk_of", return_value=size):
-                (rgb, _, depth, *kept), (order, self.forward[size]) = put_off(blend_cuda.forward, *how, True, True)
+                (rgb, _, depth, *kept), (order, self.forward[size]) = put_off(blend_cuda.forward, *how, save=True)
             order()
             self.forward[size]()
             states[size] = kept[-1]
             if size == chunk:
                 saved = (rgb, depth, *kept)
-        self.v_projected, (self.backward, self.gather) = put_off(blend_cuda.backward, *how, True, saved, *upstream)
+        self.v_projected, (self.backward, self.gather) = put_off(blend_cuda.backward, *how, saved, upstream)
         assert self.backward.inputs[STATES].tensor is states[chunk]
         self.v_slots = self.backward.inputs[-1].tensor
         self.state_mib = {size: t.numel() * 4 / 2**20 for size, t in states.items()}

@@ -16,9 +16,8 @@ import torch
 
 from bench.against_gsplat import first_camera
 from bench.garden import garden_inputs
-from warpgs.pipeline.model.table import Table
-from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.loss import LossConfig
+from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.step import STEPS_PER_BATCH, StepBuffers, StepGraph, Views
 from warpgs.scene import Gaussians
 

@@ -42,7 +42,7 @@ def test_every_op_gives_rows(result):
     assert {r["op"] for r in rows} == set(OPS)
     assert all(r["median_ms"] > 0 and r["quartiles_ms"][0] <= r["median_ms"] <= r["quartiles_ms"][1] for r in rows)
     backward = {r["op"] for r in rows if r["direction"] in ("backward", "both")}
-    assert backward == {"project", "sh", "blend", "ssim", "render"}
+    assert backward == {"project", "blend", "ssim", "render"}
     ours = [r for r in rows if r["program"] == "warpgs" and not r.get("threads")]
     assert all(r["share"] > 0 and r["bytes"] > 0 and r["roof_ms"] > 0 for r in ours)
     assert result["roofline"]["bytes_per_s"] > 0 and result["roofline"]["operations_per_s"] > 0

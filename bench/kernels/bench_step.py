@@ -10,9 +10,8 @@ from bench import inputs, peers, roofline
 from bench.harness import OURS, Task
 from bench.kernels.bench_render import costs
 from warpgs import rasterize
-from warpgs.pipeline.model.table import Table
-from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.loss import LossConfig, photometric_loss
+from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.scene import Camera
 
 AXES = ("count", "image", "degree", "threads")

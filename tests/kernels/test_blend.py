@@ -12,6 +12,7 @@ from tests.tolerances import close
 from warpgs.constants import RULES
 from warpgs.kernels.blend import blend, contributions
 from warpgs.kernels.project import project
+from warpgs.kernels.sh import C0
 from warpgs.kernels.tiles import Tiles, bin_tiles
 
 
@@ -153,14 +154,14 @@ def test_many_layers_recover_their_transmittance(device):
     rgb.sum().backward()
     assert all(bool(torch.isfinite(t.grad).all()) for t in gaussians.tensors().values())
     # colour gradients are the weights: 16 pixels of total weight alpha each, times the basis constant and three channels
-    total = float(gaussians.sh.grad.double().sum()) / 0.28209479177387814 / 3
+    total = float(gaussians.sh.grad.double().sum()) / C0 / 3
     assert abs(total - float(alpha.detach().double().sum())) <= 1e-4 * total
 
 
 def test_partition_of_unity_and_linearity(device):
     """All colours equal to the background give that colour; colours add."""
     gaussians, cam = cloud(200, torch.float32, device, degree=0), camera(40, 30, cameras=1, dtype=torch.float32, device=device)
-    gaussians.sh[:] = (0.7 - 0.5) / 0.28209479177387814
+    gaussians.sh[:] = (0.7 - 0.5) / C0
     rgb = drawn(gaussians, cam, torch.full((1, 3), 0.7, device=device), RULES["exact"], degree=0)[0]
     assert float((rgb - 0.7).abs().max()) <= 1e-6
 

@@ -9,7 +9,8 @@ import torch
 from tests.scenes import photos, ring
 from warpgs.errors import UsageError
 from warpgs.geometry import back_project, camera_extent, focus_point, in_image, project_points
-from warpgs.pipeline.metrics.evaluate import baselines, psnr, score, summarize, to_8_bit, variants
+from warpgs.pipeline.metrics.evaluate import baselines, score, summarize, to_8_bit, variants
+from warpgs.pipeline.metrics.psnr import psnr
 from warpgs.pipeline.metrics.region import counted_region
 from warpgs.pipeline.runs.camera_paths import camera_path
 from warpgs.scene import View

@@ -211,7 +211,7 @@ def test_size_follows_content_and_neither_pixels_nor_views():
     again = [*walls[0], dataclasses.replace(walls[0][1], name="again.png")]
     fits = [finished(v, start) for v in (*walls, again)]
     once, fine, twice = (complexity(f)["count"] for f in fits)
-    assert all(abs(f._view_psnr(f.gaussians) - HoldoutConfig().enough_db) < 0.6 for f in fits)
+    assert all(abs(f.strategy.view_psnr(f.gaussians) - HoldoutConfig().enough_db) < 0.6 for f in fits)
     # fine was 1.0 to 1.8 times once in six such fits, whose starts, or sums, differed by no more than rounding
     assert once < 80 and twice <= 1.1 * once and fine <= 2 * once
 
@@ -234,7 +234,7 @@ def test_walls_that_hardly_reach_enough_are_small_too(colour, most):
     fits = [finished(v, textured_planes.points(400, (2.0, 1.4))) for v in (*walls, again)]
     once, fine, twice = (complexity(f)["count"] for f in fits)
     assert once < most and twice <= 1.1 * once and fine <= 1.25 * once
-    assert all(f._view_psnr(f.gaussians) > 35.5 for f in fits)
+    assert all(f.strategy.view_psnr(f.gaussians) > 35.5 for f in fits)
 
 
 def test_command_line_says_what_the_model_takes(tmp_path, capsys):

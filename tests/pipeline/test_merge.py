@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from tests.gaussians import cloud
-from warpgs.pipeline.model.merge import OPAQUE, covariances, merges, quaternions, rotation_matrices
+from warpgs.geometry import quaternions, rotation_matrices
+from warpgs.pipeline.model.merge import OPAQUE, covariances, merges
 from warpgs.scene import Gaussians
 
 

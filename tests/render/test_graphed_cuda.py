@@ -1,4 +1,4 @@
-"""Calls that repeat are replayed on CUDA: the same bits, whatever a loop does with what it got."""
+"""Calls that repeat are replayed on CUDA, with the same bits, whatever a loop does with the results."""
 
 import dataclasses
 import time
@@ -28,23 +28,23 @@ def scene(count: int = 400, width: int = 70, height: int = 50) -> tuple[Gaussian
 
 @pytest.fixture
 def fresh():
-    """The recorder of the GPU, without a recording."""
+    """The recorder of the GPU, cleared."""
     own = graphed.recorder(CUDA)
-    own.forget()
+    own.clear()
     own.graphs.replays = 0
     yield own
-    own.forget()
+    own.clear()
 
 
 def replays() -> int:
-    """Graphs that were replayed on the GPU, on whatever stream."""
+    """Return the number of replays on the GPU, on whatever stream."""
     return sum(own.graphs.replays for own in graphed._RECORDERS.values())
 
 
 def loop(record: bool, steps: int = 9, change: float = 0.01, keep: bool = True, **options):
-    """Everything that a loop sees whose parameters move in place; of each step pictures, records, counts and gradients.
+    """Return images, projected Gaussians, counts and gradients of each step of a loop whose parameters move in place.
 
-    Without ``keep`` it holds on to nothing on the GPU.
+    Without ``keep`` the loop holds on to nothing on the GPU.
     """
     g, cams = scene()
     seen, params = [], list(g.tensors().values())
@@ -70,18 +70,18 @@ def equal(a: list, b: list) -> bool:
 
 @pytest.mark.parametrize("options", [{}, {"rule": "gsplat", "tile_size": 8}, {"sh_degree": 0, "window": (16, 0, 32, 32)}])
 def test_a_loop_sees_the_same_bits(fresh, options):
-    """Pictures, records, counts and gradients of every step, those of earlier steps too when all is over."""
+    """The results of every step agree, those of earlier steps too when all is over."""
     background = torch.tensor([0.2, 0.5, 0.1], device=CUDA)
     for more in ({}, {"background": background}):
         for keep in (True, False):
-            fresh.forget()
+            fresh.clear()
             before = replays()
             assert equal(loop(True, keep=keep, **options, **more), loop(False, keep=keep, **options, **more))
             assert replays() > before
 
 
 def test_a_training_loop_is_replayed(fresh):
-    """With torch's Adam, a loss of several steps, and cameras in turn: nearly every step is four graphs."""
+    """With torch's Adam, a loss of several terms, and cameras in turn, nearly every step is four graphs."""
     g, cams = scene(2000)
     optimizer = torch.optim.Adam(list(g.tensors().values()), 1e-3)
     target = torch.rand(50, 70, 3, device=CUDA)
@@ -92,12 +92,12 @@ def test_a_training_loop_is_replayed(fresh):
         loss.backward()
         optimizer.step()
         if step == 19:
-            before, captured = replays(), fresh.plan._draw.recorded
-    assert replays() - before == 4 * 40 and fresh.plan._draw.recorded == captured
+            before, captured = replays(), fresh.rasterizer._forward_blend.captures
+    assert replays() - before == 4 * 40 and fresh.rasterizer._forward_blend.captures == captured
 
 
-def test_more_instances_than_room_are_drawn_as_usual(fresh):
-    """Gaussians that grow twice: the same bits, and recorded anew."""
+def test_more_instances_than_the_capacity_run_without_graphs(fresh):
+    """Gaussians that grow twice give the same bits, and are captured anew."""
     g, cams = scene(3000)
 
     def image(record):
@@ -107,41 +107,41 @@ def test_more_instances_than_room_are_drawn_as_usual(fresh):
     capacities = []
     for step in range(14):
         assert equal([image(True)], [image(False)])
-        capacities.append(0 if fresh.plan is None else fresh.plan.capacity)
+        capacities.append(0 if fresh.rasterizer is None else fresh.rasterizer.capacity)
         if step in (5, 6):
             with torch.no_grad():
                 g.log_scales.add_(1)
-    # it did not pay, so the sixth call is planned, not the third
+    # it did not pay, so the sixth call is captured, not the third
     assert capacities[:2] == [0, 0] and capacities[6:11] == [0] * 5 and capacities[-1] > capacities[5] > 0
 
 
 def test_open_backward_passes_keep_what_they_need(fresh):
-    """Two pictures before either gradient, a graph that is kept, and one that is thrown away unused."""
+    """Two images before either gradient, an autograd graph that is kept, and one that is thrown away unused."""
     g, cams = scene()
     params = list(g.tensors().values())
 
-    def draw(i, record=True):
+    def image_of(i, record=True):
         return rasterize(g, cams[i], RasterizeOptions(record=record)).rgb
 
     def gradients(*images, **how):
         return torch.autograd.grad(sum((k + 1) * p.sum() for k, p in enumerate(images)), params, **how)
 
     for _ in range(MIN_CALLS):
-        gradients(draw(0))
-    assert fresh.plan is not None
-    wanted = gradients(draw(1, False), draw(2, False))
+        gradients(image_of(0))
+    assert fresh.rasterizer is not None
+    wanted = gradients(image_of(1, False), image_of(2, False))
     before = replays()
-    both = draw(1), draw(2)
+    both = image_of(1), image_of(2)
     assert replays() == before + 4 and equal([gradients(*both)], [wanted])
-    kept = draw(3)
+    kept = image_of(3)
     once = gradients(kept, retain_graph=True)
-    other = gradients(draw(0))
-    assert equal([gradients(kept)], [once]) and equal([other], [gradients(draw(0, False))])
-    assert equal([once], [gradients(draw(3, False))])
+    other = gradients(image_of(0))
+    assert equal([gradients(kept)], [once]) and equal([other], [gradients(image_of(0, False))])
+    assert equal([once], [gradients(image_of(3, False))])
 
 
-def test_batches_and_gradients_of_records(fresh):
-    """Four cameras at once, each with a background of its own and stored column by column; what densification looks at."""
+def test_batches_and_gradients_of_projected_gaussians(fresh):
+    """Four cameras at once, stored column by column, each with a background of its own; densification reads the gradients."""
     g, _ = scene()
     cams = camera(70, 50, 4, torch.float32, CUDA)
     cams = dataclasses.replace(cams, viewmat=cams.viewmat.mT.contiguous().mT)
@@ -157,13 +157,13 @@ def test_batches_and_gradients_of_records(fresh):
     assert replays() > 0 and equal([seen[True]], [seen[False]])
 
 
-def test_hooks_and_checkpoints_are_drawn_as_usual(fresh):
-    """Saved tensors that go elsewhere, and a picture that is drawn again for its gradient."""
+def test_hooks_and_checkpoints_run_without_graphs(fresh):
+    """Saved tensors that are stored elsewhere, and an image that is rendered again for its gradient."""
     g, cams = scene()
     params = list(g.tensors().values())
 
-    def gradient(draw):
-        return torch.autograd.grad(draw(g, cams[0]).rgb.sum(), params)
+    def gradient(render):
+        return torch.autograd.grad(render(g, cams[0]).rgb.sum(), params)
 
     wanted = gradient(lambda *of: rasterize(*of, PLAIN))
     for _ in range(2 * MIN_CALLS):
@@ -175,8 +175,8 @@ def test_hooks_and_checkpoints_are_drawn_as_usual(fresh):
         assert equal([torch.autograd.grad(again.sum(), params)], [wanted])
 
 
-def test_threads_draw_what_they_would_alone(fresh):
-    """Four at once, each with Gaussians of its own; at most one of them has the recording."""
+def test_threads_render_what_they_would_alone(fresh):
+    """Four at once, each with Gaussians of its own; at most one of them has the graphs."""
 
     def work(seed):
         g = leaves(cloud(300, device=CUDA, seed=seed))
@@ -192,7 +192,7 @@ def test_threads_draw_what_they_would_alone(fresh):
 
 
 def test_a_device_that_is_not_the_current_one(fresh):
-    """Its calls run as usual."""
+    """Its calls run without graphs."""
     if torch.cuda.device_count() < 2:
         pytest.skip("needs a second CUDA device to be the current one")
     g, cams = scene()
@@ -204,7 +204,7 @@ def test_a_device_that_is_not_the_current_one(fresh):
 
 
 def test_cameras_and_backgrounds_have_gradients(fresh):
-    """The pose, the intrinsics and the colour behind, each a tensor of its own at every call."""
+    """Pose, intrinsics and background, each a new tensor at every call."""
 
     def run(record):
         g, cams = scene()
@@ -219,8 +219,8 @@ def test_cameras_and_backgrounds_have_gradients(fresh):
     assert equal(run(True), run(False)) and replays() > 0
 
 
-def test_a_recording_holds_no_memory(fresh):
-    """Between calls only what graphs need for themselves; in a call what others take, and a little room."""
+def test_graphs_hold_no_memory(fresh):
+    """Between calls only what graphs need for themselves; in a call what others take, and a little spare capacity."""
     g, cams = scene(30_000, 400, 300)
     peaks, held = {}, {}
     for record in (False, True):
@@ -239,7 +239,7 @@ def test_a_recording_holds_no_memory(fresh):
 
 
 def test_streams_do_not_share(fresh):
-    """A loop that moves to another stream is recorded there anew, and sees its own steps."""
+    """A loop that moves to another stream is captured there anew, and sees its own steps."""
     found = {}
     for record in (True, False):
         g, cams = scene()

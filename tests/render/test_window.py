@@ -1,4 +1,4 @@
-"""A window is the crop of the whole picture, to the bit, and windows drawn one by one add up to it."""
+"""A window is the crop of the whole image, to the bit, and windows rendered one by one add up to it."""
 
 import dataclasses
 
@@ -8,8 +8,9 @@ import torch
 from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
-from warpgs.render.chunked import Frame, parts
+from warpgs.render.chunked import ChunkedFrame, chunks
 from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.settings import RenderSettings
 
 SIZE = (75, 53)  # no multiple of a tile
 WINDOWS = [(0, 0, 75, 53), (0, 16, 75, 16), (32, 0, 16, 53), (16, 32, 59, 21), (64, 48, 11, 5), (48, 16, 16, 32)]
@@ -38,7 +39,7 @@ def test_window_is_the_crop(device, dtype, window, rule, tile_size):
 
 
 def gradients(gaussians, cam, background, upstream, **options) -> list[torch.Tensor]:
-    """Of all Gaussians, camera and background, for the gradients of colour, alpha and depth in ``upstream``."""
+    """Return the gradients of Gaussians, camera and background; ``upstream`` holds those of colour, alpha and depth."""
     cam = dataclasses.replace(cam, viewmat=cam.viewmat.clone().requires_grad_(), K=cam.K.clone().requires_grad_())
     g, background = leaves(gaussians), background.clone().requires_grad_()
     r = rasterize(g, cam, RasterizeOptions(background=background, **options))
@@ -49,30 +50,30 @@ def gradients(gaussians, cam, background, upstream, **options) -> list[torch.Ten
     return list(torch.autograd.grad(loss, inputs, allow_unused=False))
 
 
-def test_gradients_of_bands_add_up(device, dtype):
-    """The sum over bands equals the gradient of the whole, but for the order of sums."""
+def test_gradients_of_windows_add_up(device, dtype):
+    """The sum over windows equals the gradient of the whole, but for the order of sums."""
     scenery = scene(dtype, device)
     upstream = torch.rand(2, SIZE[1], SIZE[0], 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     upstream = upstream.to(device, dtype) - 0.4
     whole = gradients(*scenery, upstream)
-    bands = [gradients(*scenery, upstream, window=(0, y, 75, min(16, 53 - y))) for y in range(0, 53, 16)]
+    windows = [gradients(*scenery, upstream, window=(0, y, 75, min(16, 53 - y))) for y in range(0, 53, 16)]
     near = 3e-5 if dtype is torch.float32 else 1e-12
-    for a, *pieces in zip(whole, *bands):
+    for a, *pieces in zip(whole, *windows):
         assert float((a - sum(pieces)).norm()) <= near * float(a.norm())
 
 
 @pytest.mark.parametrize("most", [1, 150, 700])
-def test_bands_make_the_same_picture(device, dtype, most):
-    """In parts as small as a tile, pictures are the same bits and gradients the same numbers."""
+def test_chunks_make_the_same_image(device, dtype, most):
+    """In chunks as small as a tile, images are the same bits and gradients the same numbers."""
     gaussians, cam, background = scene(dtype, device)
     whole = rasterize(gaussians, cam, RasterizeOptions(background=background))
-    banded = rasterize(gaussians, cam, RasterizeOptions(background=background, max_instances=most, contributions=True))
+    chunked = rasterize(gaussians, cam, RasterizeOptions(background=background, max_instances=most, contributions=True))
     weights = rasterize(gaussians, cam, RasterizeOptions(contributions=True))
-    assert torch.equal(weights.weight_maxima, banded.weight_maxima)
-    assert torch.allclose(weights.weight_sums, banded.weight_sums, rtol=1e-5, atol=1e-6)
-    assert int(whole.tile_counts.sum()) > 2 * most and torch.equal(whole.projected, banded.projected)
+    assert torch.equal(weights.weight_maxima, chunked.weight_maxima)
+    assert torch.allclose(weights.weight_sums, chunked.weight_sums, rtol=1e-5, atol=1e-6)
+    assert int(whole.tile_counts.sum()) > 2 * most and torch.equal(whole.projected, chunked.projected)
     for name in ("rgb", "alpha", "depth"):
-        assert torch.equal(getattr(whole, name), getattr(banded, name)), name
+        assert torch.equal(getattr(whole, name), getattr(chunked, name)), name
     upstream = torch.rand(2, SIZE[1], SIZE[0], 5, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 0.4
     upstream = upstream.to(device, dtype)
     near = 3e-5 if dtype is torch.float32 else 1e-12
@@ -81,11 +82,11 @@ def test_bands_make_the_same_picture(device, dtype, most):
         assert float((a - b).norm()) <= near * float(a.norm())
 
 
-def test_bands_hold_no_more_instances_than_asked_for():
-    """Every part but a single tile keeps to the number; together they are the window."""
+def test_chunks_hold_no_more_instances_than_asked_for():
+    """Every chunk but a single tile keeps to the number; together they are the window."""
     gaussians, cam, _ = scene(torch.float32, "cpu")
-    frame = Frame(*SIZE, (16, 16, 59, 37), 1, RULES["exact"], 16, 150)
-    found = list(parts(frame, (*gaussians.tensors().values(), cam.viewmat, cam.K)))
+    frame = ChunkedFrame(RenderSettings(*SIZE, (16, 16, 59, 37), 1, RULES["exact"], 16), 150)
+    found = list(chunks(frame, (*gaussians.tensors().values(), cam.viewmat, cam.K)))
     covered = torch.zeros(SIZE[1], SIZE[0], dtype=torch.int32)
     for (x, y, width, height), counts in found:
         covered[y : y + height, x : x + width] += 1
@@ -94,7 +95,7 @@ def test_bands_hold_no_more_instances_than_asked_for():
 
 
 def test_sources_changed_before_the_gradient_are_noticed():
-    """A band that would be drawn from other Gaussians than the picture was is an error, not a wrong gradient."""
+    """A chunk that would be rendered again from other Gaussians is an error, not a wrong gradient."""
     gaussians, cam, background = scene(torch.float32, "cpu")
     g = leaves(gaussians)
     r = rasterize(g, cam, RasterizeOptions(background=background, max_instances=100))
@@ -105,8 +106,8 @@ def test_sources_changed_before_the_gradient_are_noticed():
 
 
 @pytest.mark.parametrize("more", [{"capacity": 100}, {"max_instances": 0}])
-def test_options_that_bands_exclude_are_refused(more):
-    """Said before anything is drawn."""
+def test_options_that_chunks_exclude_are_refused(more):
+    """The error comes before anything is rendered."""
     gaussians, cam, _ = scene(torch.float32, "cpu")
     with pytest.raises(UsageError, match="max_instances must be at least 1"):
         rasterize(gaussians, cam, RasterizeOptions(**{"max_instances": 10, **more}))
@@ -116,7 +117,7 @@ def test_options_that_bands_exclude_are_refused(more):
     "window", [(1, 0, 16, 16), (0, 8, 75, 8), (0, 0, 20, 53), (0, 0, 0, 16), (0, 16, 75, 40), (-16, 0, 32, 16)]
 )
 def test_windows_off_the_tiles_are_refused(window):
-    """An edge inside a tile, beyond the picture, or nothing at all."""
+    """An edge inside a tile or beyond the image, or an empty window."""
     gaussians, cam, _ = scene(torch.float32, "cpu")
     with pytest.raises(UsageError, match=r"window .* multiples of 16"):
         rasterize(gaussians, cam, RasterizeOptions(window=window))

@@ -14,7 +14,6 @@ from warpgs.kernels.blend import blend, contributions
 from warpgs.kernels.dropout import opacity_dropout
 from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.project import project
-from warpgs.kernels.sh import evaluate_sh
 from warpgs.kernels.ssim import differences, ssim
 from warpgs.kernels.tiles import bin_tiles
 from warpgs.runtime import interop
@@ -68,18 +67,17 @@ def test_ranges_cover_every_item_once(monkeypatch, threads, count, cost, ranges)
 
 
 def everything():
-    """The result of every kernel there is for a CPU in float32, gradients included."""
+    """Return the results of every float32 kernel for a CPU, with gradients."""
     g, cam = leaves(cloud(61)), camera(37, 30, cameras=2, dtype=torch.float32)
     size, rule = {"width": 37, "height": 30}, RULES["exact"]
     views, Ks = cam.viewmat.clone().requires_grad_(), cam.K.clone().requires_grad_()
     projected, counts = project(*g.tensors().values(), views, Ks, **size, degree=1, rule=rule)
     tiles = bin_tiles(projected, counts, **size, rule=rule)
     capped = bin_tiles(projected, counts, **size, rule=rule, capacity=2000, overflow=torch.zeros(1, dtype=torch.int32))
-    pictures = blend(projected, tiles, torch.ones(2, 3), **size, rule=rule)
-    target = torch.rand(pictures[0].shape, generator=torch.Generator().manual_seed(0))
-    maps, sums = ssim(pictures[0], target), differences(pictures[0], target)
-    colors = evaluate_sh(g.sh, torch.nn.functional.normalize(g.means, dim=1), 1)
-    loss = sum((t * t).sum() for t in (*pictures, maps, sums, colors))
+    images = blend(projected, tiles, torch.ones(2, 3), **size, rule=rule)
+    target = torch.rand(images[0].shape, generator=torch.Generator().manual_seed(0))
+    maps, sums = ssim(images[0], target), differences(images[0], target)
+    loss = sum((t * t).sum() for t in (*images, maps, sums))
     gradients = torch.autograd.grad(loss, [*g.tensors().values(), views, Ks])
     moved = torch.rand(3 * 4096, 3, generator=torch.Generator().manual_seed(1))
     state = [moved, moved.flip(0).contiguous(), moved * 0, moved * 0]
@@ -88,7 +86,7 @@ def everything():
     lists = [t for tiled in (tiles, capped) for t in (tiled.ranges, tiled.counts, tiled.gaussian_ids[: len(tiles.slots)])]
     weights = contributions(projected, tiles, **size, rule=rule)
     near = mean_square_distances(moved[:91])
-    return [t.detach() for t in (projected, counts, *lists, *pictures, *gradients, *weights, *state, near, drawn, maps, sums)]
+    return [t.detach() for t in (projected, counts, *lists, *images, *gradients, *weights, *state, near, drawn, maps, sums)]
 
 
 @pytest.fixture

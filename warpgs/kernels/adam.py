@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba 2015) in place, one pass over parameter, gradient and both moments."""
+"""Adam (Kingma and Ba 2015) in place: one pass over parameter, gradient and both moments."""
 
 import functools
 from types import SimpleNamespace
@@ -10,32 +10,32 @@ from warpgs.kernels.compiler import ROLLED
 from warpgs.runtime import interop
 
 BETAS = (0.9, 0.999)
-"""Decay of the two running means (Kingma and Ba 2015)."""
+"""Decay rates of the two moments (Kingma and Ba 2015)."""
 EPS = 1e-15
-"""Added to the root; as in Kerbl et al. 2023, whose gradients are tiny."""
+"""Number added to the root, as in Kerbl et al. 2023, since gradients are tiny."""
 LANES = 16
-"""Elements that are updated together on a CPU: a loop that vectorises."""
+"""Elements that are updated together on a CPU, in a loop that vectorises."""
 SEGMENT = 4096
 """Elements that one task updates on a CPU, a multiple of `LANES`."""
 
 
 @functools.cache
 def make_functions(real):
-    """The update of one element in three parts, for one scalar type."""
+    """Make the update of one element, in three functions."""
 
     @wp.func
     def decayed(m: real, g: real, beta1: real, rest1: real) -> real:
-        """Running mean of the gradient."""
+        """Return the running mean of the gradient."""
         return beta1 * m + rest1 * g
 
     @wp.func
     def decayed_square(s: real, g: real, beta2: real, rest2: real) -> real:
-        """Running mean of its square."""
+        """Return the running mean of the squared gradient."""
         return beta2 * s + rest2 * g * g
 
     @wp.func
     def moved(p: real, m: real, s: real, lr: real, root_correction2: real, eps: real) -> real:
-        """The parameter after the step."""
+        """Return the parameter after the step."""
         return p - lr * m / (wp.sqrt(s) / root_correction2 + eps)
 
     return SimpleNamespace(decayed=decayed, decayed_square=decayed_square, moved=moved)
@@ -43,9 +43,12 @@ def make_functions(real):
 
 @functools.cache
 def make_kernel(real, split: bool, lanes: int):
-    """The update kernel for one scalar type; a task updates a segment of the flat parameter, some lanes at a time.
+    """Make the update kernel; a task updates a segment of the flat parameter, some lanes at a time.
 
-    ``split`` says whether the head of each row has a rate of its own, which costs some arithmetic.
+    Args:
+        real: wp.float32 or wp.float64.
+        split: True where the head of each row has a learning rate of its own, which costs some arithmetic.
+        lanes: Elements at a time.
     """
     values = wp.types.vector(lanes, real)
     f = make_functions(real)
@@ -97,7 +100,7 @@ def make_kernel(real, split: bool, lanes: int):
 
 
 # The same for CUDA. Products and sums that the compiler might fuse are spelled with their rounding: it may choose otherwise
-# in another kernel, and all that update must give the same bits.
+# in another kernel, and all kernels that update must give the same bits.
 ELEMENT = """
     auto one = [&](float g, float rate, float& p, float& m, float& s) {
         m = __fmaf_rn(beta1, m, __fmul_rn(rest1, g));
@@ -135,7 +138,7 @@ _UPDATE = (
 
 @functools.cache
 def make_scheduled_kernel():
-    """The update for CUDA in float32, four elements a thread, its rates in memory: it can be recorded once and replayed."""
+    """Make the update for CUDA in float32: four elements a thread, learning rates in memory, so that a graph can replay it."""
 
     @wp.func_native(_UPDATE)
     def update_body(
@@ -159,7 +162,7 @@ def make_scheduled_kernel():
 
 
 def scheduled_lrs(lr: float, step: int, betas: tuple[float, float] = BETAS, head_lr: float | None = None) -> list[float]:
-    """What `adam_scheduled` reads from memory at a step: both learning rates and the root of the second correction."""
+    """Return what `adam_scheduled` reads from memory: two corrected learning rates and the root of the second correction."""
     correction1, correction2 = 1 - betas[0] ** step, 1 - betas[1] ** step
     return [(lr if head_lr is None else head_lr) / correction1, lr / correction1, correction2**0.5]
 
@@ -232,10 +235,10 @@ def adam_step(
         exp_avg_sq: Running mean of its square, same shape, contiguous.
         lr: Learning rate.
         step: Number of this step, from 1.
-        betas: Decay of the two running means.
-        eps: Added to the root; 1e-15 as in Kerbl et al. 2023, whose gradients are tiny.
+        betas: Decay rates of the two moments.
+        eps: Number added to the root.
         head_lr: Learning rate of the first ``head`` numbers of each of the N rows.
-        head: How many numbers of a row take ``head_lr``; 0 for none.
+        head: Count of numbers of a row that take ``head_lr``; 0 for none.
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
@@ -251,7 +254,7 @@ def adam_step(
         return
     lrs = scheduled_lrs(lr, step, betas, head_lr)
     if param.is_cuda and param.dtype == torch.float32:
-        # one kernel for this and for recorded steps, so that both give the same bits
+        # one kernel for this and for captured steps, so that both give the same bits
         skip = torch.zeros(1, dtype=torch.int32, device=param.device)
         on_device = torch.tensor(lrs, device=param.device)
         adam_scheduled(param, grad, exp_avg, exp_avg_sq, on_device, skip, betas=betas, eps=eps, head=head)

@@ -1,6 +1,7 @@
-"""Composite binned Gaussians front to back: colour, alpha, expected depth, and each Gaussian's share of the picture."""
+"""Compositing of binned Gaussians front to back: colour, alpha, expected depth, and each Gaussian's blending weight."""
 
 import functools
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 import torch
@@ -9,17 +10,18 @@ from torch.autograd.function import once_differentiable
 
 from warpgs.constants import Rule
 from warpgs.kernels import blend_cpu, blend_cuda
+from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.tiles import Tiles, grid
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
 
 VALUES = 10
-"""Gradient values of an instance: the record of `project` without its last two entries."""
+"""Gradient values of an instance: those of a projected Gaussian but for its last two, which are the box."""
 
 
 @functools.cache
 def make_segments(real):
-    """Kernels that gather the slots of each Gaussian, in slot order and so repeatably."""
+    """Make the kernels that sum over the slots of each Gaussian, in slot order and so repeatably."""
     vec10 = wp.types.vector(VALUES, real)
 
     @wp.kernel(enable_backward=False, module=f"warpgs.kernels.blend.{real.__name__}")
@@ -55,12 +57,12 @@ def make_segments(real):
 
 
 def _native(projected: torch.Tensor) -> bool:
-    """Whether the CUDA kernels apply; else the generic ones do."""
+    """Return whether the CUDA kernels apply; else the generic ones do."""
     return projected.is_cuda and projected.dtype == torch.float32
 
 
 def _launch(kernel, tiles: int, inputs: list, device: torch.device) -> None:
-    """One task per tile of the generic kernels."""
+    """Launch a generic kernel, one task per tile."""
     interop.launch(kernel, tiles, inputs, device, cost=10_000, block_dim=32)
 
 
@@ -72,24 +74,38 @@ def _tile_inputs(projected: torch.Tensor, tiles: Tiles, real) -> list[interop.Vi
     ]
 
 
-def _frame(origin: tuple[int, int], width: int, height: int, tile_size: int) -> list[int]:
-    columns, rows = grid(width, height, tile_size)
-    return [*origin, width, height, columns, columns * rows]
-
-
 def composite(
-    projected, tiles, backgrounds, origin, width, height, rule, keep, deterministic=True, allocator: Allocator = TORCH
-):  # fmt: skip
-    """Pictures, and what the backward pass needs: rgb, alpha, depth, transmittances, weights, ends, states (CUDA only)."""
+    projected: torch.Tensor,
+    tiles: Tiles,
+    backgrounds: torch.Tensor,
+    settings: BlendSettings,
+    *,
+    save: bool,
+    allocator: Allocator = TORCH,
+) -> tuple[torch.Tensor, ...]:
+    """Return the images, and what the backward pass needs. Nothing is checked, and no gradient is recorded.
+
+    Args:
+        projected: Projected Gaussians, contiguous, shape [C, N, 12].
+        tiles: Their instances.
+        backgrounds: Colour behind everything, contiguous, shape [C, 3].
+        settings: Settings.
+        save: True where gradients will be taken.
+        allocator: Provider of the results' memory.
+
+    Returns:
+        ``rgb`` [C, H, W, 3]; ``alpha``, ``depth``, transmittances and weight sums [C, H, W]; one past the last instance that
+        was blended [C, H, W]; states of the chunks (CUDA only, else empty).
+    """
     if _native(projected):
-        return blend_cuda.forward(projected, tiles, backgrounds, origin, width, height, rule, keep, deterministic, allocator)
-    real, device = interop.real_of(projected), projected.device
-    shape = (len(backgrounds), height, width)
+        return blend_cuda.forward(projected, tiles, backgrounds, settings, save=save, allocator=allocator)
+    real, device, rule = interop.real_of(projected), projected.device, settings.rule
+    shape = (len(backgrounds), settings.height, settings.width)
     rgb, alpha, depth = (allocator.output(s, projected.dtype, device) for s in ((*shape, 3), shape, shape))
     transmittances, weights = (allocator.saved(shape, projected.dtype, device) for _ in range(2))
     ends = allocator.saved(shape, torch.int32, device)
     inputs = [
-        *_tile_inputs(projected, tiles, real), interop.view(backgrounds, real), *_frame(origin, width, height, tiles.size),
+        *_tile_inputs(projected, tiles, real), interop.view(backgrounds, real), *settings.window_inputs(tiles.size),
         rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), rule.transmittance_stop, int(rule.inclusive_stop),
         interop.view(rgb.view(-1, 3), real),
         *(interop.view(t.view(-1), real) for t in (alpha, depth, transmittances, weights)),
@@ -99,10 +115,11 @@ def composite(
     return rgb, alpha, depth, transmittances, weights, ends, allocator.saved((0,), projected.dtype, device)
 
 
-def _backward(projected, tiles, backgrounds, origin, width, height, rule, _, saved, v_rgb, v_alpha, v_depth, allocator):
-    """Gradient of the records by the generic kernels; ``saved`` as in blend_cuda.backward."""
+def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_images, allocator) -> torch.Tensor:
+    """Return what `blend_cuda.backward` returns, by the generic kernels."""
     _, depth, transmittances, weights, ends, _ = saved
-    real, device = interop.real_of(projected), projected.device
+    v_rgb, v_alpha, v_depth = v_images
+    real, device, rule = interop.real_of(projected), projected.device, settings.rule
     v_projected = allocator.output(projected.shape, projected.dtype, device).zero_()
     v_slots = allocator.workspace((len(tiles.slots), VALUES), projected.dtype, device).zero_()
     upstream = [interop.view(v_rgb.contiguous().view(-1, 3), real)]
@@ -110,7 +127,7 @@ def _backward(projected, tiles, backgrounds, origin, width, height, rule, _, sav
         upstream.append(interop.view((torch.zeros_like(depth) if v is None else v.contiguous()).view(-1), real))
     inputs = [
         *_tile_inputs(projected, tiles, real), interop.view(tiles.slots, wp.int32), interop.view(backgrounds, real),
-        *_frame(origin, width, height, tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
+        *settings.window_inputs(tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
         *(interop.view(t.view(-1), real) for t in (transmittances, weights, depth)), interop.view(ends.view(-1), wp.int32),
         *upstream, interop.view(v_slots, real),
     ]  # fmt: skip
@@ -123,20 +140,35 @@ def _backward(projected, tiles, backgrounds, origin, width, height, rule, _, sav
     return v_projected
 
 
-def gradients(
-    projected, tiles, backgrounds, how: tuple, saved, v_rgb, v_alpha, v_depth, allocator: Allocator = TORCH
+def composite_gradients(
+    projected: torch.Tensor,
+    tiles: Tiles,
+    backgrounds: torch.Tensor,
+    settings: BlendSettings,
+    saved: Sequence[torch.Tensor],
+    v_images: Sequence[torch.Tensor | None],
+    allocator: Allocator = TORCH,
 ) -> torch.Tensor:
-    """Gradient of the records from those of the pictures, where any of them may be None.
+    """Return the gradient of ``projected``, shape [C, N, 12]. Nothing is checked.
 
-    ``how`` is what `composite` takes after backgrounds, less ``keep``; ``saved`` what it returned, less alpha.
+    Args:
+        projected: As given to `composite`, like the next three.
+        tiles: See there.
+        backgrounds: See there.
+        settings: See there.
+        saved: The results of `composite` but for ``alpha``.
+        v_images: Gradients of ``rgb``, ``alpha`` and ``depth``, each of which may be None.
+        allocator: Provider of the gradient's memory.
     """
+    v_rgb, v_alpha, v_depth = v_images
     v_rgb = torch.zeros_like(saved[0]) if v_rgb is None else v_rgb
-    work = blend_cuda.backward if _native(projected) else _backward
-    return work(projected, tiles, backgrounds, *how, saved, v_rgb, v_alpha, v_depth, allocator)
+    backward = blend_cuda.backward if _native(projected) else _backward
+    return backward(projected, tiles, backgrounds, settings, saved, (v_rgb, v_alpha, v_depth), allocator)
 
 
 def background_gradient(transmittances: torch.Tensor, v_rgb: torch.Tensor | None) -> torch.Tensor:
-    """Shape [C, 3]. A product of matrices would sum the pixels one by one, and err several times as much."""
+    """Return the gradient of the backgrounds, shape [C, 3]; ``v_rgb`` None is zero."""
+    # a product of matrices would sum the pixels one by one, and err several times as much
     if v_rgb is None:
         return transmittances.new_zeros(len(transmittances), 3)
     return torch.stack([(transmittances * v_rgb[..., k]).sum((1, 2)) for k in range(3)], 1)
@@ -144,14 +176,14 @@ def background_gradient(transmittances: torch.Tensor, v_rgb: torch.Tensor | None
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, projected, backgrounds, tiles, origin, width, height, rule, deterministic):
+    def forward(ctx, projected, backgrounds, tiles, settings):
         projected, backgrounds = projected.contiguous(), backgrounds.contiguous()
-        keep = any(ctx.needs_input_grad)
-        rgb, alpha, depth, *rest = composite(projected, tiles, backgrounds, origin, width, height, rule, keep, deterministic)
-        if keep:
+        save = any(ctx.needs_input_grad)
+        rgb, alpha, depth, *rest = composite(projected, tiles, backgrounds, settings, save=save)
+        if save:
             # all of it as saved tensors: those are freed once the gradient is taken
             ctx.save_for_backward(projected, backgrounds, rgb, depth, *rest, *tiles.tensors())
-            ctx.tile_size, ctx.how = tiles.size, (origin, width, height, rule, deterministic)
+            ctx.tile_size, ctx.settings = tiles.size, settings
         ctx.set_materialize_grads(False)
         return rgb, alpha, depth
 
@@ -160,9 +192,9 @@ class _Blend(torch.autograd.Function):
     def backward(ctx, *v_images):
         projected, backgrounds, *tensors = ctx.saved_tensors
         saved, tiles = tensors[:6], Tiles(ctx.tile_size, *tensors[6:])
-        v_projected = gradients(projected, tiles, backgrounds, ctx.how, saved, *v_images)
+        v_projected = composite_gradients(projected, tiles, backgrounds, ctx.settings, saved, v_images)
         v_backgrounds = background_gradient(saved[2], v_images[0]) if ctx.needs_input_grad[1] else None
-        return v_projected, v_backgrounds, None, None, None, None, None, None
+        return v_projected, v_backgrounds, None, None
 
 
 def _check(projected: torch.Tensor, tiles: Tiles, width: int, height: int, **backgrounds) -> None:
@@ -188,11 +220,11 @@ def blend(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Composite C images of H x W pixels (Kerbl et al. 2023, eq. 3; order and early stop as ``rule`` says).
 
-    Differentiable in the first ten values of each record and in ``backgrounds``; the gradient of a clamped alpha is zero.
+    Differentiable in the first ten values of each projected Gaussian and in ``backgrounds``; a clamped alpha has gradient zero.
     Derivation of the backward pass: docs/blend.md. Bitwise repeatable on a CPU, whatever the number of threads, and on CUDA.
 
     Args:
-        projected: Records of `project`, shape [C, N, 12].
+        projected: Projected Gaussians of `project`, shape [C, N, 12].
         tiles: Instances of `bin_tiles` for the same image size.
         backgrounds: Colour behind everything, shape [C, 3].
         width: Image width [px].
@@ -200,7 +232,7 @@ def blend(
         rule: Cut-offs.
         deterministic: Sum gradients in a fixed order. False adds them atomically on CUDA in float32, which takes less memory
             and gives other bits each time; elsewhere it changes nothing.
-        origin: Left and top [px] of the window of that size which the tiles were made for.
+        origin: Left and top [px] of the window that the tiles were made for.
 
     Returns:
         ``rgb`` [C, H, W, 3]; ``alpha`` [C, H, W], accumulated opacity; ``depth`` [C, H, W], the mean z-depth [u] under the
@@ -211,21 +243,21 @@ def blend(
         ValueError: A shape or device disagrees, or the tiles belong to another image size.
     """
     _check(projected, tiles, width, height, backgrounds=(backgrounds, "C 3"))
-    return _Blend.apply(projected, backgrounds, tiles, origin, width, height, rule, deterministic)
+    return _Blend.apply(projected, backgrounds, tiles, BlendSettings(origin, width, height, rule, deterministic))
 
 
 def contributions(
     projected: torch.Tensor, tiles: Tiles, *, width: int, height: int, rule: Rule, origin: tuple[int, int] = (0, 0)
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """How much each Gaussian shows in each image: sum and maximum over pixels of its weight alpha * T. Not differentiable.
+    """Return sum and maximum over pixels of each Gaussian's blending weight alpha * T in each image. Not differentiable.
 
     Args:
-        projected: Records of `project`, shape [C, N, 12].
+        projected: Projected Gaussians of `project`, shape [C, N, 12].
         tiles: Instances of `bin_tiles` for the same image size.
         width: Image width [px].
         height: Image height [px].
         rule: Cut-offs.
-        origin: Left and top [px] of the window of that size which the tiles were made for.
+        origin: Left and top [px] of the window that the tiles were made for.
 
     Returns:
         ``weight_sums`` [C, N] and ``weight_maxima`` [C, N].
@@ -237,14 +269,15 @@ def contributions(
     _check(projected, tiles, width, height)
     projected = projected.detach().contiguous()
     real, device = interop.real_of(projected), projected.device
-    ends = composite(projected, tiles, projected.new_zeros(len(projected), 3), origin, width, height, rule, keep=False)[5]
+    settings = BlendSettings(origin, width, height, rule)
+    ends = composite(projected, tiles, projected.new_zeros(len(projected), 3), settings, save=False)[5]
     if _native(projected):
-        weights = blend_cuda.instance_weights(projected, tiles, origin, width, height, rule, ends)
+        weights = blend_cuda.instance_weights(projected, tiles, settings, ends)
     else:
         weights = projected.new_zeros(len(tiles.slots), 2)
         inputs = [
             *_tile_inputs(projected, tiles, real), interop.view(tiles.slots, wp.int32),
-            *_frame(origin, width, height, tiles.size),
+            *settings.window_inputs(tiles.size),
             rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), interop.view(ends.view(-1), wp.int32),
             interop.view(weights, real),
         ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Blending kernels in plain Warp, one task per tile: the CPU's kernels, and the float64 kernels on every device.
+"""Blending kernels in plain Warp, one task per tile: those of the CPU, and of float64 on every device.
 
 A task cuts the rows of its tile into strips. The innermost loops run over the pixels of one strip without branches and are
 kept rolled, so that the compiler vectorises them (docs/blend.md, section 5).
@@ -14,12 +14,12 @@ from warpgs.kernels.compiler import ROLLED
 from warpgs.kernels.falloff import ABREAST, STRIP, make_functions
 
 BATCH = 64
-"""Gaussians that the forward pass takes at a time, strip by strip; a power of 2, as indices are bounded by its bits."""
+"""Gaussians that the forward pass takes at a time, strip by strip; a power of 2, since indices are bounded by its bits."""
 
 
 @functools.cache
 def make_kernels(real, tile_size: int):
-    """Forward, backward and contribution kernels for one scalar type and tile size."""
+    """Make the forward, backward and contribution kernels for one scalar type and tile size."""
     f = make_functions(real)
     # Vectors rather than local arrays: the compiler must see that they do not overlap. One row longer than the tile, so that
     # they do not lie 4096 bytes apart, where a load is taken to wait for a store to the other.
@@ -79,7 +79,7 @@ def make_kernels(real, tile_size: int):
         strip_z = strip_reals()
         strip_total = strip_reals()
         strip_end = strip_ints()
-        # The Gaussians of a batch: values, u11 times the pixels of a strip; what they share in a row; which reach a strip.
+        # The Gaussians of a batch: values; u11 times the pixels of a strip; values shared in a row; those that reach a strip.
         mx = batch_reals()
         my = batch_reals()
         u11 = batch_reals()
@@ -107,14 +107,14 @@ def make_kernels(real, tile_size: int):
         while first < last:
             count = wp.min(batch, last - first)
             for j in range(count):
-                mx[j] = projected[gaussian_ids[first + j], 0]  # alone, so that many records are on their way at once
+                mx[j] = projected[gaussian_ids[first + j], 0]  # in a loop of its own, so that many loads are under way at once
             for j in range(batch):
                 limit[j] = real(-1.0)  # reaches nothing
             j = int(0)
             while j < count:
                 i = gaussian_ids[wp.max(first + j, 0)]
                 if i < 0:
-                    break  # never; but a loop that may end early is not vectorised, which here would mean slow gathers
+                    break  # never; but a loop that may end early is not vectorised, and here that would mean slow gathers
                 my[j] = projected[i, 1]
                 u11[j] = projected[i, 2]
                 u12[j] = projected[i, 3]
@@ -157,7 +157,7 @@ def make_kernels(real, tile_size: int):
                         k = int(0)
                         while k < reaching:
                             o = wp.max(k, 0)
-                            k += abreast  # the last few may be some that do not reach the strip: nobody reads theirs
+                            k += abreast  # the last few may not reach the strip; their values are not read
                             for lane in range(strip):
                                 for n in range(abreast):
                                     j = list[o + n] & bits

@@ -1,4 +1,4 @@
-"""The backward blending kernel in plain Warp, one task per tile: the CPU's, and in float64 that of every device."""
+"""The backward blending kernel in plain Warp, one task per tile: that of the CPU, and of float64 on every device."""
 
 import functools
 
@@ -8,12 +8,12 @@ from warpgs.kernels.compiler import ROLLED
 from warpgs.kernels.falloff import ABREAST, STRIP, make_functions
 
 VALUES = 10
-"""Gradient values of an instance."""
+"""Number of gradient values of an instance."""
 
 
 @functools.cache
 def make_backward(real, tile_size: int):
-    """The kernel for one scalar type and tile size."""
+    """Make the kernel for one scalar type and tile size."""
     f = make_functions(real)
     # The tile lies in columns as wide as a strip, one beside the other. One row longer than it: see `make_kernels`.
     count = tile_size * (tile_size // STRIP)
@@ -121,7 +121,7 @@ def make_backward(real, tile_size: int):
             instance -= 1
             i = gaussian_ids[instance]
             mx = ahead
-            ahead = projected[gaussian_ids[wp.max(instance - 1, 0)], 0]  # asked for early, as it may be far away
+            ahead = projected[gaussian_ids[wp.max(instance - 1, 0)], 0]  # loaded early, as it may be far away
             my = projected[i, 1]
             u11 = projected[i, 2]
             u12 = projected[i, 3]
@@ -169,7 +169,7 @@ def make_backward(real, tile_size: int):
             k = int(0)
             while k < reaching:
                 base = wp.max(k, 0)
-                k += abreast  # the last few may be some that are not reached: nobody reads theirs
+                k += abreast  # the last few may not be reached; their values are not read
                 for lane in range(strip):
                     for n in range(abreast):
                         o = list[base + n] & bits
@@ -181,11 +181,11 @@ def make_backward(real, tile_size: int):
                         raw = opacity * g[n]
                         alpha = wp.where(alpha_max < raw, alpha_max, raw)
                         until = end[(list[base + n] & bits) * strip + lane]
-                        drawn = alpha >= alpha_cut and instance < until
-                        alpha = wp.where(drawn, alpha, real(0.0))
+                        blended = alpha >= alpha_cut and instance < until
+                        alpha = wp.where(blended, alpha, real(0.0))
                         alphas[q] = alpha
                         inverses[q] = real(1.0) / (real(1.0) - alpha)
-                        slopes[q] = wp.where(drawn and raw <= alpha_max, g[n], real(0.0))
+                        slopes[q] = wp.where(blended and raw <= alpha_max, g[n], real(0.0))
             k = int(0)
             while k < reaching:
                 base = wp.max(k, 0) * strip

@@ -1,26 +1,27 @@
-"""Blending kernels for CUDA in float32, native bodies: warps that own 8 x 4 blocks of pixels, and gradients by chunks.
+"""Blending kernels for CUDA in float32, with native bodies: warps that own 8 x 4 blocks of pixels, and gradients by chunks.
 
 Warp has no shuffles, no ballots and no 16-byte loads, so the bodies are CUDA. They compute what the generic kernels of
 blend_cpu.py compute (docs/blend.md); tests hold them against each other.
 """
 
 import functools
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 import torch
 import warp as wp
 
-from warpgs.constants import Rule
+from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.native import source
-from warpgs.kernels.tiles import Tiles, grid
+from warpgs.kernels.tiles import Tiles
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
 
 CHUNKS = (64, 128)
-"""Instances that one warp of the backward pass works through: the first in pictures of up to MANY tiles, to have enough
-warps, the second in larger ones, to load the pixels less often. The forward pass leaves the state of every pixel at each
-multiple of this, so that a long list is worked on in many places at once. Multiples of 32."""
-MANY = 4096
+"""Instances that one warp of the backward pass takes: the first number in images of up to MAX_SMALL_TILES tiles, to have enough
+warps, the second in larger ones, to load the pixels less often. The forward pass saves the state of every pixel at each
+multiple of this, so that several warps can share a long list. Multiples of 32."""
+MAX_SMALL_TILES = 4096
 """Tiles beyond which the larger chunk is the faster one (docs/decisions/005-cuda-blending.md)."""
 STATE = 5
 """Floats of that state: transmittance, colour and depth sum so far."""
@@ -29,24 +30,25 @@ WARPS = 2
 THREADS = 1024
 """Threads of the one block that puts tiles in order."""
 STRIDE = 12
-"""Floats from one instance's sums to the next, so that rows are 16-byte aligned. There are ten at most: along the two factor
-rows, three for the factor, opacity, colour, depth."""
+"""Floats from one instance's sums to the next, so that rows are 16-byte aligned. There are at most ten sums: two along the rows
+of the factor, three for the factor, opacity, colour, depth."""
 
 # 2^-(e1^2 + e2^2) = exp(-|U d|^2 / 2) where e = SCALE U d
 SCALE = "0.84932180028801904272f"  # sqrt(log2(e) / 2)
 
 
 def _source(name: str, tile_size: int, **numbers) -> str:
-    """A body, behind what all bodies share."""
+    """Return the CUDA text of one body, after the text that all bodies share."""
     numbers |= {"SIDE": tile_size, "STATE": STATE, "SCALE": SCALE, "WARPS": WARPS, "STRIDE": STRIDE}
     return source("blend_common.cu", f"blend_{name}.cu", **numbers)
 
 
 @functools.cache
 def make_kernels(tile_size: int):
-    """Forward and contribution kernels for one tile size.
+    """Make the forward and contribution kernels for one tile size.
 
-    Images and records are flat; what there is per instance has rows, as a flat array could be too long for 32-bit sizes.
+    Images and projected Gaussians are flat arrays. Arrays with a row per instance have two axes, since a flat one could be too
+    long for 32-bit sizes.
     """
 
     @wp.func_native(_source("forward", tile_size))
@@ -117,9 +119,13 @@ def make_kernels(tile_size: int):
 
 @functools.cache
 def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
-    """Backward kernels: sums per instance, then per Gaussian; ``with_depth`` with gradients of depth and alpha.
+    """Make the backward kernels: sums per instance, then per Gaussian.
 
-    ``atomic``: sums are added to their Gaussian's without slots, in no fixed order.
+    Args:
+        tile_size: Side of a tile [px].
+        with_depth: True for gradients of depth and alpha, too.
+        chunk: Instances per warp.
+        atomic: True to add each sum to its Gaussian's at once, in no fixed order, instead of by slots.
     """
     numbers = {"CHUNK": chunk, "WITH_DEPTH": str(with_depth).lower(), "ATOMIC": str(atomic).lower()}
 
@@ -186,35 +192,36 @@ def _ints(*tensors: torch.Tensor) -> list[interop.View]:
     return [interop.view(t.view(-1), wp.int32) for t in tensors]
 
 
-def _frame(origin: tuple[int, int], width: int, height: int, tile_size: int) -> list[int]:
-    columns, rows = grid(width, height, tile_size)
-    return [*origin, width, height, columns, columns * rows]
-
-
 def chunk_of(tiles: Tiles, deterministic: bool) -> int:
-    """Instances per chunk of the backward pass; the larger one, which takes less memory, where memory is asked for."""
-    return CHUNKS[int(tiles.ranges.shape[0] > MANY or not deterministic)]
+    """Return the instances per chunk: the larger number, which takes less memory, also where order is given up for memory."""
+    return CHUNKS[int(tiles.ranges.shape[0] > MAX_SMALL_TILES or not deterministic)]
 
 
 def forward(
-    projected, tiles: Tiles, backgrounds, origin: tuple[int, int], width: int, height: int, rule: Rule, keep: bool,
-    deterministic: bool, allocator: Allocator = TORCH,
-):  # fmt: skip
-    """Pictures and what the backward pass needs of them: rgb, alpha, depth, transmittances, weights, ends, states."""
-    device = projected.device
-    shape = (backgrounds.shape[0], height, width)
+    projected: torch.Tensor,
+    tiles: Tiles,
+    backgrounds: torch.Tensor,
+    settings: BlendSettings,
+    *,
+    save: bool,
+    allocator: Allocator = TORCH,
+) -> tuple[torch.Tensor, ...]:
+    """Return what `blend.composite` returns: rgb, alpha, depth, transmittances, weights, ends, states."""
+    device, rule = projected.device, settings.rule
+    shape = (backgrounds.shape[0], settings.height, settings.width)
     rgb, alpha, depth = (allocator.output(s, torch.float32, device) for s in ((*shape, 3), shape, shape))
     transmittances, weights = allocator.saved((2, *shape), torch.float32, device).unbind()
     ends = allocator.saved(shape, torch.int32, device)
     pixels = tiles.size * tiles.size
-    chunk = chunk_of(tiles, deterministic) if keep else interop.MAX_SIZE  # of which no instance is a multiple but the first
+    # without gradients no state is saved: no instance but the first is a multiple of this
+    chunk = chunk_of(tiles, settings.deterministic) if save else interop.MAX_SIZE
     states = allocator.saved((tiles.slots.shape[0] // chunk + 1, STATE * pixels), torch.float32, device)
     k, count = make_kernels(tiles.size), tiles.ranges.shape[0]
     order = allocator.workspace((count,), torch.int32, device)
     interop.launch(k.order_tiles, THREADS, [*_ints(tiles.ranges), count, *_ints(order)], device, block_dim=THREADS)
     inputs = [
         *_floats(projected), *_ints(order, tiles.ranges, tiles.gaussian_ids), *_floats(backgrounds),
-        *_frame(origin, width, height, tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
+        *settings.window_inputs(tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
         rule.transmittance_stop, int(rule.inclusive_stop), chunk,
         *_floats(rgb, alpha, depth, transmittances, weights), *_ints(ends), interop.view(states, wp.float32),
     ]  # fmt: skip
@@ -223,12 +230,28 @@ def forward(
 
 
 def backward(
-    projected, tiles: Tiles, backgrounds, origin: tuple[int, int], width: int, height: int, rule: Rule, deterministic: bool,
-    saved, v_rgb, v_alpha, v_depth, allocator: Allocator = TORCH,
-):  # fmt: skip
-    """Gradient of the records, shape [C, N, 12], from what `forward` returned and the gradients of its pictures."""
+    projected: torch.Tensor,
+    tiles: Tiles,
+    backgrounds: torch.Tensor,
+    settings: BlendSettings,
+    saved: Sequence[torch.Tensor],
+    v_images: Sequence[torch.Tensor | None],
+    allocator: Allocator = TORCH,
+) -> torch.Tensor:
+    """Return the gradient of ``projected``, shape [C, N, 12].
+
+    Args:
+        projected: As given to `forward`, like the next three.
+        tiles: See there.
+        backgrounds: See there.
+        settings: See there.
+        saved: The results of `forward` but for ``alpha``.
+        v_images: Gradients of ``rgb``, ``alpha`` and ``depth``; the last two may be None.
+        allocator: Provider of the gradient's memory.
+    """
     rgb, depth, transmittances, weights, ends, states = saved
-    device, count = projected.device, tiles.slots.shape[0]
+    v_rgb, v_alpha, v_depth = v_images
+    device, count, rule, deterministic = projected.device, tiles.slots.shape[0], settings.rule, settings.deterministic
     with_depth = v_alpha is not None or v_depth is not None
     chunk = chunk_of(tiles, deterministic)
     k = make_backward(tiles.size, with_depth, chunk, not deterministic)
@@ -243,7 +266,7 @@ def backward(
         v_slots = v_projected.zero_().view(-1, STRIDE)
     inputs = [
         *_floats(projected), *_ints(tiles.tile_ids, tiles.ranges, tiles.gaussian_ids, tiles.slots),
-        interop.view(tiles.total, wp.int64), count, *_floats(backgrounds), *_frame(origin, width, height, tiles.size),
+        interop.view(tiles.total, wp.int64), count, *_floats(backgrounds), *settings.window_inputs(tiles.size),
         tiles.ranges.shape[0], rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
         *_floats(rgb, depth, transmittances, weights), *_ints(ends), interop.view(states, wp.float32),
         *_floats(v_rgb.contiguous(), v_alpha, v_depth), interop.view(v_slots, wp.float32),
@@ -254,13 +277,18 @@ def backward(
     return v_projected
 
 
-def instance_weights(
-    projected, tiles: Tiles, origin: tuple[int, int], width: int, height: int, rule: Rule, ends
-) -> torch.Tensor:
-    """Sum and maximum over a tile's pixels of the blending weight, for each instance at its slot, shape [M, 2]."""
-    weights = projected.new_zeros(tiles.slots.shape[0], 2)
+def instance_weights(projected: torch.Tensor, tiles: Tiles, settings: BlendSettings, ends: torch.Tensor) -> torch.Tensor:
+    """Return sum and maximum over a tile's pixels of the blending weight, for each instance at its slot, shape [M, 2].
+
+    Args:
+        projected: As given to `forward`, like the next two.
+        tiles: See there.
+        settings: See there.
+        ends: One past the last instance that was blended into each pixel, as `forward` returns it.
+    """
+    rule, weights = settings.rule, projected.new_zeros(tiles.slots.shape[0], 2)
     inputs = [
-        *_floats(projected), *_ints(tiles.ranges, tiles.gaussian_ids, tiles.slots), *_frame(origin, width, height, tiles.size),
+        *_floats(projected), *_ints(tiles.ranges, tiles.gaussian_ids, tiles.slots), *settings.window_inputs(tiles.size),
         rule.alpha_cut, rule.alpha_max, *_ints(ends), *_floats(weights),
     ]  # fmt: skip
     pixels = tiles.size * tiles.size

@@ -8,16 +8,16 @@ import warp as wp
 from warpgs.runtime import interop
 
 BLOCK = 32
-"""Threads of a block: there are some hundred lines, which more blocks spread over more multiprocessors."""
+"""Threads of a block: few, so that some hundred lines spread over many multiprocessors."""
 FAR_AWAY = 2**20
-"""More than any path costs."""
+"""Number above every path cost."""
 LARGEST = 2**13 - 1
-"""Costs plus penalties up to this keep the sum of four paths within 16 bits with a sign."""
+"""Largest cost plus penalties for which the sum of four paths fits into 16 bits with a sign."""
 
 
 @functools.cache
 def make_kernel():
-    """The kernel; a thread owns a line."""
+    """Make the kernel; a thread owns a line."""
 
     @wp.kernel(enable_backward=False, module="warpgs.kernels.scanlines")
     def follow(
@@ -38,7 +38,7 @@ def make_kernel():
                     j = length - 1 - k
                     edge = j
                 pixel = line * line_step + j * pixel_step
-                most = int(0)  # what any change of depth may add to the best of the pixel before
+                most = int(0)  # the most that any change of depth may add to the best of the pixel before
                 if k > 0:
                     most = lowest + bounds[line * line_edge + edge * pixel_edge]
                 left = int(FAR_AWAY)
@@ -60,7 +60,7 @@ def make_kernel():
 
 
 def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor, small: int) -> torch.Tensor:
-    """Sum of the path costs from above, below, left and right.
+    """Return the sum of the path costs from above, below, left and right.
 
     A path's cost at pixel k and plane d is L(k, d) = C(k, d) + min(L(k-1, d), L(k-1, d +- 1) + small, min_i L(k-1, i) + limit)
     - min_i L(k-1, i), with the limit of the step from k - 1 to k (Hirschmüller 2008, eq. 13). Not differentiable.

@@ -1,4 +1,4 @@
-"""Kernels of structural similarity for CUDA in float32: both passes of the window in shared memory, one launch each way."""
+"""Structural similarity for CUDA in float32: both passes of the window in shared memory, one launch each way."""
 
 import functools
 from types import SimpleNamespace
@@ -18,7 +18,7 @@ THREADS = 256
 
 @functools.cache
 def make_kernels():
-    """Forward and backward. ``summed``: of the two sums that a photometric loss is made of, else of the map."""
+    """Make the forward and backward kernels; their argument ``summed`` is 1 for the two sums of `differences`, 0 for a map."""
     numbers = {"WINDOW": ", ".join(f"{w!r}f" for w in WINDOW), "C1": f"{C1!r}f", "C2": f"{C2!r}f"}
 
     @wp.func_native(source("ssim_forward.cu", **numbers))
@@ -60,13 +60,13 @@ def make_kernels():
 
 
 def _shape(image: torch.Tensor) -> tuple[int, int, int]:
-    """Number of blocks, and height and row length [elements] of a picture; image [B, H, W, 3]."""
+    """Return the number of blocks, and height and row length [elements] of an image; image [B, H, W, 3]."""
     batch, height, width, channels = image.shape
     return batch * -(-height // SIDE) * -(-width // SIDE), height, width * channels
 
 
 def forward(image: torch.Tensor, target: torch.Tensor, summed: bool) -> tuple[torch.Tensor, ...]:
-    """The similarities [B, H, W, 3], or per block the sums of 1 - similarity and |image - target| [blocks, 2]; 3 partials."""
+    """Return similarities [B, H, W, 3] and three partials; or, ``summed``, first the two sums per block [blocks, 2]."""
     blocks, height, columns = _shape(image)
     result = image.new_empty(blocks, 2) if summed else torch.empty_like(image)
     partials = [torch.empty_like(image) for _ in range(3)]
@@ -77,7 +77,7 @@ def forward(image: torch.Tensor, target: torch.Tensor, summed: bool) -> tuple[to
 
 
 def backward(image: torch.Tensor, target: torch.Tensor, partials, v_result: torch.Tensor, summed: bool) -> torch.Tensor:
-    """Gradient of the image, from that of the similarities or of the two sums [2]."""
+    """Return the gradient of the image, from that of the similarities or of the two sums [2]."""
     blocks, height, columns = _shape(image)
     v_image = torch.empty_like(image)
     arrays = [interop.view(t.view(-1), wp.float32) for t in (image, target, v_result.contiguous(), *partials)]

@@ -1,4 +1,4 @@
-"""What a recorded step does beside drawing and learning: it finds out which step it is, and writes down how it went.
+"""Bookkeeping of a captured step: it reads its settings at the start, and stores its loss at the end.
 
 In torch these are some twenty kernels on a handful of numbers each, a tenth of a step's time.
 """
@@ -12,12 +12,12 @@ import warp as wp
 from warpgs.runtime import interop
 
 NOT_FINITE = 2
-"""Value of the stop flag after a loss that is no number; 1 after more instances than there is room for."""
+"""Value of the stop flag after a loss that is not finite; 1 after more instances than the capacity."""
 
 
 @functools.cache
 def make_kernels():
-    """The two kernels."""
+    """Make the two kernels."""
 
     @wp.kernel(enable_backward=False, module="warpgs.kernels.step_buffers")
     def begin_step(
@@ -65,16 +65,16 @@ def begin_step(
     counter: torch.Tensor, view_rows: torch.Tensor, lr_rows: torch.Tensor, setting_rows: torch.Tensor,
     viewmats: torch.Tensor, Ks: torch.Tensor, targets: torch.Tensor,
 ) -> tuple[torch.Tensor, ...]:  # fmt: skip
-    """What the step takes whose number the device knows. Float32 where nothing else is said.
+    """Return the inputs of the step whose number is in device memory. Tensors are float32 where nothing else is said.
 
     Args:
-        counter: The step's number in its burst, int64, shape [1].
+        counter: The step's number in its batch, int64, shape [1].
         view_rows: Number of each step's view, int64, shape [B].
-        lr_rows: Rates of each step, shape [B, R].
+        lr_rows: Learning rates of each step, shape [B, R].
         setting_rows: Settings of each step, shape [B, S].
         viewmats: camera_from_world of each view, shape [V, 4, 4].
         Ks: Intrinsics [px], shape [V, 3, 3].
-        targets: Photographs, shape [V, H, W, 3].
+        targets: Images, shape [V, H, W, 3].
 
     Returns:
         ``lrs`` [R], ``settings`` [S], ``viewmat`` [1, 4, 4], ``K`` [1, 3, 3] and ``target`` [H, W, 3].
@@ -94,17 +94,17 @@ def begin_step(
 def end_step(
     loss: torch.Tensor, mse: torch.Tensor, counter: torch.Tensor, stop: torch.Tensor, history: torch.Tensor
 ) -> torch.Tensor:
-    """Write down a step's result, and count it unless something stops the burst: then it will be taken again.
+    """Store a step's result, and count the step unless something stops the batch: then it will be taken again.
 
     Args:
-        loss: Float32, shape []. Where it is no number, ``stop`` becomes NOT_FINITE.
+        loss: Float32, shape []. Where it is not finite, ``stop`` becomes NOT_FINITE.
         mse: Mean squared error, float32, shape [].
-        counter: Number of the step, int64, shape [1]; one more where the burst goes on.
-        stop: 0, or why the burst stops, int32, shape [1].
+        counter: Number of the step, int64, shape [1]; one more where the batch goes on.
+        stop: 0, or the reason to stop, int32, shape [1].
         history: Loss and mean squared error of each step, float32, shape [B, 2].
 
     Returns:
-        Whether the burst goes on, bool, shape [1].
+        True where the batch goes on, bool, shape [1].
     """
     going = torch.empty(1, dtype=torch.bool, device=loss.device)
     inputs = [

@@ -1,7 +1,6 @@
-"""Bin projected Gaussians into image tiles, front to back: depth sort, emission, stable tile sort (docs/tiles.md)."""
+"""Binning of projected Gaussians into tiles, front to back: depth sort, emission, stable tile sort (docs/tiles.md)."""
 
 import functools
-import os
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -14,23 +13,21 @@ from warpgs.kernels.functions import make_spans
 from warpgs.kernels.native import make_functions as make_native
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
+from warpgs.runtime.device_memory import available_bytes, installed_bytes
 
 LIST_BYTES = 20
-"""Of an instance while the lists are made: two sort buffers of (key, slot), and the owner."""
+"""Bytes of an instance while the lists are made: two sort buffers of (key, slot), and the owner."""
 BYTES_PER_INSTANCE = LIST_BYTES + 48 + 80
-"""The same and, of the backward pass on CUDA, the gradient slot and the share of the states that blending leaves
-(blend_cuda.CHUNKS)."""
+"""The same plus the gradient slot and the fraction of the saved states (blend_cuda.CHUNKS) of the backward pass on CUDA."""
 
 VISIBLE = 2**36
-"""What a visible Gaussian adds to a running sum of tile counts, so that one sum has both; more are counted apart first."""
+"""Number that a visible Gaussian adds to a running sum of tile counts, so that one sum counts both."""
 MAX_VISIBLE = 2**63 // VISIBLE - 1
-"""Visible Gaussians that such a sum has room for."""
-
+"""Most visible Gaussians that such a sum can count."""
 SMALL = 32
-"""Tiles of a Gaussian that one CUDA thread lists alone."""
-
+"""Most tiles of a Gaussian that one CUDA thread lists alone."""
 MAX_INSTANCES = interop.MAX_SIZE // 2
-"""A radix sort wants one array of twice that size."""
+"""Most instances: a radix sort needs one array of twice that size."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +44,7 @@ class Tiles:
     gaussian_ids: torch.Tensor
     """Flat Gaussian number of each instance, int32, shape [M]."""
     slots: torch.Tensor
-    """Where an instance stood before the tile sort, int32, shape [M]: there the instances of a Gaussian are neighbours,
+    """Position of an instance before the tile sort, int32, shape [M]: there the instances of a Gaussian are neighbours,
     so each owns a row that gradients can be written to and then summed in a fixed order, without atomics."""
     starts: torch.Tensor
     """First slot of each Gaussian that has any, int32, shape [C * N]."""
@@ -59,18 +56,18 @@ class Tiles:
     """M, int64, shape [1], where kernels can read it."""
 
     def tensors(self) -> tuple[torch.Tensor, ...]:
-        """All but the size, in the order in which the constructor takes them."""
+        """Return all fields but the size, in the order in which the constructor takes them."""
         return self.ranges, self.gaussian_ids, self.slots, self.starts, self.counts, self.tile_ids, self.total
 
 
 def grid(width: int, height: int, tile_size: int) -> tuple[int, int]:
-    """Columns and rows of tiles that cover an image."""
+    """Return the columns and rows of tiles that cover an image."""
     return -(-width // tile_size), -(-height // tile_size)
 
 
 @functools.cache
 def make_kernels(real, native: bool):
-    """Kernels for one scalar type; ``native`` is for CUDA, where a running sum has one entry for the 32 items of a warp."""
+    """Make the kernels for one scalar type; ``native`` is for CUDA, where a running sum has one entry for a warp's 32 items."""
     lanes, per = make_native() if native else None, wp.constant(32 if native else 1)
     module = f"warpgs.kernels.tiles.{real.__name__}.{int(native)}"
 
@@ -137,7 +134,7 @@ def make_kernels(real, native: bool):
     ):  # fmt: skip
         i = begin + wp.tid()
         tile = keys[i]
-        slot = slots[i]  # asked for before its tile is known, as are the neighbours: the waits overlap
+        slot = slots[i]  # loaded before its tile is known, like the neighbours: the waits overlap
         before = keys[wp.max(i - 1, 0)]
         after = keys[wp.min(i + 1, count - 1)]
         if tile == no_tile:
@@ -157,7 +154,7 @@ def make_kernels(real, native: bool):
 
 @functools.cache
 def make_emit(real, native: bool):
-    """The kernel that writes the instances of each Gaussian, row by row of tiles.
+    """Make the kernel that writes the instances of each Gaussian, row by row of tiles.
 
     ``native`` is for CUDA: a Gaussian of more than SMALL tiles is written by its whole warp, a lane a row.
     """
@@ -188,7 +185,7 @@ def make_emit(real, native: bool):
         overflow: wp.array(dtype=int),
     ):  # fmt: skip
         j = begin + wp.tid()
-        corner = (origin_y // tile_size) * columns + origin_x // tile_size  # rows and columns count from the picture's corner
+        corner = (origin_y // tile_size) * columns + origin_x // tile_size  # rows and columns count from the image's corner
         i = int(0)
         touched = int(0)
         slot = int(0)
@@ -197,7 +194,7 @@ def make_emit(real, native: bool):
             i = order[j]
             touched = tile_counts[i]
             last_slot = ends[j]
-            if last_slot > wp.int64(capacity):  # the lists are cut, and nobody may use them; see `bin_tiles`
+            if last_slot > wp.int64(capacity):  # the lists are cut, and must not be used; see `bin_tiles`
                 overflow[0] = 1
                 touched = int(wp.max(wp.int64(touched) - (last_slot - wp.int64(capacity)), wp.int64(0)))
                 last_slot = wp.int64(capacity)
@@ -260,23 +257,8 @@ def make_emit(real, native: bool):
     return emit
 
 
-def available_bytes(device: torch.device) -> int:
-    """Memory that is free now on a device [bytes]."""
-    if device.type == "cuda":
-        free, _ = torch.cuda.mem_get_info(device)
-        return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-
-
-@functools.cache
-def installed_bytes(device: torch.device) -> int:
-    """Memory of a device [bytes]."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_properties(device).total_memory
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-
-
 def _check_total(total: int, visible: int, device: torch.device, tiles: int, budget_bytes: int | None) -> None:
+    """Raise ResourceError where the instances exceed the budget, or what kernels can number."""
     needed = total * BYTES_PER_INSTANCE
     # asking what is free costs 0.1 ms or more: not worth it for a twentieth of the machine
     countable = total <= MAX_INSTANCES and visible <= MAX_VISIBLE
@@ -308,25 +290,25 @@ def bin_tiles(
     origin: tuple[int, int] = (0, 0),
     allocator: Allocator = TORCH,
 ) -> Tiles:
-    """List for every tile the Gaussians that touch it, front to back. Not differentiable.
+    """Return for every tile the Gaussians that touch it, front to back. Not differentiable.
 
     Args:
-        projected: Records of `project`, shape [C, N, 12].
+        projected: Projected Gaussians of `project`, shape [C, N, 12].
         tile_counts: Tiles that each touches, int32, shape [C, N].
         width: Image width [px].
         height: Image height [px].
         tile_size: Side of a tile [px].
         rule: Cut-offs, the same as given to `project`.
-        budget_bytes: Memory the instances may take; None for four fifths of what is free.
-        capacity: Make room for this many instances instead of asking the device how many there are, so that the work can be
-            recorded once and replayed. What is over is marked as no tile's.
+        budget_bytes: Memory that the instances may take; None for four fifths of the free memory.
+        capacity: Number of instances to allocate memory for, instead of asking the device how many there are, so that the work
+            can be captured as a CUDA graph. Unused entries are marked as no tile's.
         overflow: Set to 1 where there are more instances than ``capacity``: the lists are then cut short and must not be
             used. Int32, shape [1]; needed with ``capacity``.
         origin: Left and top [px] of the window of that width and height which `project` was given; a tile's corner.
-        allocator: Where to put the lists.
+        allocator: Provider of the lists' memory.
 
     Returns:
-        The sorted instances; M is ``capacity`` where one is given.
+        Sorted instances; M is ``capacity`` where one is given.
 
     Raises:
         ResourceError: The instances, counted in 64 bits before anything is allocated, exceed the budget or 2^30 - 1; or
@@ -344,7 +326,7 @@ def bin_tiles(
     if no_tile > interop.MAX_SIZE:
         raise ResourceError(
             f"{sizes['C']:,} images of {width} x {height} px have {no_tile:,} tiles of {tile_size} px, beyond the "
-            f"{interop.MAX_SIZE:,} that can be numbered; draw fewer cameras at once, or a window of each"
+            f"{interop.MAX_SIZE:,} that can be numbered; render fewer cameras at once, or a window of each"
         )
     counts = tile_counts.contiguous().view(-1)
     ranges = allocator.saved((no_tile, 2), torch.int32, device).zero_()
@@ -360,7 +342,7 @@ def bin_tiles(
             if count * tiles >= VISIBLE or count > MAX_VISIBLE:
                 many = torch.stack([(counts > 0).sum(), counts.sum(dtype=torch.int64)])
                 _check_total(*reversed(many.tolist()), device, tiles, budget_bytes)
-            # One look at the device, before the sorts, tells how many are visible and how many tiles they touch.
+            # One read from the device, before the sorts, tells how many are visible and how many tiles they touch.
             sums, threads = (-(-count // 32), -(-count // 256) * 256) if native else (count, count)
             packed = allocator.workspace((sums,), torch.int64, device)
             interop.launch(k.pack_counts, threads, [counts_view, interop.view(packed, wp.int64)], device)
@@ -395,14 +377,7 @@ def bin_tiles(
         wp.utils.radix_sort_pairs(keys_view.array(), slots_view.array(), total, end_bit=no_tile.bit_length())
         # the second half of the sorted buffers is free again
         ids = slots[total:]
-        inputs = [
-            keys_view,
-            slots_view,
-            owners_view,
-            total,
-            no_tile,
-            interop.view(ids, wp.int32),
-            interop.view(ranges, wp.int32),
-        ]
+        outputs = [interop.view(ids, wp.int32), interop.view(ranges, wp.int32)]
+        inputs = [keys_view, slots_view, owners_view, total, no_tile, *outputs]
         interop.launch(k.find_ranges, total, inputs, device)
     return Tiles(tile_size, ranges, ids, slots[:total], starts, counts, keys[:total], ends[-1:])

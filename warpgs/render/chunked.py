@@ -1,42 +1,34 @@
-"""A picture in bands: never more (Gaussian, tile) instances at a time than there is room for."""
+"""Chunked rendering: an image is rendered in windows, each with at most a given number of (Gaussian, tile) instances."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from torch.autograd.function import once_differentiable
 
-from warpgs.constants import Rule
 from warpgs.kernels.blend import blend, contributions
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
-
-Window = tuple[int, int, int, int]
-"""Left, top, width and height [px]."""
+from warpgs.render.settings import RenderSettings, Window
 
 
 @dataclass(frozen=True)
-class Frame:
-    """What is drawn, and in how large parts."""
+class ChunkedFrame:
+    """Settings of a chunked render."""
 
-    width: int
-    """Of the picture [px]."""
-    height: int
-    """Of the picture [px]."""
-    window: Window
-    """The part of it that is wanted."""
-    degree: int
-    rule: Rule
-    tile_size: int
-    most: int
-    """Instances at a time. One tile is not divided, so there may be as many as there are records."""
+    settings: RenderSettings
+    """Settings of the whole render; its window is divided."""
+    max_instances: int
+    """Most instances of a chunk. A single tile is never divided, so it may have up to one for each projected Gaussian."""
     deterministic: bool = True
+    """True to sum gradients in a fixed order."""
 
 
 def halves(window: Window, tile_size: int) -> tuple[Window, Window] | None:
-    """Upper and lower half of a window at a tile's border; left and right of a single row; None of a single tile."""
+    """Split a window at a tile's border: into upper and lower half, or left and right of a single row; None for one tile."""
     x, y, width, height = window
     if height > tile_size:
         first = -(-height // (2 * tile_size)) * tile_size
@@ -47,46 +39,53 @@ def halves(window: Window, tile_size: int) -> tuple[Window, Window] | None:
     return None
 
 
-def _counts(frame: Frame, window: Window, sources: tuple[torch.Tensor, ...]) -> torch.Tensor:
-    size = {"width": frame.width, "height": frame.height, "tile_size": frame.tile_size, "window": window}
+def _counts(frame: ChunkedFrame, window: Window, sources: tuple[torch.Tensor, ...]) -> torch.Tensor:
+    """Return the number of tiles in a window that each Gaussian touches, shape [C, N]."""
     factors = sources[7] if len(sources) > 7 else None
-    return project(*sources[:7], degree=frame.degree, rule=frame.rule, opacity_factors=factors, **size)[1]
+    settings = dataclasses.replace(frame.settings, window=window)
+    return project(*sources[:7], opacity_factors=factors, **settings.project_options())[1]
 
 
-def parts(frame: Frame, sources: tuple[torch.Tensor, ...]) -> Iterator[tuple[Window, torch.Tensor]]:
-    """Windows of at most ``frame.most`` instances each, from top to bottom, with the tiles that each record touches there.
+def chunks(frame: ChunkedFrame, sources: tuple[torch.Tensor, ...]) -> Iterator[tuple[Window, torch.Tensor]]:
+    """Yield windows of at most ``frame.max_instances`` instances, from top to bottom, with the tile counts [C, N] in each.
 
-    A window of too many is halved. ``sources`` are the seven tensors that `project` takes, and opacity factors if there are
-    any, detached.
+    A window with more is halved.
+
+    Args:
+        frame: Settings.
+        sources: The seven tensors that `project` takes, and the opacity factors if there are any; all detached.
     """
-    left = [frame.window]
+    left = [frame.settings.window]
     while left:
         window = left.pop()
         counts = _counts(frame, window, sources)
-        smaller = halves(window, frame.tile_size)
-        if smaller is None or int(counts.sum()) <= frame.most:
+        smaller = halves(window, frame.settings.tile_size)
+        if smaller is None or int(counts.sum()) <= frame.max_instances:
             yield window, counts
         else:
             left += reversed(smaller)
 
 
-def _draw(projected: torch.Tensor, backgrounds: torch.Tensor, frame: Frame, window: Window, counts: torch.Tensor):
+def _render_chunk(
+    projected: torch.Tensor, backgrounds: torch.Tensor, frame: ChunkedFrame, window: Window, counts: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return ``rgb``, ``alpha`` and ``depth`` of one window."""
     x, y, width, height = window
-    how = {"width": width, "height": height, "rule": frame.rule, "origin": (x, y)}
-    tiles = bin_tiles(projected, counts, tile_size=frame.tile_size, **how)
-    return blend(projected, tiles, backgrounds, deterministic=frame.deterministic, **how)
+    options = {"width": width, "height": height, "rule": frame.settings.rule, "origin": (x, y)}
+    tiles = bin_tiles(projected, counts, tile_size=frame.settings.tile_size, **options)
+    return blend(projected, tiles, backgrounds, deterministic=frame.deterministic, **options)
 
 
-class _Banded(torch.autograd.Function):
+class _BlendChunked(torch.autograd.Function):
     @staticmethod
     def forward(ctx, projected, backgrounds, frame, *sources):
-        x0, y0, width, height = frame.window
+        x0, y0, width, height = frame.settings.window
         images = [projected.new_empty(len(projected), height, width, *rest) for rest in ((3,), (), ())]
         ctx.windows = []
-        for window, counts in parts(frame, sources):
+        for window, counts in chunks(frame, sources):
             x, y, w, h = window
             rows, columns = slice(y - y0, y - y0 + h), slice(x - x0, x - x0 + w)
-            for image, part in zip(images, _draw(projected.detach(), backgrounds.detach(), frame, window, counts)):
+            for image, part in zip(images, _render_chunk(projected.detach(), backgrounds.detach(), frame, window, counts)):
                 image[:, rows, columns] = part
             ctx.windows.append((window, rows, columns))
         # the sources too, so that torch notices where they are changed before the gradient is taken
@@ -105,8 +104,8 @@ class _Banded(torch.autograd.Function):
             counts = _counts(ctx.frame, window, sources)
             with torch.enable_grad():
                 inputs = [projected.detach().requires_grad_(), backgrounds.detach().requires_grad_()]
-                drawn = _draw(*inputs, ctx.frame, window, counts)
-            wanted = [(p, v[:, rows, columns]) for p, v in zip(drawn, upstream) if v is not None]
+                rendered = _render_chunk(*inputs, ctx.frame, window, counts)
+            wanted = [(p, v[:, rows, columns]) for p, v in zip(rendered, upstream) if v is not None]
             images, gradients = zip(*wanted)
             part, part_background = torch.autograd.grad(images, inputs, gradients)
             v_projected += part
@@ -114,35 +113,35 @@ class _Banded(torch.autograd.Function):
         return v_projected, v_backgrounds, *(None for _ in range(1 + len(sources)))
 
 
-def contributions_in_bands(
-    projected: torch.Tensor, frame: Frame, sources: tuple[torch.Tensor, ...]
+def contributions_chunked(
+    projected: torch.Tensor, frame: ChunkedFrame, sources: tuple[torch.Tensor, ...]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Sum and maximum of each record's weights, as `contributions` returns them, part by part."""
+    """Return sum and maximum of each projected Gaussian's weights, as `contributions` does, chunk by chunk."""
     sums, maxima = torch.zeros_like(projected[..., 0]), torch.zeros_like(projected[..., 0])
-    for (x, y, width, height), counts in parts(frame, tuple(t.detach() for t in sources)):
-        how = {"width": width, "height": height, "rule": frame.rule, "origin": (x, y)}
-        tiles = bin_tiles(projected, counts, tile_size=frame.tile_size, **how)
-        part, part_maxima = contributions(projected, tiles, **how)
+    for (x, y, width, height), counts in chunks(frame, tuple(t.detach() for t in sources)):
+        options = {"width": width, "height": height, "rule": frame.settings.rule, "origin": (x, y)}
+        tiles = bin_tiles(projected, counts, tile_size=frame.settings.tile_size, **options)
+        part, part_maxima = contributions(projected, tiles, **options)
         sums += part
         maxima = torch.maximum(maxima, part_maxima)
     return sums, maxima
 
 
-def blend_in_bands(
-    projected: torch.Tensor, backgrounds: torch.Tensor, frame: Frame, sources: tuple[torch.Tensor, ...]
+def blend_chunked(
+    projected: torch.Tensor, backgrounds: torch.Tensor, frame: ChunkedFrame, sources: tuple[torch.Tensor, ...]
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Composite the records of `project` part by part: the same pictures as at once, to the bit.
+    """Composite projected Gaussians chunk by chunk: the same images as `blend` gives, to the bit.
 
-    Nothing is kept for the backward pass, which draws each part again; the gradients of the parts add up. That takes about
-    half as long again as drawing at once, and memory for the instances of one part only.
+    The backward pass renders each chunk again and adds up the gradients, so nothing but the inputs is saved for it. That
+    takes about half as long again as `blend`, and memory for the instances of one chunk only.
 
     Args:
-        projected: Records of `project` for the frame's window, shape [C, N, 12]; differentiable.
+        projected: Result of `project` for the frame's window, shape [C, N, 12]; differentiable.
         backgrounds: Colour behind everything, shape [C, 3]; differentiable.
-        frame: What to draw.
-        sources: The seven tensors that ``projected`` were projected from, and the opacity factors if there were any.
+        frame: Settings.
+        sources: The seven tensors that ``projected`` was projected from, and the opacity factors if there were any.
 
     Returns:
         ``rgb``, ``alpha`` and ``depth`` as `blend` returns them.
     """
-    return _Banded.apply(projected, backgrounds, frame, *(t.detach() for t in sources))
+    return _BlendChunked.apply(projected, backgrounds, frame, *(t.detach() for t in sources))

@@ -1,4 +1,4 @@
-"""What the rules cost and save, as measured, and the choice among them by the error that one accepts."""
+"""Measured errors and times of the rules, and the choice among them by the error that is accepted."""
 
 from __future__ import annotations
 
@@ -7,20 +7,21 @@ from dataclasses import dataclass
 from warpgs.errors import UsageError
 
 SOURCE = "bench/results/tradeoff_kernel_cpu2.json, scene trained"
-"""Where the prices come from; a test holds them together. docs/trade.md says how to measure again."""
+"""Source of the figures; a test compares them. docs/trade.md says how to measure again."""
 
 
 @dataclass(frozen=True)
 class RuleCost:
-    """One rule against `exact`, on a trained scene."""
+    """Error and time of one rule against `exact`, on a trained scene."""
 
     rule: str
+    """Name of the rule."""
     mean_error: float
     """Mean absolute error of colours in [0, 1]."""
     max_error: float
-    """The largest."""
+    """Largest absolute error of a colour."""
     time: float
-    """Time of a picture with its gradients as a share of `exact`'s."""
+    """Time of an image with its gradients, as a fraction of `exact`'s."""
 
 
 RULE_COSTS = (
@@ -28,18 +29,18 @@ RULE_COSTS = (
     RuleCost("balanced", 2.4e-3, 3.8e-2, 0.93),
     RuleCost("exact", 6e-7, 2e-3, 1.0),
 )
-"""From fast to slow. Of `exact` the error is that of float32 against float64, the largest found on parts of fits of fern: a
-Gaussian whose alpha is within rounding of the cut is drawn by the one and not by the other."""
+"""Costs from fast to slow. The error of `exact` is that of float32 against float64, the largest found on parts of fits of fern:
+a Gaussian whose alpha is within rounding of the cut is blended by the one and not by the other."""
 
 
 def select_rule(*, max_error: float) -> tuple[str, str]:
-    """The fastest rule whose error keeps a limit.
+    """Return the fastest rule whose error keeps a limit.
 
     Args:
         max_error: Mean absolute error against rule `exact` that is accepted, of colours in [0, 1].
 
     Returns:
-        The rule's name, for ``RasterizeOptions(rule=...)`` or ``FitConfig(rule=...)``, and a sentence that says why.
+        The rule's name, for ``RasterizeOptions(rule=...)`` or ``FitConfig(rule=...)``, and a message that says why.
 
     Raises:
         UsageError: The limit is no positive number, or below what float32 arithmetic itself errs by.

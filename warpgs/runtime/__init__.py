@@ -1,1 +1,1 @@
-"""Torch and Warp side by side: interop, memory, CUDA graphs."""
+"""What everything runs on: torch and Warp side by side, memory, CUDA graphs; the machine, its caches and its processes."""

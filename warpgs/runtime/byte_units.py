@@ -7,10 +7,15 @@ import re
 from warpgs.errors import UsageError
 
 UNITS = {"B": 1} | {f"{p}{u}": b**i for i, p in enumerate("KMGT", 1) for u, b in (("B", 1000), ("iB", 1024))}
+"""Bytes of each unit by name."""
 
 
 def parse_bytes(text: str) -> int:
-    """A size such as 2GiB, 512 MB or 1.5GiB in bytes; UsageError for anything else."""
+    """Return a size such as 2GiB, 512 MB or 1.5GiB in bytes.
+
+    Raises:
+        UsageError: The text is no such size, or less than a byte.
+    """
     found = re.fullmatch(r"\s*(\d+(?:\.\d+)?|\.\d+)\s*([A-Za-z]+)\s*", text)
     units = {u.lower(): b for u, b in UNITS.items()}
     if not found or found[2].lower() not in units:
@@ -22,7 +27,7 @@ def parse_bytes(text: str) -> int:
 
 
 def format_bytes(size: float) -> str:
-    """A size for people to read."""
+    """Return a size [bytes] as text for people to read."""
     for unit in ("B", "KiB", "MiB", "GiB"):
         if size < 1024:
             return f"{size:.0f} {unit}" if unit in ("B", "KiB") else f"{size:.1f} {unit}"

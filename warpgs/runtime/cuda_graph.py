@@ -1,145 +1,229 @@
-"""Functions of tensors whose kernels are recorded as CUDA graphs, and replayed wherever they meet the same addresses again."""
+"""CUDA graphs: capture of torch's and Warp's kernels, replay, the memory of graphs, and functions that are graphed by address.
+
+`CapturedGraph` is one graph. `GraphedFunction` captures a function of tensors wherever it meets the same addresses again.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import gc
 import threading
 import warnings
 from collections.abc import Callable
 
 import torch
+import warp as wp
 
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import Arena, SizingAllocator, part
 
-VARIANTS = 8
-"""Sets of addresses that graphs are kept for: a loop that holds on to some result alternates between two."""
-PAID = 30
-"""Replays that are worth a recording."""
-FREE = 16
-"""Recordings of a work that need not have paid: a loop takes a while to settle."""
-SMALL = 2**16
-"""Bytes that are not worth asking for at each call."""
+MAX_GRAPHS = 8
+"""Most graphs of one function, each for one set of addresses: a loop that holds on to some result alternates between two."""
+MIN_REPLAYS = 30
+"""Replays that pay for one capture."""
+FREE_CAPTURES = 16
+"""Captures of a function that need not have paid: a loop takes a while until its addresses repeat."""
+SMALL_BYTES = 2**16
+"""Size of a workspace up to which it is kept, since to ask for it at each call costs more."""
+
+_CAPTURING = threading.Lock()
+"""Lock held during a capture."""
+
+
+@contextlib.contextmanager
+def _no_collection():
+    """Switch off garbage collection: it might free another graph, which must not happen during a capture."""
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()
+
+
+class CapturedGraph:
+    """A CUDA graph of the kernels that torch and Warp launch in one call, and everything that must live as long as it."""
+
+    def __init__(self, work: Callable[[], object], stream: torch.cuda.Stream, pool: tuple[int, int] | None = None):
+        """Capture; nothing runs yet.
+
+        The caller lets ``stream`` wait for what ``work`` reads, and other streams wait for ``stream`` where they need it.
+
+        Args:
+            work: A function that neither reads from the device nor loads kernels: call it once before, to load them.
+            stream: Stream to capture on, not the default one.
+            pool: `pool` of a graph to share memory with, which is never replayed at the same time and leaves nothing there;
+                None for memory of its own.
+
+        Raises:
+            RuntimeError: The work cannot be captured; `torch.OutOfMemoryError` where its memory does not fit.
+        """
+        # torch.cuda.graph would collect garbage and empty the cache each time, which takes 80 ms
+        self._graph = torch.cuda.CUDAGraph()
+        with torch.cuda.stream(stream), _CAPTURING, _no_collection():
+            here = interop.warp_stream(torch.device("cuda"))
+            # other threads may allocate meanwhile, and wait for streams and events, but not for the whole device
+            self._graph.capture_begin(pool=pool, capture_error_mode="thread_local")
+            try:
+                wp.capture_begin(stream=here, external=True)
+                try:
+                    self.result = work()
+                    """Return value of the work."""
+                finally:
+                    self._lent = wp.capture_end(stream=here)  # memory of Warp that the graph uses
+            finally:
+                self._graph.capture_end()
+
+    def replay(self) -> None:
+        """Run the graph on the current stream."""
+        self._graph.replay()
+
+    def pool(self) -> tuple[int, int]:
+        """Return the handle of the graph's memory, for graphs that share it."""
+        return self._graph.pool()
+
+
+class GraphMemory:
+    """Account of the memory that torch keeps for graphs that are gone.
+
+    A graph has memory of its own, which torch keeps after the graph is gone and lends to no other.
+    """
+
+    def __init__(self, device: torch.device):
+        self.device = device
+        self.reserved = torch.cuda.memory_reserved(device)
+        """Bytes that torch held when memory was last given back."""
+
+    def give_back(self, limit: int) -> None:
+        """Return unused memory to the device once torch holds ``limit`` bytes more than when memory was last given back.
+
+        That takes milliseconds, in which the device waits.
+        """
+        if torch.cuda.memory_reserved(self.device) - self.reserved > limit:
+            torch.cuda.empty_cache()
+            self.reserved = torch.cuda.memory_reserved(self.device)
 
 
 class GraphPool:
-    """Records on one stream of a device, and replays one graph at a time."""
+    """Graphs of one stream of a device that share memory, since only one of them is replayed at a time."""
 
     def __init__(self, device: torch.device):
         self.device = device
         self.stream = torch.cuda.current_stream(device) if device.type == "cuda" else None
         self.lock = threading.RLock()
         self.replays = 0
+        """Number of replays so far."""
         self.failed = False
-        """Whether something could not be recorded, for another reason than want of memory."""
+        """True once a capture failed for another reason than lack of memory."""
         self._aside: torch.cuda.Stream | None = None
-        self._keeper: tuple | None = None
+        self._keeper: CapturedGraph | None = None
 
     @functools.cached_property
     def byte(self) -> torch.Tensor:
-        """A tensor of bytes on the device, without any."""
+        """An empty tensor of bytes on the device."""
         return torch.empty(0, dtype=torch.uint8, device=self.device)
 
     def capturing(self) -> bool:
-        """Whether somebody records a graph of their own on the current stream."""
+        """Return whether somebody else captures a graph on the current stream."""
         return self.stream is not None and torch._C._cuda_isCurrentStreamCapturing()
 
-    def capture(self, work: Callable[[], object]) -> tuple[object, object]:
-        """A graph of ``work``, and what must live as long.
+    def capture(self, work: Callable[[], object]) -> CapturedGraph:
+        """Return a graph of ``work``, captured on a stream aside.
 
         Raises:
-            RuntimeError: It cannot be recorded; `torch.OutOfMemoryError` where its memory does not fit.
+            RuntimeError: The work cannot be captured; `torch.OutOfMemoryError` where its memory does not fit.
         """
         if self._aside is None:
             self._aside = torch.cuda.Stream(self.device)
         here = torch.cuda.current_stream(self.device)
-        self._aside.wait_stream(here)  # recording sets numbers of torch's generator that graphs in flight may still read
+        self._aside.wait_stream(here)  # a capture sets numbers of torch's generator that graphs in flight may still read
         try:
-            return self._capture_aside(work)
+            with torch.no_grad():
+                # holds the shared memory, which torch would lend to nobody once the last graph is gone
+                if self._keeper is None:
+                    self._keeper = CapturedGraph(lambda: torch.zeros(1, device=self.device), self._aside)
+                return CapturedGraph(work, self._aside, self._keeper.pool())
         finally:
             here.wait_stream(self._aside)
 
-    def _capture_aside(self, work: Callable[[], object]) -> tuple[object, object]:
-        with torch.cuda.stream(self._aside), torch.no_grad():
-            if self._keeper is None:  # memory that graphs share, and that torch would lend to nobody once the last is gone
-                self._keeper = interop.capture(lambda: torch.zeros(1, device=self.device))
-            graph, (_, lent) = interop.capture(work, self._keeper[0].pool())
-        return graph, lent
-
     def pool(self) -> tuple[int, int] | None:
-        """Of the memory that graphs use and nobody else."""
-        return None if self._keeper is None else self._keeper[0].pool()
+        """Return the handle of the shared memory; None before the first capture."""
+        return None if self._keeper is None else self._keeper.pool()
 
     def release(self) -> None:
-        """Keep no memory for graphs to come, and try again."""
+        """Keep no memory for graphs to come, and forget that a capture failed."""
         self._keeper, self.failed = None, False
 
 
 class GraphedFunction:
-    """A function of tensors whose kernels are recorded for each set of addresses that it meets, up to VARIANTS."""
+    """A function of tensors that is captured for each set of addresses that it meets, up to MAX_GRAPHS."""
 
     def __init__(self, function: Callable[..., tuple[torch.Tensor, ...]], graphs: GraphPool):
-        """Nothing is recorded yet.
+        """Prepare; nothing is captured yet.
 
         Args:
-            function: Takes an `Allocator` and tensors or Nones, always of the same shapes; asks the allocator for what it
-                makes, does not read from the device, and returns those saved tensors that `kept` is to find.
-            graphs: Where to record.
+            function: A function of an `Allocator` and of tensors or Nones, always of the same shapes. It gets its memory from
+                the allocator, does not read from the device, and returns the saved tensors that `saved` is to find.
+            graphs: Pool to capture graphs in.
         """
         self.function, self.graphs = function, graphs
-        self.replays = self.recorded = 0
-        self._measured: SizingAllocator | None = None
+        self.replays = self.captures = 0
+        self._sizes: SizingAllocator | None = None
         self._workspace: torch.Tensor | None = None
-        self._known: dict[tuple[int, ...], tuple] = {}
+        self._graphs: dict[tuple[int, ...], CapturedGraph] = {}
         self._places: list[tuple] = []
 
     def __call__(self, *inputs: torch.Tensor | None) -> tuple[list[torch.Tensor], torch.Tensor | None]:
-        """The caller's tensors, and the block of those that are kept."""
+        """Return the function's output tensors, and the block with its saved tensors (None where there are none)."""
         with self.graphs.lock:
-            if self._measured is None:  # a first run, which also loads what may not be loaded while recording
-                measured = SizingAllocator()
+            if self._sizes is None:  # a first run, which also loads kernels: that is not possible during a capture
+                sizes = SizingAllocator()
                 with torch.no_grad():
-                    self.function(measured, *inputs)
-                self._measured = measured
-                if measured.workspace_bytes <= SMALL:
-                    self._workspace = self.graphs.byte.new_empty(measured.workspace_bytes)
-            blocks = Arena(self._measured, self.graphs.byte, self._workspace)
-            key = (*[0 if t is None else t.data_ptr() for t in inputs], *blocks.addresses())
-            known = None
+                    self.function(sizes, *inputs)
+                self._sizes = sizes
+                if sizes.workspace_bytes <= SMALL_BYTES:
+                    self._workspace = self.graphs.byte.new_empty(sizes.workspace_bytes)
+            arena = Arena(self._sizes, self.graphs.byte, self._workspace)
+            key = (*[0 if t is None else t.data_ptr() for t in inputs], *arena.addresses())
+            graph = None
             if not self.graphs.capturing():
-                known = self._known.get(key) or self._record(key, blocks, inputs)
-            if known is None:
+                graph = self._graphs.get(key) or self._capture(key, arena, inputs)
+            if graph is None:
                 with torch.no_grad():
-                    self._run(blocks, inputs)
+                    self._run(arena, inputs)
             else:
-                known[0].replay()
+                graph.replay()
                 self.replays += 1
                 self.graphs.replays += 1
-        return blocks.outputs, blocks.block
+        return arena.outputs, arena.block
 
     def saved(self, block: torch.Tensor) -> list[torch.Tensor]:
-        """What the function returned when it made this block."""
+        """Return the tensors that the function returned when it filled this block."""
         return [part(block, *place) for place in self._places]
 
-    def _run(self, blocks: Arena, inputs: tuple[torch.Tensor | None, ...]) -> None:
-        blocks.begin()  # a recording may have ended half way
-        found = self.function(blocks, *inputs)
-        self._places = [blocks.place(t) for t in found]
+    def _run(self, arena: Arena, inputs: tuple[torch.Tensor | None, ...]) -> None:
+        """Call the function without a graph."""
+        arena.begin()  # a capture may have ended half way
+        found = self.function(arena, *inputs)
+        self._places = [arena.place(t) for t in found]
 
-    def _record(self, key: tuple[int, ...], blocks: Arena, inputs: tuple[torch.Tensor | None, ...]) -> tuple | None:
-        if self.graphs.failed or self.recorded - FREE > self.replays // PAID:
+    def _capture(self, key: tuple[int, ...], arena: Arena, inputs: tuple[torch.Tensor | None, ...]) -> CapturedGraph | None:
+        """Return a new graph; None where it would not pay or is not possible."""
+        if self.graphs.failed or self.captures - FREE_CAPTURES > self.replays // MIN_REPLAYS:
             return None  # the latter where addresses change too often
-        self.recorded += 1
+        self.captures += 1
         try:
-            known = self.graphs.capture(lambda: self._run(blocks, inputs))
+            graph = self.graphs.capture(lambda: self._run(arena, inputs))
         except torch.OutOfMemoryError:
             return None
         except RuntimeError as error:  # of the driver, or of an allocator that knows no graphs
             self.graphs.failed = True
-            said = f"calls of the rasterizer are not recorded from here on, which makes small ones slower: {error}"
-            warnings.warn(said, stacklevel=2)
+            message = f"calls of the rasterizer are not captured from here on, which makes small ones slower: {error}"
+            warnings.warn(message, stacklevel=2)
             return None
-        if len(self._known) == VARIANTS:
-            del self._known[next(iter(self._known))]
-        self._known[key] = known
-        return known
+        if len(self._graphs) == MAX_GRAPHS:
+            del self._graphs[next(iter(self._graphs))]
+        self._graphs[key] = graph
+        return graph

@@ -1,14 +1,13 @@
-"""Between torch and Warp: scalar types, zero-copy views, checks, streams, and launches spread over CPU threads."""
+"""Interop of torch and Warp: scalar types, zero-copy views, checks, streams, and launches spread over CPU threads."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import gc
 import os
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -16,13 +15,14 @@ import torch
 import warp as wp
 
 from warpgs.errors import ResourceError
+from warpgs.runtime.kernel_cache import prepare_kernel_cache
 
-wp.config.log_level = wp.LOG_WARNING  # its banner and compile notes are not for our users
+wp.config.log_level = wp.LOG_WARNING  # its banner and compile notes are not for users
 
 
 @contextlib.contextmanager
 def _without_driver_notice():
-    """Warp's native code prints a warning where there is no CUDA driver; on a machine without one that is no news."""
+    """Hide the warning that Warp's native code prints where there is no CUDA driver."""
     if torch.cuda.is_available():
         yield
         return
@@ -37,26 +37,28 @@ def _without_driver_notice():
         os.close(sink)
 
 
+prepare_kernel_cache()
 with _without_driver_notice():
     wp.init()  # device_from_torch fails before this
 
 REALS = {torch.float32: wp.float32, torch.float64: wp.float64}
+"""Warp's scalar type by torch's."""
 
 CHUNKS_PER_THREAD = 8
-"""A CPU launch is cut into this many ranges per thread, so that a few heavy tiles do not hold up the rest."""
+"""Ranges per thread of a CPU launch: several, so that a few heavy tiles do not hold up the rest."""
 
 FEW_THREADS = 4
-"""With more threads than this there are half as many ranges each: Python hands them out one at a time."""
+"""Number of threads above which each gets half as many ranges: Python hands them out one at a time."""
 
 SERIAL_WORK = 20_000
-"""Launches with less work than this (items times cost) stay on the calling thread: a hand-over costs about 50 us."""
-
+"""Work (items times cost) below which a launch stays on the calling thread: a hand-over costs about 50 us."""
 
 MAX_SIZE = 2**31 - 1
-"""Warp numbers the entries of an axis, and the items of a launch, in signed 32 bits."""
+"""Largest number of entries of an axis, and of items of a launch: Warp numbers them in signed 32 bits."""
 
 
 def _check_size(size: int) -> None:
+    """Raise ResourceError where kernels cannot number so many entries."""
     if size > MAX_SIZE:
         raise ResourceError(
             f"an array of {size:,} entries is beyond the {MAX_SIZE:,} that kernels can number; use fewer Gaussians or "
@@ -65,14 +67,18 @@ def _check_size(size: int) -> None:
 
 
 def real_of(tensor: torch.Tensor) -> type:
-    """Warp scalar type of a tensor: float32 or float64; TypeError for any other."""
+    """Return the Warp scalar type of a tensor, float32 or float64.
+
+    Raises:
+        TypeError: The tensor is of another type.
+    """
     if tensor.dtype not in REALS:
         raise TypeError(f"kernels take float32 or float64 tensors, not {tensor.dtype}")
     return REALS[tensor.dtype]
 
 
 def set_threads(count: int) -> None:
-    """Let CPU launches use this many threads (at least 1). The number is torch's own, so both agree."""
+    """Set the number of threads of CPU launches, at least 1. The number is torch's own, so both agree."""
     torch.set_num_threads(count)
 
 
@@ -88,19 +94,19 @@ class View(NamedTuple):
     dtype: object
 
     def array(self) -> wp.array:
-        """The same memory as a Warp array, without a copy and without gradient."""
+        """Return the same memory as a Warp array, without a copy and without gradient."""
         for size in self.tensor.shape:
             _check_size(size)
         return wp.from_torch(self.tensor.detach(), dtype=self.dtype, requires_grad=False)
 
 
 def view(tensor: torch.Tensor, dtype) -> View:
-    """A contiguous tensor as a kernel argument of that element type."""
+    """Return a contiguous tensor as a kernel argument of that element type."""
     return View(tensor, dtype)
 
 
 def warp_device(device: torch.device) -> wp.Device:
-    """Warp's object for a torch device, also for one without a number."""
+    """Return Warp's object for a torch device, also for one without a number."""
     if device.type == "cuda" and device.index is None:
         device = torch.device("cuda", torch.cuda.current_device())
     return wp.device_from_torch(device)
@@ -112,7 +118,7 @@ def _several_devices() -> bool:
 
 
 def _current(device: torch.device):
-    """A block in which a CUDA device is the current one, and after which the caller's is again.
+    """Return a context in which a CUDA device is the current one, and after which the caller's is again.
 
     Warp makes a device current when it works there, and leaves it so; torch takes that for the caller's choice.
     """
@@ -126,24 +132,24 @@ def _warp_stream(device: torch.device, pointer: int) -> wp.Stream:
 
 
 def warp_stream(device: torch.device) -> wp.Stream:
-    """Torch's current stream of a CUDA device as Warp's object."""
+    """Return torch's current stream of a CUDA device as Warp's object."""
     # torch.cuda.current_stream makes a Python object each time, which takes ten times as long
     index = torch.cuda.current_device() if device.index is None else device.index
     return _warp_stream(device, torch._C._cuda_getCurrentRawStream(index))
 
 
 _LOADING = threading.Lock()
-"""Held while a CPU module is loaded, since to compile one from several threads at once is not safe; and in debug mode, in
-which kernels are not safe either, while one runs."""
+"""Lock held while a CPU module is loaded, since it is not safe to compile one from several threads at once; and in debug mode,
+in which kernels are not safe either, while one runs."""
 _SORTING = threading.RLock()
-"""Warp has one stream for all threads of a device: a thread keeps it while it sorts."""
+"""Lock held by a thread while it sorts: Warp has one stream for all threads of a device."""
 
 
 @contextlib.contextmanager
 def stream_of(device: torch.device):
-    """Run Warp's own work (sorts, scans) on torch's current stream of that device; nothing to do on a CPU.
+    """Run Warp's own work (sorts, scans) on torch's current stream of that device; does nothing on a CPU.
 
-    Our kernels need no such block: `launch` hands them the stream.
+    Kernels started with `launch` need no such context.
     """
     if device.type != "cuda":
         yield
@@ -158,53 +164,11 @@ def stream_of(device: torch.device):
             where.set_stream(before, sync=False)
 
 
-_CAPTURING = threading.Lock()
-"""Held while a graph is recorded."""
-
-
-@contextlib.contextmanager
-def _no_collection():
-    """Without garbage collection, which might free another graph; that must not happen while recording."""
-    collecting = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if collecting:
-            gc.enable()
-
-
-def capture(work: Callable[[], object], pool: tuple[int, int] | None = None) -> tuple[torch.cuda.CUDAGraph, object]:
-    """Record what torch and Warp do in ``work`` on torch's current stream, which must not be the default one.
-
-    Args:
-        work: May not look at the device, nor load kernels: run it once before.
-        pool: Memory of another graph to share, which is never replayed at the same time and leaves nothing there.
-
-    Returns:
-        The graph, and what must live as long as it does: what ``work`` returned, and what Warp lent to the graph.
-    """
-    # torch.cuda.graph would collect garbage and empty the cache each time, which takes 80 ms
-    graph, here = torch.cuda.CUDAGraph(), warp_stream(torch.device("cuda"))
-    with _CAPTURING, _no_collection():
-        # other threads may allocate meanwhile, and wait for streams and events, but not for the whole device
-        graph.capture_begin(pool=pool, capture_error_mode="thread_local")
-        try:
-            wp.capture_begin(stream=here, external=True)
-            try:
-                result = work()
-            finally:
-                lent = wp.capture_end(stream=here)
-        finally:
-            graph.capture_end()
-    return graph, (result, lent)
-
-
 class _Recorded:
-    """One CUDA kernel whose launch is recorded once and then only patched.
+    """A CUDA kernel whose launch is recorded once and then only patched.
 
-    ``wp.launch`` packs and checks every argument anew, which was measured at 47 us on an H200's host, more than most of our
-    kernels take. The recorded launch keeps the packed arguments; a call writes pointers, sizes and scalars into them.
+    ``wp.launch`` packs and checks every argument anew, which was measured at 47 us on an H200's host, more than most kernels
+    here take. The recorded launch keeps the packed arguments; a call writes pointers, sizes and scalars into them.
     """
 
     def __init__(self, kernel, device: torch.device, block_dim: int):
@@ -239,7 +203,7 @@ class _Recorded:
                 packed = command.params[i + 2]  # after the bounds and ``begin``
                 for size in now[1][: packed.ndim]:
                     _check_size(size)  # it would wrap around
-                known[i] = None  # whoever is interrupted here leaves nothing that is taken for known
+                known[i] = None  # an interrupt here must leave nothing that is taken for known
                 packed.data = now[0]
                 for axis in range(packed.ndim):
                     packed.shape[axis] = now[1][axis]
@@ -257,7 +221,7 @@ def _recorded(kernel, device: torch.device, block_dim: int) -> _Recorded:
 
 
 def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: int = 1, block_dim: int = 256) -> None:
-    """Run ``kernel`` over ``count`` independent items; its first argument is the number of the first item.
+    """Launch ``kernel`` over ``count`` independent items; its first argument is the number of the first item.
 
     On a CPU the items are cut into ranges over torch's number of threads. That is safe and repeatable because every
     kernel here writes to memory that its item alone owns.
@@ -266,8 +230,8 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
         kernel: Warp kernel whose item number is ``begin + wp.tid()``.
         count: Number of items.
         inputs: Arguments after ``begin``.
-        device: Where the arrays live.
-        cost: Rough work of an item in units of 10 ns, to decide whether threads pay.
+        device: Device of the arrays.
+        cost: Rough work of an item in units of 10 ns, which decides whether threads pay.
         block_dim: CUDA threads per block.
 
     Raises:
@@ -311,11 +275,14 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
 def check(**tensors: tuple[torch.Tensor, str]) -> dict[str, int]:
     """Check shapes, scalar types and devices of named tensors against patterns such as ``means=(means, "N 3")``.
 
-    A capital letter stands for a size that must agree wherever it occurs. Returns the sizes by letter.
+    A capital letter stands for a size that must agree wherever it occurs.
+
+    Returns:
+        The sizes by letter.
 
     Raises:
-        TypeError: something is no tensor, or its scalar type is neither float32 nor float64, or types differ.
-        ValueError: a shape or a device disagrees; the message names the argument, what was wanted and what was found.
+        TypeError: An argument is no tensor, or its scalar type is neither float32 nor float64, or types differ.
+        ValueError: A shape or a device disagrees; the message names the argument, what was wanted and what was found.
     """
     sizes: dict[str, int] = {}
     first_name, first = "", None

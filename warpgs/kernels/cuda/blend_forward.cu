@@ -19,7 +19,7 @@ int i = (begin & ~31) + lane;
 Splat s;
 if (i >= begin && i < end)
     s.load(projected.data, gaussian_ids.data[i]);
-int next_id = i + 32 < end ? gaussian_ids.data[i + 32] : 0;  // known a batch before its record is loaded
+int next_id = i + 32 < end ? gaussian_ids.data[i + 32] : 0;  // known a batch before it is loaded
 for (int batch = begin & ~31; batch < end; batch += 32) {
     if (__all_sync(ALL, done))
         break;
@@ -47,7 +47,7 @@ for (int batch = begin & ~31; batch < end; batch += 32) {
         s_i[warp][slot] = i + 1;
     }
     if (lane < AHEAD)
-        s_i[warp][count + lane] = 0;  // what fills up the last group draws nothing
+        s_i[warp][count + lane] = 0;  // the entries that fill up the last group blend nothing
     __syncwarp();
     i += 32;
     if (i < end)

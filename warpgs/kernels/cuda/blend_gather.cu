@@ -1,4 +1,4 @@
-// Gradient of one record from the sums of its instances. Their slots are neighbours: a thread sums a short list, the warp
+// Gradient of one projected Gaussian from the sums of its instances. Their slots are neighbours: a thread sums a short list, the warp
 // shares a long one. The factors common to all pixels are applied here, once.
 constexpr int SHORT = 32;
 constexpr bool with_depth = WITH_DEPTH, atomic = ATOMIC;

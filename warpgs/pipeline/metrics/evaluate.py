@@ -9,6 +9,7 @@ import torch
 
 from warpgs.kernels.ssim import ssim
 from warpgs.pipeline.metrics.lpips import Lpips
+from warpgs.pipeline.metrics.psnr import psnr
 from warpgs.pipeline.metrics.region import scored_region
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Gaussians, View
@@ -48,15 +49,6 @@ class ViewMetrics:
 def to_8_bit(image: np.ndarray) -> np.ndarray:
     """Colours clamped to [0, 1] and rounded to multiples of 1/255, as a saved PNG holds them."""
     return np.round(np.clip(image, 0, 1) * 255).astype(np.float32) / 255
-
-
-def psnr(image: np.ndarray, target: np.ndarray, region: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio [dB] of two images in [0, 1], over all channels of the pixels in ``region`` [H, W]."""
-    difference = image.astype(np.float64) - target
-    if region is not None:
-        difference = difference[region]
-    mse = float((difference**2).mean())
-    return float("inf") if mse == 0 else -10 * float(np.log10(mse))
 
 
 def over_white(image: np.ndarray, region: np.ndarray) -> np.ndarray:

@@ -48,6 +48,8 @@ class InitConfig:
     """Number of random points."""
     opacity: float = 0.1
     """First opacity, in (0, 1)."""
+    scale_factor: float = 1.0
+    """First width of a Gaussian, as a multiple of the distance to its neighbours, in (0, 10]."""
     max_sh_degree: int = 3
     """Spherical-harmonics degree stored, 0 to 3."""
     near_views: int = 4
@@ -74,6 +76,8 @@ class InitConfig:
         if self.flow_range not in RANGES:
             raise UsageError(f"init flow-range {self.flow_range!r} is not one of {', '.join(RANGES)}")
         self.epipolar()  # its own checks
+        if not 0 < self.scale_factor <= 10:
+            raise UsageError(f"init scale-factor {self.scale_factor} must lie above 0 and be at most 10")
         if not 0 < self.opacity < 1:
             raise UsageError(f"init opacity {self.opacity} must lie between 0 and 1")
         if not 0 <= self.max_sh_degree <= MAX_DEGREE:
@@ -290,7 +294,7 @@ def scene_extent(cameras: list[Camera], cloud: PointCloud) -> float:
 
 
 def initial_gaussians(cloud: PointCloud, config: InitConfig, extent: float, device: torch.device) -> Gaussians:
-    """One isotropic Gaussian per point, as wide as the root mean square distance to its three neighbours.
+    """Return one isotropic Gaussian per point, as wide as the root mean square distance to its three neighbours.
 
     Args:
         cloud: At least one point.
@@ -304,16 +308,15 @@ def initial_gaussians(cloud: PointCloud, config: InitConfig, extent: float, devi
     points = torch.as_tensor(cloud.points, dtype=torch.float32, device=device)
     colors = torch.as_tensor(cloud.colors, dtype=torch.float32, device=device)
     count = len(points)
-    scales = mean_square_distances(points).sqrt().clamp(1e-6 * extent, 0.1 * extent)
+    scales = config.scale_factor * mean_square_distances(points).sqrt().clamp(1e-6 * extent, 0.1 * extent)
     sh = points.new_zeros(count, coefficient_count(config.max_sh_degree), 3)
     sh[:, 0] = (colors - 0.5) / C0
     quats = points.new_zeros(count, 4)
     quats[:, 0] = 1
-    logit = float(np.log(config.opacity / (1 - config.opacity)))
     return Gaussians(
         means=points,
         quats=quats,
         log_scales=scales.log()[:, None].repeat(1, 3),
-        logit_opacities=points.new_full((count,), logit),
+        logit_opacities=points.new_full((count,), geometry.logit(config.opacity)),
         sh=sh,
     )

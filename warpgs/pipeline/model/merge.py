@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
+from warpgs.geometry import quaternions, rotation_matrices
 from warpgs.kernels.knn import morton_codes
 from warpgs.kernels.sh import C0
 from warpgs.pipeline.model.table import DensityUpdate
@@ -15,35 +16,9 @@ OPAQUE = 0.99
 """Opacity of a merged Gaussian at the most: what the rasterizer draws at the most."""
 
 
-def rotation_matrices(quats: torch.Tensor) -> torch.Tensor:
-    """Rotations [N, 3, 3] of quaternions wxyz of any length [N, 4]."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, 1).reshape(-1, 3, 3)
-
-
-def quaternions(rotations: torch.Tensor) -> torch.Tensor:
-    """Unit quaternions wxyz [N, 4] of rotations [N, 3, 3], from the largest of their components, so nothing cancels."""
-    m = rotations
-    xx, yy, zz = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
-    # row i is 4 q_i q
-    outer = torch.stack([
-        torch.stack([1 + xx + yy + zz, m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], 1),
-        torch.stack([m[:, 2, 1] - m[:, 1, 2], 1 + xx - yy - zz, m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0]], 1),
-        torch.stack([m[:, 0, 2] - m[:, 2, 0], m[:, 0, 1] + m[:, 1, 0], 1 - xx + yy - zz, m[:, 1, 2] + m[:, 2, 1]], 1),
-        torch.stack([m[:, 1, 0] - m[:, 0, 1], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1], 1 - xx - yy + zz], 1),
-    ], 1)  # fmt: skip
-    largest = outer.diagonal(dim1=1, dim2=2).argmax(1)
-    return torch.nn.functional.normalize(outer[torch.arange(len(m), device=m.device), largest], dim=1)
-
-
 def covariances(quats: torch.Tensor, log_scales: torch.Tensor) -> torch.Tensor:
     """Covariances [N, 3, 3] [u^2]."""
-    axes = rotation_matrices(quats) * log_scales.exp()[:, None, :]
+    axes = rotation_matrices(torch.nn.functional.normalize(quats, dim=1)) * log_scales.exp()[:, None, :]
     return axes @ axes.transpose(1, 2)
 
 

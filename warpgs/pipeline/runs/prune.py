@@ -15,7 +15,8 @@ import torch
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
-from warpgs.pipeline.metrics.evaluate import psnr, render_view, to_8_bit
+from warpgs.pipeline.metrics.evaluate import render_view, to_8_bit
+from warpgs.pipeline.metrics.psnr import psnr
 from warpgs.pipeline.metrics.region import scored_region
 from warpgs.pipeline.model import compress
 from warpgs.pipeline.model.parameter_bounds import model_bytes, pack

@@ -10,8 +10,9 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from warpgs.pipeline.metrics.psnr import psnr_of
 from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.render.reference import psnr_of, reference_image
+from warpgs.render.reference import reference_image
 from warpgs.scene import Camera, Gaussians, View
 
 VIEWS = 3

@@ -155,6 +155,10 @@ PRESETS: dict[str, FitConfig] = {
     ),
     "strong-3dgs": _SPARSE,
     "3dgs": FitConfig(),
+    "mcmc": FitConfig(
+        preset="mcmc", strategy="mcmc", init=InitConfig(opacity=0.5, scale_factor=0.1),
+        optimizer=OptimizerConfig(scales_lr=0.005),
+    ),
     "nexusgs": _NEXUS,
     "dropgaussian": FitConfig(
         preset="dropgaussian", steps=10_000, dropout=0.2, optimizer=OptimizerConfig(scales_lr=0.005),
@@ -172,7 +176,8 @@ PRESETS: dict[str, FitConfig] = {
 }  # fmt: skip
 """paper: the method, with the constants of docs/decisions/008-method.md. quick: the same in a fifth of the steps; balanced: in
 two fifths, the first at half size (docs/trade.md). strong-3dgs: the start, degree, rates, dropout and schedule of ``paper``,
-none of its parts. 3dgs: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few. nexusgs: Zheng et al.
+none of its parts. 3dgs: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few.
+mcmc: Kheradmand et al. 2024, from the same points. nexusgs: Zheng et al.
 2025, a start from flow with every pixel, and its resets. dropgaussian: Park et al. 2025. fsgs: our trainer with
 the depth term, rates, threshold and resets of Zhu et al. 2024, without their unpooling and unseen views, from our own sweep.
 paper-literal: the paper on ``nexusgs``, with what it leaves open as first proposed."""

@@ -14,7 +14,7 @@ import torch
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.kernels import blend, blend_cuda
-from warpgs.kernels.project import RECORD, project
+from warpgs.kernels.project import PROJECTED_SIZE, project
 from warpgs.kernels.tiles import LIST_BYTES, MAX_INSTANCES, grid
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.scene import Camera, Gaussians
@@ -35,7 +35,7 @@ def instance_bytes(cuda: bool, tiles: int) -> tuple[int, int]:
     kept = LIST_BYTES - FLOAT
     if not cuda:
         return LIST_BYTES, kept + FLOAT * blend.VALUES
-    chunk = blend_cuda.CHUNKS[int(tiles > blend_cuda.MANY)]
+    chunk = blend_cuda.CHUNKS[int(tiles > blend_cuda.MAX_SMALL_TILES)]
     return LIST_BYTES, kept + FLOAT * blend_cuda.STRIDE + FLOAT * blend_cuda.STATE * TILE * TILE // chunk
 
 
@@ -83,7 +83,7 @@ class Layout:
         columns, rows = grid(self.width, self.height, TILE)
         listing, backward = (b * instances for b in instance_bytes(self.cuda, 0 if banded else columns * rows))
         waiting = backward - FLOAT * (blend_cuda.STRIDE if self.cuda else blend.VALUES) * instances
-        record = FLOAT * RECORD * count
+        record = FLOAT * PROJECTED_SIZE * count
         records = record + FLOAT * count  # with the tile counts
         ranges = 8 * columns * rows + 2 * FLOAT * count
         sorting = count * (FLOAT * 4 + 2 * 8)  # depths and order twice, two running sums
@@ -116,7 +116,7 @@ class Layout:
 
     def _projection(self, count: int) -> int:
         """Records, their gradient and its copy for the density statistics, and the gradients of the parameters."""
-        return (FLOAT * (3 * RECORD + 1) + self.row) * count
+        return (FLOAT * (3 * PROJECTED_SIZE + 1) + self.row) * count
 
     def event(self, before: int, after: int) -> int:
         """Bytes on top of ``held(after)`` while Gaussians are added: new rows, and one tensor before, cut and grown."""

@@ -19,14 +19,15 @@ from warpgs.kernels.blend import blend
 from warpgs.kernels.dropout import opacity_dropout
 from warpgs.kernels.project import project
 from warpgs.kernels.step_buffers import NOT_FINITE, begin_step, end_step
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, available_bytes, bin_tiles
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, bin_tiles
 from warpgs.pipeline.metrics.psnr import masked_mse
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.loss import LossTerm, Target
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.views import ViewStack
 from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.runtime import interop
+from warpgs.runtime.cuda_graph import CapturedGraph, GraphMemory
+from warpgs.runtime.device_memory import available_bytes
 from warpgs.scene import Camera, Gaussians, Render
 
 MAX_BATCH = 100
@@ -209,9 +210,9 @@ class StepGraphs:
         self.device = device
         self.stream = torch.cuda.Stream(device)
         """Where steps are captured: always the same one, since torch keeps freed memory for the stream that it was used on."""
-        self.reserved = torch.cuda.memory_reserved(device)
-        """Bytes that torch held after `give_back` last gave something back."""
-        self._graphs: dict[tuple, tuple] = {}
+        self.memory = GraphMemory(device)
+        """Account of the memory that torch keeps for graphs that are gone."""
+        self._graphs: dict[tuple, CapturedGraph] = {}
 
     def clear(self) -> None:
         """Forget all graphs: what they refer to has changed."""
@@ -220,7 +221,7 @@ class StepGraphs:
     def capture_all(
         self, kinds: Sequence[Hashable], stacks: Mapping[Hashable, ViewStack], learned: Learned, buffers: StepBuffers,
         plan: StepPlan, rule: str, background: torch.Tensor, max_instances: int | None,
-    ) -> list[torch.cuda.CUDAGraph]:  # fmt: skip
+    ) -> list[CapturedGraph]:  # fmt: skip
         """Return the graph of each of several steps of one plan, by the kind of their views; captured where there is none.
 
         Raises:
@@ -237,14 +238,14 @@ class StepGraphs:
                 raise OverLimitError(
                     f"a captured step would need capacity for {capacity:,} instances, the limit allows {max_instances:,}"
                 )
-            self._give_back(0 if max_instances is not None else DEAD_BYTES)
+            self.memory.give_back(0 if max_instances is not None else DEAD_BYTES)
             render = captured_renderer(rule, background, capacity, buffers.stop)
             work = functools.partial(step, learned, views, buffers, plan, render)
             self._graphs[kind, plan] = self._capture(work, buffers)
-        return [self._graphs[kind, plan][0] for kind in kinds]
+        return [self._graphs[kind, plan] for kind in kinds]
 
-    def _capture(self, work: Callable[[], None], buffers: StepBuffers) -> tuple:
-        """Return the graph of a step, and what must live as long."""
+    def _capture(self, work: Callable[[], None], buffers: StepBuffers) -> CapturedGraph:
+        """Return the graph of a step."""
         here, loaded = torch.cuda.current_stream(), buffers.view_rows.clone()
         self.stream.wait_stream(here)
         with torch.cuda.stream(self.stream):
@@ -255,18 +256,9 @@ class StepGraphs:
             buffers.stop.zero_()
             buffers.view_rows.copy_(loaded)
             self.stream.synchronize()
-            captured = interop.capture(work)
+            captured = CapturedGraph(work, self.stream)
         here.wait_stream(self.stream)
         return captured
-
-    def _give_back(self, dead: int) -> None:
-        """Return to the device what torch keeps for nobody, once that may be more than ``dead`` bytes.
-
-        A graph has memory of its own, which torch keeps after the graph is gone and lends to no other.
-        """
-        if torch.cuda.memory_reserved(self.device) - self.reserved > dead:
-            torch.cuda.empty_cache()
-            self.reserved = torch.cuda.memory_reserved(self.device)
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Runs tests against a mutated copy of the tree: a forked child a mutant, which inherits torch and Warp already imported."""
+"""Tests run against mutated copies of the tree, in a forked child for each mutant, which inherits torch and Warp imported."""
 
 import contextlib
 import os
@@ -11,9 +11,11 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from tools.mutation.rules import SKIPPED
+
 COPIED = ("warpgs", "tests", "bench")
 PASSED, NO_TESTS, NOT_RUN = 0, 5, (3, 4, 70)
-"""What pytest returns for tests that pass, where there are none, and where it cannot run: its own error, no such file; ours."""
+"""Exit status of tests that pass, where there are none, and where pytest cannot run: its own error, no such file; ours."""
 
 
 @dataclass(frozen=True)
@@ -23,19 +25,17 @@ class Job:
     name: str
     tests: tuple[str, ...]
     cuda: bool
-    """Whether to run the tests marked cuda, else the others."""
+    """True to run the tests marked cuda, False to run the others."""
     file: str | None = None
     """Path of the file that is replaced; None for the tree as it is."""
     source: bytes = b""
-    skipped: tuple[str, ...] = ()
-    """Tests to leave out."""
     patience: float = 1.0
     """Factor of the time limits."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a job."""
+    """Result of a job."""
 
     name: str
     status: str
@@ -47,7 +47,7 @@ class Outcome:
 
 
 def copy_tree(root: Path, to: Path) -> None:
-    """Hard links to all that tests read; a file that is to differ must be unlinked first."""
+    """Make hard links to all that tests read; a file that is to differ must be unlinked first."""
     ignored = shutil.ignore_patterns("__pycache__", "*.pyc")
     for name in COPIED:
         if (root / name).is_dir():
@@ -83,8 +83,8 @@ class _Clock:
         signal.setitimer(signal.ITIMER_REAL, self.seconds)
 
 
-def _child(job: Job, tree: Path, root: Path, cache: Path, test_timeout: float, threads: int) -> int:
-    """Everything a forked child does; returns pytest's exit status."""
+def _child(job: Job, tree: Path, root: Path, cache: Path, test_timeout: float) -> int:
+    """Do all that a forked child does, and return pytest's exit status."""
     import pytest
     import torch
 
@@ -99,17 +99,16 @@ def _child(job: Job, tree: Path, root: Path, cache: Path, test_timeout: float, t
     sys.path[:] = [str(tree), *(p for p in sys.path if Path(p or ".").resolve() != root)]
     sys.dont_write_bytecode = True
     os.environ |= {"WARP_CACHE_PATH": str(cache), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTHONPATH": str(tree)}
-    torch.set_num_threads(threads)
+    torch.set_num_threads(1)  # some tests set their own number
     clock = _Clock(test_timeout)
     mark = f"not slow and {'cuda' if job.cuda else 'not cuda'}"
     # the project's own options ask for plugins and warnings that a mutant need not load
-    skipped = [f"--deselect={test}" for test in job.skipped]
-    options = [*skipped, "-x", "-q", "--tb=line", "-p", "no:cacheprovider", "-m", mark]
+    options = [*(f"--deselect={test}" for test in SKIPPED), "-x", "-q", "--tb=line", "-p", "no:cacheprovider", "-m", mark]
     status = int(pytest.main([*job.tests, *options], plugins=[clock])) if job.tests else NO_TESTS
     return NO_TESTS if status == PASSED and not clock.run else status  # all of them were skipped
 
 
-def _start(job: Job, folder: Path, root: Path, cache: Path, test_timeout: float, threads: int) -> int:
+def _start(job: Job, folder: Path, root: Path, cache: Path, test_timeout: float) -> int:
     tree = folder / "tree"
     tree.mkdir(parents=True)
     if pid := os.fork():
@@ -120,7 +119,7 @@ def _start(job: Job, folder: Path, root: Path, cache: Path, test_timeout: float,
         out = os.open(folder / "output", os.O_WRONLY | os.O_CREAT)
         os.dup2(out, 1)
         os.dup2(out, 2)
-        status = _child(job, tree, root, cache, test_timeout, threads)
+        status = _child(job, tree, root, cache, test_timeout)
     except BaseException:
         import traceback
 
@@ -148,7 +147,7 @@ def _outcome(job: Job, status: int, timed_out: bool, seconds: float, output: str
 
 
 def run_jobs(
-    jobs: Iterable[Job], root: Path, cache: Path, *, workers: int, timeout: float, test_timeout: float = 600, threads: int = 1
+    jobs: Iterable[Job], root: Path, cache: Path, *, workers: int, timeout: float, test_timeout: float = 600
 ) -> Iterator[Outcome]:
     """Run jobs, ``workers`` at a time, and yield each outcome as it comes.
 
@@ -159,7 +158,6 @@ def run_jobs(
         workers: Processes at a time.
         timeout: Seconds after which a job is ended.
         test_timeout: Seconds after which it is ended if they all went into one test.
-        threads: CPU threads of each process; some tests set their own number.
     """
     waiting, running = iter(jobs), {}
     with tempfile.TemporaryDirectory(prefix="mutants-") as scratch:
@@ -169,7 +167,7 @@ def run_jobs(
                 while len(running) < workers and (job := next(waiting, None)) is not None:
                     folder = Path(scratch) / str(count)
                     count += 1
-                    pid = _start(job, folder, root, cache, test_timeout * job.patience, threads)
+                    pid = _start(job, folder, root, cache, test_timeout * job.patience)
                     running[pid] = (job, folder, time.monotonic(), set())
                 if not running:
                     return

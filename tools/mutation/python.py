@@ -4,11 +4,13 @@ import ast
 import io
 import itertools
 import tokenize
+from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 
-from tests.mutate import rules
-from tests.mutate.edit import NAMES, Edit, other_number, swaps
-from tests.mutate.native import native_edits
+from tools.mutation import rules
+from tools.mutation.edit import NAMES, Edit, Place, fingerprint, other_number, swaps
+from tools.mutation.native import native_edits
 
 COMPARISONS = {
     ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=", ast.Is: "is", ast.IsNot: "is not",
@@ -20,8 +22,22 @@ OPERATORS = {
 
 
 def python_edits(source: bytes, file: str) -> list[Edit]:
-    """All mutants of a file, in the order in which they stand in it."""
+    """Return all mutants of a file, in the order in which they stand in it."""
     return sorted(_Walker(source, file).edits, key=lambda e: (e.start, e.end, e.change))
+
+
+def shape_of(node: ast.AST) -> str:
+    """Return the syntax of a statement, names numbered as they come, without the statements in its body."""
+    names: dict[str, str] = {}
+
+    def text(part) -> str:
+        if isinstance(part, ast.AST):
+            return f"{type(part).__name__}({','.join(text(value) for _, value in ast.iter_fields(part))})"
+        if isinstance(part, list):
+            return f"[{','.join(text(p) for p in part if not isinstance(p, ast.stmt))}]"
+        return names.setdefault(part, f"_{len(names)}") if isinstance(part, str) else repr(part)
+
+    return fingerprint(text(node))
 
 
 class _Walker:
@@ -40,7 +56,8 @@ class _Walker:
         self.edits: list[Edit] = []
         self.statement: ast.stmt | None = None
         self.indices: set[int] = set()  # numbers that stand alone in brackets
-        self.walk(ast.parse(source), (), False)
+        self.counts: Counter = Counter()
+        self.walk(ast.parse(source), Place(cuda=file in rules.CUDA_FILES))
 
     def begin(self, node) -> int:
         return self.starts[node.lineno - 1] + node.col_offset
@@ -48,64 +65,61 @@ class _Walker:
     def end(self, node) -> int:
         return self.starts[node.end_lineno - 1] + node.end_col_offset
 
-    def walk(self, node, scope: tuple[str, ...], cuda: bool) -> None:
+    def walk(self, node, place: Place) -> None:
         """Collect the edits of a node and of all below it that no rule leaves out."""
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            place = place.inside(node.name)
+            place = replace(place, cuda=place.cuda or place.function in rules.CUDA_FUNCTIONS.get(self.file, ()))
+        elif isinstance(node, ast.stmt):
+            place = place.below(type(node).__name__, self.counts, shape_of(node))
+        self.statement = node if isinstance(node, ast.stmt) else self.statement
         if rules.left_out(node):
             return
-        if isinstance(node, ast.stmt):
-            self.statement = node
-        name = getattr(node, "name", None) if isinstance(node, ast.FunctionDef | ast.ClassDef) else None
-        if name:
-            scope = (*scope, name)
-            cuda = cuda or ".".join(scope) in rules.CUDA_FUNCTIONS.get(self.file, ())
-        for start, end, new, change in self.of(node):
-            self.edits.append(Edit(start, end, new, change, ".".join(scope), cuda or self.file in rules.CUDA_FILES))
+        self.edits += [Edit(*edit, place) for edit in self.of(node)]
         if isinstance(node, ast.Constant) and rules.is_native(node):
-            self.native(node, scope)
+            self.native(node, place)
         if isinstance(node, ast.Dict):
             for key, value in zip(node.keys, node.values):
                 if not rules.is_hint(key):
-                    self.walk(value, scope, cuda)
+                    self.walk(value, place)
             return
         if isinstance(node, ast.arguments):
-            named = [*zip([*node.posonlyargs, *node.args][::-1], node.defaults[::-1]), *zip(node.kwonlyargs, node.kw_defaults)]
-            for argument, default in named:
+            named = [*zip([*node.posonlyargs, *node.args][::-1], node.defaults[::-1])][::-1]
+            for argument, default in [*named, *zip(node.kwonlyargs, node.kw_defaults)]:
                 if default is not None:
-                    self.walk(default, scope, cuda or argument.arg in rules.CUDA_ARGUMENTS)
+                    cuda = place.cuda or argument.arg in rules.CUDA_ARGUMENTS
+                    self.walk(default, replace(place.below("Default", self.counts, shape_of(default)), cuda=cuda))
             return
-        cuda = cuda or (isinstance(node, ast.keyword) and node.arg in rules.CUDA_ARGUMENTS)
+        cuda = place.cuda or (isinstance(node, ast.keyword) and node.arg in rules.CUDA_ARGUMENTS)
         body_cuda, else_cuda = rules.sides(node)
         for field, child in ast.iter_fields(node):
+            children = [c for c in (child if isinstance(child, list) else [child]) if isinstance(c, ast.AST)]
             if field in ("annotation", "returns", "decorator_list", "type_params"):
-                self.strings(child, scope)
+                # of annotations and compile options nothing is mutated but CUDA bodies
+                for part in itertools.chain.from_iterable(map(ast.walk, children)):
+                    if isinstance(part, ast.Constant) and rules.is_native(part):
+                        self.native(part, place)
                 continue
             side = cuda or (field == "body" and body_cuda) or (field == "orelse" and else_cuda)
-            for item in child if isinstance(child, list) else [child]:
-                if isinstance(item, ast.AST):
-                    self.walk(item, scope, side)
+            for part in children:
+                self.walk(part, replace(place, cuda=side))
 
-    def strings(self, children, scope) -> None:
-        """Native bodies among decorators, of which nothing else is mutated: compile options and annotations."""
-        for child in children if isinstance(children, list) else []:
-            for node in ast.walk(child):
-                if isinstance(node, ast.Constant) and rules.is_native(node):
-                    self.native(node, scope)
-
-    def native(self, node: ast.Constant, scope) -> None:
+    def native(self, node: ast.Constant, place: Place) -> None:
         begin, end = self.begin(node), self.end(node)
         quotes = 3 if self.source[begin : begin + 3] == b'"""' else 1
-        text = self.source[begin + quotes : end - quotes]
-        for e in native_edits(text):
-            shift = begin + quotes
-            self.edits.append(Edit(e.start + shift, e.end + shift, e.new, e.change, ".".join(scope), True))
+        body = place.below("Body", self.counts)
+        for e in native_edits(self.source[begin + quotes : end - quotes]):
+            inner = replace(e.place, function=place.inside(e.place.function).function, path=f"{body.path}.{e.place.path}")
+            self.edits.append(replace(e, start=e.start + begin + quotes, end=e.end + begin + quotes, place=inner))
 
     def between(self, left, right, operator: str) -> tuple[int, int]:
-        """Where an operator stands between two operands."""
-        start = self.bare.index(operator.split()[0].encode(), self.end(left), self.begin(right))
-        return start, self.bare.index(operator.split()[-1].encode(), start, self.begin(right)) + len(operator.split()[-1])
+        """Return where an operator stands between two operands."""
+        words = operator.encode().split()
+        start = self.bare.index(words[0], self.end(left), self.begin(right))
+        return start, self.bare.index(words[-1], start, self.begin(right)) + len(words[-1])
 
     def of(self, node) -> Iterator[tuple[int, int, str, str]]:
-        """Start, end, new text and description of the mutants of one node."""
+        """Yield start, end, new text and description of the mutants of one node."""
         match node:
             case ast.BinOp(left=left, op=op, right=right) if type(op) in OPERATORS:
                 for new in swaps(old := OPERATORS[type(op)]):

@@ -1,7 +1,8 @@
-"""What is mutated, where it runs, and which tests look at it."""
+"""Rules: the code that is mutated, the device that runs it, and the tests that look at it."""
 
 import ast
 import re
+from pathlib import Path
 
 SPEED = {
     "AHEAD", "SHORT", "CHUNKS_PER_THREAD", "FEW_THREADS", "SERIAL_WORK", "SEGMENT", "LANES", "BATCH", "BLOCK", "BOX", "SMALL",
@@ -18,77 +19,75 @@ HINTS = {
 SLACK = {"margin", "slack", "slack_x", "slack_y", "limit_of"}
 """Widths by which bounds are safe: a hundredth more lists a tile in excess, which draws nothing. Their operators count."""
 
-CUDA_FILES = ("blend_cuda.py", "ssim_cuda.py", "native.py")
+MUTATED = (
+    "warpgs/kernels/*.py", "warpgs/kernels/cuda/*.cu", "warpgs/runtime/interop.py", "warpgs/runtime/allocator.py",
+)  # fmt: skip
+"""The files that are mutated."""
+
+CUDA_FILES = ("warpgs/kernels/blend_cuda.py", "warpgs/kernels/ssim_cuda.py", "warpgs/kernels/native.py")
 CUDA_FUNCTIONS = {
-    "bridge.py": ("_Recorded", "_recorded", "warp_stream", "_warp_stream", "stream_of", "warp_device"),
-    "adam.py": ("make_scheduled_kernel", "scheduled_rates", "adam_scheduled"),
-    "ssim.py": ("make_kernels", "_Plan.padded", "_Plan.launch"),
+    "warpgs/runtime/interop.py": ("_Recorded", "_recorded", "warp_stream", "_warp_stream", "stream_of", "warp_device"),
+    "warpgs/kernels/adam.py": ("make_scheduled_kernel", "scheduled_lrs", "adam_scheduled"),
+    "warpgs/kernels/ssim.py": ("make_kernels", "_Plan.padded", "_Plan.launch"),
 }
-"""What only a CUDA device runs, beside the branches that `sides` finds."""
+"""Code that only a CUDA device runs, beside the branches that `sides` finds."""
 
 CUDA_ARGUMENTS = {"deterministic", "block_dim"}
 """Arguments that mean something on CUDA alone: their defaults, and what is passed for them, are judged there."""
 
 LIMITS, LIMITS_PROJECT, LIMITS_BLEND = (f"kernels/test_limits{what}.py" for what in ("", "_project", "_blend"))
-SPANS, CUTS = "kernels/test_spans.py", "kernels/test_bridge.py"
-RECORDS, BODIES, FENCES = (f"kernels/test_{what}.py" for what in ("limits_gradients", "native", "fences"))
+SPANS, CUTS = "kernels/test_spans.py", "runtime/test_interop.py"
+RECORDS, BODIES, GUARDS = (f"kernels/test_{what}.py" for what in ("limits_gradients", "native", "guard_bytes"))
 EXTREMES, LAYERS = "numerics/test_extreme_projection.py", "numerics/test_extreme_compositing.py"
 OPS = {
     "adam": ["kernels/test_adam.py", LIMITS],
-    "blend": ["kernels/test_blend.py", "test_rasterizer.py", LIMITS_BLEND],
-    "blend_cpu": ["kernels/test_blend.py", LIMITS_BLEND, RECORDS, LAYERS, "test_window.py"],
-    "blend_cuda": ["kernels/test_blend.py", "test_rasterizer.py", LIMITS_BLEND, RECORDS, LAYERS, "test_window.py"],
-    "burst": ["kernels/test_burst.py"],
-    "bridge": [CUTS, "kernels/test_adam.py", "kernels/test_sh.py", "kernels/test_tiles.py"],
+    "blend": ["kernels/test_blend.py", "render/test_rasterize.py", LIMITS_BLEND],
+    "blend_cpu": ["kernels/test_blend.py", LIMITS_BLEND, RECORDS, LAYERS, "render/test_window.py"],
+    "blend_cuda": ["kernels/test_blend.py", "render/test_rasterize.py", LIMITS_BLEND, RECORDS, LAYERS, "render/test_window.py"],
+    "step_buffers": ["kernels/test_step_buffers.py"],
+    "interop": [CUTS, "kernels/test_adam.py", "kernels/test_sh.py", "kernels/test_tiles.py"],
     "compiler": ["kernels/test_blend.py"],
     "dropout": ["kernels/test_dropout.py"],
     "falloff": [SPANS, "kernels/test_blend.py", LIMITS_BLEND],
-    "functions": ["kernels/test_project.py", SPANS, LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "test_window.py"],
+    "functions": ["kernels/test_project.py", SPANS, LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "render/test_window.py"],
     "knn": ["kernels/test_knn.py", LIMITS],
-    "memory": ["kernels/test_memory.py", "test_graphs.py", "test_recording.py"],
+    "allocator": ["runtime/test_allocator.py", "runtime/test_cuda_graph.py", "render/test_graphed.py"],
     "native": [
-        "kernels/test_project.py",
-        "kernels/test_project_adam.py",
-        "kernels/test_tiles.py",
-        "test_rasterizer.py",
-        LIMITS_PROJECT,
-        LIMITS_BLEND,
-        RECORDS,
+        "kernels/test_project.py", "kernels/test_tiles.py", "render/test_rasterize.py", LIMITS_PROJECT, LIMITS_BLEND, RECORDS,
     ],
-    "project": ["kernels/test_project.py", LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "test_rasterizer.py"],
-    "project_adam": ["kernels/test_project_adam.py"],
-    "project_backward": ["kernels/test_project.py", LIMITS_PROJECT, RECORDS, EXTREMES, "test_rasterizer.py"],
+    "project": ["kernels/test_project.py", LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "render/test_rasterize.py"],
+    "project_backward": ["kernels/test_project.py", LIMITS_PROJECT, RECORDS, EXTREMES, "render/test_rasterize.py"],
     "scanlines": ["kernels/test_scanlines.py"],
     "sh": ["kernels/test_sh.py", "kernels/test_project.py"],
     "ssim": ["kernels/test_ssim.py", LIMITS],
-    "tiles": ["kernels/test_tiles.py", LIMITS_BLEND, RECORDS, "test_rasterizer.py", "test_window.py"],
-}
+    "tiles": ["kernels/test_tiles.py", LIMITS_BLEND, RECORDS, "render/test_rasterize.py", "render/test_window.py"],
+}  # fmt: skip
 """The tests of a file by the beginning of its name, the longest that fits; those that fail soonest come first."""
 
 CUDA_OPS = {
-    "adam": [FENCES, "pipeline/test_graph.py"], "blend_cuda": [BODIES, FENCES],
-    "bridge": [BODIES, "kernels/test_project.py", "pipeline/test_graph.py"], "native": [BODIES, FENCES], "project": [FENCES],
-    "project_adam": [FENCES, "pipeline/test_graph.py"], "project_backward": [FENCES], "ssim": [FENCES],
-    "tiles": [BODIES, FENCES, "pipeline/test_graph.py"],
+    "adam": [GUARDS, "pipeline/test_step.py"], "blend_cuda": [BODIES, GUARDS],
+    "interop": [BODIES, "kernels/test_project.py", "pipeline/test_step.py"], "native": [BODIES, GUARDS], "project": [GUARDS],
+    "project_backward": [GUARDS], "ssim": [GUARDS],
+    "tiles": [BODIES, GUARDS, "pipeline/test_step.py"],
 }  # fmt: skip
-"""More of them for CUDA: bodies one by one, memory beside a tensor, steps that are recorded and replayed."""
+"""More tests for CUDA: bodies one by one, memory beside a tensor, steps that are recorded and replayed."""
 
 SKIPPED = ("tests/kernels/test_blend.py::test_gradcheck",)
 """Tests that take most of a minute, and check what another in the list checks to the same digits by other means."""
 
 
 def tests_of(file: str, cuda: bool) -> list[str]:
-    """Test files for a kernel file, given by its path below warpgs/kernels, on CUDA or on the CPU."""
-    stem = file.removeprefix("cuda/").split(".")[0]
+    """Return the test files for a file that is mutated, on CUDA or on the CPU."""
+    stem = Path(file).stem
     op = max((name for name in OPS if stem.startswith(name)), key=len)
-    if file.startswith("cuda/blend"):
+    if file.endswith(".cu") and op == "blend":
         op = "blend_cuda"
     more = CUDA_OPS.get(op, []) if cuda else [CUTS]
     return [f"tests/{name}" for name in dict.fromkeys([*OPS[op], *more])]
 
 
 def left_out(node: ast.AST) -> bool:
-    """Whether a node is not mutated, with all below it.
+    """Return whether a node is not mutated, with all below it.
 
     Errors: their text, and what is computed for it, is no arithmetic. Formatted text: names of modules and messages.
     Imports and `__all__` hold no operator. Hints and portions change the time, not the numbers. Slack: see `SLACK`.
@@ -106,28 +105,28 @@ def left_out(node: ast.AST) -> bool:
 
 
 def is_hint(node: ast.AST) -> bool:
-    """Whether a key of a dictionary is the name of a hint; its value is left out then."""
+    """Return whether a key of a dictionary is the name of a hint; its value is left out then."""
     return isinstance(node, ast.Constant) and node.value in HINTS
 
 
 def number_left_out(statement: ast.stmt | None) -> bool:
-    """Whether the numbers of a statement are left out, its operators not."""
+    """Return whether the numbers of a statement are left out, its operators not."""
     return isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) in SLACK
 
 
 def native_number_left_out(line: str) -> bool:
-    """The same for a line of a CUDA body, and the sizes of portions there."""
+    """Return the same for a line of a CUDA body; sizes of portions of work count there, too."""
     declared = re.match(r"\s*(?:const float|auto|constexpr int) (\w+) =", line)
     return bool(declared) and declared[1] in SLACK | SPEED
 
 
 def is_native(node: ast.Constant) -> bool:
-    """Whether a string is a CUDA body: it has a statement, or more, of its own."""
+    """Return whether a string is a CUDA body: it has a statement, or more, of its own."""
     return isinstance(node.value, str) and ";" in node.value and ("return " in node.value or ";\n" in node.value)
 
 
 def sides(node: ast.AST) -> tuple[bool, bool]:
-    """Whether only CUDA runs the body of an ``if`` (or conditional expression), and the same of its ``else``."""
+    """Return whether only CUDA runs the body of an ``if`` (or conditional expression), and the same of its ``else``."""
     if not isinstance(node, ast.If | ast.IfExp):
         return False, False
     test = ast.unparse(node.test)
