@@ -14,7 +14,6 @@ from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.rule_report import TILE, rule_report_of
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.step import stack_views
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView, half_size
 from warpgs.render.rasterize import RasterizeOptions, rasterize
@@ -105,19 +104,19 @@ def test_a_fit_starts_at_half_size_and_ends_whole(device):
     """The first steps see halved views; the share decides when; without it everything is as before."""
     config = FitConfig(steps=8, init=InitConfig(source="points"), half_resolution=0.5)
     fit = Trainer(photos(3), seeds(), config, device)
-    assert [fit._phase(s).halved for s in range(1, 9)] == [True] * 4 + [False] * 4
+    assert [fit.plan_of(s).half_size for s in range(1, 9)] == [True] * 4 + [False] * 4
     sizes = []
     for _ in range(8):
         number = fit.next_view()
         fit.order.append(number)
-        phase = fit._phase(fit.step + 1)
-        sizes.append(fit.shown[number + phase.halved * len(fit.views)].camera.width)
-        report = fit.advance()
+        kind, _ = fit.places[number + fit.plan_of(fit.step + 1).half_size * len(fit.views)]
+        sizes.append(fit.stacks[kind].size["width"])
+        (report,) = fit.advance()
         assert math.isfinite(report.loss)
     assert sizes == [20] * 4 + [40] * 4
-    assert len(stack_views(fit.shown)[0]) == 2
+    assert len(fit.stacks) == 2 and len(fit.places) == 6
     plain = Trainer(photos(3), seeds(), dataclasses.replace(config, half_resolution=0.0), device)
-    assert plain.shown == plain.views
+    assert len(plain.stacks) == 1 and len(plain.places) == 3
     with pytest.raises(UsageError, match="half-resolution"):
         dataclasses.replace(config, half_resolution=float("nan"))
 

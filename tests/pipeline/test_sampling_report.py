@@ -29,8 +29,8 @@ def run(tmp_path_factory):
     views = photos(3)
     fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
     with images_kept(fit, NAMES, out):
-        draw = fit.on_event
-        fit.on_event = lambda step, event: (draw(step, event), seen.append((step, event)))
+        draw = fit.strategy.on_event
+        fit.strategy.on_event = lambda step, event: (draw(step, event), seen.append((step, event)))
         while fit.step < CONFIG.steps:
             fit.advance()
     return fit, out, seen
@@ -158,4 +158,4 @@ def test_a_picture_that_cannot_be_written_is_said(tmp_path, monkeypatch, until):
     with pytest.raises(ResourceError, match="no space left"), images_kept(fit, NAMES, tmp_path):
         while fit.step < until:
             fit.advance()
-    assert fit.on_event is None and (fit.step == 10) == (until == 10)
+    assert fit.strategy.on_event is None and (fit.step == 10) == (until == 10)

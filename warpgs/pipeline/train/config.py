@@ -108,7 +108,7 @@ class FitConfig:
             terms = tuple(_term(dict(t)) for t in values.pop("loss_terms"))
             own = values.pop("strategy_config")
             kind = find_strategy(values["strategy"]).Config
-            return _compose(FitConfig, values | {"loss_terms": terms, "strategy_config": own and kind(**own)})
+            return _compose(FitConfig, values | {"loss_terms": terms, "strategy_config": own if own is None else kind(**own)})
         except (TypeError, KeyError) as e:
             raise UsageError(f"the stored configuration is of another version of warpgs ({e})") from e
 
