@@ -18,7 +18,7 @@ from warpgs.runtime.allocator import TORCH, Allocator
 LIST_BYTES = 20
 """Bytes of an instance while the lists are made: two sort buffers of (key, slot), and the owner."""
 BYTES_PER_INSTANCE = LIST_BYTES + 48 + 80
-"""The same plus the gradient slot and the fraction of the saved states (blend_cuda.CHUNKS) of the backward pass on CUDA."""
+"""Bytes of an instance with the gradient slot and the part of the saved states (blend_cuda.CHUNKS) on CUDA."""
 
 VISIBLE = 2**36
 """Number that a visible Gaussian adds to a running sum of tile counts, so that one sum counts both."""
