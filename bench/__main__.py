@@ -23,6 +23,7 @@ from bench.points import Point, growth, load, points
 from bench.series import SIZES
 from warpgs.errors import ResourceError
 from warpgs.runtime import interop
+from warpgs.runtime.device_memory import available_bytes
 
 OPS = ("project", "tiles", "blend", "ssim", "adam", "burst", "dropout", "knn", "scanlines", "render", "step")
 FAILURES = (ResourceError, RuntimeError, MemoryError)
@@ -50,7 +51,7 @@ class Bench:
 
     def _chosen(self, op: str, module, point: Point, sizes: dict) -> set[tuple[str, str]]:
         """The tasks of an op at a point that can be expected to fit into time and memory; the others are noted."""
-        chosen, predicted, free = set(), 0.0, predict.free_bytes(self.device)
+        chosen, predicted, free = set(), 0.0, available_bytes(self.device)
         for program, directions in module.PROGRAMS.items():
             largest = getattr(module, "LARGEST", {}).get(program, point.count)
             if program in peers.absent(self.device) or point.count > largest:

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import gc
 import math
-import os
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
+import psutil
 import torch
 import warp as wp
 
@@ -85,14 +85,13 @@ def _warm_up(work: Callable[[], object], device: torch.device, limit_ms: float, 
 
 
 def others_seconds() -> float | None:
-    """CPU time that everything but this process has used since the machine started [s]; None where Linux does not say."""
+    """Return the CPU time that everything but this process has used since the machine started [s]; None if unknown."""
     try:
-        with open("/proc/stat") as f:
-            user, nice, system, _, _, irq, soft, steal = map(int, f.readline().split()[1:9])
-    except (OSError, ValueError):
+        times = psutil.cpu_times()
+    except (OSError, RuntimeError):
         return None
-    busy = user + nice + system + irq + soft + steal
-    return busy / os.sysconf("SC_CLK_TCK") - time.process_time()
+    busy = sum(getattr(times, name, 0.0) for name in ("user", "nice", "system", "irq", "softirq", "steal"))
+    return busy - time.process_time()
 
 
 def measure_in_turn(

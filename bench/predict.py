@@ -5,10 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-import torch
-
 from bench.points import Point, growth
-from warpgs.kernels.tiles import available_bytes
 
 LIMIT_MS = 2000.0
 """Longest time of one repeat that is still measured [ms]."""
@@ -77,14 +74,3 @@ def reason_to_skip(
     if needed > free:
         return f"predicted {needed / 2**30:.2g} GiB, free {free / 2**30:.2g} GiB"
     return None
-
-
-def free_bytes(device: torch.device) -> int:
-    """Memory that is free now [bytes]; that of files kept in memory counts as free on a CPU where the system says so."""
-    if device.type == "cpu":
-        try:
-            with open("/proc/meminfo") as f:
-                return next(int(line.split()[1]) * 1024 for line in f if line.startswith("MemAvailable"))
-        except (OSError, StopIteration):
-            pass
-    return available_bytes(device)

@@ -6,7 +6,8 @@ import torch
 from bench import inputs, roofline
 from bench.harness import OURS, Task
 from warpgs.kernels.scanlines import scanline_costs
-from warpgs.priors.sweep import UNIT, path_costs
+from warpgs.priors.sweep_cpu import path_costs
+from warpgs.priors.sweep_planes import UNIT
 
 AXES = ("image",)
 NUMPY = "numpy"

@@ -3,7 +3,6 @@
 import importlib
 import io
 import sys
-import tempfile
 import types
 
 import pytest
@@ -11,6 +10,8 @@ from rich.console import Console
 
 from warpgs.app import doctor
 from warpgs.app.doctor import MISSING, NOTE, OK, Finding
+from warpgs.errors import ResourceError
+from warpgs.runtime.kernel_cache import KernelCache
 
 
 def text_of(findings, width=80, terminal=False):
@@ -136,11 +137,16 @@ def test_the_prior_cache(monkeypatch, tmp_path):
     assert f.status == NOTE and "WARPGS_CACHE" in f.remedy and not f.required
 
 
-def test_a_kernel_cache_that_cannot_be_written(monkeypatch):
-    def refuse(*args, **kwargs):
-        raise PermissionError(13, "Permission denied")
+def test_a_kernel_cache_that_cannot_be_used(monkeypatch, tmp_path):
+    """A private one is a note: a fit works, and compiles each time; none at all stops it."""
+    monkeypatch.setattr(doctor, "prepare_kernel_cache", lambda: KernelCache(tmp_path, "it cannot be written"))
+    (f,) = doctor._kernel_cache()
+    assert f.status == NOTE and "cannot be written" in f.detail and "WARP_CACHE_PATH" in f.remedy
 
-    monkeypatch.setattr(tempfile, "TemporaryFile", refuse)
+    def refuse():
+        raise ResourceError("nowhere")
+
+    monkeypatch.setattr(doctor, "prepare_kernel_cache", refuse)
     (f,) = doctor._kernel_cache()
     assert f.status == MISSING and f.required and "WARP_CACHE_PATH" in f.remedy
 
@@ -165,7 +171,7 @@ def test_an_encoder_that_writes_nothing(monkeypatch):
 def test_little_disk_and_memory_are_notes(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(doctor.shutil, "disk_usage", lambda p: types.SimpleNamespace(free=2**20))
-    monkeypatch.setattr(doctor, "_memory", lambda: (2**32, 2**30))
+    monkeypatch.setattr(doctor, "machine_memory", lambda: (2**32, 2**30))
     found = by_topic([*doctor._disk(), *doctor._processor()])
     assert found["Disk"].status == found["Memory"].status == NOTE
     assert found["Disk"].remedy and "4.0 GiB" in found["Memory"].detail

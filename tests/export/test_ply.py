@@ -7,7 +7,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from warpgs.errors import DataError, ResourceError
-from warpgs.export.ply import HEADER_LIMIT, read_ply, write_ply
+from warpgs.export.ply import MAX_HEADER_BYTES, read_ply, write_ply
 from warpgs.scene import Gaussians, Normalization
 
 
@@ -154,7 +154,7 @@ MALFORMED = {
     "empty": (b"", "start with 'ply'"),
     "not ply": (b"solid cube\n", "start with 'ply'"),
     "no end": (b"ply\nformat binary_little_endian 1.0\n", "no 'end_header'"),
-    "long header": (b"ply\n" + b"comment a\n" * (HEADER_LIMIT // 10) + b"end_header\n", "no 'end_header'"),
+    "long header": (b"ply\n" + b"comment a\n" * (MAX_HEADER_BYTES // 10) + b"end_header\n", "no 'end_header'"),
     "not ascii": (ply(["comment \u00e9"]), "not ASCII"),
     "ascii format": (ply([]).replace(b"binary_little_endian", b"ascii"), "its format is ascii"),
     "big endian": (ply([]).replace(b"little", b"big"), "its format is binary_big_endian"),

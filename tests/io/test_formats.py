@@ -1,4 +1,4 @@
-"""The same cameras and photographs give the same scene, whatever the format."""
+"""The same cameras and images give the same scene, whatever the format."""
 
 import numpy as np
 import pytest
@@ -10,14 +10,14 @@ from warpgs.io.splits import split_views
 
 
 def landing(scene, i, point):
-    """Where a point in file coordinates lands in the i-th view [px], through everything that the scene says."""
+    """Return the position in the i-th view [px] of a point in file coordinates, by all that the scene holds."""
     camera, n = scene.views[i].camera, scene.normalization
     x = camera.viewmat[:3, :3] @ (n.scale * (point - n.offset)) + camera.viewmat[:3, 3]
     return (camera.K @ (x / x[2]))[:2]
 
 
 def by_index(scene):
-    """Positions of the views in the order of their cameras; only Blender's folders shuffle them."""
+    """Return the positions of the views in the order of their cameras; only Blender's folders change it."""
     return sorted(range(len(scene.views)), key=lambda j: scene.views[j].name.rpartition("/")[2])
 
 
@@ -39,7 +39,7 @@ def test_pixels_arrive_as_rgb(kind, tmp_path):
         view = scene.views[j]
         assert view.image.dtype == np.float32 and view.image.shape == (scenes.HEIGHT, scenes.WIDTH, 3)
         right = (slice(None), slice(scenes.WIDTH // 2, None))  # Blender's left halves are transparent
-        np.testing.assert_allclose(view.image[right], scenes.picture(i)[right] / 255, atol=1e-6)
+        np.testing.assert_allclose(view.image[right], scenes.image(i)[right] / 255, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", scenes.WRITERS)
@@ -119,7 +119,7 @@ def test_ply_points_of_nerfstudio_are_left_with_a_note(tmp_path):
 def test_fingerprint_follows_the_data(tmp_path):
     first = load_scene(scenes.write_colmap(tmp_path / "a")).fingerprint
     assert len(first) == 64 and first == load_scene(scenes.write_colmap(tmp_path / "b")).fingerprint
-    image = scenes.picture(1)
+    image = scenes.image(1)
     image[0, 0, 0] ^= 1
     scenes.save(tmp_path / "b" / "images" / "photo1.png", image)
     assert load_scene(tmp_path / "b").fingerprint != first
@@ -196,8 +196,8 @@ def test_rigs_and_frames_are_ignored(tmp_path):
 
 def test_images_without_a_pose_are_counted(tmp_path):
     scenes.write_colmap(tmp_path)
-    scenes.save(tmp_path / "images" / "extra.png", scenes.picture(0))
-    scenes.save(tmp_path / "images" / "._photo0.png", scenes.picture(0))
+    scenes.save(tmp_path / "images" / "extra.png", scenes.image(0))
+    scenes.save(tmp_path / "images" / "._photo0.png", scenes.image(0))
     assert any(n.startswith("1 images of images have no pose") for n in load_scene(tmp_path).notes)
 
 
@@ -205,7 +205,7 @@ def test_outside_images_need_permission_and_get_harmless_names(tmp_path):
     content = scenes.transforms_json()
     content["frames"][0]["file_path"] = "../elsewhere.png"
     root = scenes.write_transforms(tmp_path / "scene", content)
-    scenes.save(tmp_path / "elsewhere.png", scenes.picture(0))
+    scenes.save(tmp_path / "elsewhere.png", scenes.image(0))
     with pytest.raises(DataError, match=r"frame 0: '../elsewhere.png' leads out of the scene folder.*--allow-outside"):
         load_scene(root)
     scene = load_scene(root, allow_outside=True)

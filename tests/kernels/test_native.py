@@ -10,7 +10,6 @@ import warp as wp
 
 from warpgs.constants import ALPHA_CUT
 from warpgs.kernels import blend_cuda, native
-from warpgs.kernels.tiles import available_bytes
 from warpgs.runtime import interop
 
 pytestmark = pytest.mark.cuda
@@ -130,14 +129,6 @@ def test_chunks_are_the_larger_ones_in_large_pictures_and_without_an_order():
     """Both passes take the chunk from the same function."""
     few, many = (SimpleNamespace(ranges=torch.zeros(count, 2)) for count in (4096, 4097))
     assert [blend_cuda.chunk_of(tiles, order) for tiles in (few, many) for order in (True, False)] == [64, 128, 128, 128]
-
-
-def test_memory_that_torch_holds_unused_is_available(monkeypatch):
-    """Free memory includes what torch has reserved and not given out."""
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (1000, 5000))
-    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda _: 300)
-    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda _: 20)
-    assert available_bytes(CUDA) == 1280
 
 
 def test_devices_and_streams_without_a_number():

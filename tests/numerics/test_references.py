@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.gaussians import SMOOTH, cloud
 from tests.numerics.scenes import SCENES
@@ -80,6 +81,34 @@ def test_p32_is_r64c_in_float32():
         p32(inputs.to(torch.float64), frame, rule)
     with pytest.raises(TypeError, match=r"torch\.float64"):
         r64c(inputs.to(torch.float32), frame, rule)
+
+
+class Ops(TorchDispatchMode):
+    """Names of the ops that make a float32 tensor."""
+
+    def __init__(self):
+        super().__init__()
+        self.names = set()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        made = func(*args, **(kwargs or {}))
+        if isinstance(made, torch.Tensor) and made.dtype == torch.float32:
+            self.names.add(func.overloadpacket.__name__)
+        return made
+
+
+def test_p32_leaves_no_product_to_a_library():
+    """Its pictures and gradients are yardsticks: no BLAS, whose order of sums and fused products vary with the processor."""
+    library = {"mm", "bmm", "addmm", "baddbmm", "mv", "addmv", "dot", "vdot", "addr", "convolution"}
+    inputs, frame = small()
+    single = inputs.to(torch.float32)
+    with Ops() as ops:
+        sum(p.sum() for p in p32(single, frame, RULES["exact"])).backward()
+    assert {"mul", "add", "sum"} <= ops.names and not ops.names & library
+    assert not [n for n in ops.names if n.startswith("linalg") and n != "linalg_vector_norm"]
+    with Ops() as ops:
+        single.viewmat @ single.viewmat
+    assert ops.names == {"mm"}  # such a product would be seen
 
 
 @pytest.mark.parametrize("reason", ["cut", "stop", "clamp", "order", "near"])

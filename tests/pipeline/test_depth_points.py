@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from tests.priors.flo_files import write_flo
 from tests.priors.rigs import still_life
 from tests.scenes import photos, ring
 from warpgs.errors import UsageError
 from warpgs.geometry import in_image, project_points
 from warpgs.pipeline.model.depth_points import coarse_points, depth_bounds, in_free_space, merge, merge_cells
 from warpgs.pipeline.model.init import InitConfig, initial_points
-from warpgs.priors.flow import write_flo
 from warpgs.scene import Camera, View, ViewDepth
 
 

@@ -129,7 +129,7 @@ def pixel_centers(frame: Frame, dtype: torch.dtype) -> torch.Tensor:
 
 
 def layers(pixels: torch.Tensor, reach: torch.Tensor | None, projected: ProjectedGaussians, rule: Rule) -> Layers:
-    """Kerbl et al. 2023, equation 3, with the cut-offs of a rule; ``reach`` [N, P] is True where tiles let a Gaussian contribute."""
+    """Kerbl et al. 2023, equation 3, with the cut-offs of a rule; ``reach`` [N, P] is True where tiles let one contribute."""
     dx = pixels[None, :, 0] - projected.means[:, 0, None]
     dy = pixels[None, :, 1] - projected.means[:, 1, None]
     xx, xy, yy = (projected.conics[:, k, None] for k in range(3))

@@ -86,7 +86,7 @@ def test_sh_degree_limits_the_colour(device):
 
 
 def test_capacity_changes_nothing_but_says_when_it_is_too_small(device):
-    """A larger capacity gives the same images and gradients, bit for bit; one too small sets overflow, and nothing else breaks."""
+    """A larger capacity gives the same bits of images and gradients; one too small sets overflow, and nothing else breaks."""
     gaussians, cam = leaves(cloud(200, device=device)), camera(70, 50, dtype=torch.float32, device=device)
     results = []
     for capacity in (None, 5000):

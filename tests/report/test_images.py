@@ -23,11 +23,11 @@ def test_png_decodes_to_the_rounded_pixels_in_rgb_order():
 
 
 def test_error_map_is_black_without_error_and_brighter_with_more():
-    truth = np.full((1, 5, 3), 0.4, np.float32)
-    image = truth + np.array([0, 0.05, 0.15, 0.3, 0.5], np.float32)[None, :, None]
-    brightness = error_map(image, truth).sum(-1)[0]
+    reference = np.full((1, 5, 3), 0.4, np.float32)
+    image = reference + np.array([0, 0.05, 0.15, 0.3, 0.5], np.float32)[None, :, None]
+    brightness = error_map(image, reference).sum(-1)[0]
     assert brightness[0] < 0.1 and (np.diff(brightness[:4]) > 0).all() and brightness[4] == brightness[3]
-    np.testing.assert_array_equal(error_map(truth - 0.15, truth), error_map(truth + 0.15, truth))
+    np.testing.assert_array_equal(error_map(reference - 0.15, reference), error_map(reference + 0.15, reference))
 
 
 def test_depth_map_is_warm_near_cold_far_and_gray_where_nothing_is():
@@ -99,7 +99,7 @@ def test_frames_of_two_sizes_are_refused(tmp_path):
 
 
 def test_threads_may_write_one_file(tmp_path):
-    """The file is one of what they wrote, whole, and nothing else is left."""
+    """The file is one of those written, complete, and no other file is left."""
     contents = [bytes([i]) * 50_000 for i in range(8)]
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda c: [write_bytes(tmp_path / "a.png", c) for _ in range(20)], contents))

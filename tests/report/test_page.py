@@ -79,10 +79,10 @@ def test_nothing_is_loaded_from_anywhere(tmp_path):
         assert attrs.get("src", "data:").startswith("data:image/png;base64,") or "src" not in attrs
 
 
-def test_all_pictures_are_embedded_byte_for_byte(tmp_path):
+def test_all_images_are_embedded_byte_for_byte(tmp_path):
     values, _, page = write(tmp_path / "report.html")
     embedded = [base64.b64decode(a["src"].split(",", 1)[1], validate=True) for a in page.all("img")]
-    given = [b for v in values["views"] for b in (v.truth, v.render, v.error, v.depth)]
+    given = [b for v in values["views"] for b in (v.reference, v.render, v.error, v.depth)]
     given += [values["overview"], *(data for _, data in values["sampling"].images)]
     assert sorted(embedded) == sorted(given)
     for data in embedded:
@@ -132,8 +132,8 @@ def test_parts_that_are_not_there_leave_no_empty_heading(tmp_path):
     assert page.text("h2") == ["Settings"] and not page.all("img")
 
 
-def test_sampling_shows_the_first_picture_and_the_others_on_request(tmp_path):
-    """The first event stands open under its words, later ones in a fold with their caption."""
+def test_sampling_shows_the_first_image_and_the_others_on_request(tmp_path):
+    """The first event is open under its text, later ones in a fold with their caption."""
     _, text, page = write(tmp_path / "report.html")
     assert "Why Gaussians were placed" in page.text("h2") and "Two sentences." in page.text("p")
     section = text[text.index("Why Gaussians") : text.index("Cameras and Gaussians")]

@@ -1,4 +1,4 @@
-"""The demo folder, read back by a parser of its own and checked against its own pictures."""
+"""The demo folder, read back by a parser of its own and checked against its own images."""
 
 import cv2
 import numpy as np
@@ -81,7 +81,7 @@ def test_points_reproject_onto_their_observations(made):
     assert sum(len(t) for _, _, t in points.values()) == sum(len(v["observed"]) for v in views.values())
 
 
-def test_point_colours_agree_with_the_pictures(made):
+def test_point_colours_agree_with_the_images(made):
     _, _, camera, views, points = made
     errors = []
     for x, rgb, track in points.values():
@@ -122,7 +122,7 @@ def test_split_is_a_partition_that_interpolates(made):
         assert (centers[name][:2] > xs.min(axis=0)).all() and (centers[name][:2] < xs.max(axis=0)).all()
 
 
-def test_photographs_are_poor_predictors_of_each_other(made):
+def test_images_are_poor_predictors_of_each_other(made):
     _, spec, _, views, _ = made
     image = {v["name"]: v["image"] for v in views.values()}
     train, test = (part.split("=")[1].split(",") for part in spec.split(";"))
@@ -167,7 +167,7 @@ def test_a_file_in_the_way(tmp_path):
 
 
 def surface_equation(shape, p):
-    """Zero on the surface of a shape, by textbook formulas, at local positions."""
+    """Return a value that is zero on the surface of a shape, by textbook formulas, at local positions."""
     x, y, z = p.T
     if isinstance(shape, raycast.Plane):
         return z

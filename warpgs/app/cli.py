@@ -316,10 +316,16 @@ def _internal_error(error: Exception, arguments: list[str]) -> int:
     import tempfile
     import traceback
 
-    with tempfile.NamedTemporaryFile("w", prefix="warpgs-error-", suffix=".txt", delete=False) as f:
-        f.write(f"warpgs {__version__} {' '.join(arguments)}\n\n{''.join(traceback.format_exception(error))}")
+    details = f"warpgs {__version__} {' '.join(arguments)}\n\n{''.join(traceback.format_exception(error))}"
+    try:
+        with tempfile.NamedTemporaryFile("w", prefix="warpgs-error-", suffix=".txt", delete=False, encoding="utf-8") as f:
+            f.write(details)
+        where = f"in {f.name}"
+    except OSError:  # no folder can be written
+        print(details, file=sys.stderr)
+        where = "above"
     print(
-        f"warpgs: internal error, {type(error).__name__}: {error}. This is a defect of warpgs; the details are in {f.name}, "
+        f"warpgs: internal error, {type(error).__name__}: {error}. This is a defect of warpgs; the details are {where}, "
         "please report them",
         file=sys.stderr,
     )

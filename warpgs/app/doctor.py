@@ -14,7 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from warpgs.errors import ResourceError
 from warpgs.runtime.byte_units import format_bytes
+from warpgs.runtime.device_memory import ASSUMED_BYTES, machine_memory
+from warpgs.runtime.kernel_cache import prepare_kernel_cache
+from warpgs.runtime.processor import processor_name, usable_cores
 
 OK, MISSING, NOTE = "ok", "missing", "note"
 PYTHON = ((3, 11), (3, 14))  # from, and below
@@ -59,6 +63,7 @@ PACKAGES = (
     Package("scipy", "scipy", True, "rotations and neighbours"),
     Package("scikit-image", "skimage", True, "metrics"),
     Package("opencv-contrib-python-headless", "cv2", True, "images, matches, video"),
+    Package("psutil", "psutil", False, "free memory"),
     Package("safetensors", "safetensors", True, "checkpoints"),
     Package("onnxruntime", "onnxruntime", False, "depth and feature networks"),
     Package("pyvista", "pyvista", False, "3D overviews in reports"),
@@ -111,43 +116,12 @@ def _packages() -> Iterable[Finding]:
     return map(_package, PACKAGES)
 
 
-def _cpu_name() -> str:
-    """Model of the processor."""
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
-
-
-def _memory() -> tuple[int, int] | None:
-    """Total and available memory [bytes]; None where the system does not say."""
-    try:
-        rows = dict(r.split(":", 1) for r in Path("/proc/meminfo").read_text(encoding="utf-8").splitlines())
-        total, free = (int(rows[k].split()[0]) * 1024 for k in ("MemTotal", "MemAvailable"))
-    except (OSError, KeyError, ValueError):
-        try:
-            total = free = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-        except (AttributeError, OSError, ValueError):
-            return None
-    try:  # a container may hold less than the machine has
-        total = min(total, int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="utf-8")))
-    except (OSError, ValueError):
-        pass
-    return total, min(total, free)
-
-
 def _processor() -> Iterable[Finding]:
-    try:
-        usable = len(os.sched_getaffinity(0))
-    except AttributeError:
-        usable = os.cpu_count() or 1
-    yield Finding("CPU", OK, f"{_cpu_name()}, {usable} of {os.cpu_count()} cores usable")
-    memory = _memory()
+    yield Finding("CPU", OK, f"{processor_name()}, {usable_cores()} of {os.cpu_count()} cores usable")
+    memory = machine_memory()
     if memory is None:
-        yield Finding("Memory", NOTE, "the system does not say how much there is")
+        assumed = f"the system does not say how much there is; {format_bytes(ASSUMED_BYTES)} are assumed"
+        yield Finding("Memory", NOTE, assumed)
         return
     total, free = memory
     detail = f"{format_bytes(total)}, {format_bytes(free)} available"
@@ -191,6 +165,7 @@ def _quiet_warp():
     """Warp, initialised without its banner and warnings: what they say is said by the report."""
     import warp
 
+    prepare_kernel_cache()
     before = warp.config.log_level
     warp.config.log_level = warp.LOG_ERROR
     try:
@@ -245,16 +220,16 @@ def _kernel_cache() -> Iterable[Finding]:
     topic = "Kernel cache"
     try:
         folder = Path(_quiet_warp().config.kernel_cache_dir)
+        refused = prepare_kernel_cache().refused
+    except ResourceError as e:
+        yield Finding(topic, MISSING, str(e), "set WARP_CACHE_PATH or TMPDIR to a folder that you may write to", True)
+        return
     except Exception as e:
         yield Finding(topic, MISSING, _reason(e), "mend warp-lang first", True)
         return
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as e:
-        remedy = "set WARP_CACHE_PATH to a folder that you may write to"
-        yield Finding(topic, MISSING, f"{folder} is not writable ({e.strerror})", remedy, True)
+    if refused:
+        remedy = "set WARP_CACHE_PATH to a folder that you, and nobody else, may write to"
+        yield Finding(topic, NOTE, f"{refused}; every run compiles its kernels for a minute or two", remedy, True)
         return
     size = _size(folder)
     first = "" if size else "; empty: the first fit compiles for a minute or two"
@@ -344,8 +319,6 @@ def print_report(findings: list[Finding], console=None) -> int:
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
-
-    from warpgs.errors import ResourceError
 
     console = console or Console()
     styles = {OK: "green", NOTE: "yellow", MISSING: "bold red"}

@@ -14,7 +14,7 @@ BLOCK = 128
 def source(*names: str, **numbers) -> str:
     """Return the CUDA text of some files of the folder ``cuda``, joined, with names in capitals replaced by numbers."""
     folder = importlib.resources.files("warpgs.kernels") / "cuda"
-    text = "".join((folder / name).read_text() for name in names)
+    text = "".join((folder / name).read_text("utf-8") for name in names)
     for name, number in numbers.items():
         text = re.sub(rf"\b{name}\b", str(number), text)
     return text

@@ -1,7 +1,6 @@
 """Binning of projected Gaussians into tiles, front to back: depth sort, emission, stable tile sort (docs/tiles.md)."""
 
 import functools
-import os
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -14,6 +13,7 @@ from warpgs.kernels.functions import make_spans
 from warpgs.kernels.native import make_functions as make_native
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
+from warpgs.runtime.device_memory import available_bytes, installed_bytes
 
 LIST_BYTES = 20
 """Bytes of an instance while the lists are made: two sort buffers of (key, slot), and the owner."""
@@ -255,22 +255,6 @@ def make_emit(real, native: bool):
                     at += 32
 
     return emit
-
-
-def available_bytes(device: torch.device) -> int:
-    """Return the memory that is free now on a device [bytes]."""
-    if device.type == "cuda":
-        free, _ = torch.cuda.mem_get_info(device)
-        return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-
-
-@functools.cache
-def installed_bytes(device: torch.device) -> int:
-    """Return the memory of a device [bytes]."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_properties(device).total_memory
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def _check_total(total: int, visible: int, device: torch.device, tiles: int, budget_bytes: int | None) -> None:

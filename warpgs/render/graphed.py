@@ -18,11 +18,12 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from warpgs.kernels import blend, project, sh
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, Tiles, available_bytes, bin_tiles
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, Tiles, bin_tiles
 from warpgs.render.settings import RenderSettings
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import Allocator, fetch
 from warpgs.runtime.cuda_graph import MIN_REPLAYS, GraphedFunction, GraphPool
+from warpgs.runtime.device_memory import available_bytes
 
 MIN_CALLS = 3
 """Equal calls in a row from which on kernels are captured. Where a capture did not pay, the number doubles for the next."""

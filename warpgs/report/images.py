@@ -1,4 +1,4 @@
-"""Pictures of a fit as PNG bytes: photographs, errors, depth."""
+"""Images of a report: PNG bytes, colour maps, error and depth maps."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ def png(image: np.ndarray) -> bytes:
     pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
     done, data = cv2.imencode(".png", pixels[..., ::-1])
     if not done:
-        raise ResourceError(f"a picture of {image.shape[1]} x {image.shape[0]} px could not be encoded as PNG")
+        raise ResourceError(f"an image of {image.shape[1]} x {image.shape[0]} px could not be encoded as PNG")
     return data.tobytes()
 
 
 def resized(image: np.ndarray, width: int, height: int):
-    """Colours in [0, 1], [H, W, 3], at another size, as a Pillow image; every pixel counts where it shrinks."""
+    """Return colours in [0, 1], [H, W, 3], at another size, as a Pillow image; areas are averaged where it shrinks."""
     from PIL import Image
 
     pixels = Image.fromarray(np.round(np.clip(image, 0, 1) * 255).astype(np.uint8))
@@ -30,20 +30,20 @@ def resized(image: np.ndarray, width: int, height: int):
 
 
 def colored(values: np.ndarray, name: str) -> np.ndarray:
-    """Colours [H, W, 3] of values in [0, 1], [H, W], by one of OpenCV's colour maps: INFERNO, TURBO, VIRIDIS and so on."""
+    """Return colours [H, W, 3] of values in [0, 1], [H, W], by a colour map of OpenCV: INFERNO, TURBO, VIRIDIS ..."""
     import cv2
 
     table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], getattr(cv2, f"COLORMAP_{name}"))[:, 0, ::-1]
     return table[np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)].astype(np.float32) / 255
 
 
-def error_map(image: np.ndarray, truth: np.ndarray, largest: float = 0.3) -> np.ndarray:
-    """Colours [H, W, 3] of the absolute error averaged over channels; ``largest`` and above is the brightest."""
-    return colored(np.abs(np.clip(image, 0, 1) - truth).mean(-1) / largest, "INFERNO")
+def error_map(image: np.ndarray, reference: np.ndarray, largest: float = 0.3) -> np.ndarray:
+    """Return colours [H, W, 3] of the absolute error averaged over channels; ``largest`` and above is the brightest."""
+    return colored(np.abs(np.clip(image, 0, 1) - reference).mean(-1) / largest, "INFERNO")
 
 
 def depth_map(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Colours [H, W, 3] of depth, near warm and far cold, on the inverse depth between its 2nd and 98th percentile.
+    """Return colours [H, W, 3] of depth, near warm and far cold, by inverse depth between its 2nd and 98th percentile.
 
     Gray where less than half of the pixel is covered.
     """
@@ -57,7 +57,7 @@ def depth_map(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 
 def side_by_side(images: list[np.ndarray], gap: int = 4) -> np.ndarray:
-    """Images [H, W, 3] of one height in a row, with white between them."""
+    """Return images [H, W, 3] of one height in a row, with ``gap`` white columns between them."""
     height = images[0].shape[0]
     bar = np.ones((height, gap, 3), np.float32)
     row = [part for image in images for part in (image, bar)][:-1]

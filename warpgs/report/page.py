@@ -1,4 +1,4 @@
-"""The report of a fit: one HTML file with everything in it."""
+"""Report page of a fit: one HTML file with everything in it."""
 
 from __future__ import annotations
 
@@ -57,24 +57,24 @@ SCRIPT = (
 
 @dataclass(frozen=True)
 class ViewImages:
-    """What the page shows of one view; pictures are PNG bytes."""
+    """Images of one held-out view, as PNG bytes."""
 
     name: str
     caption: str
     render: bytes
-    truth: bytes
+    reference: bytes
     error: bytes
     depth: bytes
 
 
 @dataclass(frozen=True)
 class SamplingReport:
-    """What the page says of the sampling events of a fit."""
+    """Section of the page on the sampling events of a fit."""
 
     words: str
-    """Sentences that say what the pictures show."""
+    """Sentences that explain the images."""
     images: list[tuple[str, bytes]]
-    """Caption and PNG of each pictured event, the first shown, the others on request."""
+    """Caption and PNG of each event that has an image; the first is open, the others open on request."""
     table: list[list[str]]
     """Header row, then rows."""
 
@@ -91,10 +91,10 @@ def _figure(data: bytes, caption: str) -> str:
 def _view(v: ViewImages) -> str:
     name = html.escape(v.name)
     return (
-        f'<div class="view"><div class="row"><figure><div class="slider">{_embed(v.truth, f"photograph {v.name}")}'
-        f'<div class="top">{_embed(v.render, f"rendering {v.name}")}</div><div class="bar"></div>'
-        '<span class="tag" style="left:8px">rendering</span><span class="tag" style="right:8px">photograph</span>'
-        f'<input type="range" min="0" max="100" value="50" aria-label="rendering against photograph of {name}"></div>'
+        f'<div class="view"><div class="row"><figure><div class="slider">{_embed(v.reference, f"reference image {v.name}")}'
+        f'<div class="top">{_embed(v.render, f"render {v.name}")}</div><div class="bar"></div>'
+        '<span class="tag" style="left:8px">render</span><span class="tag" style="right:8px">reference</span>'
+        f'<input type="range" min="0" max="100" value="50" aria-label="render against reference image of {name}"></div>'
         f"<figcaption><b>{name}</b> &nbsp; {html.escape(v.caption)}</figcaption></figure>"
         f'<div class="stack">{_figure(v.error, "absolute error, 0 to 0.3")}'
         f"{_figure(v.depth, 'depth, near red, far blue')}</div>"
@@ -115,6 +115,14 @@ def _table(rows: list[list[str]]) -> str:
     return f"<table><tr>{head}</tr>{''.join(f'<tr>{r}</tr>' for r in body)}</table>"
 
 
+def _document(title: str, body: str) -> str:
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,'
+        f'initial-scale=1"><title>{html.escape(title)}</title><style>{STYLE}</style></head><body><main>'
+        f"{body}</main><script>{SCRIPT}</script></body></html>\n"
+    )
+
+
 def write_page(
     path: Path,
     *,
@@ -130,7 +138,7 @@ def write_page(
     protocol: dict[str, str],
     details: dict,
 ) -> None:
-    """Write the report, self-contained and without a link to anywhere.
+    """Write the report page: one file that refers to nothing outside it.
 
     Args:
         path: The HTML file.
@@ -139,11 +147,11 @@ def write_page(
         figures: Label and value of each key figure.
         notes: Choices made for the user.
         table: Header row, then a row per held-out view.
-        views: Pictures of held-out views.
+        views: Images of held-out views.
         curves: SVG charts.
         sampling: The fit's sampling events, or None where it had none.
-        overview: Picture of cameras and points, or None.
-        protocol: What scores must agree in to be compared, and what each figure is, by name.
+        overview: Image of cameras and points, or None.
+        protocol: Settings in which two scores must agree to be compared, and the definition of each figure, by name.
         details: Configuration, versions and data, shown as JSON on request.
 
     Raises:
@@ -173,9 +181,4 @@ def write_page(
     sections.append(
         f"<h2>Settings</h2><details><summary>configuration, versions, data</summary><pre>{settings}</pre></details>"
     )
-    write_text(
-        path,
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,'
-        f'initial-scale=1"><title>{html.escape(title)}</title><style>{STYLE}</style></head><body><main>'
-        f"{''.join(sections)}</main><script>{SCRIPT}</script></body></html>\n",
-    )
+    write_text(path, _document(title, "".join(sections)))

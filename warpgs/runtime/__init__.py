@@ -1,1 +1,1 @@
-"""Interop of torch and Warp, memory, and CUDA graphs."""
+"""What everything runs on: torch and Warp side by side, memory, CUDA graphs; the machine, its caches and its processes."""

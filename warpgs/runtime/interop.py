@@ -15,6 +15,7 @@ import torch
 import warp as wp
 
 from warpgs.errors import ResourceError
+from warpgs.runtime.kernel_cache import prepare_kernel_cache
 
 wp.config.log_level = wp.LOG_WARNING  # its banner and compile notes are not for users
 
@@ -36,6 +37,7 @@ def _without_driver_notice():
         os.close(sink)
 
 
+prepare_kernel_cache()
 with _without_driver_notice():
     wp.init()  # device_from_torch fails before this
 

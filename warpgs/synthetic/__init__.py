@@ -1,1 +1,1 @@
-"""Synthetic scenes."""
+"""Synthetic scenes: a ray caster, and the demo scene."""

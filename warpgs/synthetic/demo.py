@@ -1,8 +1,8 @@
-"""The demo scene: a textured still life, ray cast here and written as a COLMAP folder, so a fit needs no download.
+"""The demo scene: a textured still life, ray cast here and written as a COLMAP folder, so that a fit needs no download.
 
-It is made to be learnable from six photographs and hard to fake: everything in it is smooth and matte, the training
-views surround the held-out ones, and yet a step between neighbours moves the pattern by more than half its period, so
-that no training photograph, nor their mean, resembles a held-out view pixel by pixel.
+It can be learnt from six images and not be copied from them: everything in it is smooth and matte, and the training
+views surround the held-out ones, but a step between neighbours moves the pattern by more than half its period, so that no
+training image, nor their mean, resembles a held-out view pixel by pixel.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ TAU = 2 * np.pi
 
 
 def _texture(rng: np.random.Generator, low: str, high: str, period: float, kind: str = "solid") -> raycast.Texture:
-    """A smoothed checker with five tinting waves between half and twice its pitch.
+    """Return a smoothed checker with five tinting waves between half and twice its pitch.
 
     Args:
-        rng: chooses directions, tints and phases.
-        low: the one colour, as six hexadecimal digits.
-        high: the other colour, likewise.
-        period: of the checker [u].
+        rng: Generator of directions, tints and phases.
+        low: One colour, as six hexadecimal digits.
+        high: The other colour, likewise.
+        period: Period of the checker [u].
         kind: ``solid``; ``flat`` where the surface is the local plane z = 0 and only x and y make a pattern; ``box``
-            where the period is half the edge, so that the faces fall on the checker's strongest layers, not its weakest.
+            where the period is half the edge, so that the faces lie in the strongest layers of the checker.
     """
     directions = rng.normal(size=(5, 3))
     if kind == "flat":
@@ -49,16 +49,16 @@ def _texture(rng: np.random.Generator, low: str, high: str, period: float, kind:
 
 
 def _turn(x: float = 0.0, y: float = 0.0) -> np.ndarray:
-    """Rotation by ``x`` degrees about the x axis, then by ``y`` degrees about the y axis, shape [3, 3]."""
+    """Return the rotation by ``x`` degrees about the x axis, then by ``y`` degrees about the y axis, shape [3, 3]."""
     (cx, cy), (sx, sy) = np.cos(np.radians([x, y])), np.sin(np.radians([x, y]))
     return np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]) @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
 
 
 def still_life(seed: int = 0) -> list[raycast.Shape]:
-    """The shapes of the scene: three walls and a floor that fill the frame, and six objects that hide one another.
+    """Return the shapes of the scene: three walls and a floor that fill the frame, and six objects that hide one another.
 
     Args:
-        seed: varies the patterns, not the arrangement.
+        seed: Seed of the patterns; the arrangement is fixed.
 
     Returns:
         The shapes, the four planes first.
@@ -83,16 +83,16 @@ def still_life(seed: int = 0) -> list[raycast.Shape]:
 
 
 def camera_path(views: int, width: int, height: int) -> list[Camera]:
-    """Cameras along a wave from left to right whose crests and troughs are where the training views stand.
+    """Return cameras along a wave from left to right whose crests and troughs are the training views.
 
     Args:
-        views: number of cameras.
-        width: image width [px].
-        height: image height [px].
+        views: Number of cameras.
+        width: Image width [px].
+        height: Image height [px].
 
     Returns:
-        The cameras in the order of the path. Those between two training views lie between them in both directions, so
-        the held-out views interpolate.
+        The cameras in the order of the path. Held-out views lie between two training views in both directions, so that
+        they interpolate.
     """
     focal = 0.95 * max(width, height * 4 / 3)
     K = np.array([[focal, 0, 0.515 * width], [0, focal, 0.485 * height], [0, 0, 1]])
@@ -112,7 +112,7 @@ def camera_path(views: int, width: int, height: int) -> list[Camera]:
 
 
 def split_spec(views: int) -> str:
-    """The split of a demo with that many views: six evenly spaced training views, all others held out."""
+    """Return the split of a demo with that many views: six evenly spaced training views, all others held out."""
     train = {round(i) for i in np.linspace(0, views - 1, TRAIN_VIEWS).tolist()}
     names = [f"{i:03d}.png" for i in range(views)]
     held_out = [n for i, n in enumerate(names) if i not in train]
@@ -120,7 +120,7 @@ def split_spec(views: int) -> str:
 
 
 def _project(camera: Camera, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Image positions [px], shape [N, 2], and depths [u], shape [N], of world points [u], shape [N, 3]."""
+    """Return image positions [px], shape [N, 2], and depths [u], shape [N], of world points [u], shape [N, 3]."""
     p = x @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         xy = p[:, :2] / p[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
@@ -128,16 +128,16 @@ def _project(camera: Camera, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sees(shapes: list[raycast.Shape], camera: Camera, x: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Which points a camera sees well enough for a feature detector.
+    """Return True for points that a camera sees well enough for a feature detector.
 
-    A point counts where the rays through its projection and 1.5 px around it all meet the point's own shape, and the one
-    in the middle meets it there: so nothing on a silhouette, where a pixel mixes two surfaces, becomes an observation.
+    A point counts where the rays through its projection and 1.5 px around it all hit the point's own shape, and the one
+    in the middle hits the point itself. Points on a silhouette, where a pixel mixes two surfaces, do not count.
 
     Args:
-        shapes: what there is to see.
-        camera: who looks.
-        x: surface points [u], shape [N, 3].
-        index: the shape each lies on, shape [N].
+        shapes: Shapes of the scene.
+        camera: The camera.
+        x: Surface points [u], shape [N, 3].
+        index: Index of the shape of each point, shape [N].
 
     Returns:
         True where seen, shape [N].
@@ -159,17 +159,17 @@ def _sees(shapes: list[raycast.Shape], camera: Camera, x: np.ndarray, index: np.
 def surface_points(
     shapes: list[raycast.Shape], light: raycast.Light, cameras: list[Camera], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points on the visible surfaces, as a reconstruction without error would find them.
+    """Return points on the visible surfaces, as a reconstruction without error would find them.
 
     Args:
-        shapes: what there is to see.
-        light: what lights it.
-        cameras: who looks.
-        rng: chooses the pixels whose surface points are taken.
+        shapes: Shapes of the scene.
+        light: Light of the scene.
+        cameras: C cameras.
+        rng: Generator of the pixels whose surface points are taken.
 
     Returns:
-        Positions [u], float64, shape [N, 3]; colours in [0, 1], shape [N, 3]; and who sees what, bool, shape [N, C]:
-        every point is seen by at least two cameras.
+        Positions [u], float64, shape [N, 3]; colours in [0, 1], shape [N, 3]; and True where a camera sees a point, shape
+        [N, C]: every point is seen by at least two cameras.
     """
     width, height = cameras[0].width, cameras[0].height
     count = int(np.clip(CANDIDATES * width * height / (320 * 240), 600, CANDIDATES))
@@ -188,22 +188,19 @@ def surface_points(
 
 
 def _quaternion(R: np.ndarray) -> np.ndarray:
-    """Unit quaternion wxyz of a rotation by less than half a turn, shape [3, 3] to [4]."""
+    """Return the unit quaternion wxyz [4] of a rotation [3, 3] by less than half a turn."""
     w = np.sqrt(1 + np.trace(R)) / 2
     return np.array([w, *(np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (4 * w))])
 
 
 def colmap_text(cameras: list[Camera], x: np.ndarray, colors: np.ndarray, seen: np.ndarray) -> dict[str, str]:
-    """The three text files of a COLMAP model.
+    """Return the contents of the three text files of a COLMAP model, by file name.
 
     Args:
-        cameras: with equal intrinsics; camera i took ``{i:03d}.png``.
-        x: point positions [u], shape [N, 3].
-        colors: in [0, 1], shape [N, 3].
-        seen: which camera sees which point, bool, shape [N, C].
-
-    Returns:
-        Content by file name.
+        cameras: C cameras with equal intrinsics; camera i took ``{i:03d}.png``.
+        x: Point positions [u], shape [N, 3].
+        colors: Point colours in [0, 1], shape [N, 3].
+        seen: True where a camera sees a point, bool, shape [N, C].
     """
 
     def join(values, digits: int) -> str:
@@ -238,7 +235,7 @@ def colmap_text(cameras: list[Camera], x: np.ndarray, colors: np.ndarray, seen: 
 
 
 def _check(folder: Path, views: int, width: int, height: int) -> None:
-    """Refuse what cannot be written, before anything is."""
+    """Raise a UsageError for a demo that cannot be written, before anything is."""
     if views < MIN_VIEWS:
         raise UsageError(f"a demo needs at least {MIN_VIEWS} views ({TRAIN_VIEWS} to fit, the rest held out), not {views}")
     if min(width, height) < MIN_SIDE:
@@ -253,7 +250,7 @@ def _check(folder: Path, views: int, width: int, height: int) -> None:
 
 
 def _files(views: int, width: int, height: int, seed: int) -> dict[str, bytes]:
-    """Everything in the demo folder, by relative path: made as a whole, so that a stop midway leaves no half a scene."""
+    """Return the contents of the demo folder by relative path, all at once, so that an interruption leaves no half a scene."""
     import cv2
 
     shapes, light = still_life(seed), raycast.Light()
@@ -270,16 +267,16 @@ def _files(views: int, width: int, height: int, seed: int) -> dict[str, bytes]:
 
 
 def write_demo(folder: Path, *, views: int = 24, width: int = 320, height: int = 240, seed: int = 0) -> str:
-    """Write the demo scene as a COLMAP folder: photographs, cameras, and exact points with their tracks.
+    """Write the demo scene as a COLMAP folder: images, cameras, and exact points with their tracks.
 
     The same arguments give the same bytes on the same machine and library versions.
 
     Args:
-        folder: where to; new or empty.
-        views: number of photographs, at least 8; six of them are to be fitted.
-        width: image width [px].
-        height: image height [px].
-        seed: varies the patterns and the choice of points.
+        folder: Target folder, new or empty.
+        views: Number of images, at least 8; six of them are training views.
+        width: Image width [px].
+        height: Image height [px].
+        seed: Seed of the patterns and of the choice of points.
 
     Returns:
         The split to use: six training views along the camera path, all others held out.
@@ -291,7 +288,7 @@ def write_demo(folder: Path, *, views: int = 24, width: int = 320, height: int =
     folder = Path(folder)
     _check(folder, views, width, height)
     try:
-        folder.mkdir(parents=True, exist_ok=True)  # before the work: a folder that cannot be made is told at once
+        folder.mkdir(parents=True, exist_ok=True)  # before the work: a folder that cannot be made is reported at once
         for path, content in _files(views, width, height, seed).items():
             target = folder / path
             target.parent.mkdir(parents=True, exist_ok=True)

@@ -1,9 +1,8 @@
 """A small ray caster in numpy: closed shapes with smooth solid textures under one soft light, no GL, no mesh.
 
-It exists so that the demo scene needs no download and no graphics driver. Every shape answers three questions about
-rays in its own frame (where first hit, which normal, how large), so an image, the exact depth behind a pixel and the
-visibility of a point all come from the same intersection code. Shading is diffuse: a surface point has one colour,
-from wherever it is seen.
+It exists so that the demo scene needs no download and no graphics driver. Every shape knows the first hit of a ray in its
+own frame, the normal there and its radius, so that an image, the exact depth of a pixel and the visibility of a point all
+come from the same intersection code. Shading is diffuse: a surface point has one colour from all directions.
 
 Axes as in an OpenCV camera: +x right, +y down, +z away from the viewer. Lengths in scene units [u].
 """
@@ -16,7 +15,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-BAND_RAYS = 40_000  # rays cast at once: the working set of a band stays in the second-level cache
+BAND_RAYS = 40_000
+"""Number of rays cast at once: the working set of a band stays in the second-level cache."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Texture:
     """A solid texture: a smoothed checker between two colours, plus plane waves that tint it."""
 
     low: tuple[float, float, float]
-    """Colour of the one half of the checker, in [0, 1]."""
+    """Colour of one half of the checker, in [0, 1]."""
     high: tuple[float, float, float]
     """Colour of the other half, in [0, 1]."""
     checker: tuple[float, float, float]
@@ -39,10 +39,10 @@ class Texture:
     """Gain before the tanh that rounds the checker's edges: a larger one makes crisper edges."""
 
     def __call__(self, p: np.ndarray) -> np.ndarray:
-        """Albedo at local positions.
+        """Return the albedo at local positions.
 
         Args:
-            p: local positions [u], shape [N, 3].
+            p: Local positions [u], shape [N, 3].
 
         Returns:
             Colours in [0, 1], shape [N, 3], in the dtype of ``p``.
@@ -60,14 +60,14 @@ class Texture:
 
 @dataclass(frozen=True)
 class Shape(abc.ABC):
-    """A textured shape at a place. Subclasses know its geometry in the local frame ``x_local = R^T (x - center)``."""
+    """A textured shape at a place; subclasses give its geometry in the local frame ``x_local = R^T (x - center)``."""
 
     center: tuple[float, float, float]
     """Origin of the local frame in the world [u]."""
     texture: Texture
-    """Albedo by local position."""
+    """Albedo as a function of local position."""
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
-    """World from local, shape [3, 3]."""
+    """Rotation world_from_local, shape [3, 3]."""
 
     @property
     def radius(self) -> float:
@@ -75,16 +75,16 @@ class Shape(abc.ABC):
         return np.inf
 
     def local(self, x: np.ndarray) -> np.ndarray:
-        """World positions [u] in the local frame, shape [N, 3]."""
+        """Return world positions [u], shape [N, 3], in the local frame."""
         return (x - np.asarray(self.center, x.dtype)) @ self.rotation.astype(x.dtype)
 
     @abc.abstractmethod
     def hit(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
-        """Distance to the first hit in front of the origin.
+        """Return the distance to the first hit in front of the origin.
 
         Args:
-            o: ray origin in the local frame [u], shape [3].
-            d: unit directions in the local frame, shape [N, 3].
+            o: Ray origin in the local frame [u], shape [3].
+            d: Unit directions in the local frame, shape [N, 3].
 
         Returns:
             Distances [u], shape [N]; infinite where the ray misses.
@@ -92,7 +92,7 @@ class Shape(abc.ABC):
 
     @abc.abstractmethod
     def normal(self, p: np.ndarray) -> np.ndarray:
-        """Outward unit normals in the local frame at local surface positions ``p``; both shape [N, 3]."""
+        """Return outward unit normals in the local frame at local surface positions ``p``; both shape [N, 3]."""
 
 
 @dataclass(frozen=True)
@@ -112,10 +112,10 @@ class Plane(Shape):
 
 @dataclass(frozen=True)
 class Sphere(Shape):
-    """A sphere."""
+    """A sphere around ``center``."""
 
     size: float = 1.0
-    """Its radius [u]."""
+    """Radius of the shape [u]."""
 
     @property
     def radius(self) -> float:
@@ -136,7 +136,7 @@ class Sphere(Shape):
 
 @dataclass(frozen=True)
 class Box(Shape):
-    """A box."""
+    """A box around ``center``, its edges along the local axes."""
 
     half: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Half edge lengths [u]."""
@@ -169,7 +169,7 @@ class Cylinder(Shape):
     """An upright cylinder (axis: local y) with flat caps."""
 
     size: float = 1.0
-    """Its radius [u]."""
+    """Radius of the shape [u]."""
     half_height: float = 1.0
     """Half its height [u]."""
 
@@ -217,7 +217,7 @@ class Torus(Shape):
         return self.ring + self.tube
 
     def _distance(self, p: np.ndarray) -> np.ndarray:
-        """Signed distance to the surface [u] of local positions, shape [N, 3] to [N]."""
+        """Return the signed distance to the surface [u], shape [N], of local positions [N, 3]."""
         return np.hypot(np.hypot(p[:, 0], p[:, 2]) - self.ring, p[:, 1]) - self.tube
 
     def hit(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
@@ -250,25 +250,25 @@ class Torus(Shape):
 
 @dataclass(frozen=True)
 class Light:
-    """A distant soft light and what the surroundings add."""
+    """A distant soft light, and ambient light of the surroundings."""
 
     direction: tuple[float, float, float] = (-0.45, -0.75, -0.5)
-    """Towards the light, any length."""
+    """Direction towards the light, any length."""
     sun: float = 0.62
-    """Brightness of a surface that faces the light, over the ambient."""
+    """Brightness of a surface that faces the light, above the ambient."""
     ambient: float = 0.6
     """Brightness where the light does not reach."""
     sharpness: float = 5.0
-    """How fast a shadow's edge goes from dark to lit, per unit of clearance over distance."""
+    """Steepness of a shadow's edge, per unit of clearance over distance."""
 
 
 def cast(shapes: Sequence[Shape], origin: np.ndarray, dirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First hits of rays from one point.
+    """Return the first hits of rays from one point.
 
     Args:
-        shapes: what there is to hit.
-        origin: where the rays start in the world [u], shape [3].
-        dirs: unit directions in the world, shape [N, 3].
+        shapes: Shapes of the scene.
+        origin: Origin of the rays in the world [u], shape [3].
+        dirs: Unit directions in the world, shape [N, 3].
 
     Returns:
         Distances [u], shape [N], infinite where nothing is hit; and indices into ``shapes``, shape [N], -1 for nothing.
@@ -292,13 +292,13 @@ def cast(shapes: Sequence[Shape], origin: np.ndarray, dirs: np.ndarray) -> tuple
 
 
 def shade(shapes: Sequence[Shape], light: Light, x: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Colours of surface points: albedo times soft light, contact shade and soft shadows; the same from everywhere.
+    """Return the colours of surface points: albedo times soft light, contact shade and soft shadows.
 
     Args:
-        shapes: what there is to see.
-        light: what lights it.
-        x: surface points in the world [u], shape [N, 3].
-        index: the shape each point lies on, shape [N]; -1 is black.
+        shapes: Shapes of the scene.
+        light: Light of the scene.
+        x: Surface points in the world [u], shape [N, 3].
+        index: Index of the shape of each point, shape [N]; -1 is black.
 
     Returns:
         Colours in [0, 1], shape [N, 3], in the dtype of ``x``.
@@ -332,12 +332,12 @@ def shade(shapes: Sequence[Shape], light: Light, x: np.ndarray, index: np.ndarra
 
 
 def pixel_rays(K: np.ndarray, viewmat: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Unit world directions through image positions.
+    """Return unit world directions through image positions.
 
     Args:
-        K: intrinsics [px], shape [3, 3].
+        K: Intrinsics [px], shape [3, 3].
         viewmat: camera_from_world, shape [4, 4].
-        xy: image positions [px], pixel centres at +0.5, shape [N, 2].
+        xy: Image positions [px], pixel centres at +0.5, shape [N, 2].
 
     Returns:
         Directions, shape [N, 3], in the dtype of ``xy``.
@@ -352,16 +352,16 @@ def pixel_rays(K: np.ndarray, viewmat: np.ndarray, xy: np.ndarray) -> np.ndarray
 def render(
     shapes: Sequence[Shape], light: Light, K: np.ndarray, viewmat: np.ndarray, width: int, height: int, samples: int = 3
 ) -> np.ndarray:
-    """An anti-aliased picture.
+    """Render an anti-aliased image.
 
     Args:
-        shapes: what there is to see.
-        light: what lights it.
-        K: intrinsics [px], shape [3, 3].
+        shapes: Shapes of the scene.
+        light: Light of the scene.
+        K: Intrinsics [px], shape [3, 3].
         viewmat: camera_from_world, shape [4, 4].
-        width: image width [px].
-        height: image height [px].
-        samples: rays along each side of a pixel.
+        width: Image width [px].
+        height: Image height [px].
+        samples: Number of rays along each side of a pixel.
 
     Returns:
         Colours in [0, 1], float32, shape [H, W, 3].

@@ -19,7 +19,7 @@ from warpgs.kernels.blend import blend
 from warpgs.kernels.dropout import opacity_dropout
 from warpgs.kernels.project import project
 from warpgs.kernels.step_buffers import NOT_FINITE, begin_step, end_step
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, available_bytes, bin_tiles
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, bin_tiles
 from warpgs.pipeline.metrics.psnr import masked_mse
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.loss import LossTerm, Target
@@ -27,6 +27,7 @@ from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.views import ViewStack
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.runtime.cuda_graph import CapturedGraph, GraphMemory
+from warpgs.runtime.device_memory import available_bytes
 from warpgs.scene import Camera, Gaussians, Render
 
 MAX_BATCH = 100

@@ -13,7 +13,6 @@ import torch
 
 from warpgs.errors import DataError, NotFiniteError
 from warpgs.kernels.step_buffers import NOT_FINITE
-from warpgs.kernels.tiles import available_bytes
 from warpgs.pipeline.model.init import initial_gaussians, scene_extent
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.config import FitConfig
@@ -34,6 +33,7 @@ from warpgs.pipeline.train.step import (
 )
 from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.views import TrainingView, half_size, stack_views
+from warpgs.runtime.device_memory import available_bytes
 from warpgs.scene import Gaussians, PointCloud, Prior, Scene, View
 
 
