@@ -1,4 +1,6 @@
-"""Put the measured error budget and the needles into docs/accuracy.md: usage: python -m bench.accuracy.
+"""Put the measured error budget and the needles into docs/accuracy.md.
+
+usage: python -m bench.accuracy
 
 The figures are those of bench/results/budget_*.json (`python -m tests.numerics.report`) and bench/results/needles_*.json
 (`python -m bench.needles`), a table for each machine.
@@ -6,16 +8,9 @@ The figures are those of bench/results/budget_*.json (`python -m tests.numerics.
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
+from bench import result_file
 
-ROOT = Path(__file__).resolve().parent.parent
-PAGE = ROOT / "docs/accuracy.md"
-
-
-def _results(kind: str) -> dict[str, dict]:
-    paths = sorted((ROOT / "bench/results").glob(f"{kind}_*.json"))
-    return {p.stem.removeprefix(f"{kind}_"): json.loads(p.read_text("utf-8")) for p in paths}
+PAGE = result_file.ROOT / "docs/accuracy.md"
 
 
 def _table(head: list[str], rows: list[list[str]]) -> str:
@@ -28,12 +23,11 @@ def _e(value: float) -> str:
 
 
 def _machine(stem: str, result: dict) -> str:
-    m = result["machine"]
-    return f"**{m['name']}** ({stem}, commit {m['commit']}, {m['date']})."
+    return f"**{result['machine']['name']}** ({stem}, commit {result['commit']}, {result['date']})."
 
 
 def budget_text(results: dict[str, dict]) -> str:
-    """Two tables a machine: pictures and gradients."""
+    """Two tables a machine: images and gradients."""
     parts = []
     for stem, result in results.items():
         images, gradients = [], []
@@ -55,7 +49,7 @@ def budget_text(results: dict[str, dict]) -> str:
                 str(sum(e["wrong zeros"] for e in v.values())),
             ])  # fmt: skip
         kept = "Every line is kept." if not result["broken"] else "Broken: " + "; ".join(result["broken"]) + "."
-        head = ["pictures", "mean E", "max E", "allowed", "max P32", "max E depth", "mean A", "max A", "band", "flips"]
+        head = ["images", "mean E", "max E", "allowed", "max P32", "max E depth", "mean A", "max A", "band", "flips"]
         parts += [f"{_machine(stem, result)} {kept}\n", _table(head, images)]
         head = ["gradients", "relative L2", "1 - cosine", "bias", "max E", "max P32", "max A", "wrong zeros"]
         parts.append(_table(head, gradients))
@@ -69,20 +63,23 @@ def needles_text(results: dict[str, dict]) -> str:
         rows = []
         for row in result["rows"]:
             line = [f"{row['sigma']:,}"]
-            for what, peers in (("weight", ("conic", "plain")), ("picture", ("conic", "plain")), ("gradient", ("plain",))):
+            for what, peers in (("weight", ("conic", "plain")), ("image", ("conic", "plain")), ("gradient", ("plain",))):
                 e = row[what]
                 line += [" / ".join(_e(e[n][k]) for k in ("max", "mean")) for n in ("factor", *peers)]
                 line.append(f"{min(e[n]['max'] / e['factor']['max'] for n in peers):,.0f}")
             rows.append(line)
-        head = ["length [px]", "weight: factor", "conic", "plain", "times", "picture: factor", "conic", "plain", "times"]
-        of = f"Max / mean over {result['needles']} needles (weight) and {result['images']} (picture, gradient)."
+        head = ["length [px]", "weight: factor", "conic", "plain", "times", "image: factor", "conic", "plain", "times"]
+        of = f"Max / mean over {result['needles']} needles (weight) and {result['images']} (image, gradient)."
         parts += [f"{_machine(stem, result)} {of}\n", _table([*head, "gradient: factor", "plain", "times"], rows)]
     return "\n".join(parts)
 
 
 def filled(page: str) -> str:
     """The page with the text between each pair of marks made anew."""
-    for name, text in (("budget", budget_text(_results("budget"))), ("needles", needles_text(_results("needles")))):
+    for name, text in (
+        ("budget", budget_text(result_file.stored("budget"))),
+        ("needles", needles_text(result_file.stored("needles"))),
+    ):
         begin, end = f"<!-- {name}: written by bench.accuracy -->\n", f"<!-- end of {name} -->"
         before, rest = page.split(begin)
         page = before + begin + "\n" + text + "\n" + end + rest.split(end)[1]

@@ -1,4 +1,4 @@
-"""How things are timed here: warm-up, then repeats that go round all programs, median and quartiles, one row per task.
+"""Timing: warm-up, then repeats that go round all programs, median and quartiles, one row per task.
 
 Programs that are compared run in turn, one repeat each, so that whatever else the machine does meets all of them alike;
 only programs far slower than the others run after them.
@@ -40,14 +40,14 @@ class Task:
     """One thing to time, inputs loaded."""
 
     program: str
-    """Whose code runs: warpgs, or a peer."""
+    """Name of the program: warpgs, or a peer."""
     direction: str
     """forward, backward, both (one after the other) or step."""
     run: Callable[[], object]
     cost: Cost | None = None
     """The least it has to do, where that is known."""
     facts: dict = field(default_factory=dict)
-    """What else belongs in the row, such as the number of instances."""
+    """Other entries of the row, such as the number of instances."""
 
 
 def _drain(device: torch.device) -> None:

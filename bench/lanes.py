@@ -60,7 +60,7 @@ def cloud(count: int) -> tuple[torch.Tensor, Tiles]:
 
 
 def lanes(projected: torch.Tensor, tiles: Tiles, pixel_ends: torch.Tensor) -> tuple[int, int]:
-    """Lanes evaluated and boxed lanes, by the formulas of the kernels; ``pixel_ends`` has the shape of the picture."""
+    """Lanes evaluated and boxed lanes, by the formulas of the kernels; ``pixel_ends`` has the shape of the image."""
     side, strips = tiles.size, tiles.size // STRIP
     ends = pixel_ends.view(HEIGHT // side, side, WIDTH // side, strips, STRIP).amax(4).permute(0, 2, 1, 3).flatten(0, 1)
     first, last = tiles.ranges.long().unbind(1)

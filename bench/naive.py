@@ -4,7 +4,6 @@ The rule is `exact`, in float32. On a CPU Warp's atomics are plain additions, so
 """
 
 import functools
-from types import SimpleNamespace
 
 import torch
 import warp as wp
@@ -17,15 +16,16 @@ from warpgs.runtime import interop
 from warpgs.scene import Camera, Gaussians
 
 
-@functools.cache
-def make_kernels():
-    """Forward and backward kernel."""
+@wp.func
+def tile_of(i: wp.int32, width: wp.int32, height: wp.int32, columns: wp.int32, tiles: wp.int32, side: wp.int32):
+    camera = i // (width * height)
+    y = (i // width) % height
+    return camera * tiles + (y // side) * columns + (i % width) // side
 
-    @wp.func
-    def tile_of(i: wp.int32, width: wp.int32, height: wp.int32, columns: wp.int32, tiles: wp.int32, side: wp.int32):
-        camera = i // (width * height)
-        y = (i // width) % height
-        return camera * tiles + (y // side) * columns + (i % width) // side
+
+@functools.cache
+def forward_kernel():
+    """Return the kernel that blends, a thread per pixel."""
 
     @wp.kernel(enable_backward=False, module="bench.naive")
     def forward(
@@ -68,7 +68,14 @@ def make_kernels():
         transmittances[i] = t
         ends[i] = end
 
-    @wp.kernel(enable_backward=False, module="bench.naive")
+    return forward
+
+
+@functools.cache
+def backward_kernel():
+    """Return the kernel of the gradients, which are added by float atomics."""
+
+    @wp.kernel(enable_backward=False, module="bench.naive.backward")
     def backward(
         projected: wp.array2d(dtype=float), ranges: wp.array2d(dtype=int), ids: wp.array(dtype=int),
         backgrounds: wp.array2d(dtype=float), width: int, height: int, columns: int, tiles: int, side: int,
@@ -117,7 +124,7 @@ def make_kernels():
                 wp.atomic_add(v_projected, s, 4, v_e2 * dy)
                 wp.atomic_add(v_projected, s, 5, v * g)
 
-    return SimpleNamespace(forward=forward, backward=backward)
+    return backward
 
 
 class Naive:
@@ -144,7 +151,6 @@ class Naive:
         ]  # fmt: skip
         self.stop, self.kept = rule.transmittance_stop, [transmittances, ends]
         self.state = [interop.view(transmittances, wp.float32), interop.view(ends, wp.int32)]
-        self.kernels = make_kernels()
 
     def _launch(self, kernel, inputs: list) -> None:
         inputs = [a.array() if isinstance(a, interop.View) else a for a in inputs]
@@ -154,14 +160,14 @@ class Naive:
     def forward(self) -> torch.Tensor:
         """The image, shape [C, H, W, 3]."""
         outputs = [interop.view(self.rgb.view(-1, 3), wp.float32), *self.state]
-        self._launch(self.kernels.forward, [*self.inputs, self.stop, *outputs])
+        self._launch(forward_kernel(), [*self.inputs, self.stop, *outputs])
         return self.rgb
 
     def backward(self, v_rgb: torch.Tensor) -> torch.Tensor:
         """Gradient of the records for an upstream gradient, after `forward`; shape [C, N, 12]."""
         self.v_projected.zero_()
         arrays = [interop.view(t.view(-1, t.shape[-1]), wp.float32) for t in (v_rgb.contiguous(), self.v_projected)]
-        self._launch(self.kernels.backward, [*self.inputs, *self.state, *arrays])
+        self._launch(backward_kernel(), [*self.inputs, *self.state, *arrays])
         return self.v_projected
 
 
@@ -178,7 +184,7 @@ class _Blend(torch.autograd.Function):
 
 
 def rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
-    """Pictures [C, H, W, 3] of a batch of cameras over black: our projection and lists, the naive blending."""
+    """Images [C, H, W, 3] of a batch of cameras over black: our projection and lists, the naive blending."""
     size = {"width": camera.width, "height": camera.height}
     how = {"degree": gaussians.sh_degree, "rule": RULES["exact"]}
     projected, counts = project(*gaussians.tensors().values(), camera.viewmat, camera.K, **size, **how)

@@ -94,7 +94,7 @@ def _composite(pixels, means, inverses, opacities, colors):
 
 
 def dense_rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
-    """Rule `exact` in plain torch, without tiles: pictures [C, H, W, 3] over black, for small N only."""
+    """Rule `exact` in plain torch, without tiles: images [C, H, W, 3] over black, for small N only."""
     device = gaussians.means.device
     y, x = torch.meshgrid(torch.arange(camera.height, device=device), torch.arange(camera.width, device=device), indexing="ij")
     centers = torch.stack([x, y], -1).reshape(-1, 2) + 0.5
@@ -107,7 +107,7 @@ def dense_rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
 
 
 def gsplat_rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
-    """The same pictures by gsplat, activations applied outside as its interface asks."""
+    """The same images by gsplat, activations applied outside as its interface asks."""
     from gsplat import rasterization
 
     rgb, _, _ = rasterization(
@@ -118,17 +118,17 @@ def gsplat_rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
 
 
 def naive_rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
-    """The same pictures by the straightforward kernel, one thread per pixel."""
+    """The same images by the straightforward kernel, one thread per pixel."""
     return naive.rasterize(gaussians, camera)
 
 
 RASTERIZERS = {DENSE: dense_rasterize, NAIVE: naive_rasterize, GSPLAT: gsplat_rasterize}
-"""Peers that draw: Gaussians and a batch of cameras in, pictures [C, H, W, 3] out."""
+"""Peers that draw: Gaussians and a batch of cameras in, images [C, H, W, 3] out."""
 
 
 @functools.cache
 def absent(device: torch.device) -> dict[str, str]:
-    """Peers that cannot draw a picture and its gradient on a device, each with the reason."""
+    """Peers that cannot draw an image and its gradient on a device, each with the reason."""
     reasons = {}
     for name, draw in RASTERIZERS.items():
         try:

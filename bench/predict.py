@@ -1,4 +1,4 @@
-"""What a measurement will take, foretold from smaller ones, so that hopeless ones are left out and said to be."""
+"""Prediction of time and memory from smaller measurements, so that hopeless ones are left out and listed."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def memory_bytes(rows: list[dict], op: str, program: str, direction: str, point:
 def reason_to_skip(
     rows: list[dict], op: str, program: str, direction: str, point: Point, sizes: dict, free: float
 ) -> str | None:
-    """Why a task should not run, or None."""
+    """Return why a task should not run, or None."""
     predicted = time_ms(rows, op, program, direction, sizes)
     if predicted is not None and predicted > LIMIT_MS:
         return f"predicted {predicted / 1000:.2g} s a repeat, above {LIMIT_MS / 1000:g} s"

@@ -119,19 +119,23 @@ def check(scene: Scene) -> float:
     shapes, light, worst = still_life(), raycast.Light(), math.inf
     n = scene.normalization
     for view in scene.views:
-        viewmat = view.camera.viewmat.copy()
+        viewmat = np.array(view.camera.viewmat)
         # back from scene units to those of the file
         viewmat[:3, 3] = viewmat[:3, 3] / n.scale - viewmat[:3, :3] @ n.offset
-        rgb = raycast.render(shapes, light, view.camera.K, viewmat, view.camera.width, view.camera.height)
+        rgb = raycast.render(shapes, light, np.asarray(view.camera.K), viewmat, view.camera.width, view.camera.height)
         worst = min(worst, -10 * math.log10(float(np.mean((rgb - view.image) ** 2))))
     return worst
 
 
-def main() -> None:
-    """Write, read and check a scene."""
+def main(arguments: list[str] | None = None) -> float:
+    """Write, read and check a scene; return the PSNR [dB] of `check`.
+
+    Raises:
+        SystemExit: The poses that were read do not fit the images.
+    """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, help="folder to keep the scene in; without it a temporary one is used")
-    out = parser.parse_args().out
+    out = parser.parse_args(arguments).out
     with tempfile.TemporaryDirectory() as temporary:
         folder = out or Path(temporary)
         write_shots(folder)
@@ -140,6 +144,7 @@ def main() -> None:
     if psnr < 50:
         raise SystemExit(f"the poses that were read do not fit the images: {psnr:.1f} dB; at least 50 dB are expected")
     print(f"{scene.format}: {len(scene.views)} views read; rendered again, they equal their images to {psnr:.1f} dB")
+    return psnr
 
 
 if __name__ == "__main__":

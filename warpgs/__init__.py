@@ -43,7 +43,7 @@ _HOMES = {
 }
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> object:
     # Public names load on first use: torch and Warp cost seconds that `warpgs --help` must not pay.
     if name in _HOMES:
         import importlib

@@ -9,11 +9,19 @@ import pkgutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Generic, TypeVar
+from types import ModuleType
+from typing import ClassVar, Generic, Protocol, TypeVar
 
 from warpgs.errors import UsageError
 
-T = TypeVar("T")
+
+class Named(Protocol):
+    """A class that carries the name by which it is found."""
+
+    name: ClassVar[str]
+
+
+T = TypeVar("T", bound=Named)
 
 
 class Registry(Generic[T]):
@@ -98,7 +106,7 @@ class Registry(Generic[T]):
         return cls
 
 
-def _load_file(path: Path):
+def _load_file(path: Path) -> ModuleType:
     """Import a file by its path, once, under a name of its own."""
     path = path.resolve()
     name = f"_warpgs_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"

@@ -39,7 +39,8 @@ class Camera:
     def center(self) -> np.ndarray:
         """Return the camera centre in the world [u], shape [..., 3] (numpy cameras only)."""
         R, t = self.viewmat[..., :3, :3], self.viewmat[..., :3, 3]
-        return -np.einsum("...ij,...i->...j", R, t)
+        center: np.ndarray = -np.einsum("...ij,...i->...j", R, t)
+        return center
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Time of the path costs of a picture's depth planes, beside numpy, which a fit on a CPU uses."""
+"""Time of the path costs of an image's depth planes, beside numpy, which a fit on a CPU uses."""
 
 import numpy as np
 import torch

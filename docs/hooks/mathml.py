@@ -27,7 +27,7 @@ def on_page_content(content: str, page, **_) -> str:
     def formula(match: re.Match) -> str:
         tex = html.unescape(match[3])
         maths = convert(simplified(tex), display="block" if match[2] == "[" else "inline")
-        unknown = re.findall(r"\\[A-Za-z_]+|<mi>&</mi>", maths)
+        unknown = re.findall(r"\\[A-Za-z_]+|<mi>&</mi>|\$", maths)
         if unknown:
             log.warning("%s: unknown TeX %s in %s", page.file.src_uri, ", ".join(unknown), tex)
         return maths

@@ -76,6 +76,14 @@ def test_a_reader_that_does_not_find_its_format_is_refused(tmp_path):
     refused(tmp_path / "gone", "there is no such folder", reader=Cameras())
 
 
+def test_camera_models_arrive_and_change_the_fingerprint(folder):
+    def fisheye(scene):
+        return replace(scene, views=tuple(replace(v, camera=replace(v.camera, model="fisheye")) for v in scene.views))
+
+    plain, other = load_scene(folder, reader=Cameras()), load_scene(folder, reader=Cameras(fisheye))
+    assert {v.camera.model for v in other.views} == {"fisheye"} and plain.fingerprint != other.fingerprint
+
+
 def with_view(**changes):
     return lambda scene: replace(scene, views=(replace(scene.views[0], **changes), *scene.views[1:]))
 

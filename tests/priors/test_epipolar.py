@@ -1,5 +1,7 @@
 """Depth from matches: exact where geometry is, rejected where it is not, blended as said."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from warpgs.priors.epipolar import (
     pixel_grid,
     round_trip,
 )
+from warpgs.priors.sweep_planes import plane_homography, project_inverse
 from warpgs.scene import Camera, View
 
 
@@ -36,6 +39,16 @@ def exact_flow(views: list[View], depths: list[np.ndarray]):
         return at.astype(np.float32).reshape(*depths[i].shape, 2)
 
     return flow
+
+
+def test_only_pinholes_have_epipolar_lines():
+    """Another camera model is refused on either side, instead of a depth by the wrong geometry."""
+    a, b, _ = rig()
+    fisheye = dataclasses.replace(b, model="fisheye")
+    for pair in ((a, fisheye), (fisheye, a)):
+        for op, more in ((fundamental, ()), (plane_homography, (0.3,)), (project_inverse, (np.zeros((1, 2)), np.ones(1)))):
+            with pytest.raises(UsageError, match="pinhole cameras only, and this one is 'fisheye'"):
+                op(*pair, *more)
 
 
 def test_pixel_centres_are_at_one_half():

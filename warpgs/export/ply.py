@@ -65,7 +65,7 @@ class _Element:
     """True where a property is a list, so that rows differ in length."""
 
 
-def write_ply(path: str | os.PathLike, gaussians: Gaussians, normalization: Normalization) -> None:
+def write_ply(path: str | os.PathLike[str], gaussians: Gaussians, normalization: Normalization) -> None:
     """Write Gaussians as a PLY file in the INRIA 3DGS layout, in the coordinates of the scene's files.
 
     Means become ``mean / scale + offset`` [file units] and log scales ``log_scale - log(scale)``, computed in float64 and
@@ -108,7 +108,7 @@ def write_ply(path: str | os.PathLike, gaussians: Gaussians, normalization: Norm
         ) from e
 
 
-def read_ply(path: str | os.PathLike) -> Gaussians:
+def read_ply(path: str | os.PathLike[str]) -> Gaussians:
     """Read Gaussians from a PLY file in the INRIA 3DGS layout, binary little endian.
 
     Properties and elements that are not part of the layout are ignored. The number of rows is checked against the size of

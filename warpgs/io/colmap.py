@@ -130,6 +130,12 @@ def _understood(path: Path, line: int):
         raise DataError(f"{path}, line {line}: cannot be understood ({e}); write the file again") from e
 
 
+def _expect(condition: bool, message: str) -> None:
+    """Raise a ValueError for `_understood` where a line breaks a rule."""
+    if not condition:
+        raise ValueError(message)
+
+
 def _store(table: dict, key: int, value: object, where: str) -> None:
     if key in table:
         raise DataError(f"{where}: number {key} is given twice; write the file again")
@@ -156,7 +162,11 @@ def _unknown_model(path: Path, model: object) -> DataError:
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:
-    """Return lenses by camera number from cameras.bin or cameras.txt; DataError where the file is malformed."""
+    """Return lenses by camera number from cameras.bin or cameras.txt.
+
+    Raises:
+        DataError: The file is malformed, or a camera model is not supported.
+    """
     cameras: dict[int, Lens] = {}
     if path.suffix == ".bin":
         r = _BinaryFile(path)
@@ -175,15 +185,18 @@ def read_cameras(path: Path) -> dict[int, Lens]:
             number, model, parameters = int(words[0]), words[1], tuple(float(w) for w in words[4:])
             if model not in counts:
                 raise _unknown_model(path, model)
-            if len(parameters) != counts[model]:
-                raise ValueError(f"{model} has {counts[model]} parameters, not {len(parameters)}")
+            _expect(len(parameters) == counts[model], f"{model} has {counts[model]} parameters, not {len(parameters)}")
             where = f"{path}, line {line}, camera {number}"
             _store(cameras, number, _lens(where, model, int(words[2]), int(words[3]), parameters), where)
     return cameras
 
 
 def read_poses(path: Path) -> dict[int, Pose]:
-    """Return poses by image number from images.bin or images.txt; DataError where the file is malformed."""
+    """Return poses by image number from images.bin or images.txt.
+
+    Raises:
+        DataError: The file is malformed.
+    """
     poses: dict[int, Pose] = {}
     if path.suffix == ".bin":
         r = _BinaryFile(path)
@@ -242,8 +255,7 @@ def read_points(path: Path, names: dict[int, str]) -> PointCloud:
     else:
         for line, words in _rows(path):
             with _understood(path, line):
-                if len(words) < 8 or len(words) % 2:
-                    raise ValueError("a point has 8 numbers, then pairs IMAGE OBSERVATION")
+                _expect(len(words) >= 8 and len(words) % 2 == 0, "a point has 8 numbers, then pairs IMAGE OBSERVATION")
                 points.append(tuple(float(w) for w in words[1:4]))
                 colors.append(tuple(min(max(int(w), 0), 255) for w in words[4:7]))
                 tracks.append(frozenset(names[i] for w in words[8::2] if (i := int(w)) in names))

@@ -39,7 +39,11 @@ class Lens:
     """Name of the camera model, for notes."""
 
     def checked(self, where: str) -> Lens:
-        """Return this lens; DataError where a number is not finite, not positive or absurd (``where``: file and image)."""
+        """Return this lens after a check of its numbers; ``where`` is file and image, for errors.
+
+        Raises:
+            DataError: A number is not finite, not positive or absurdly large.
+        """
         f, c = self.K[[0, 1], [0, 1]], self.K[:2, 2]
         if not (1 <= self.width <= MAX_INTRINSIC and 1 <= self.height <= MAX_INTRINSIC):
             raise DataError(f"{where}: the camera's image size {self.width} x {self.height} px is impossible; fix the file")

@@ -17,7 +17,11 @@ FILE = "poses_bounds.npy"
 
 
 def read_rows(path: Path) -> np.ndarray:
-    """Return the array of poses_bounds.npy, float64, shape [N, 17]; DataError where it is anything else."""
+    """Return the array of poses_bounds.npy, float64, shape [N, 17].
+
+    Raises:
+        DataError: The file holds anything else.
+    """
     try:
         # mapped, because that holds the announced shape against the file's size before memory is taken
         rows = np.load(path, mmap_mode="r", allow_pickle=False)

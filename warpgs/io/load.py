@@ -139,7 +139,7 @@ def _check_views(root: Path, views: list[View]) -> None:
             raise DataError(f"{root}: the image {v.name!r} is listed twice; remove one of its cameras")
         seen.add(v.name)
         where, size = f"{root}, image {v.name!r}", (v.camera.height, v.camera.width)
-        rigid(v.camera.viewmat, where)
+        rigid(np.asarray(v.camera.viewmat), where)
         wanted = [("image", v.image, (*size, 3), np.float32), ("mask", v.mask, size, bool)]
         for noun, array, shape, dtype in wanted:
             if array is not None and (array.shape != shape or array.dtype != dtype):

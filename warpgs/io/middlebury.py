@@ -20,7 +20,11 @@ def files_of(root: Path) -> list[Path]:
 
 
 def read_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
-    """Return line number, image name and 21 numbers (K, R, t) of each camera; DataError where the file is malformed."""
+    """Return line number, image name and the numbers K, R, t, float64, shape [21], of each camera.
+
+    Raises:
+        DataError: The file is malformed; the message names the line.
+    """
     try:
         lines = path.read_bytes().decode("utf-8-sig").splitlines()
         words = [(number, line.split()) for number, line in enumerate(lines, 1) if line.strip()]

@@ -36,7 +36,11 @@ def rigid(viewmat: np.ndarray, where: str) -> np.ndarray:
 
 
 def quat_rotation(quat: tuple[float, ...], where: str) -> np.ndarray:
-    """Return the rotation [3, 3] of a quaternion wxyz of any length; DataError where it is zero or not finite."""
+    """Return the rotation [3, 3] of a quaternion wxyz of any length.
+
+    Raises:
+        DataError: The quaternion is zero or not finite.
+    """
     q = np.array(quat, np.float64)
     norm = float(np.linalg.norm(q)) if (np.abs(q) < 1e100).all() else np.inf
     if not 1e-12 < norm < np.inf:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import abc
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from warpgs.errors import UsageError
 from warpgs.plugins import Registry
@@ -29,7 +29,7 @@ class ReadOptions:
     invert_masks: bool = False
     """White in a mask file removes a pixel instead of keeping it."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if isinstance(self.downscale, bool) or not isinstance(self.downscale, int) or self.downscale < 1:
             raise UsageError(f"--downscale must be a whole number of at least 1, not {self.downscale!r}")
 
@@ -56,7 +56,7 @@ class Reader(abc.ABC):
 
     _declared_name: ClassVar[str] = ""
 
-    def __init_subclass__(cls, **kwargs):
+    def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         cls.name = cls._declared_name = cls.__dict__.get("name", cls.__name__)
 
@@ -81,12 +81,12 @@ class Reader(abc.ABC):
             warpgs.errors.DataError: A file is missing or malformed; the message names file, reason and remedy.
         """
 
-    def scene(self, folder: Path, views: list[View], notes: list[str], **fields) -> Scene:
+    def scene(self, folder: Path, views: list[View], notes: list[str], **fields: Any) -> Scene:
         """Return a `Scene` of this format with further ``fields`` (points, background, pixels) as given."""
         return Scene(str(folder), self.name, tuple(views), notes=tuple(notes), **fields)
 
 
-READERS: Registry[Reader] = Registry("reader", Reader, __package__)
+READERS: Registry[Reader] = Registry("reader", Reader, __package__)  # type: ignore[type-abstract]
 
 register = READERS.register
 """Class decorator ``@register("name")`` that adds a reader to the built-in ones."""

@@ -39,7 +39,11 @@ def _reject_constant(name: str):
 
 
 def read_json(path: Path) -> dict:
-    """Return the parsed file with its list of frames; DataError where it is malformed or holds NaN or Infinity."""
+    """Return the parsed file with its list of frames.
+
+    Raises:
+        DataError: The file is malformed, or holds NaN or Infinity.
+    """
     try:
         values = json.loads(path.read_bytes().decode("utf-8-sig"), parse_constant=_reject_constant)
     except (OSError, ValueError, RecursionError) as e:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpgs.errors import UsageError
+from warpgs.geometry import check_pinhole
 from warpgs.scene import Camera, View, ViewDepth
 
 BLENDS = ("least_sensitive", "nearest_first", "mean_valid", "inverse_sensitivity")
@@ -84,7 +85,12 @@ def fundamental(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray, 
 
     ``F (x, y, 1)`` is the epipolar line in the second image of a pixel of the first. ``X_second = R_st (X_first + tau)``: -tau
     is the second camera's centre in the frame of the first.
+
+    Raises:
+        UsageError: A camera is no pinhole.
     """
+    check_pinhole(first)
+    check_pinhole(second)
     R_s, t_s = first.viewmat[:3, :3], first.viewmat[:3, 3]
     R_t, t_t = second.viewmat[:3, :3], second.viewmat[:3, 3]
     R_st = R_t @ R_s.T

@@ -108,6 +108,9 @@ def classical_semantics(image: np.ndarray) -> SemanticMaps:
     L0 smoothing (Xu et al. 2011) flattens texture; Canny's edges in the result are the boundaries. Foreground is
     fine-grained saliency (Montabone and Soto 2010), smoothed within the flat regions. Confidence is the larger of foreground
     and 1 - foreground.
+
+    Raises:
+        DataError: OpenCV cannot compute the saliency.
     """
     import cv2
 

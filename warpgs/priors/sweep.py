@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from warpgs.priors.epipolar import homogeneous, nearest_views, pixel_grid
 from warpgs.priors.sweep_planes import SweepConfig, inside_image, plane_inverses, project_inverse
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.device_memory import installed_bytes
-from warpgs.scene import Camera, View, ViewDepth
+from warpgs.scene import View, ViewDepth
 
 CPU = torch.device("cpu")
 GPU_FRACTION = 0.25
@@ -38,7 +39,7 @@ def _reduced(view: View, max_pixels: int) -> View:
     width, height = max(1, int(c.width * shrink)), max(1, int(c.height * shrink))
     K = np.diag([width / c.width, height / c.height, 1]) @ c.K
     image = cv2.resize(view.image, (width, height), interpolation=cv2.INTER_AREA)
-    return View(view.name, Camera(c.viewmat, K, width, height), image)
+    return View(view.name, replace(c, K=K, width=width, height=height), image)
 
 
 def consistent_depth(views: Sequence[View], inverses: Sequence[np.ndarray], index: int, config: SweepConfig) -> ViewDepth:

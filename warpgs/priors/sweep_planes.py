@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpgs.errors import UsageError
+from warpgs.geometry import check_pinhole
 from warpgs.priors.epipolar import homogeneous
 from warpgs.scene import Camera, View
 
@@ -65,6 +66,8 @@ class SweepConfig:
 
 def project_inverse(first: Camera, second: Camera, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     """Return the positions [px] in the second image, shape [N, 2], of pixels [N, 2] at inverse depths [1/u] [N]; NaN behind."""
+    check_pinhole(first)
+    check_pinhole(second)
     relative = second.viewmat @ np.linalg.inv(first.viewmat)
     rays = homogeneous(pixels) @ np.linalg.inv(first.K).T
     p = (rays @ relative[:3, :3].T + inverse[:, None] * relative[:3, 3]) @ second.K.T
@@ -100,6 +103,8 @@ def plane_inverses(
 
 def plane_homography(first: Camera, second: Camera, inverse: float) -> np.ndarray:
     """Return H [3, 3] from first to second by the plane z = 1 / inverse, for pixel centres at whole numbers (OpenCV)."""
+    check_pinhole(first)
+    check_pinhole(second)
     relative = second.viewmat @ np.linalg.inv(first.viewmat)
     H = second.K @ (relative[:3, :3] + inverse * np.outer(relative[:3, 3], [0, 0, 1])) @ np.linalg.inv(first.K)
     shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])

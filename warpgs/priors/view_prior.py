@@ -179,7 +179,7 @@ def _fall_back(found: list[tuple[SemanticMaps, str]], views: Sequence[View], reg
         if _stands_out(region) and (classical or not knows_foreground(maps)):
             replaced.append(view.name)
             foreground, source = region.astype(np.float32), f"{source}; foreground from the view's mask or black background"
-            if classical:  # saliency is a guess, a region is knowledge
+            if classical:  # saliency is an estimate, a region is known
                 maps = SemanticMaps(np.ones_like(foreground), maps.boundary, foreground)
             else:
                 maps = SemanticMaps(maps.confidence, boundary_weight(region), foreground)

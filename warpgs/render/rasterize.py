@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -93,7 +94,7 @@ def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
     return x, y, w, h
 
 
-def _as_batch(array, like: torch.Tensor, rows: int) -> torch.Tensor:
+def _as_batch(array: Any, like: torch.Tensor, rows: int) -> torch.Tensor:
     """Return one matrix or a batch of them as a tensor [C, rows, rows] of the type and on the device of ``like``."""
     if isinstance(array, torch.Tensor) and array.ndim == 3 and array.dtype == like.dtype and array.device == like.device:
         return array
@@ -101,10 +102,10 @@ def _as_batch(array, like: torch.Tensor, rows: int) -> torch.Tensor:
     return tensor.reshape(-1, rows, rows) if tensor.ndim < 3 else tensor
 
 
-def _backgrounds(background, viewmats: torch.Tensor) -> torch.Tensor:
+def _backgrounds(background: Any, viewmats: torch.Tensor) -> torch.Tensor:
     """Return one colour or a batch of them as a tensor [C, 3]."""
-    background = torch.as_tensor(background, dtype=viewmats.dtype, device=viewmats.device)
-    return background.expand(len(viewmats), 3) if background.ndim == 1 else background
+    colors: torch.Tensor = torch.as_tensor(background, dtype=viewmats.dtype, device=viewmats.device)
+    return colors.expand(len(viewmats), 3) if colors.ndim == 1 else colors
 
 
 def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = RasterizeOptions()) -> Render:
@@ -149,7 +150,7 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
 
 def _rasterize(
     sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor, settings: RenderSettings, options: RasterizeOptions
-) -> tuple:
+) -> tuple[Any, ...]:
     """Return the images as one tuple, and the further fields of `Render`, by kernels that are launched one by one."""
     projected, tile_counts = project(*sources, opacity_factors=options.opacity_factors, **settings.project_options())
     if options.max_instances is not None and int(tile_counts.sum()) > options.max_instances:
@@ -161,7 +162,7 @@ def _rasterize(
         return images, projected, tile_counts, *weights
     overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=projected.device)
     x, y, width, height = settings.window
-    shared = {"width": width, "height": height, "rule": settings.rule, "origin": (x, y)}
+    shared: dict[str, Any] = {"width": width, "height": height, "rule": settings.rule, "origin": (x, y)}
     tiles = bin_tiles(
         projected, tile_counts, tile_size=options.tile_size,
         budget_bytes=options.memory_budget, capacity=options.capacity, overflow=overflow, **shared,
@@ -171,7 +172,7 @@ def _rasterize(
     return images, projected, tile_counts, *weights, overflow
 
 
-def _as_render(camera: Camera, images: tuple[torch.Tensor, ...], *rest) -> Render:
+def _as_render(camera: Camera, images: tuple[torch.Tensor, ...], *rest: Any) -> Render:
     """Return the result; without a leading axis for a single camera."""
     # not p[0], whose gradient would be a copy among zeros
     return Render(*(p.squeeze(0) if len(camera.viewmat.shape) == 2 else p for p in images), *rest)

@@ -10,7 +10,11 @@ GRAY = (0.5, 0.5, 0.5)
 
 
 def png(image: np.ndarray) -> bytes:
-    """Encode colours in [0, 1], [H, W, 3], as 8-bit PNG; values outside are clamped."""
+    """Encode colours in [0, 1], [H, W, 3], as 8-bit PNG; values outside are clamped.
+
+    Raises:
+        ResourceError: OpenCV cannot encode the image.
+    """
     import cv2
 
     pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
@@ -30,7 +34,7 @@ def resized(image: np.ndarray, width: int, height: int):
 
 
 def colored(values: np.ndarray, name: str) -> np.ndarray:
-    """Return colours [H, W, 3] of values in [0, 1], [H, W], by a colour map of OpenCV: INFERNO, TURBO, VIRIDIS ..."""
+    """Return colours [H, W, 3] of values in [0, 1], [H, W], by a colour map of OpenCV, such as INFERNO or TURBO."""
     import cv2
 
     table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], getattr(cv2, f"COLORMAP_{name}"))[:, 0, ::-1]

@@ -34,7 +34,7 @@ class LossConfig:
     depth_until: float = 0.95
     """Share of the steps, from the first, that have the depth term."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, most in (("depth_weight", 1000), ("depth_until", 1)):
             if not 0 <= getattr(self, name) <= most:
                 raise UsageError(f"loss {name.replace('_', ' ')} {getattr(self, name)} must lie between 0 and {most}")
@@ -72,7 +72,7 @@ def photometric_loss(
         rgb, target = rgb * mask[..., None], target * mask[..., None]
     pixels = target.shape[0] * target.shape[1] if mask is None else mask.sum().clamp_min(1)
     l1 = (rgb - target).abs().sum() / (3 * pixels)
-    if fraction == 0:
+    if mask is None or fraction == 0:
         return l1
     structural = ((1 - ssim(rgb, target)) * mask[..., None]).sum() / (3 * pixels)
     return (1 - fraction) * l1 + fraction * structural
@@ -195,6 +195,7 @@ class DepthCorrelation(LossTerm):
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
         """Return the disparity of the view's prior."""
+        assert prior is not None  # `needs_priors`
         return {"disparity": torch.as_tensor(prior.disparity, dtype=torch.float32, device=view.image.device)}
 
     def active(self, step: int, steps: int) -> bool:

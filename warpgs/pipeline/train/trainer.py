@@ -219,10 +219,9 @@ class Trainer:
         if not self.strategy.due(self.step):
             return
         self._forget_graphs()
-        with torch.no_grad():
-            for change in self.strategy.update(self.step):
-                self.table.apply(change)
-                self.count_changed()
+        for change in self.strategy.update(self.step):
+            self.table.apply(change)
+            self.count_changed()
 
     def _forget_graphs(self) -> None:
         if self.graphs is not None:

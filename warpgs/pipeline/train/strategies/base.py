@@ -104,14 +104,14 @@ class Strategy:
         """Yield changes of the set of Gaussians after a step; each has been applied to the table when the next is asked for."""
         return iter(())
 
-    def state(self) -> tuple[dict[str, torch.Tensor], dict]:
+    def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Return tensors and plain values beside the table from which the strategy goes on as if it had never stopped."""
         return {}, {}
 
-    def load(self, tensors: Mapping[str, torch.Tensor], plain: dict) -> None:
+    def load(self, tensors: Mapping[str, torch.Tensor], plain: dict[str, Any]) -> None:
         """Take over what `state` gave."""
 
-    def figures(self) -> dict:
+    def figures(self) -> dict[str, Any]:
         """Return what the report says of it, plain values for metrics.json."""
         return {}
 
