@@ -171,7 +171,7 @@ def adam_scheduled(
     param: torch.Tensor, grad: torch.Tensor, exp_avg: torch.Tensor, exp_avg_sq: torch.Tensor, lrs: torch.Tensor,
     skip: torch.Tensor, *, head: int, betas: tuple[float, float] = BETAS, eps: float = EPS,
 ) -> None:  # fmt: skip
-    """Take the step of `adam_step` in float32, with its learning rates in memory, so that CUDA can record it once.
+    """Update as `adam_step` does, in float32, with learning rates in memory, so that a CUDA graph can replay it.
 
     Args:
         param: Parameter, contiguous, shape [N, ...].
