@@ -9,7 +9,7 @@ from warpgs.constants import RULES
 from warpgs.scene import Camera, Gaussians
 
 SMOOTH = dataclasses.replace(RULES["exact"], name="smooth", alpha_cut=0.0, transmittance_stop=0.0)
-"""No cut-off and no stop: the picture is a smooth function of everything, so finite differences can be trusted."""
+"""No cut-off and no stop: the image is a smooth function of everything, so finite differences can be trusted."""
 
 
 def hand_placed(dtype=torch.float64, device="cpu", degree: int = 3) -> Gaussians:

@@ -6,8 +6,8 @@ import torch
 from tests.scenes import photos, seeds
 from warpgs.pipeline.metrics.evaluate import render_view, score
 from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.model.table import OptimizerConfig
 from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.rasterize import RasterizeOptions
 
@@ -20,6 +20,6 @@ def test_a_tiny_scene_passes_35_db_in_200_steps():
         optimizer=OptimizerConfig(means_lr=2e-3, means_lr_final=2e-4, scales_lr=0.03, sh_lr=0.02),
     )  # fmt: skip
     fit = Trainer([v for i, v in enumerate(views) if i != 3], seeds(), config, torch.device("cpu"))
-    losses = [fit.advance().loss for _ in range(200)]
+    losses = [fit.advance()[0].loss for _ in range(200)]
     assert np.mean(losses[-10:]) < 0.1 * np.mean(losses[:10])
     assert score(views[3], render_view(fit.gaussians, views[3], RasterizeOptions())[0]).psnr > 35

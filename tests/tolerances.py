@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 
 RELATIVE_L2 = {
-    # quantity: (float32, float64); measured on the scenes of tests/splats.py, CPU, times about 4
+    # quantity: (float32, float64); measured on the scenes of tests/gaussians.py, CPU, times about 4
     "projection": (2e-6, 1e-13),  # measured 3.8e-7, 3.5e-16
     "image": (2e-6, 1e-13),  # measured 2.9e-7, 1.5e-16
     "gradient": (2e-5, 1e-12),  # measured 2.6e-6 (quats), 1.5e-14

@@ -90,7 +90,7 @@ class Registry(Generic[T]):
         if not colon or spec in self._classes:
             return self.find(spec)
         try:
-            module = _load_file(Path(where)) if where.endswith(".py") else importlib.import_module(where)
+            module = _load_file(Path(where)) if where.endswith(".py") else _import_module(where)
         except (ImportError, OSError) as e:
             raise UsageError(f"the {self.kind} {spec!r} cannot be imported ({e}); give path/to/file.py:Class") from e
         if not hasattr(module, name):
@@ -104,6 +104,13 @@ class Registry(Generic[T]):
         if not (isinstance(cls, type) and issubclass(cls, self.base)):
             raise UsageError(f"{name} is no {self.kind}: it must be a class that derives from warpgs.{self.base.__name__}")
         return cls
+
+
+def _import_module(name: str) -> ModuleType:
+    """Import a module by its full dotted name."""
+    if not name or name.startswith("."):
+        raise ImportError(f"{name!r} is no full name of a module")
+    return importlib.import_module(name)
 
 
 def _load_file(path: Path) -> ModuleType:

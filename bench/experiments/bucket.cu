@@ -47,7 +47,7 @@ while (top_instance > floor) {
         s[j].a = s[j].b = s[j].c = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
         if (i >= first) {
             number[j] = i;
-            s[j].load(splats.data, splat_ids.data[i]);
+            s[j].load(projected.data, gaussian_ids.data[i]);
             s[j].rescale();
             const float limit = limit_of(s[j].b.y, alpha_cut);
             #pragma unroll

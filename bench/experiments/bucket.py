@@ -70,7 +70,7 @@ class Case:
     A variant is the product's kernel with another size of chunk, or one by buckets.
 
     Args:
-        splats: Records of `project`, shape [C, N, 12].
+        projected: Projected Gaussians of `project`, shape [C, N, 12].
         tiles: Their instances.
         width: Image width [px].
         height: Image height [px].

@@ -50,7 +50,7 @@ def test_a_fit_starts_without_libraries_that_it_does_not_need_yet(scene, tmp_pat
         "from warpgs.app.cli import main\n"
         "from warpgs.pipeline.train import trainer\n"
         "def stop(*_): raise KeyboardInterrupt\n"
-        "trainer.Fit.advance = stop\n"
+        "trainer.Trainer.advance = stop\n"
         f"flags = ['--out', {str(tmp_path / 'run')!r}, '--device', 'cpu', '--init.source', 'random']\n"
         f"code = main(['fit', {str(scene)!r}, *flags])\n"
         "late = {'scipy', 'skimage', 'pyvista', 'onnxruntime', 'torch._dynamo', 'torch._inductor'}\n"

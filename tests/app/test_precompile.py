@@ -40,7 +40,8 @@ def test_a_fit_launches_nothing_else(device, recorded, monkeypatch):
         events=True, hier=True, pm=False, sampler=SamplerConfig(fraction=0.01, min_alpha=0.05, max_fraction=0.05)
     )
     config = FitConfig(
-        steps=20, dropout=0.2, cuda_graph=recorded, init=InitConfig(source="points"), method=method,
+        steps=20, dropout=0.2, cuda_graph=recorded, init=InitConfig(source="points"),
+        strategy="importance_sampling", method=method,
         loss=LossConfig(depth_weight=0.1, depth_until=0.5),
         density=DensityConfig(start=2, every=2), phases=PhaseConfig(4, 6, every=2),
     )  # fmt: skip

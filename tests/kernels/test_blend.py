@@ -1,4 +1,4 @@
-"""Compositing against a plain loop over Gaussians: pictures, gradients, rules, repeatability."""
+"""Compositing against a plain loop over Gaussians: images, gradients, rules, repeatability."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ from warpgs.kernels.tiles import Tiles, bin_tiles
 
 
 def drawn(gaussians, cam, background, rule, tile_size=16, degree=1):
-    """Pictures of the kernels: rgb, alpha, depth, and what they were made of."""
+    """Return the images of the kernels, rgb, alpha, depth, and the projected Gaussians and tiles."""
     size = {"width": cam.width, "height": cam.height}
     projected, counts = project(
         *gaussians.tensors().values(), cam.viewmat, cam.K, **size, degree=degree, rule=rule, tile_size=tile_size
@@ -27,7 +27,7 @@ def drawn(gaussians, cam, background, rule, tile_size=16, degree=1):
 
 
 def coincident_views(tensors, cam, background, rule, tile_size=16, degree=1):
-    """The same pictures by the references, stacked over cameras, and the weights [C, N, H, W]."""
+    """Return the same images by the references, stacked over cameras, and the weights [C, N, H, W]."""
     *gaussians, viewmats, Ks = tensors
     means, covs, colors, depths, opacities = project_reference(
         *gaussians, viewmats, Ks, width=cam.width, height=cam.height, degree=degree, low_pass=rule.low_pass
@@ -71,7 +71,7 @@ def test_pictures_and_gradients_equal_reference(device, dtype, rule, tile_size):
 
 
 def test_gradcheck(device):
-    """Finite differences agree with the backward kernel for every entry of the record and for the background."""
+    """Finite differences agree with the backward kernel for every value of a projected Gaussian and for the background."""
     gaussians, cam = hand_placed(device=device), camera(cameras=2, device=device)
     size = {"width": cam.width, "height": cam.height}
     background = backgrounds(2, torch.float64, device).requires_grad_()
@@ -179,7 +179,7 @@ def test_contributions_are_the_weights(device, dtype):
 
 
 def everything(gaussians, cam, tile_size=16):
-    """All pictures and gradients of one rendering, for bitwise comparison."""
+    """Return all images and gradients of one render, for bitwise comparison."""
     gaussians = leaves(gaussians)
     background = torch.full((len(cam.viewmat), 3), 0.3, device=gaussians.means.device)
     rgb, alpha, depth, _, _ = drawn(gaussians, cam, background, RULES["exact"], tile_size)
@@ -188,7 +188,7 @@ def everything(gaussians, cam, tile_size=16):
 
 
 def test_repeats_and_threads_give_the_same_bits(device):
-    """Pictures and gradients are the same on every run, and for one thread and two."""
+    """Images and gradients are the same on every run, and for one thread and two."""
     gaussians, cam = cloud(2000, device=device), camera(80, 60, cameras=2, dtype=torch.float32, device=device)
     torch.set_num_threads(1)
     first = everything(gaussians, cam)
@@ -198,7 +198,7 @@ def test_repeats_and_threads_give_the_same_bits(device):
 
 
 def test_tile_size_permutation_and_batch_give_the_same_picture(device):
-    """The bits of the picture depend neither on the tile size, nor on the order of Gaussians, nor on the batch."""
+    """The bits of the image depend neither on the tile size, nor on the order of Gaussians, nor on the batch."""
     gaussians, cam = cloud(500, device=device), camera(80, 60, cameras=3, dtype=torch.float32, device=device)
     images = everything(gaussians, cam)[:3]
     assert all(torch.equal(a, b) for a, b in zip(images, everything(gaussians, cam, tile_size=8)))
@@ -232,7 +232,7 @@ def test_bad_input_names_the_argument():
 
 @pytest.mark.cuda
 def test_cpu_equals_cuda():
-    """The CUDA kernels draw what the CPU draws, gradients included, where no threshold is near."""
+    """The CUDA kernels give the images and gradients of the CPU where no threshold is near."""
     found = {}
     for device in ("cpu", "cuda:0"):
         gaussians, cam = hand_placed(torch.float32, device), camera(33, 21, cameras=2, dtype=torch.float32, device=device)

@@ -58,7 +58,7 @@ def test_free_memory_is_asked_for_only_where_it_may_matter(monkeypatch):
     ("spare_sum", "spare_count", "apart"), [(1, 0, False), (0, 0, True), (1, -1, True)], ids=["fits", "sum", "count"]
 )
 def test_counted_apart_where_one_sum_might_not_hold_both(monkeypatch, spare_sum, spare_count, apart):
-    """From as many (Gaussian, tile) pairs on as a sum has room for, and beyond as many Gaussians."""
+    """Pairs are counted apart from as many (Gaussian, tile) pairs on as a sum can hold, and beyond as many Gaussians."""
     projected, counts = torch.zeros(2, 5, 12), torch.ones(2, 5, dtype=torch.int32)  # 10 Gaussians, 6 tiles
 
     def stop(word):
@@ -146,7 +146,7 @@ def test_counts_that_differ_from_what_is_found(device):
 
 
 def test_capacity_to_the_instance(device):
-    """Exactly enough is no overflow; one less is, and what is kept fits."""
+    """An exact capacity is no overflow; one less is, and the cut lists fit."""
     gaussians, cam = one_a_tile(device)
     gaussians.log_scales.add_(2.2)  # several tiles each
     projected, counts = run(gaussians, cam)
@@ -181,7 +181,7 @@ def plain(opacities, device, dtype, rule, side=16):
 
 @pytest.mark.parametrize(("inclusive", "weights"), [(True, [0.5, 0.25, 0.125, 0, 0]), (False, [0.5, 0.25, 0, 0, 0])])
 def test_a_transmittance_equal_to_the_stop(device, dtype, inclusive, weights):
-    """Halves to the bit: at the stop itself a pixel is still open, and the next layer is the last or not drawn."""
+    """At the stop itself, to the bit, a pixel is still open, and the next layer is the last or is not blended."""
     rule = dataclasses.replace(EXACT, transmittance_stop=0.25, inclusive_stop=inclusive)
     projected, (rgb, alpha, depth), (sums, maxima) = plain([0.5] * 5, device, dtype, rule)
     assert bool((alpha == sum(weights)).all()) and bool((rgb == sum(weights)).all())
@@ -211,7 +211,7 @@ def test_nothing_is_drawn_behind_a_stop(device, dtype, rule):
 
 
 def test_an_alpha_equal_to_the_cut_or_to_the_most(device, dtype):
-    """The cut itself is drawn; at the largest alpha the opacity still has its gradient, above it has none."""
+    """An alpha at the cut is blended; at the largest alpha the opacity still has its gradient, above it has none."""
     rule = dataclasses.replace(EXACT, alpha_cut=2.0**-8, alpha_max=0.5)
     projected, (_, alpha, _), (_, maxima) = plain([2.0**-8, 2.0**-9, 0.5, 0.75], device, dtype, rule)
     first, second = 2.0**-8, (1 - 2.0**-8) * 0.5
@@ -230,7 +230,7 @@ def test_layers_behind_one_open_pixel(device, dtype):
 
 
 def needles(count, device):
-    """Long and round Gaussians of many sizes and opacities, from a fraction of a pixel to the whole picture."""
+    """Long and round Gaussians of many sizes and opacities, from a fraction of a pixel to the whole image."""
     gaussians = cloud(count, torch.float32, device)
     generator = torch.Generator().manual_seed(4)
     gaussians.log_scales[:] = torch.rand(count, 3, generator=generator) * 5.5 - 6.5
@@ -240,7 +240,7 @@ def needles(count, device):
 
 @pytest.mark.parametrize("rule", ["exact", "gsplat", "inria"])
 def test_all_three_passes_draw_the_same_pixels(device, dtype, rule):
-    """A colour's gradient is its Gaussian's contribution, and colours times contributions add up to the picture."""
+    """A colour's gradient is its Gaussian's contribution, and colours times contributions add up to the image."""
     gaussians, cam = needles(400, device), camera(70, 50, cameras=1, dtype=dtype, device=device)
     gaussians.log_scales[:100] = -2.9  # about 3 sigma times 10 px to the edge of a square, which alpha passes by a row
     gaussians = Gaussians(**{n: t.to(dtype) for n, t in gaussians.tensors().items()})
@@ -261,7 +261,7 @@ def test_all_three_passes_draw_the_same_pixels(device, dtype, rule):
 @pytest.mark.parametrize("tile_size", [8, 16])
 @pytest.mark.parametrize("rule", ["exact", "gsplat", "inria"])
 def test_blocks_that_are_left_out_draw_nothing(rule, tile_size):
-    """CUDA asks for each block of 8 x 4 pixels what the CPU asks for rows: but for alphas at the cut the pictures agree."""
+    """CUDA skips blocks of 8 x 4 pixels where the CPU skips strips: except for alphas at the cut the images agree."""
     rule = dataclasses.replace(RULES[rule], transmittance_stop=0.0)
     found = []
     for device in ("cpu", "cuda:0"):
@@ -283,7 +283,7 @@ def test_blocks_that_are_left_out_draw_nothing(rule, tile_size):
 @pytest.mark.cuda
 @pytest.mark.parametrize("tile_size", [8, 16])
 def test_blocks_at_needles_far_longer_than_the_picture(tile_size):
-    """Needles with half widths up to 70,000 px: the same pixels are drawn as on the CPU, where no block is left out."""
+    """Needles with half widths up to 70,000 px: the same pixels are covered as on the CPU, which leaves out no block."""
     found = []
     for device in ("cpu", "cuda:0"):
         gaussians, cam = needles(300, device), camera(150, 110, cameras=2, dtype=torch.float32, device=device)

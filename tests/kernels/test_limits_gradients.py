@@ -41,7 +41,7 @@ def test_coefficients_that_are_stored_and_not_used(device, degree, stored):
 
 
 def of_records(projected, made, rule, only_rgb, deterministic=True, **size):
-    """Gradient of the records, in fresh memory full of NaN."""
+    """Return the gradient of the projected Gaussians, in fresh memory full of NaN."""
     record = projected.detach().requires_grad_()
     black = torch.zeros(len(projected), 3, dtype=projected.dtype, device=projected.device)
     with Filled(math.nan, 0):
@@ -76,7 +76,7 @@ def test_every_row_of_the_gradient_is_written(device, only_rgb, deterministic):
 
 @pytest.mark.parametrize("extra", [1, 3, 40])
 def test_slots_of_no_tile_add_nothing(device, dtype, extra):
-    """Room that was counted and not needed: the same gradients."""
+    """Capacity that was counted and not needed does not change the gradients."""
     size = {"width": 96, "height": 80}
     gaussians, cam = cloud(61, dtype, device), camera(**size, cameras=1, dtype=dtype, device=device)
     projected, counts = run(gaussians, cam)
@@ -99,13 +99,13 @@ def test_layers_that_draw_nothing_have_no_gradient(device, dtype):
 
 
 def test_contributions_count_the_pixels_of_the_picture(device, dtype):
-    """Of a tile that is larger than it, the first instance too."""
+    """In a tile with more instances than a chunk, the first instance has its gradient, too."""
     _, _, (sums, _) = plain([0.25, 0.5, 0.5], device, dtype, EXACT, side=3)
     assert sums.tolist() == [[9 * 0.25, 9 * 0.375, 9 * 0.1875]]
 
 
 def test_a_first_layer_behind_the_stop(device, dtype):
-    """Where one layer is already too much, nothing is drawn, and nothing has a gradient."""
+    """Where one layer already crosses the stop, nothing is blended, and nothing has a gradient."""
     rule = dataclasses.replace(EXACT, transmittance_stop=0.6, inclusive_stop=False)
     projected, (rgb, alpha, depth), (sums, _) = plain([0.5, 0.1], device, dtype, rule)
     assert not bool(alpha.any()) and not bool(sums.any())
@@ -130,7 +130,7 @@ def test_depth_where_every_weight_is_zero(device, dtype):
 
 @pytest.mark.parametrize("count", [255, 256, 257])
 def test_as_many_gaussians_as_a_block_has_threads(device, count):
-    """And one more or fewer: each is listed and has its gradient."""
+    """With one more or fewer, too, each is listed and has its gradient."""
     gaussians, cam = facing(count, device=device)
     gaussians.logit_opacities[:] = -4.0
     projected, counts = run(gaussians, cam)

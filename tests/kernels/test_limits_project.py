@@ -70,7 +70,7 @@ def test_a_mean_whose_pixel_overflows_is_culled(device, slot):
 
 @pytest.mark.parametrize(("axis", "log_scale"), [(0, 88.0), (1, 88.0), (2, 89.0), (0, 100.0)])
 def test_one_axis_that_overflows_culls(device, axis, log_scale):
-    """In the image, along one side only, or before it comes there."""
+    """The mean lies in the image, beside it along one side, or beyond a corner."""
     gaussians, cam = facing(2, device=device)
     gaussians.log_scales[1, axis] = log_scale
     projected, counts = run(gaussians, cam)
@@ -90,7 +90,7 @@ def test_without_a_filter_a_flat_gaussian_is_culled_and_no_other(device):
 
 
 def test_quaternions_up_to_the_shortest_and_longest(device, dtype):
-    """At the shortest length itself a rotation can be read, not below; as long, the other way."""
+    """The shortest length itself gives a rotation, a shorter one does not; likewise for the longest."""
     gaussians, cam = facing(5, dtype, device)
     shortest = torch.tensor(SHORTEST_QUAT, dtype=dtype)
     gaussians.quats[:, 0] = torch.stack(
@@ -131,7 +131,7 @@ def test_an_opacity_equal_to_the_cut_is_drawn_and_none_is_not(device, dtype):
 
 @pytest.mark.parametrize("logit", [-700.0, -40.0, -3.0, 0.0, 0.7, 3.0, 40.0, 700.0, 1000.0])
 def test_opacities_equal_the_sigmoid(device, logit):
-    """On both sides and far out, in float64, whose exponential overflows beyond 709."""
+    """Both signs are tested far out, in float64, whose exponential overflows beyond 709."""
     gaussians, cam = facing(1, torch.float64, device)
     gaussians.logit_opacities[:] = logit
     found = run(gaussians, cam, dataclasses.replace(SMOOTH, near=0.01))[0][0, 0, 5].cpu()
@@ -154,7 +154,7 @@ def test_factors_of_the_largest_shrink_as_the_scale_grows(device, log_scale):
 
 
 def test_tiles_have_16_px_unless_it_is_said(device):
-    """A picture of 17 px has two columns and two rows of them."""
+    """An image of 17 px has two columns and two rows of them."""
     gaussians, cam = facing(1, device=device, size=17)
     gaussians.log_scales.add_(6.0)
     assert run(gaussians, cam)[1].tolist() == [[4]]
@@ -215,7 +215,7 @@ def test_squares_grow_with_the_longest_axis(device, dtype):
 
 
 def test_no_cut_asks_for_every_tile_however_far(device):
-    """Half sides without a cut cover any picture."""
+    """Half sides without a cut cover any image."""
     gaussians, cam = facing(1, device=device)
     projected, counts = run(gaussians, cam, SMOOTH, window=(0, 0, 16, 16))
     assert bool((projected[0, :, 10:] >= 1e30).all()) and counts.tolist() == [[1]]
@@ -233,7 +233,7 @@ def test_image_and_coefficients_may_be_the_smallest():
 
 @pytest.mark.parametrize("wanted", ["viewmats", "Ks"])
 def test_one_gradient_of_the_camera_may_be_asked_for_alone(device, wanted):
-    """And nothing of it costs nothing: the gradients are None."""
+    """Camera gradients that are not needed are None."""
     gaussians, cam = hand_placed(device=device), camera(cameras=2, device=device)
     views = cam.viewmat.clone().requires_grad_(wanted == "viewmats")
     Ks = cam.K.clone().requires_grad_(wanted == "Ks")
@@ -272,7 +272,7 @@ def test_colours_and_gradients_of_near_gaussians(device):
 
 
 def test_one_gaussian_takes_its_factor(device):
-    """Also where there is only one; half of the opacity, or none."""
+    """It holds for a single Gaussian, too, with half of its opacity, or none."""
     gaussians, cam = facing(1, device=device)
     full = run(gaussians, cam, SMOOTH)[0][0, 0, 5]
     for factor in (0.5, 1.0):
@@ -283,7 +283,7 @@ def test_one_gaussian_takes_its_factor(device):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_unseen_gaussians_have_zero_gradients(device, degree):
-    """In memory full of NaN: rows of every length, seen and unseen among each other, by one camera, both or none."""
+    """Memory full of NaN is overwritten for rows of every length, of Gaussians seen by one camera, both or none."""
     gaussians, cam = cloud(300, torch.float32, device, degree=degree), camera(cameras=2, dtype=torch.float32, device=device)
     gaussians.means[::3, 2] = -4.0
     gaussians.means[130:260, 0] += 2.2

@@ -1,4 +1,4 @@
-"""What the CUDA bodies promise each other: items dealt, tiles ordered, blocks left out, chunks of one size for both passes."""
+"""Contracts between the CUDA bodies: items dealt, tiles ordered, blocks left out, chunks of one size for both passes."""
 
 import functools
 import math
@@ -48,7 +48,7 @@ def small_kernels() -> SimpleNamespace:
         native.source("blend_common.cu", **numbers)
         + """
         Splat s;
-        s.load(splats.data, i);
+        s.load(projected.data, i);
         s.rescale();
         return s.touches(corners.data[2 * i], corners.data[2 * i + 1], limit_of(s.b.y, cut));
         """
@@ -72,7 +72,7 @@ def small_kernels() -> SimpleNamespace:
 
 @pytest.mark.parametrize("fraction", [0.0, 0.3, 0.97, 1.0])
 def test_wanted_items_go_to_the_first_threads(fraction):
-    """In order within their block, whatever number says that they are wanted; -1 for the threads that are left over."""
+    """Wanted items come in order within their block, for any nonzero flag; left-over threads get -1."""
     blocks = 50
     draw = torch.rand(blocks * native.BLOCK, generator=torch.Generator().manual_seed(0))
     wanted = torch.where(draw < fraction, (draw * 1000).int() % 3 + 1, 0).int()
@@ -85,7 +85,7 @@ def test_wanted_items_go_to_the_first_threads(fraction):
 
 
 def at_their_edge(count: int, longest: float, corner: bool):
-    """Records, and for each a block of which one pixel lies at the edge of what it draws; ``longest``: log of the axis [px]."""
+    """Return projected Gaussians, and for each a block with one pixel at its edge; ``longest`` is the log of the axis [px]."""
     generator = torch.Generator().manual_seed(int(longest) + corner)
 
     def rand(*shape):
@@ -112,7 +112,7 @@ def at_their_edge(count: int, longest: float, corner: bool):
 @pytest.mark.parametrize("corner", [False, True], ids=["any pixel", "corners"])
 @pytest.mark.parametrize("longest", [5.0, 11.5, 15.5])
 def test_no_block_that_draws_is_left_out(longest, corner):
-    """Of Gaussians as round as a pixel and as long as 3 million, at the very edge of what they draw, in float64."""
+    """No block is left out of Gaussians as round as a pixel or as long as 3 million, at their very edge in float64."""
     records, corners = at_their_edge(200_000, longest, corner)
     mx, my, u11, u12, u22, opacity = (t[:, None, None] for t in records.double().unbind(1)[:6])
     dx = corners[:, 0, None, None].double() + torch.arange(8) + 0.5 - mx
@@ -126,7 +126,7 @@ def test_no_block_that_draws_is_left_out(longest, corner):
 
 
 def test_chunks_are_the_larger_ones_in_large_pictures_and_without_an_order():
-    """Both passes ask the same function."""
+    """Both passes take the chunk from the same function."""
     few, many = (SimpleNamespace(ranges=torch.zeros(count, 2)) for count in (4096, 4097))
     assert [blend_cuda.chunk_of(tiles, order) for tiles in (few, many) for order in (True, False)] == [64, 128, 128, 128]
 

@@ -37,7 +37,7 @@ def inverse_of(factor):
     return U.transpose(-1, -2) @ U
 
 
-def test_record_equals_reference(device, dtype):
+def test_values_equal_reference(device, dtype):
     """Mean, factor, opacity, colour and depth of every Gaussian, also of those outside the image."""
     gaussians, cam = hand_placed(dtype, device), camera(cameras=3, dtype=dtype, device=device)
     projected, counts = run(gaussians, cam, SMOOTH)
@@ -51,7 +51,7 @@ def test_record_equals_reference(device, dtype):
 
 
 def test_gradients_equal_reference(device, dtype):
-    """Gradients of a random projection of the record, for Gaussians, poses and intrinsics."""
+    """Gradients of a random weighting of the results, for Gaussians, poses and intrinsics."""
     gaussians, cam = leaves(hand_placed(dtype, device)), camera(cameras=2, dtype=dtype, device=device)
     views, Ks = cam.viewmat.clone().requires_grad_(), cam.K.clone().requires_grad_()
     projected, _ = project(*gaussians.tensors().values(), views, Ks, width=cam.width, height=cam.height, degree=3, rule=SMOOTH)
@@ -109,7 +109,7 @@ def test_rotation_has_no_radial_gradient(device):
 @pytest.mark.parametrize("slot", ["means", "quats", "log_scales", "logit_opacities", "sh"])
 @pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf])
 def test_poisoned_gaussian_is_no_op(device, slot, poison):
-    """A Gaussian with one non-finite number is culled: zero record, zero gradient, its neighbours untouched bit for bit."""
+    """A Gaussian with one non-finite number is culled: zero results, zero gradient, its neighbours untouched bit for bit."""
     clean, cam = cloud(8, device=device), camera(cameras=1, dtype=torch.float32, device=device)
     cut = Gaussians(**{n: torch.cat([t[:3], t[4:]]) for n, t in clean.tensors().items()})
     for column in range(clean.tensors()[slot][0].numel()):
@@ -136,7 +136,7 @@ def test_zero_quaternion_is_culled(device, dtype):
 
 @pytest.mark.parametrize("z", [-1.0, 0.0, -0.0, 1e-30, 0.01, 1e10, 1e30])
 def test_near_plane(device, z):
-    """Drawn from the near plane on up to FAR, culled before it, one float apart; gradients finite everywhere."""
+    """Rendered from the near plane on up to FAR, culled before it, one float apart; gradients finite everywhere."""
     gaussians, cam = cloud(3, device=device), camera(cameras=1, dtype=torch.float32, device=device)
     near = torch.tensor(EXACT.near, dtype=torch.float32)
     gaussians.log_scales[:] = math.log(min(max(abs(z), 1e-3), FAR))
@@ -152,7 +152,7 @@ def test_near_plane(device, z):
 
 @pytest.mark.parametrize("log_scale", [-200.0, -50.0, -44.0, -10.0, 0.0, 10.0, 40.0, 44.4, 88.0, 88.8, 200.0])
 def test_extreme_scales_stay_finite(device, dtype, log_scale):
-    """Any finite scale is drawn or culled; up to e^40 it is drawn; record and gradients are finite."""
+    """Any finite scale is rendered or culled; up to e^40 it is rendered; results and gradients are finite."""
     gaussians, cam = cloud(3, dtype, device), camera(cameras=1, dtype=dtype, device=device)
     for axis in range(3):
         gaussians.log_scales[1] = -2.0

@@ -50,7 +50,7 @@ def test_values_equal_scipy(device, dtype, degree):
 
 
 def test_each_basis_function_equals_scipy(device):
-    """The same for one coefficient at a time, so that none hides behind another."""
+    """One coefficient at a time gives its basis function, so that none hides behind another."""
     coefficients, dirs, viewmats = inputs(torch.float64, device)
     basis = basis_reference(dirs)
     for k in range(16):

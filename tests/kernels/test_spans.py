@@ -1,4 +1,4 @@
-"""Which rows, columns and strips a Gaussian's box and ellipse touch: the shared functions themselves, against a fine search."""
+"""The functions for rows, columns and strips that a Gaussian touches, against a fine search."""
 
 import functools
 import math
@@ -74,7 +74,7 @@ def ellipses(origin=16, size=53, tile_size=16, far=1.0) -> torch.Tensor:
 
 
 def margin_of(center, half):
-    """What the functions promise to allow for rounding [px]."""
+    """Return the margin that the functions promise for rounding [px]."""
     return 0.01 + 2e-6 * (center.abs() + half)
 
 
@@ -89,7 +89,7 @@ def tiles_of(low, high, origin, size, tile_size):
 @pytest.mark.parametrize("far", [1.0, 1e5])
 @pytest.mark.parametrize("tile_size", [1, 16])
 def test_rows_of_tiles_are_those_of_the_box(device, tile_size, far):
-    """All that the box and its margin touch within the window, and no other."""
+    """The rows are those that the box and its margin touch within the window, and no others."""
     cases = ellipses(far=far)
     found = probe(cases, device, tile_size=tile_size)[:, :2]
     low, high = cases[:, 1] - cases[:, 7], cases[:, 1] + cases[:, 7]
@@ -124,7 +124,7 @@ def test_strips_are_those_of_the_ellipse(device, far):
 @pytest.mark.parametrize("far", [1.0, 1e4])
 @pytest.mark.parametrize("tile_size", [1, 16])
 def test_columns_of_tiles_are_those_of_the_ellipse(device, tile_size, far):
-    """In a row of tiles, widened by its margin: all that the ellipse touches, and no other."""
+    """The columns of a row of tiles, widened by its margin, are those that the ellipse touches, and no others."""
     cases = ellipses(far=far, tile_size=tile_size)
     mx, my, u11, u12, u22, reach, half_width, half_height, row = (t[:, None] for t in cases.unbind(-1))
     slack = margin_of(my, half_height)
@@ -189,7 +189,7 @@ def reaches(opacities, cut, square_sigma, xs):
 
 
 def test_reach_is_where_alpha_is_the_cut():
-    """At the reach alpha lies a little below the cut; the box is asked for by 0."""
+    """At the reach alpha is a little below the cut; 0 stands for the whole box."""
     opacities, cut = torch.linspace(0.004, 1.0, 500, dtype=torch.float64), 1 / 255
     found, _ = reaches(opacities, cut, 0.0, torch.zeros(500))
     alpha = opacities * torch.exp(-0.5 * found**2)
@@ -202,7 +202,7 @@ def test_reach_is_where_alpha_is_the_cut():
 
 
 def test_falloff_is_the_exponential():
-    """To the polynomial's 3e-7 where x is small, then to what the rounding of x leaves, down to the bound."""
+    """The error is the polynomial's 3e-7 where x is small, then that of rounding x, down to the bound."""
     x = torch.cat([torch.linspace(0, 152, 400_001), torch.tensor([153.0, 200.0, 1e4, 1e30])])
     _, found = reaches(torch.ones(len(x), dtype=torch.float64), 0.5, 0.0, x)
     error = (found.double() / torch.exp(-0.5 * x.double()).clamp_min(2.0**-110) - 1).abs()

@@ -1,4 +1,4 @@
-"""The bookkeeping of recorded steps, against torch."""
+"""The bookkeeping of captured steps, against torch."""
 
 import math
 
@@ -18,7 +18,7 @@ def rows(device, height=5, width=7, views=3, steps=4) -> list[torch.Tensor]:
 
 @pytest.mark.parametrize("size", [(5, 7), (1, 1), (1, 2), (33, 65)])
 def test_a_step_finds_its_own(device, size):
-    """Rates, settings, camera and photograph by the number of the step, for pictures smaller than a matrix too."""
+    """Learning rates, settings, camera and image follow the number of the step, for images smaller than a matrix, too."""
     given, views = rows(device, *size), torch.tensor([2, 0, 1, 0], device=device)
     for step in range(4):
         counter = torch.tensor([step], device=device)
@@ -27,7 +27,7 @@ def test_a_step_finds_its_own(device, size):
 
 
 def test_nothing_is_written_beside_what_a_step_finds(device):
-    """Pictures larger and smaller than a matrix."""
+    """Image sizes larger and smaller than a matrix."""
     for size in ((5, 7), (1, 1)):
         given, views = rows(device, *size), torch.tensor([2, 0, 1, 0], device=device)
         counter = torch.tensor([1], device=device)
@@ -41,7 +41,7 @@ def test_nothing_is_written_beside_what_a_step_finds(device):
 @pytest.mark.parametrize("stopped", [0, 1, NOT_FINITE])
 @pytest.mark.parametrize("value", [0.25, 0.0, math.nan, math.inf, -math.inf])
 def test_a_step_is_written_down_and_counted_if_it_counts(device, value, stopped):
-    """A loss that is no number stops the burst, what has stopped stays so, and neither is counted."""
+    """A loss that is not finite stops the batch, a stopped batch stays so, and neither step is counted."""
     ends = []
     for f in (end_step, reference.end_step):
         counter, stop = torch.tensor([2], device=device), torch.tensor([stopped], dtype=torch.int32, device=device)

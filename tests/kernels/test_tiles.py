@@ -1,4 +1,4 @@
-"""Binning: every tile that a Gaussian draws in is listed, in depth order, within the budget."""
+"""Binning: every tile that a Gaussian contributes to is listed, in depth order, within the budget."""
 
 import pytest
 import torch
@@ -88,7 +88,7 @@ def test_without_a_cut_every_tile_is_listed(device):
 
 @pytest.mark.parametrize("extra", [1, 3, 40])
 def test_tiles_that_are_counted_and_not_found_are_no_tiles(device, extra):
-    """Room for more than a Gaussian touches, as rounding may count: every slot of it says so, and the lists are the same."""
+    """A count above what a Gaussian touches, as rounding may give, leaves marked slots and the same lists."""
     gaussians, cam = cloud(60, device=device), camera(96, 80, 1, torch.float32, device)
     size = {"width": 96, "height": 80, "rule": EXACT}
     projected, counts = project(*gaussians.tensors().values(), cam.viewmat, cam.K, degree=1, **size)

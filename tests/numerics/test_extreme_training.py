@@ -8,9 +8,9 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from warpgs.pipeline.model.layers import ProtectConfig
 
 from tests.gaussians import cloud
+from tests.pipeline import tables
 from tests.reference.knn import mean_square_distances_reference
 from tests.scenes import photos, priors, ring, seeds
 from warpgs.errors import DataError, NotFiniteError, UsageError
@@ -21,14 +21,15 @@ from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.ssim import differences, ssim
 from warpgs.pipeline.metrics.quantiles import quantiles
 from warpgs.pipeline.model.init import InitConfig, initial_gaussians, initial_points
+from warpgs.pipeline.model.table import Column, DensityUpdate, Table
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LossConfig, photometric_loss
 from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
-from warpgs.pipeline.train.strategies.clone_split import DensityConfig, DensityStats, DensityUpdate, refine
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig, refine
 from warpgs.pipeline.train.strategies.holdout_blocks import HoldoutConfig
 from warpgs.pipeline.train.strategies.importance import ImportanceConfig, normalized
-from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
+from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig, ProtectConfig
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig, geometry_gate, sample_pixels
 from warpgs.pipeline.train.trainer import Trainer, run
 from warpgs.render.rasterize import rasterize
@@ -50,7 +51,7 @@ def taken(views, cloud_, device, steps: int = 3, **more) -> Trainer:
     """A fit after some steps, all of whose numbers are finite."""
     fit = Trainer(views, cloud_, FitConfig(steps=steps, init=POINTS, **more), device)
     for _ in range(steps):
-        assert math.isfinite(fit.advance().loss)
+        assert math.isfinite(fit.advance()[0].loss)
     assert all(bool(torch.isfinite(t).all()) for t in fit.state()[0].values() if t.is_floating_point())
     return fit
 
@@ -131,12 +132,12 @@ def test_cameras_without_extent(device, kind, source):
     density = DensityConfig(start=1, every=1, stop_fraction=1.0)
     init = InitConfig(source=source, random_count=60, max_sh_degree=0)
     fit = Trainer(views, points, FitConfig(steps=4, init=init, density=density), device)
-    assert 0 < fit.extent < math.inf and fit.lrs(0.0)["means"] > 0
+    assert 0 < fit.extent < math.inf and fit.lrs(1)["means"] > 0
     # what stands before the near plane would never be drawn, and never be moved
     assert int(rasterize(fit.gaussians, fit.views[0].camera).visible.sum()) >= 20
-    fit.reset_done = True  # size pruning is on
+    fit.strategy.was_reset = True  # size pruning is on
     for _ in range(4):
-        assert math.isfinite(fit.advance().loss)
+        assert math.isfinite(fit.advance()[0].loss)
     assert len(fit.gaussians) >= 30
 
 
@@ -151,48 +152,52 @@ def test_pruning_everything_leaves_one_and_the_fit_goes_on(device):
 
 
 def test_a_set_of_none_is_legal(device):
-    """No rows: optimizer, refinement and statistics work on nothing."""
+    """No rows: a step, refinement, a change of the set and columns work on nothing."""
     g = cloud(0, device=device)
-    optimizer = Optimizer(g, OptimizerConfig(), 1.0)
-    for t in optimizer.params.values():
-        t.grad = torch.zeros_like(t)
-    optimizer.step(0.0)
-    optimizer.apply(
-        DensityUpdate(torch.zeros(0, dtype=torch.int64, device=device), g.tensors(), torch.zeros(0, dtype=torch.int64))
-    )
-    assert all(t.shape[0] == 0 for t in optimizer.state().values())
+    table = Table.of_gaussians(g, {"seen": Column(0.0)})
+    tables.adam_step(table, {n: torch.zeros_like(t) for n, t in table.params.items()})
+    none = torch.zeros(0, dtype=torch.int64, device=device)
+    table.apply(DensityUpdate(none, g.tensors(), none))
+    change = refine(
+        g, torch.zeros(0, device=device), DensityConfig(prune_opacity=0.0), extent=1.0, capacity=9, after_reset=False,
+        generator=torch.Generator(),
+    )  # fmt: skip
+    assert len(change.keep) == len(change.parents) == len(table) == 0
+    assert all(t.shape[0] == 0 for t in table.state().values())
 
 
 def test_rows_follow_any_chain_of_changes(device):
     """Ten random refinements, the first before any step, some of them empty: every row keeps its moments and its tag."""
     count, generator = 40, torch.Generator().manual_seed(0)
-    optimizer, stats = Optimizer(cloud(count, device=device), OptimizerConfig(), 1.0), DensityStats(count, device)
+    table = Table.of_gaussians(cloud(count, device=device), {"seen": Column(0.0, inherited=False)})
     for event in range(10):
-        rows = len(optimizer.gaussians)
+        rows = len(table)
         tags = torch.arange(rows, dtype=torch.float32, device=device)
-        for group in (optimizer.params, optimizer.means, optimizer.squares):
+        for group in (table.params, table.exp_avg, table.exp_avg_sq):
             for t in group.values():
                 t.detach().copy_((tags + 1000 * event).view(-1, *[1] * (t.ndim - 1)).expand_as(t))
-        stats.seen.copy_(tags)
+        table.columns["seen"].copy_(tags)
         kept = torch.nonzero(torch.rand(rows, generator=generator) < (1.0 if event == 4 else 0.7)).squeeze(1).to(device)
         fresh = cloud(0 if event == 4 else event, device=device, seed=event)
         change = DensityUpdate(kept, fresh.tensors(), torch.full((len(fresh),), -1, device=device))
-        before = {k: v.clone() for k, v in optimizer.state().items()}
-        optimizer.apply(change)
-        stats.apply(change)
-        for name, t in optimizer.state().items():
-            assert len(t) == len(kept) + len(fresh) == len(stats.seen)
+        before = {k: v.clone() for k, v in table.state().items()}
+        table.apply(change)
+        for name, t in table.state().items():
+            assert len(t) == len(kept) + len(fresh) == len(table)
             assert torch.equal(t[: len(kept)], before[name][kept])
-            if not name.startswith("param"):
+            if not name.startswith("params"):
                 assert not bool(t[len(kept) :].any())
-        assert torch.equal(stats.seen[: len(kept)], tags[kept])
+        assert torch.equal(table.columns["seen"][: len(kept)], tags[kept])
 
 
 def test_refinement_that_changes_nothing_changes_no_bit(device):
     """Nothing pulled at and nothing faint: all rows stay, with their moments."""
     g = cloud(30, device=device)
     g.logit_opacities[:] = 1.0
-    change = refine(g, DensityStats(30, device), DensityConfig(), extent=1.0, after_reset=False, generator=torch.Generator())
+    change = refine(
+        g, torch.zeros(30, device=device), DensityConfig(), extent=1.0, capacity=100, after_reset=False,
+        generator=torch.Generator(),
+    )  # fmt: skip
     assert torch.equal(change.keep.cpu(), torch.arange(30)) and len(change.parents) == 0
 
 
@@ -226,9 +231,9 @@ def poison(fit: Trainer, name: str, where: str, value: float) -> None:
             gradient[0] = value
             return gradient
 
-        fit.optimizer.params[name].register_hook(spoil)
+        fit.table.params[name].register_hook(spoil)
     else:
-        fit.optimizer.params[name].detach()[0] = value
+        fit.table.params[name].detach()[0] = value
 
 
 @pytest.mark.parametrize(
@@ -252,15 +257,17 @@ def test_what_is_no_number_is_never_saved(device, tmp_path, name, where, value):
     def on_step(report) -> None:
         assert math.isfinite(report.loss)
 
-    original = fit.burst
+    original = fit.advance
 
-    def burst(limit: int):
+    def advance(limit: int):
         if fit.step == 3:
             poison(fit, name, where, value)
         return original(limit)
 
-    fit.burst = burst
-    with pytest.raises(NotFiniteError, match=rf"(param|mean|square)\.{name} holds numbers that are not finite.*--resume"):
+    fit.advance = advance
+    with pytest.raises(
+        NotFiniteError, match=rf"(params|exp_avg|exp_avg_sq)\.{name} holds numbers that are not finite.*--resume"
+    ):
         run(fit, on_step, save, lambda: False)
     tensors, state = load_checkpoint(tmp_path)
     assert saved == [2] and state["step"] == 2
@@ -349,7 +356,8 @@ KINDS = [
 ]  # fmt: skip
 SHORT = FitConfig(
     steps=4, init=InitConfig(source="points", max_sh_degree=1), sh_every=2, phases=PhaseConfig(coarse=1, every=1),
-    density=DensityConfig(start=1, every=2, stop_fraction=1.0, gradient=1e-6, max_gaussians=200),
+    density=DensityConfig(start=1, every=2, stop_fraction=1.0, gradient=1e-6),
+    max_gaussians=200, strategy="importance_sampling",
     method=MethodConfig(events=True, hier=True, pm=False, sampler=SamplerConfig(min_alpha=0.01)),
 )  # fmt: skip
 
@@ -397,11 +405,11 @@ def test_a_setting_is_refused_or_works(kind):
                 continue
             fit = Trainer(views, points, config, torch.device("cpu"), priors=known)
             for _ in range(2):
-                assert math.isfinite(fit.advance().loss), (field.name, value)
-            fit.optimizer.cap_opacity(config.density.reset_opacity)
-            fit.reset_done = True
-            assert math.isfinite(fit.advance().loss), (field.name, value)
-            for name, t in fit.optimizer.state().items():
+                assert math.isfinite(fit.advance()[0].loss), (field.name, value)
+            fit.table.reset_opacities(config.density.reset_opacity)
+            fit.strategy.was_reset = True
+            assert math.isfinite(fit.advance()[0].loss), (field.name, value)
+            for name, t in fit.table.state().items():
                 assert bool(torch.isfinite(t).all()), (field.name, value, name)
     assert refused > 0
 
@@ -431,7 +439,7 @@ def test_masks_that_leave_nothing_or_one_pixel(device, fraction, masked):
     generator = torch.Generator().manual_seed(0)
     image, target = torch.rand(2, 12, 13, 3, generator=generator).to(device)
     leaf = image.requires_grad_()
-    loss = photometric_loss(leaf, target, mask, LossConfig(ssim_weight=fraction))
+    loss = photometric_loss(leaf, target, mask, fraction)
     loss.backward()
     assert math.isfinite(float(loss.detach())) and bool(torch.isfinite(leaf.grad).all())
     moved = torch.nonzero(leaf.grad.abs().sum(-1)).tolist()

@@ -88,13 +88,13 @@ def test_a_side_stream_gives_the_same_bits():
 
 PROCESS = """
 import hashlib, torch
-from tests.scenes import photographs
-from warpgs.pipeline.config import FitConfig
+from tests.scenes import photos
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.pipeline.init import InitConfig
 torch.set_num_threads({threads})
 config = FitConfig(steps=12, seed=5, dropout=0.1, init=InitConfig(source="random", random_count=300))
-fit = Trainer(photographs(3), None, config, torch.device("cpu"))
+fit = Trainer(photos(3), None, config, torch.device("cpu"))
 for _ in range(12):
     fit.advance()
 digest = hashlib.sha256()

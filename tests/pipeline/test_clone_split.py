@@ -1,4 +1,4 @@
-"""Clone, split and prune, and the optimizer's rows that must follow."""
+"""Clone, split and prune, and how fast scales may change meanwhile."""
 
 import math
 
@@ -8,20 +8,15 @@ import torch
 from tests.gaussians import cloud
 from warpgs.errors import UsageError
 from warpgs.pipeline.train.schedule import OptimizerConfig
-from warpgs.pipeline.train.strategies.clone_split import DensityConfig, DensityStats, DensityUpdate, refine
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig, refine
 from warpgs.scene import Gaussians
 
 
-def stats_of(pull: list[float]) -> DensityStats:
-    stats = DensityStats(len(pull), torch.device("cpu"))
-    stats.gradient[:] = torch.tensor(pull)
-    stats.seen[:] = 1
-    return stats
-
-
-def run(gaussians, pull, config=DensityConfig(), after_reset=False, seed=0):  # noqa: B008
-    generator = torch.Generator().manual_seed(seed)
-    return refine(gaussians, stats_of(pull), config, extent=1.0, after_reset=after_reset, generator=generator)
+def run(gaussians, pull, config=DensityConfig(), after_reset=False, seed=0, capacity=1000):  # noqa: B008
+    generator, pull = torch.Generator().manual_seed(seed), torch.tensor(pull, dtype=torch.float32)
+    return refine(
+        gaussians, pull, config, extent=1.0, capacity=capacity, after_reset=after_reset, generator=generator
+    )  # fmt: skip
 
 
 def gaussians_of(scales: list[float], opacities: list[float]) -> Gaussians:
@@ -50,7 +45,7 @@ def test_children_lie_where_their_parent_does():
     g.quats[:] = 3 * torch.tensor([math.cos(math.pi / 6), 0, 0, math.sin(math.pi / 6)])
     g.log_scales[:] = torch.log(torch.tensor([0.5, 0.1, 0.2]))
     g.logit_opacities[:] = 2.0
-    children = run(g, [1.0] * count).added["means"].double()
+    children = run(g, [1.0] * count, capacity=2 * count).added["means"].double()
     offsets = children - torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
     c, s = 0.5, math.sqrt(0.75)
     turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
@@ -62,9 +57,9 @@ def test_children_lie_where_their_parent_does():
 def test_the_cap_lets_only_the_strongest_grow():
     """With room for one, the most pulled Gaussian is cloned; with none, nothing is."""
     g = gaussians_of([0.005] * 4, [0.5] * 4)
-    change = run(g, [1.0, 3.0, 2.0, 0.0], DensityConfig(max_gaussians=5))
+    change = run(g, [1.0, 3.0, 2.0, 0.0], capacity=5)
     assert torch.equal(change.added["means"], g.means[1:2])
-    assert len(run(g, [1.0] * 4, DensityConfig(max_gaussians=4)).added["means"]) == 0
+    assert len(run(g, [1.0] * 4, capacity=4).added["means"]) == 0
 
 
 def test_huge_ones_go_only_after_a_reset():
@@ -86,38 +81,7 @@ def test_same_seed_same_children():
     assert torch.equal(a, b) and not torch.equal(a, c)
 
 
-def test_optimizer_rows_follow():
-    """Survivors keep parameters and moments bit for bit, new rows start with zero moments."""
-    optimizer = Optimizer(cloud(5), OptimizerConfig(), 1.0)
-    for t in optimizer.params.values():
-        t.grad = torch.randn(t.shape, generator=torch.Generator().manual_seed(1))
-    optimizer.step(0.0)
-    before = {k: v.clone() for k, v in optimizer.state().items()}
-    keep = torch.tensor([0, 3, 4])
-    added = {n: t[:2] + 1 for n, t in cloud(5).tensors().items()}
-    optimizer.apply(DensityUpdate(keep, added, torch.full((2,), -1)))
-    after = optimizer.state()
-    for name in added:
-        assert torch.equal(after[f"params.{name}"][:3], before[f"params.{name}"][keep])
-        assert torch.equal(after[f"params.{name}"][3:], added[name])
-        for kind in ("mean", "square"):
-            assert torch.equal(after[f"{kind}.{name}"][:3], before[f"{kind}.{name}"][keep])
-            assert bool(before[f"{kind}.{name}"].any()) and not bool(after[f"{kind}.{name}"][3:].any())
-    assert all(t.requires_grad and t.is_leaf for t in optimizer.params.values())
-
-
-def test_opacity_reset_caps_and_forgets():
-    """No opacity stays above the cap, lower ones stay, and opacity moments are zero."""
-    optimizer = Optimizer(gaussians_of([0.1] * 2, [0.9, 0.004]), OptimizerConfig(), 1.0)
-    optimizer.params["logit_opacities"].grad = torch.ones(2)
-    optimizer.step(0.0)
-    optimizer.cap_opacity(0.01)
-    opacities = optimizer.params["logit_opacities"].detach().sigmoid()
-    assert abs(float(opacities[0]) - 0.01) < 1e-6 and float(opacities[1]) < 0.0045
-    assert not bool(optimizer.means["logit_opacities"].any()) and not bool(optimizer.squares["logit_opacities"].any())
-
-
-@pytest.mark.parametrize("bad", [{"every": 0}, {"start": -1}, {"stop_fraction": 1.5}, {"max_gaussians": 0}])
+@pytest.mark.parametrize("bad", [{"every": 0}, {"start": -1}, {"stop_fraction": 1.5}, {"reset_opacity": 0}])
 def test_bad_settings_are_refused(bad):
     """A setting that cannot work is an error at once."""
     with pytest.raises(UsageError):
@@ -127,28 +91,22 @@ def test_bad_settings_are_refused(bad):
 def test_protected_are_not_pruned_and_only_the_growing_grow():
     """Two faint ones, one of them protected; two that are pulled at, one of which may grow."""
     gaussians = gaussians_of([0.1] * 4, [0.001, 0.001, 0.5, 0.5])
-    stats = DensityStats(4, torch.device("cpu"))
-    stats.gradient[2:], stats.seen[:] = 1.0, 1.0
+    pull = torch.tensor([0.0, 0, 1, 1])
     change = refine(
-        gaussians, stats, DensityConfig(clone_size=1.0), extent=1.0, after_reset=False, generator=torch.Generator(),
+        gaussians, pull, DensityConfig(clone_size=1.0), extent=1.0, capacity=100, after_reset=False,
+        generator=torch.Generator(),
         growing=torch.tensor([True, True, True, False]), protected=torch.tensor([True, False, False, False]),
     )  # fmt: skip
     assert change.keep.tolist() == [0, 2, 3] and change.parents.tolist() == [2]
 
 
-def test_statistics_follow_rows():
-    """What is known of a row that stays stays with it; of new rows nothing is known."""
-    stats = DensityStats(3, torch.device("cpu"))
-    stats.gradient[:], stats.seen[:] = torch.tensor([1.0, 2, 3]), torch.tensor([4.0, 5, 6])
-    stats.apply(DensityUpdate(torch.tensor([2, 0]), {}, torch.tensor([-1])))
-    assert stats.gradient.tolist() == [3, 1, 0] and stats.seen.tolist() == [6, 4, 0]
-
-
 def test_rates_of_scales_may_fall():
     """Log-linear to the share that is left at the last step, from where the set settles; level where nothing is asked for."""
-    gaussians = cloud(3)
-    falling = Optimizer(gaussians, OptimizerConfig(scales_lr=0.1, scales_decay=0.01), 1.0)
-    assert [falling.lrs(p)["log_scales"] for p in (0.0, 0.5, 1.0)] == pytest.approx([0.1, 0.01, 0.001])
-    late = Optimizer(gaussians, OptimizerConfig(scales_lr=0.1, scales_decay=0.01), 1.0, stable_start=0.5)
-    assert [late.lrs(p)["log_scales"] for p in (0.0, 0.5, 0.75, 1.0)] == pytest.approx([0.1, 0.1, 0.01, 0.001])
-    assert Optimizer(gaussians, OptimizerConfig(scales_lr=0.1), 1.0).lrs(1.0)["log_scales"] == pytest.approx(0.1)
+    falling = OptimizerConfig(scales_lr=0.1, scales_decay=0.01)
+
+    def lrs(stable_start: float, *progress: float) -> list[float]:
+        return [falling.lrs(p, 1.0, stable_start)["log_scales"] for p in progress]
+
+    assert lrs(0.0, 0.0, 0.5, 1.0) == pytest.approx([0.1, 0.01, 0.001])
+    assert lrs(0.5, 0.0, 0.5, 0.75, 1.0) == pytest.approx([0.1, 0.1, 0.01, 0.001])
+    assert OptimizerConfig(scales_lr=0.1).lrs(1.0, 1.0)["log_scales"] == pytest.approx(0.1)

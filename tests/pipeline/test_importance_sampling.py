@@ -1,4 +1,4 @@
-"""The method's parts in a fit: phases, layers, protection, room, and every combination of switches."""
+"""The method's parts in a fit: phases, layers, protection, capacity, and every combination of switches."""
 
 import dataclasses
 import itertools
@@ -6,16 +6,25 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from warpgs.pipeline.model.layers import COARSE, FINE, Layers, ProtectConfig
 
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig, initial_points
+from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
-from warpgs.pipeline.train.strategies.clone_split import DensityConfig, DensityUpdate
-from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig, sample_view, sampling_event
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.strategies.importance_sampling import (
+    COARSE,
+    FINE,
+    NOT_SAMPLED,
+    Event,
+    MethodConfig,
+    ProtectConfig,
+    sample_view,
+    sampling_event,
+)
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.rasterize import RasterizeOptions
@@ -27,7 +36,8 @@ METHOD = MethodConfig(
 )
 CONFIG = FitConfig(
     steps=40, sh_every=10, dropout=0.2, init=InitConfig(source="points", max_sh_degree=1),
-    density=DensityConfig(start=2, every=8, gradient=1e-5), phases=PhaseConfig(8, 12, every=5), method=METHOD,
+    density=DensityConfig(start=2, every=8, gradient=1e-5), phases=PhaseConfig(8, 12, every=5),
+    strategy="importance_sampling", method=METHOD,
 )  # fmt: skip
 
 
@@ -37,6 +47,22 @@ def fitted(config: FitConfig = CONFIG, steps: int | None = None, size: tuple[int
     for _ in range(config.steps if steps is None else steps):
         fit.advance()
     return fit
+
+
+def grown(fit: Trainer, keep: int | list[int], parents: list[int], **more) -> DensityUpdate:
+    """A change that keeps some rows and appends copies of the first row, grown from these parents."""
+    rows = torch.tensor(range(keep) if isinstance(keep, int) else keep)
+    added = {n: t[:1].expand(len(parents), *t.shape[1:]) for n, t in fit.gaussians.tensors().items()}
+    return DensityUpdate(rows, added, torch.tensor(parents), **more)
+
+
+def event_of(fit: Trainer, views, method: MethodConfig, step: int) -> Event:
+    """A sampling event on some views that is not applied."""
+    protected = fit.strategy.is_protected(step) & method.pm
+    return sampling_event(
+        fit.gaussians, fit.strategy.fine, protected, views, method, step=step, capacity=10_000,
+        options=RasterizeOptions(background=torch.zeros(3)), generator=torch.Generator().manual_seed(0),
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("length, count", [(5000, 21), (25_000, 102)])
@@ -57,25 +83,36 @@ def test_short_fit_has_all_phases():
 
 
 def test_protected_gaussian_survives_its_protection_and_no_step_longer():
-    """An opacity pushed down every step stays at the floor for T_protect steps after birth, then falls."""
-    config, layers = ProtectConfig(steps=5), Layers(2, CPU)
-    layers.apply(DensityUpdate(torch.arange(2), {}, torch.tensor([-1])), level=FINE, created_step=7)
-    logits = torch.full((3,), -10.0)
+    """An opacity pushed down every step stays at the least for T_protect steps after the event, then falls.
+
+    In a step that is not taken nothing changes.
+    """
+    config = dataclasses.replace(CONFIG, method=dataclasses.replace(METHOD, protect=ProtectConfig(steps=5)))
+    fit = fitted(config, steps=0)
+    fit.table.apply(grown(fit, 2, [-1], columns={"level": FINE, "created_step": 7}))
+    logits, going = fit.table.params["logit_opacities"].detach(), torch.ones(1, dtype=torch.bool)
     for step in range(8, 16):
-        layers.clamp_min_opacity(logits, step, config)
-        held = float(logits[2]) == pytest.approx(config.logit)
-        assert held == (step <= 12) and bool(layers.is_protected(step, config)[2]) == (step <= 12)
+        logits[:] = -10.0
+        settings = torch.tensor([0.0, step, 0.0])
+        fit.strategy.after_step(fit.strategy.phase(step), settings, ~going)
+        assert logits.tolist() == [-10.0] * 3
+        fit.strategy.after_step(fit.strategy.phase(step), settings, going)
+        held = float(logits[2]) == pytest.approx(fit.strategy.method.protect.logit)
+        assert held == (step <= 12) and bool(fit.strategy.is_protected(step)[2]) == (step <= 12)
         assert logits[:2].tolist() == [-10.0, -10.0]
-        logits[2] = -10.0
 
 
 def test_children_are_as_old_as_their_parent():
-    """Rows that grew from another take its layer and birth; sampled rows have their own."""
-    layers = Layers(2, CPU)
-    layers.apply(DensityUpdate(torch.tensor([0, 1]), {}, torch.tensor([-1, -1])), level=FINE, created_step=3)
-    layers.apply(DensityUpdate(torch.tensor([1, 2]), {}, torch.tensor([3, 0])), level=COARSE)
-    assert layers.level.tolist() == [COARSE, FINE, FINE, COARSE]
-    assert layers.created_step[1:3].tolist() == [3, 3] and int(layers.created_step[3]) < -(10**8)
+    """Rows that grew from another take its layer and age; sampled rows have their own; of gradients nothing is known."""
+    fit = fitted(steps=0)
+    for name in ("grad_sum", "seen_count"):
+        fit.table.columns[name] += 1
+    fit.table.apply(grown(fit, 2, [-1, -1], columns={"level": FINE, "created_step": 3}))
+    fit.table.apply(grown(fit, [1, 2], [3, 0]))
+    columns = fit.table.columns
+    assert columns["level"].tolist() == [COARSE, FINE, FINE, COARSE]
+    assert columns["created_step"].tolist() == [NOT_SAMPLED, 3, 3, NOT_SAMPLED] and NOT_SAMPLED < -(10**8)
+    assert columns["grad_sum"].tolist() == columns["seen_count"].tolist() == [1, 0, 0, 0]
 
 
 def test_coarse_layer_is_stable_and_fine_layer_grows():
@@ -83,14 +120,15 @@ def test_coarse_layer_is_stable_and_fine_layer_grows():
     fit = fitted(steps=8)
     before = fit.gaussians.means.clone()
     coarse = int((~fit.strategy.fine).sum())
-    assert len(fit.strategy.events) == 1 and fit.strategy.events[0]["step"] == 8 and fit.strategy.events[0]["added"] == int(fit.strategy.fine.sum()) > 0
+    (event,) = fit.strategy.events
+    assert event["step"] == 8 and event["added"] == int(fit.strategy.fine.sum()) > 0
     fit.advance()
     moved = (fit.gaussians.means - before).abs().amax(1)
-    lr = fit.lrs(8 / 39)["means"]
+    lr = fit.lrs(9)["means"]
     assert float(moved[~fit.strategy.fine].max()) < 0.11 * 3 * lr < float(moved[fit.strategy.fine].max())
     while fit.step < 40:
         fit.advance()
-    assert int((~fit.strategy.fine).sum()) <= coarse and int(fit.strategy.fine.sum()) > fit.strategy.events[0]["added"]
+    assert int((~fit.strategy.fine).sum()) <= coarse and int(fit.strategy.fine.sum()) > event["added"]
     assert [e["step"] for e in fit.strategy.events] == list(fit.phases.events)
 
 
@@ -98,10 +136,14 @@ def test_phase_three_leaves_the_set_alone():
     """From the end of phase 2 on rows neither come nor go."""
     fit = fitted(steps=29)
     count = len(fit.gaussians)
-    created_steps = fit.layers.created_step.clone()
+    created_steps = fit.table.columns["created_step"].clone()
     for _ in range(11):
         fit.advance()
-    assert fit.phases.stable_start == 28 and len(fit.gaussians) == count and torch.equal(fit.layers.created_step, created_steps)
+    assert (
+        fit.phases.stable_start == 28
+        and len(fit.gaussians) == count
+        and torch.equal(fit.table.columns["created_step"], created_steps)
+    )
 
 
 def test_full_fine_layer_frees_its_least_contributors():
@@ -111,12 +153,9 @@ def test_full_fine_layer_frees_its_least_contributors():
     method = dataclasses.replace(
         METHOD, sampler=dataclasses.replace(METHOD.sampler, max_fraction=cap / int((~fit.strategy.fine).sum()))
     )
-    arguments = {
-        "room": 10_000, "rule": "exact", "background": torch.zeros(3), "generator": torch.Generator().manual_seed(0)
-    }  # fmt: skip
-    is_protected = sampling_event(fit.gaussians, fit.layers, fit.views, method, step=9, **arguments)
-    assert is_protected.evicted == 0 and len(is_protected.change.parents) == 0
-    old = sampling_event(fit.gaussians, fit.layers, fit.views, method, step=500, **arguments)
+    protected = event_of(fit, fit.views, method, 9)
+    assert protected.evicted == 0 and len(protected.change.parents) == 0
+    old = event_of(fit, fit.views, method, 500)
     assert old.evicted == len(old.change.parents) == cap
     assert bool((~fit.strategy.fine)[old.change.keep].all())
 
@@ -144,7 +183,9 @@ def test_continued_fit_with_all_parts_equals_uninterrupted_one(tmp_path):
     while resumed.step < 40:
         resumed.advance()
     a, b = straight.state()[0], resumed.state()[0]
-    assert a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a) and straight.events == resumed.events
+    assert (
+        a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a) and straight.strategy.events == resumed.strategy.events
+    )
 
 
 def test_settings_travel_through_json():
@@ -168,10 +209,7 @@ def test_fine_gaussians_stand_at_confirmed_depths(reliable):
         ra=reliable,
         sampler=SamplerConfig(depth="consistent", fraction=0.2, gate_quantile=0, max_fraction=50, min_alpha=0.05),
     )
-    event = sampling_event(
-        fit.gaussians, fit.layers, views, method, step=9, capacity=10_000, rule="exact", background=torch.zeros(3),
-        generator=torch.Generator().manual_seed(0),
-    )  # fmt: skip
+    event = event_of(fit, views, method, 9)
     columns = event.views[0].at[:, 1]
     points = event.change.added["means"]
     z = points @ view.camera.viewmat[2, :3] + view.camera.viewmat[2, 3]
@@ -195,10 +233,10 @@ def test_unknown_semantics_leave_the_weights_to_the_others():
 
 def test_dropout_falls_with_the_number_of_views():
     """Full up to `dropout_views` training views, then in proportion; it grows over the fit from 0."""
-    few = Trainer(photos(3), seeds(), dataclasses.replace(CONFIG, method=MethodConfig()), CPU)
-    many = Trainer(photos(6), seeds(), dataclasses.replace(CONFIG, method=MethodConfig()), CPU)
+    plain = dataclasses.replace(CONFIG, strategy="clone_split", method=MethodConfig())
+    few, many = (Trainer(photos(n), seeds(), plain, CPU) for n in (3, 6))
     assert few.dropout == pytest.approx(0.2) and many.dropout == pytest.approx(0.1)
-    assert few._settings(1) == (0, 1) and few._settings(40) == (pytest.approx(0.2), 40)
+    assert few.strategy.dropout(1) == 0 and few.strategy.dropout(40) == pytest.approx(0.2)
 
 
 def test_auto_start_sweeps_few_views():

@@ -11,12 +11,24 @@ from tests.scenes import photos, priors, seeds
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.train.config import PRESETS, FitConfig
-from warpgs.pipeline.train.loss import FLAT, MIN_ALPHA, LossConfig, depth_disagreement, training_loss
+from warpgs.pipeline.train.loss import (
+    FLAT,
+    MIN_ALPHA,
+    DepthCorrelation,
+    LossConfig,
+    Photometric,
+    Target,
+    built_in_terms,
+    depth_disagreement,
+    photometric_loss,
+)
+from warpgs.pipeline.train.step import total_loss
+from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView, half_size
 from warpgs.render.rasterize import rasterize
-from warpgs.scene import Prior
+from warpgs.scene import Prior, Render
 
 CPU = torch.device("cpu")
 GUIDED = FitConfig(
@@ -113,7 +125,9 @@ def test_depth_term_hides_no_nan():
 def test_depth_term_reaches_the_gaussians():
     """The whole way from means to the term, in float64, against central differences along a random direction."""
     view, prior = photos(1)[0], priors(photos(1))[0]
-    fit = Trainer([view], seeds(), dataclasses.replace(GUIDED, init=InitConfig(source="points", opacity=0.9)), CPU, priors=[prior])
+    fit = Trainer(
+        [view], seeds(), dataclasses.replace(GUIDED, init=InitConfig(source="points", opacity=0.9)), CPU, priors=[prior]
+    )
     tensors = {n: t.double() for n, t in fit.gaussians.tensors().items()}
     disparity = torch.as_tensor(prior.disparity, dtype=torch.float64)
 
@@ -129,14 +143,20 @@ def test_depth_term_reaches_the_gaussians():
     assert abs(slope) > 0.1 and float((gradient * towards).sum()) == pytest.approx(slope, rel=1e-4)
 
 
-def test_training_loss_adds_the_weighted_term():
-    """Photometric alone where no disparity is given."""
+def test_total_loss_is_the_sum_of_terms_and_of_what_the_strategy_adds():
+    """The photometric loss alone without a depth weight, to the bit; then the weighted depth term; then a regularisation."""
     depth, alpha, disparity, mask = maps(torch.float32)
-    rgb, target = torch.rand(2, 9, 11, 3)
-    config = LossConfig(depth_weight=0.25)
-    plain = training_loss((rgb, alpha, depth), target, mask, None, config)
-    both = training_loss((rgb, alpha, depth), target, mask, disparity, config)
+    rgb, image = torch.rand(2, 9, 11, 3)
+    render, target = Render(rgb, alpha, depth, rgb, rgb), Target(image, mask, {"disparity": disparity}, {})
+    strategy = Strategy.__new__(Strategy)
+    plain = total_loss(built_in_terms(LossConfig()), render, target, None, strategy)
+    terms = built_in_terms(LossConfig(depth_weight=0.25, depth_until=0.5))
+    both = total_loss(terms, render, target, None, strategy)
+    assert terms == (Photometric(0.2), DepthCorrelation(0.25, 0.5)) and built_in_terms(LossConfig()) == (Photometric(),)
+    assert torch.equal(plain, photometric_loss(rgb, image, mask))
     assert float(both - plain) == pytest.approx(0.25 * float(depth_disagreement(depth, alpha, disparity, mask)), abs=1e-6)
+    strategy.regularisation = lambda gaussians: torch.tensor(2.0)
+    assert torch.equal(total_loss(terms, render, target, None, strategy), both + 2)
 
 
 def fitted(config: FitConfig, found: list[Prior] | None = None) -> Trainer:
@@ -169,7 +189,7 @@ def test_term_ends_when_it_should():
     for until, same in ((0.0, True), (0.5, False)):
         fit = fitted(dataclasses.replace(GUIDED, loss=LossConfig(depth_weight=0.5, depth_until=until)))
         assert torch.equal(fit.gaussians.means, plain.gaussians.means) == same
-    assert [fit._phase(s).depth_supervised for s in (1, 20, 21, 40)] == [True, True, False, False]
+    assert [len(fit.plan_of(s).terms) for s in (1, 20, 21, 40)] == [2, 2, 1, 1]
 
 
 def test_fit_says_in_which_views_it_has_the_term():
@@ -184,12 +204,15 @@ def test_fit_says_in_which_views_it_has_the_term():
 
 
 def test_half_size_views_keep_their_disparity():
-    """Each pixel has the mean of what it covers."""
+    """Each pixel has the mean of what it covers, whatever channels a map has."""
     view = photos(1)[0]
-    depth_supervised = TrainingView.of(view, CPU).depth_supervised(priors([view])[0])
-    half = half_size(depth_supervised)
-    assert torch.allclose(half.disparity, depth_supervised.disparity.reshape(16, 2, 20, 2).mean((1, 3)), atol=1e-6)
-    assert half_size(TrainingView.of(view, CPU)).disparity is None
+    whole = TrainingView.of(view, CPU)
+    (disparity,) = DepthCorrelation().needs(whole, priors([view])[0]).values()
+    whole = dataclasses.replace(whole, maps={"disparity": disparity, "two": torch.stack([disparity, 1 - disparity], 2)})
+    half = half_size(whole).maps
+    assert torch.allclose(half["disparity"], disparity.reshape(16, 2, 20, 2).mean((1, 3)), atol=1e-6)
+    assert torch.allclose(half["two"][..., 1], 1 - half["disparity"], atol=1e-6) and half["two"].shape == (16, 20, 2)
+    assert half_size(TrainingView.of(view, CPU)).maps == {}
 
 
 @pytest.mark.parametrize(

@@ -53,10 +53,9 @@ def instances(fit: Trainer) -> int:
 
 def measured(fit: Trainer, steps: int) -> int:
     """Bytes that the tensors of a fit take at the heaviest moment of some steps."""
-    o = fit.optimizer
-    views = (t for v in fit.views for t in vars(v).values() if isinstance(t, torch.Tensor))
-    stats = (fit.stats.gradient, fit.stats.seen, fit.layers.level, fit.layers.created_step)
-    with Allocations([*views, *stats, *o.params.values(), *o.means.values(), *o.squares.values()]) as allocations:
+    views = (t for v in fit.views for t in (*vars(v).values(), *v.maps.values()) if isinstance(t, torch.Tensor))
+    stacks = (t for s in fit.stacks.values() for t in (*vars(s).values(), *s.maps.values()) if isinstance(t, torch.Tensor))
+    with Allocations([*views, *stacks, *fit.table.state().values()]) as allocations:
         for _ in range(steps):
             fit.advance()
     return allocations.peak
@@ -100,7 +99,9 @@ def test_plan_covers_sampling_events():
     method = MethodConfig(
         events=True, hier=True, pm=False, sampler=SamplerConfig(fraction=0.01, min_alpha=0.05, max_fraction=0.2)
     )
-    config = dataclasses.replace(STEADY, steps=40, method=method, phases=PhaseConfig(4, 6, every=2))
+    config = dataclasses.replace(
+        STEADY, steps=40, strategy="importance_sampling", method=method, phases=PhaseConfig(4, 6, every=2)
+    )
     fit = Trainer(views, seeds(1500), config, CPU, priors=priors(views))
     for _ in range(6):
         fit.advance()
@@ -145,7 +146,7 @@ def test_fit_keeps_to_its_limit(tmp_path):
     """A limit that forces bands and fewer Gaussians: it is said, kept, and costs no quality."""
     views = photos(4, 160, 120)
     config = dataclasses.replace(
-        STEADY, steps=50, sh_every=25, density=DensityConfig(start=10, every=10, gradient=2e-5, max_gaussians=4000)
+        STEADY, steps=50, sh_every=25, density=DensityConfig(start=10, every=10, gradient=2e-5), max_gaussians=4000
     )
     free = Trainer(views, seeds(1200), config, CPU)
     whole = free.layout.step(1200, free.memory.instances)
@@ -198,7 +199,7 @@ def test_limit_holds_on_cuda(recorded):
     """What torch's allocator counted at its peak lies below the limit, in bands and in recorded steps."""
     device = torch.device("cuda", 0)
     views = photos(4, 160, 120)
-    config = dataclasses.replace(STEADY, steps=60, density=DensityConfig(start=10, every=10, gradient=2e-5, max_gaussians=4000))
+    config = dataclasses.replace(STEADY, steps=60, density=DensityConfig(start=10, every=10, gradient=2e-5), max_gaussians=4000)
     free = Trainer(views, seeds(1200), dataclasses.replace(config, cuda_graph=recorded), device)
     most = 4 * free.memory.planned_at_cap if recorded else free.layout.smallest(1500)
     del free

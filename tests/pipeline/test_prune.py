@@ -23,7 +23,6 @@ from warpgs.pipeline.model.compress import (
 from warpgs.pipeline.runs.checkpoint import load_checkpoint
 from warpgs.pipeline.runs.folder import open_run
 from warpgs.pipeline.runs.prune import prune
-from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera
 from warpgs.synthetic.demo import split_spec, write_demo
@@ -165,20 +164,3 @@ def test_only_the_mirror_keeps_its_harmonics():
 
     degrees = needed_degrees(g, view_set.coverage(g).supported_degree(), view_set, accepted)
     assert bool((degrees[~right] == 0).all()) and float(degrees[right].float().mean()) > 0.8
-
-
-def test_moments_go_where_their_gaussians_go():
-    """First ones in their sum, second ones as the square of the sum of roots; those of what was removed are gone."""
-    g = cloud(4)
-    optimizer = Optimizer(g, OptimizerConfig(), 1.0)
-    for name in optimizer.params:
-        values = torch.arange(1.0, 5).reshape(4, *[1] * (g.tensors()[name].dim() - 1)).expand_as(g.tensors()[name])
-        optimizer.means[name], optimizer.squares[name] = values.clone(), values.square()
-    new = rows_of(g, torch.tensor([2, 0]))
-    optimizer.regroup(new, torch.tensor([1, -1, 0, 1]))
-    for name, t in new.tensors().items():
-        assert torch.equal(optimizer.params[name], t) and optimizer.params[name].requires_grad
-        for moments, wanted in ((optimizer.means, [3.0, 5.0]), (optimizer.squares, [9.0, 25.0])):
-            assert torch.allclose(
-                moments[name].flatten(1) if t.dim() > 1 else moments[name][:, None], torch.tensor(wanted)[:, None]
-            )

@@ -72,7 +72,7 @@ def test_the_seed_draws_views_and_parts():
 
 
 def test_a_gaussian_that_is_no_number_changes_nothing():
-    """The kernels leave it out, and so does the reference."""
+    """The kernels leave it out, and so does the truth."""
     g = crowd(CPU)
     bad = g.means.clone()
     bad[5] = float("nan")
@@ -109,14 +109,14 @@ def test_a_fit_starts_at_half_size_and_ends_whole(device):
     for _ in range(8):
         number = fit.next_view()
         fit.order.append(number)
-        (width, _, _), _ = fit.places[number + fit.plan_of(fit.step + 1).half_size * len(fit.views)]
-        sizes.append(width)
+        kind, _ = fit.places[number + fit.plan_of(fit.step + 1).half_size * len(fit.views)]
+        sizes.append(fit.stacks[kind].size["width"])
         (report,) = fit.advance()
         assert math.isfinite(report.loss)
     assert sizes == [20] * 4 + [40] * 4
-    assert len(fit.stacks) == 2
+    assert len(fit.stacks) == 2 and len(fit.places) == 6
     plain = Trainer(photos(3), seeds(), dataclasses.replace(config, half_resolution=0.0), device)
-    assert len(plain.stacks) == 1 and len(plain.places) == len(plain.views)
+    assert len(plain.stacks) == 1 and len(plain.places) == 3
     with pytest.raises(UsageError, match="half-resolution"):
         dataclasses.replace(config, half_resolution=float("nan"))
 

@@ -8,12 +8,13 @@ import torch
 
 from tests.pipeline.test_importance_sampling import CONFIG as METHOD
 from tests.scenes import photos, priors, seeds
+from warpgs.errors import NotFiniteError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.train import step
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LossConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.trainer import NotFiniteError, Trainer
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.scene import View
 
 pytestmark = pytest.mark.cuda
@@ -60,7 +61,7 @@ def test_recorded_method_equals_single_steps():
     single, said = fitted(photos(3), recorded=False, config=METHOD)
     recorded, reports = fitted(photos(3), recorded=True, config=METHOD)
     a, b = single.state()[0], recorded.state()[0]
-    assert single.events == recorded.events and len(single.events) > 2
+    assert single.strategy.events == recorded.strategy.events and len(single.strategy.events) > 2
     assert all(torch.equal(a[k], b[k]) for k in a) and [r.count for r in said] == [r.count for r in reports]
 
 
@@ -78,16 +79,16 @@ def test_recordings_do_not_pile_up(monkeypatch):
     assert max(held[20:]) <= max(held[:10]) + 2**22
 
 
-def test_too_little_room_is_found_and_mended(monkeypatch):
-    """Steps that would overflow change nothing; they are recorded anew and taken, and the result is the same."""
+def test_too_little_capacity_is_found_and_fixed(monkeypatch):
+    """Steps that would overflow change nothing; they are captured anew and taken, and the result is the same."""
     reference, _ = fitted(photos(4), recorded=False)
-    honest, tries = step.StepGraph._capacity, []
+    honest, tries = step.instance_capacity, []
 
-    def scarce(self):
-        tries.append(honest(self))
+    def scarce(*args):
+        tries.append(honest(*args))
         return 16 if len(tries) % 2 else tries[-1]
 
-    monkeypatch.setattr(step.StepGraph, "_capacity", scarce)
+    monkeypatch.setattr(step, "instance_capacity", scarce)
     fit, reports = fitted(photos(4), recorded=True)
     assert len(tries) >= 4
     a, b = reference.state()[0], fit.state()[0]

@@ -14,17 +14,17 @@ import pytest
 import torch
 
 from tests.scenes import photos, seeds
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, NotFiniteError, UsageError
 from warpgs.geometry import look_at
 from warpgs.kernels.knn import morton_codes
 from warpgs.pipeline.metrics.region import counted_region
 from warpgs.pipeline.model.init import InitConfig, empty_votes, initial_gaussians, initial_points, nearest, random_points
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.config import PRESETS, FitConfig
-from warpgs.pipeline.train.loss import LossConfig, photometric_loss
+from warpgs.pipeline.train.loss import photometric_loss
 from warpgs.pipeline.train.schedule import log_linear, sh_degree
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.trainer import NotFiniteError, Trainer
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.scene import Camera, PointCloud, View
 from warpgs.synthetic.demo import split_spec, write_demo
 
@@ -102,21 +102,22 @@ def test_order_of_the_gaussians_changes_nothing_but_their_order():
         density = DensityConfig(start=5, every=10, gradient=1e-5, clone_size=1e9, morton_order=morton)
         fit = fitted(FitConfig(steps=60, sh_every=15, init=InitConfig(source="points"), density=density), 30)
         assert bool((morton_codes(fit.gaussians.means).diff() >= 0).all()) == morton
-        tensors = [t.flatten(1) if t.ndim > 1 else t[:, None] for t in fit.optimizer.state().values()]
+        tensors = [t.flatten(1) if t.ndim > 1 else t[:, None] for t in fit.table.state().values()]
         results.append(sorted(map(tuple, torch.cat(tensors, 1).tolist())))
     assert len(results[0]) > 2 * len(seeds()) and results[0] == results[1]
 
 
 def test_all_that_goes_by_row_is_sorted_together():
-    """Parameters, moments and layers of a Gaussian stay together."""
-    fit = fitted(FitConfig(steps=9, init=InitConfig(source="points")), 3)
-    fit.layers.created_step = torch.arange(len(fit.gaussians), dtype=torch.int32)
-    before = {name: t.clone() for name, t in fit.optimizer.state().items()}
-    fit.layers.reorder(fit.optimizer.sort_along_curve())
-    rows = fit.layers.created_step.long()
+    """Parameters, moments and columns of a Gaussian stay together."""
+    fit = fitted(FitConfig(steps=9, init=InitConfig(source="points"), strategy="importance_sampling"), 3)
+    table = fit.table
+    table.columns["created_step"] = torch.arange(len(fit.gaussians), dtype=torch.int32)
+    before = {name: t.clone() for name, t in table.state().items()}
+    table.sort_along_curve()
+    rows = table.columns["created_step"].long()
     assert not bool((rows.diff() > 0).all()) and bool((rows.sort().values.diff() == 1).all())
-    assert all(torch.equal(t, before[name][rows]) for name, t in fit.optimizer.state().items())
-    assert all(t.requires_grad for t in fit.optimizer.params.values())
+    assert all(torch.equal(t, before[name][rows]) for name, t in table.state().items()) and len(before) == 15 + 4
+    assert all(t.requires_grad and t.is_leaf for t in table.params.values())
 
 
 def test_masked_pixels_do_not_count():
@@ -132,7 +133,7 @@ def test_masked_pixels_do_not_count():
             image[~mask] = filling
             changed.append(View(v.name, v.camera, image, mask))
         fit = Trainer(changed, seeds(), FitConfig(steps=5, init=InitConfig(source="points")), CPU)
-        reports = [fit.advance() for _ in range(5)]
+        reports = [r for _ in range(5) for r in fit.advance()]
         results.append((fit.gaussians.means, [r.psnr for r in reports]))
     assert torch.equal(results[0][0], results[1][0]) and results[0][1] == results[1][1]
 
@@ -140,7 +141,7 @@ def test_masked_pixels_do_not_count():
 def test_fully_masked_view_has_loss_zero():
     """No pixel counts: loss 0, gradient 0, no division by zero."""
     image = torch.rand(9, 8, 3, requires_grad=True)
-    loss = photometric_loss(image, torch.rand(9, 8, 3), torch.zeros(9, 8), LossConfig())
+    loss = photometric_loss(image, torch.rand(9, 8, 3), torch.zeros(9, 8))
     loss.backward()
     assert float(loss.detach()) == 0 and not bool(image.grad.any())
 
@@ -205,7 +206,7 @@ def test_start_falls_back_to_random_and_says_so():
 def test_a_start_of_more_points_than_allowed_is_drawn_from():
     """Some of the points, each once and the same every time, said so; wider, for they lie farther apart; and no more later."""
     most = len(seeds()) // 4
-    config = dataclasses.replace(BUSY, density=dataclasses.replace(BUSY.density, gradient=1e-6, max_gaussians=most))
+    config = dataclasses.replace(BUSY, density=dataclasses.replace(BUSY.density, gradient=1e-6), max_gaussians=most)
     whole, fit = fitted(BUSY, 0), fitted(config, 0)
     kept = (whole.gaussians.means[None] == fit.gaussians.means[:, None]).all(2)
     assert len(fit.gaussians) == most and bool((kept.sum(1) == 1).all()) and bool((kept.sum(0) <= 1).all())
@@ -237,7 +238,7 @@ def test_config_survives_json():
     assert all(isinstance(p, FitConfig) for p in PRESETS.values())
 
 
-@pytest.mark.parametrize("bad", [{"steps": 0}, {"sh_every": 0}, {"rule": "best"}])
+@pytest.mark.parametrize("bad", [{"steps": 0}, {"sh_every": 0}, {"rule": "best"}, {"max_gaussians": 0}, {"strategy": "best"}])
 def test_bad_configuration_is_refused(bad):
     """A setting that cannot work is an error at once."""
     with pytest.raises(UsageError):

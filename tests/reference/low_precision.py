@@ -1,4 +1,4 @@
-"""Whole pictures by three twins of the rasterizer, dense and differentiable by autograd: `r64`, `r64c` and `p32`.
+"""Whole images by three references of the rasterizer, dense and differentiable by autograd: `r64`, `r64c` and `p32`.
 
 `r64` is the truth of the model: float64, every Gaussian in every pixel. `r64c` is the truth of the algorithm: float64 with
 the cut-offs of a rule. `p32` is what a plain program gets: `r64c` line by line in float32, in the textbook form with an
@@ -21,7 +21,7 @@ PAIRS = 1 << 22
 
 
 class Frame(NamedTuple):
-    """Size of the whole picture [px], spherical-harmonics degree, and the part that is drawn: left, top, width, height."""
+    """Size of the whole image [px], spherical-harmonics degree, and the part that is rendered: left, top, width, height."""
 
     width: int
     height: int
@@ -30,7 +30,7 @@ class Frame(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """All that a picture depends on smoothly; of one scalar type, shapes as `rasterize` takes them, one camera."""
+    """All inputs that an image depends on smoothly; of one scalar type, shapes as `rasterize` takes them, one camera."""
 
     means: torch.Tensor
     quats: torch.Tensor
@@ -42,7 +42,7 @@ class Inputs(NamedTuple):
     background: torch.Tensor
 
     def to(self, dtype: torch.dtype) -> Inputs:
-        """The same numbers as leaves of another type on the CPU."""
+        """Return the same numbers as leaves of another type on the CPU."""
         return Inputs(*(t.detach().cpu().to(dtype).requires_grad_() for t in self))
 
 
@@ -70,7 +70,7 @@ class ProjectedGaussians(NamedTuple):
 
 
 class Layers(NamedTuple):
-    """What every Gaussian does in every pixel, [N, P]: Mahalanobis distance squared, alpha before its clamp and after, whether
+    """Effect of every Gaussian in every pixel, [N, P]: Mahalanobis distance squared, alpha before its clamp and after, whether
     it passes the cut, transmittance in front of it were there no stop, whether it is blended."""
 
     power: torch.Tensor
@@ -105,7 +105,7 @@ def projected_of(inputs: Inputs, frame: Frame, rule: Rule) -> ProjectedGaussians
 
 
 def squares(projected: ProjectedGaussians, frame: Frame, rule: Rule, tile_size: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """By Gaussian, columns [N, W] and rows [N, H] of the tiles that its square touches: all that tiles ever decide."""
+    """Return for each Gaussian the columns [N, W] and rows [N, H] of the tiles that its square touches."""
     flags = []
     half = torch.ceil(rule.square_sigma * projected.sigmas[:, 1]).double()
     for axis, size in enumerate((frame.width, frame.height)):
@@ -129,7 +129,7 @@ def pixel_centers(frame: Frame, dtype: torch.dtype) -> torch.Tensor:
 
 
 def layers(pixels: torch.Tensor, reach: torch.Tensor | None, projected: ProjectedGaussians, rule: Rule) -> Layers:
-    """Kerbl et al. 2023, equation 3, with the cut-offs of a rule; ``reach`` [N, P] is where tiles let a Gaussian draw."""
+    """Kerbl et al. 2023, equation 3, with the cut-offs of a rule; ``reach`` [N, P] is True where tiles let one contribute."""
     dx = pixels[None, :, 0] - projected.means[:, 0, None]
     dy = pixels[None, :, 1] - projected.means[:, 1, None]
     xx, xy, yy = (projected.conics[:, k, None] for k in range(3))
@@ -178,7 +178,7 @@ def parts(projected: ProjectedGaussians, frame: Frame, rule: Rule, tile_size: in
 
 
 def draw(inputs: Inputs, frame: Frame, rule: Rule, tile_size: int = 16) -> Images:
-    """The pictures in the scalar type of the inputs, differentiable in all of them."""
+    """Return the images in the scalar type of the inputs, differentiable in all of them."""
     projected = projected_of(inputs, frame, rule)
     width, height = frame.window[2:]
     if len(projected.ids) == 0:

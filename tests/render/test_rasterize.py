@@ -23,7 +23,7 @@ def test_public_names_load_on_use():
 
 
 def test_one_camera_has_no_leading_axis(device):
-    """A single camera gives pictures without a batch axis, equal to a batch of one; numpy cameras work too."""
+    """A single camera gives images without a batch axis, equal to a batch of one; numpy cameras work too."""
     gaussians, cam = cloud(50, device=device), camera(20, 12, dtype=torch.float32, device=device)
     single = rasterize(gaussians, cam)
     batch = rasterize(gaussians, dataclasses.replace(cam, viewmat=cam.viewmat[None], K=cam.K[None]))
@@ -60,7 +60,7 @@ def test_moving_scene_and_camera_together_changes_nothing(device):
 
 
 def test_gradients_of_projected_means_on_request(device):
-    """`splats.retain_grad()` gives what densification needs."""
+    """`projected.retain_grad()` gives the gradients that densification needs."""
     gaussians, cam = leaves(cloud(50, device=device)), camera(20, 12, dtype=torch.float32, device=device)
     r = rasterize(gaussians, cam)
     r.projected.retain_grad()
@@ -86,7 +86,7 @@ def test_sh_degree_limits_the_colour(device):
 
 
 def test_capacity_changes_nothing_but_says_when_it_is_too_small(device):
-    """Room to spare: the same pictures and gradients, bit for bit. Too little: overflow says so, and nothing else breaks."""
+    """A larger capacity gives the same bits of images and gradients; one too small sets overflow, and nothing else breaks."""
     gaussians, cam = leaves(cloud(200, device=device)), camera(70, 50, dtype=torch.float32, device=device)
     results = []
     for capacity in (None, 5000):
@@ -144,7 +144,7 @@ def test_errors_name_the_cause(device):
 
 
 def test_opacity_factors_multiply_opacities_and_hide():
-    """The same picture and gradients as with those opacities, also in bands; 0 hides a Gaussian and leaves it no gradient."""
+    """Image and gradients are those of such opacities, also in chunks; 0 hides a Gaussian and leaves it no gradient."""
     gaussians, camera = three_gaussians(), ring(3)[0]
     factors = torch.tensor([0.5, 0.0, 1.0])
     opacities = gaussians.logit_opacities.sigmoid() * factors

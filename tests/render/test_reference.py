@@ -1,4 +1,4 @@
-"""The float64 picture against the reference, the generic float64 kernels, and what a Gaussian in the way does to it."""
+"""The float64 image against the tests' reference, the float64 kernels, and with a Gaussian in the way."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ BACKGROUND = torch.tensor([0.2, 0.5, 0.7], dtype=torch.float64)
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_equals_the_reference(degree):
-    """Same picture as the loop over Gaussians, in another structure; two of the Gaussians are clamped at the frustum."""
+    """The image is that of the loop over Gaussians, in another structure; two of the Gaussians are clamped at the frustum."""
     g, cam, rule = hand_placed(), camera(), RULES["exact"]
     projected = project_reference(
         *g.tensors().values(), cam.viewmat[None], cam.K[None], width=18, height=17, degree=degree, low_pass=rule.low_pass

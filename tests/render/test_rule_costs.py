@@ -1,4 +1,4 @@
-"""Knobs that are chosen for the user: by error, by time, and one clear line where neither can be kept."""
+"""Settings that are chosen for the user: by error, by time, and one clear message where neither can be kept."""
 
 import dataclasses
 import json
@@ -30,7 +30,7 @@ def scene(tmp_path_factory):
 
 
 def test_the_fastest_rule_within_the_error():
-    """At each price's own error its rule, just below it the next one; every rule named exists."""
+    """At each cost's own error its rule is chosen, just below it the next one; every rule named exists."""
     assert [p.rule for p in RULE_COSTS][-1] == "exact"
     errors, times = [p.mean_error for p in RULE_COSTS], [p.time for p in RULE_COSTS]
     assert errors == sorted(errors, reverse=True) and times == sorted(times)
@@ -54,7 +54,7 @@ def test_an_error_below_float32():
 
 
 def test_more_time_more_steps(monkeypatch):
-    """By the prices of a probe of 10 ms: what is foretold keeps the budget, and one step more would not."""
+    """By the costs of a probe of 10 ms, the predicted time keeps the budget, and one step more would not."""
     monkeypatch.setattr(time_budget, "probe_seconds", lambda *_: 0.01)
     views, config = photos(3), FitConfig(seed=7, rule="fast")
     setup, step = 0.01 * time_budget.SETUP * 3, 0.01 * time_budget.STEP

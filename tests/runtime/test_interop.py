@@ -54,7 +54,7 @@ class Recorded:
     ],
 )  # fmt: skip
 def test_ranges_cover_every_item_once(monkeypatch, threads, count, cost, ranges):
-    """As many ranges as there is work for, at most one hand-over a thread; small launches stay where they are."""
+    """There are as many ranges as there is work for, and at most one hand-over a thread; small launches stay on theirs."""
     pool = Recorded()
     monkeypatch.setattr(interop, "_pool", lambda _: pool)
     torch.set_num_threads(threads)
@@ -82,11 +82,11 @@ def everything():
     moved = torch.rand(3 * 4096, 3, generator=torch.Generator().manual_seed(1))
     state = [moved, moved.flip(0).contiguous(), moved * 0, moved * 0]
     adam_step(*state, lr=0.1, step=1)
-    drawn = opacity_dropout(53, torch.tensor([0.3, 1.0]), 5)
+    factors = opacity_dropout(53, torch.tensor([0.3, 1.0]), 5)
     lists = [t for tiled in (tiles, capped) for t in (tiled.ranges, tiled.counts, tiled.gaussian_ids[: len(tiles.slots)])]
     weights = contributions(projected, tiles, **size, rule=rule)
     near = mean_square_distances(moved[:91])
-    return [t.detach() for t in (projected, counts, *lists, *images, *gradients, *weights, *state, near, drawn, maps, sums)]
+    return [t.detach() for t in (projected, counts, *lists, *images, *gradients, *weights, *state, near, factors, maps, sums)]
 
 
 @pytest.fixture
@@ -108,7 +108,7 @@ def whole():
 
 
 def test_every_op_gives_the_same_bits_in_ranges(monkeypatch, whole, poisoned_memory):
-    """However a launch is cut: items know their own number, share nothing, and none is left out.
+    """However a launch is cut, items know their own number, share nothing, and none is left out.
 
     Ranges of unequal length, none of which may cover for another: Warp counts a negative index from the end, and so a
     kernel that goes backwards from the beginning of its range visits every item of equal ranges.
@@ -134,7 +134,7 @@ def test_items_run_in_any_order(monkeypatch, whole, poisoned_memory):
 
 
 def test_memory_that_nobody_wrote_is_not_read(whole, poisoned_memory):
-    """Scratch and outputs full of NaN and of the largest numbers beforehand: the same bits."""
+    """Workspace and outputs that were full of NaN and of the largest numbers give the same bits."""
     for i, (a, b) in enumerate(zip(whole, everything(), strict=True)):
         assert torch.equal(a, b), i
 
@@ -201,7 +201,7 @@ def test_check_names_what_disagrees():
 
 
 def test_a_driver_that_is_missing_is_no_news(monkeypatch, capfd):
-    """What native code prints meanwhile is dropped, what follows is not."""
+    """Output of native code is dropped inside the context, not after it."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with interop._without_driver_notice():
         os.write(2, b"no driver")

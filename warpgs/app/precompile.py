@@ -35,6 +35,8 @@ TILE = 16
 """Side of a tile in a fit [px]."""
 THREADS = 256
 """Threads of a block where a launch does not say otherwise."""
+CAMERA_MODEL = "pinhole"
+"""Model of the cameras of a fit: readers give no other."""
 
 
 def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
@@ -44,9 +46,10 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     """
     real = wp.float32
     common = [
-        (project.make_forward(real, cuda), THREADS), (project.make_backward(real, cuda), BLOCK),
+        (project.make_forward(real, cuda, CAMERA_MODEL), THREADS), (project.make_backward(real, cuda, CAMERA_MODEL), BLOCK),
         (tiles.make_kernels(real, cuda).pack_counts, THREADS), (tiles.make_kernels(real, cuda).find_ranges, THREADS),
         (tiles.make_emit(real, cuda), THREADS), (knn.make_kernels(real).search, THREADS), (dropout.make_kernel(), THREADS),
+        (step_buffers.make_kernels().end_step, THREADS),
     ]  # fmt: skip
     if not cuda:
         blending, scoring = (
@@ -62,7 +65,6 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     blending, warps = blend_cuda.make_kernels(TILE), 32 * blend_cuda.WARPS
     own = [(blending.forward, warps), (blending.order_tiles, 1024), (blending.contributions, TILE * TILE)]
     own += [(blend.make_segments(real).gather_weights, THREADS), (scanlines.make_kernel(), scanlines.BLOCK)]
-    own += [(step_buffers.make_kernels().begin_step, THREADS)]
     for depth, chunk in itertools.product((False, True), blend_cuda.CHUNKS):  # with a depth term, and without
         passes = blend_cuda.make_backward(TILE, depth, chunk, False)
         own += [(passes.backward, warps), (passes.gather, THREADS)]

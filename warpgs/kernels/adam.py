@@ -113,25 +113,25 @@ _UPDATE = (
     """
     if (skip.data[0] != 0)
         return;
-    const float head_rate = rates.data[0], rate = rates.data[1], root_correction2 = rates.data[2];
+    const float head_lr = lrs.data[0], lr = lrs.data[1], root_correction2 = lrs.data[2];
     const int size = parameter.shape[0];
 """
     + ELEMENT
-    + """    auto rate_of = [&](int i) { return i % row < head ? head_rate : rate; };
+    + """    auto lr_of = [&](int i) { return i % row < head ? head_lr : lr; };
     if (4 * four + 4 <= size) {
         float4 p = reinterpret_cast<float4*>(parameter.data)[four], m = reinterpret_cast<float4*>(mean.data)[four];
         float4 s = reinterpret_cast<float4*>(square.data)[four];
         const float4 g = reinterpret_cast<const float4*>(gradient.data)[four];
-        one(g.x, rate_of(4 * four), p.x, m.x, s.x);
-        one(g.y, rate_of(4 * four + 1), p.y, m.y, s.y);
-        one(g.z, rate_of(4 * four + 2), p.z, m.z, s.z);
-        one(g.w, rate_of(4 * four + 3), p.w, m.w, s.w);
+        one(g.x, lr_of(4 * four), p.x, m.x, s.x);
+        one(g.y, lr_of(4 * four + 1), p.y, m.y, s.y);
+        one(g.z, lr_of(4 * four + 2), p.z, m.z, s.z);
+        one(g.w, lr_of(4 * four + 3), p.w, m.w, s.w);
         reinterpret_cast<float4*>(parameter.data)[four] = p;
         reinterpret_cast<float4*>(mean.data)[four] = m;
         reinterpret_cast<float4*>(square.data)[four] = s;
     } else
         for (int i = 4 * four; i < size; ++i)
-            one(gradient.data[i], rate_of(i), parameter.data[i], mean.data[i], square.data[i]);
+            one(gradient.data[i], lr_of(i), parameter.data[i], mean.data[i], square.data[i]);
 """
 )
 
@@ -171,7 +171,7 @@ def adam_scheduled(
     param: torch.Tensor, grad: torch.Tensor, exp_avg: torch.Tensor, exp_avg_sq: torch.Tensor, lrs: torch.Tensor,
     skip: torch.Tensor, *, head: int, betas: tuple[float, float] = BETAS, eps: float = EPS,
 ) -> None:  # fmt: skip
-    """Take the step of `adam_step` in float32, with its learning rates in memory, so that CUDA can record it once.
+    """Update as `adam_step` does, in float32, with learning rates in memory, so that a CUDA graph can replay it.
 
     Args:
         param: Parameter, contiguous, shape [N, ...].

@@ -185,7 +185,7 @@ def make_functions():
         row[1] = make_float4(v[4], v[5], v[6], v[7]);
         row[2] = make_float4(v[8], v[9], v[10], v[11]);
     """)
-    def store_record(records: wp.array2d(dtype=float), i: int, v: vec12):
+    def store_row(records: wp.array2d(dtype=float), i: int, v: vec12):
         """Write row i of an array of rows of 12 floats, 16-byte aligned."""
         ...
 
@@ -254,7 +254,7 @@ def make_functions():
         ...
 
     return SimpleNamespace(
-        compact=compact, store_record=store_record, clear_rows=clear_rows, ballot=ballot, broadcast=broadcast,
+        compact=compact, store_row=store_row, clear_rows=clear_rows, ballot=ballot, broadcast=broadcast,
         running_sum=running_sum, whole_sum=whole_sum, lowest=lowest, color=color, color_backward=color_backward,
         color_weights=color_weights,
     )  # fmt: skip

@@ -59,11 +59,11 @@ def make_forward(real, native: bool, camera_model: str):
     vec12 = wp.types.vector(PROJECTED_SIZE, real)
 
     @wp.func
-    def store_values(projected: wp.array2d(dtype=real), i: int, record: vec12):
+    def store_values(projected: wp.array2d(dtype=real), i: int, values: vec12):
         for k in range(wp.static(PROJECTED_SIZE)):
-            projected[i, k] = record[k]
+            projected[i, k] = values[k]
 
-    store = make_native().store_record if native else store_values
+    store = make_native().store_row if native else store_values
     module = f"warpgs.kernels.project.forward.{real.__name__}.{int(native)}.{camera_model}"
 
     @wp.func

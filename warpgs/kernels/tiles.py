@@ -18,7 +18,7 @@ from warpgs.runtime.device_memory import available_bytes, installed_bytes
 LIST_BYTES = 20
 """Bytes of an instance while the lists are made: two sort buffers of (key, slot), and the owner."""
 BYTES_PER_INSTANCE = LIST_BYTES + 48 + 80
-"""The same plus the gradient slot and the fraction of the saved states (blend_cuda.CHUNKS) of the backward pass on CUDA."""
+"""Bytes of an instance with the gradient slot and the part of the saved states (blend_cuda.CHUNKS) on CUDA."""
 
 VISIBLE = 2**36
 """Number that a visible Gaussian adds to a running sum of tile counts, so that one sum counts both."""
@@ -276,6 +276,42 @@ def _check_total(total: int, visible: int, device: torch.device, tiles: int, bud
     )
 
 
+def _depth_order(
+    projected: torch.Tensor, counts: torch.Tensor, tiles: int, *,
+    budget_bytes: int | None, capacity: int | None, allocator: Allocator,
+) -> tuple[torch.Tensor, int, int]:  # fmt: skip
+    """Return Gaussian numbers from front to back, int32; how many of them are visible; and the number of instances.
+
+    With a capacity nothing is read from the device: all Gaussians count as visible, those that are not come last, and the
+    number of instances is the capacity. ``projected`` is [C * N, 12], ``counts`` [C * N], ``tiles`` the tiles of an image.
+    """
+    device, count, real, native = projected.device, len(counts), interop.real_of(projected), projected.is_cuda
+    k = make_kernels(real, native)
+    projected_view, counts_view = interop.view(projected, real), interop.view(counts, wp.int32)
+    if capacity is not None:
+        visible, total = count, capacity
+    else:
+        if count * tiles >= VISIBLE or count > MAX_VISIBLE:
+            many = torch.stack([(counts > 0).sum(), counts.sum(dtype=torch.int64)])
+            _check_total(*reversed(many.tolist()), device, tiles, budget_bytes)
+        # One read from the device, before the sorts, tells how many are visible and how many tiles they touch.
+        sums, threads = (-(-count // 32), -(-count // 256) * 256) if native else (count, count)
+        packed = allocator.workspace((sums,), torch.int64, device)
+        interop.launch(k.pack_counts, threads, [counts_view, interop.view(packed, wp.int64)], device)
+        torch.cumsum(packed, 0, out=packed)
+        visible, total = divmod(int(packed[-1]), VISIBLE)
+        _check_total(total, visible, device, tiles, budget_bytes)
+    depths, order = (allocator.workspace((2 * visible,), t, device) for t in (projected.dtype, torch.int32))
+    depths_view, order_view = interop.view(depths, real), interop.view(order, wp.int32)
+    if capacity is not None:
+        interop.launch(k.depth_keys, count, [projected_view, counts_view, depths_view, order_view], device)
+    else:
+        inputs = [projected_view, counts_view, interop.view(packed, wp.int64), depths_view, order_view]
+        interop.launch(k.visible_keys, threads, inputs, device)
+    wp.utils.radix_sort_pairs(depths_view.array(), order_view.array(), visible)
+    return order, visible, total
+
+
 def bin_tiles(
     projected: torch.Tensor,
     tile_counts: torch.Tensor,
@@ -336,27 +372,9 @@ def bin_tiles(
     projected = projected.detach().contiguous().view(count, -1)
     projected_view, counts_view, fixed = interop.view(projected, real), interop.view(counts, wp.int32), capacity is not None
     with interop.stream_of(device):
-        if fixed:
-            visible, total = count, capacity
-        else:
-            if count * tiles >= VISIBLE or count > MAX_VISIBLE:
-                many = torch.stack([(counts > 0).sum(), counts.sum(dtype=torch.int64)])
-                _check_total(*reversed(many.tolist()), device, tiles, budget_bytes)
-            # One read from the device, before the sorts, tells how many are visible and how many tiles they touch.
-            sums, threads = (-(-count // 32), -(-count // 256) * 256) if native else (count, count)
-            packed = allocator.workspace((sums,), torch.int64, device)
-            interop.launch(k.pack_counts, threads, [counts_view, interop.view(packed, wp.int64)], device)
-            torch.cumsum(packed, 0, out=packed)
-            visible, total = divmod(int(packed[-1]), VISIBLE)
-            _check_total(total, visible, device, tiles, budget_bytes)
-        depths, order = (allocator.workspace((2 * visible,), t, device) for t in (projected.dtype, torch.int32))
-        depths_view, order_view = interop.view(depths, real), interop.view(order, wp.int32)
-        if fixed:
-            interop.launch(k.depth_keys, count, [projected_view, counts_view, depths_view, order_view], device)
-        else:
-            inputs = [projected_view, counts_view, interop.view(packed, wp.int64), depths_view, order_view]
-            interop.launch(k.visible_keys, threads, inputs, device)
-        wp.utils.radix_sort_pairs(depths_view.array(), order_view.array(), visible)
+        limits = {"budget_bytes": budget_bytes, "capacity": capacity, "allocator": allocator}
+        order, visible, total = _depth_order(projected, counts, tiles, **limits)
+        order_view = interop.view(order, wp.int32)
         ends = allocator.saved((max(visible, 1),), torch.int64, device)
         ends_view = interop.view(ends, wp.int64)
         interop.launch(k.ordered_counts, visible, [order_view, counts_view, ends_view], device)
@@ -375,8 +393,7 @@ def bin_tiles(
         threads = -(-visible // 256) * 256 if native else visible
         interop.launch(make_emit(real, native), threads, inputs, device, cost=10)
         wp.utils.radix_sort_pairs(keys_view.array(), slots_view.array(), total, end_bit=no_tile.bit_length())
-        # the second half of the sorted buffers is free again
-        ids = slots[total:]
+        ids = slots[total:]  # the second half of the sorted buffers is free again
         outputs = [interop.view(ids, wp.int32), interop.view(ranges, wp.int32)]
         inputs = [keys_view, slots_view, owners_view, total, no_tile, *outputs]
         interop.launch(k.find_ranges, total, inputs, device)

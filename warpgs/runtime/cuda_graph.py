@@ -47,7 +47,7 @@ class CapturedGraph:
     """A CUDA graph of the kernels that torch and Warp launch in one call, and everything that must live as long as it."""
 
     def __init__(self, work: Callable[[], object], stream: torch.cuda.Stream, pool: tuple[int, int] | None = None):
-        """Capture; nothing runs yet.
+        """Capture the work; nothing runs yet.
 
         The caller lets ``stream`` wait for what ``work`` reads, and other streams wait for ``stream`` where they need it.
 
@@ -161,7 +161,7 @@ class GraphedFunction:
     """A function of tensors that is captured for each set of addresses that it meets, up to MAX_GRAPHS."""
 
     def __init__(self, function: Callable[..., tuple[torch.Tensor, ...]], graphs: GraphPool):
-        """Prepare; nothing is captured yet.
+        """Prepare the function; nothing is captured yet.
 
         Args:
             function: A function of an `Allocator` and of tensors or Nones, always of the same shapes. It gets its memory from

@@ -74,6 +74,7 @@ def _directions(means: torch.Tensor, camera: Camera) -> torch.Tensor:
     return torch.nn.functional.normalize(center - means, dim=1)
 
 
+@torch.enable_grad()  # whoever asks may have switched gradients off, as the trainer does when the set changes
 def fisher(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions, seed: int) -> torch.Tensor:
     """How much the pictures change when a Gaussian is moved by its own width or its axes grow, shape [N], at least 0.
 

@@ -108,7 +108,7 @@ class FitConfig:
             terms = tuple(_term(dict(t)) for t in values.pop("loss_terms"))
             own = values.pop("strategy_config")
             kind = find_strategy(values["strategy"]).Config
-            own = kind(**own) if kind is not None and own else own
+            own = own if own is None or kind is None else kind(**own)
             config: FitConfig = _compose(FitConfig, values | {"loss_terms": terms, "strategy_config": own})
             return config
         except (TypeError, KeyError) as e:

@@ -56,19 +56,20 @@ class StepBuffers:
     """What steps read and write between two looks at the device: views, learning rates, losses, and the stop flag."""
 
     def __init__(self, device: torch.device, lrs: int):
-        """Allocate for `MAX_BATCH` steps with ``lrs`` numbers of learning rates each."""
+        """Allocate for `MAX_BATCH` steps on CUDA, elsewhere for the one of a batch, with ``lrs`` learning rates each."""
         self.device = device
-        self.view_rows = torch.zeros(MAX_BATCH, dtype=torch.int64, device=device)
+        rows = MAX_BATCH if device.type == "cuda" else 1
+        self.view_rows = torch.zeros(rows, dtype=torch.int64, device=device)
         """Row of each step's view in its stack."""
-        self.lr_rows = torch.ones(MAX_BATCH, lrs, device=device)
+        self.lr_rows = torch.ones(rows, lrs, device=device)
         """Learning rates of each step (`Table.lr_row` of all tables)."""
-        self.setting_rows = torch.zeros(MAX_BATCH, 3, device=device)
+        self.setting_rows = torch.zeros(rows, 3, device=device)
         """Dropout probability, number, and learning rate of the means [u] of each step."""
         self.counter = torch.zeros(1, dtype=torch.int64, device=device)
         """Number of the step at hand. It stays once a step stops, and so do all Gaussians."""
         self.stop = torch.zeros(1, dtype=torch.int32, device=device)
         """0 while all is well, else why the steps stopped."""
-        self.history = torch.zeros(MAX_BATCH, 2, device=device)
+        self.history = torch.zeros(rows, 2, device=device)
         """Loss and mean squared error of each step."""
         self.one = torch.ones((), device=device)
         """Gradient of the loss."""

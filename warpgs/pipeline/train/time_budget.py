@@ -48,7 +48,7 @@ def probe_seconds(width: int, height: int, device: torch.device) -> float:
     seconds = []
     for _ in range(REPEATS + 1):
         began = time.perf_counter()
-        loss = photometric_loss(rasterize(gaussians, camera).rgb, target, None, LossConfig())
+        loss = photometric_loss(rasterize(gaussians, camera).rgb, target, None, LossConfig().ssim_weight)
         torch.autograd.grad(loss, list(gaussians.tensors().values()))
         loss.item()
         if device.type == "cuda":

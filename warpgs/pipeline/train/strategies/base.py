@@ -39,7 +39,8 @@ class Strategy:
             trainer: The trainer. Its table exists, its views do not: see `setup`.
         """
         self.trainer = trainer
-        self.config: Any = trainer.config.strategy_config
+        own = trainer.config.strategy_config
+        self.config: Any = self.Config() if own is None and self.Config is not None else own
         """The strategy's own settings."""
 
     @classmethod

@@ -127,7 +127,7 @@ def refine(
                 faint |= huge
         if protected is not None:
             faint &= ~protected
-        if bool(faint.all()):
+        if len(gaussians) > 0 and bool(faint.all()):
             faint[opacities.argmax()] = False
         cloned = torch.nonzero(grows & small & ~faint).squeeze(1)
         split = torch.nonzero(grows & ~small & ~faint).squeeze(1)
