@@ -104,7 +104,8 @@ def step_parts(trainer: Trainer) -> StepParts:
     row = table.lr_row(trainer.lrs(trainer.step + 1), trainer.step + 1, trainer.config.optimizer.head_lrs)
     lrs, going = torch.tensor(row, device=device), torch.zeros(1, dtype=torch.int32, device=device)
     gradients = {name: torch.zeros_like(p) for name, p in table.params.items()}
-    parameters = table.gaussians.tensors()
+    # leaves of their own: a live graph of the table's parameters would tie a captured step to this stream
+    parameters = {name: p.detach().requires_grad_() for name, p in table.gaussians.tensors().items()}
     return StepParts(
         view.camera, view.image, parameters, trainer.background, trainer.config.rule,
         lambda: table.adam_step(gradients, lrs, going),

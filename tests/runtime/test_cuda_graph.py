@@ -146,10 +146,10 @@ def test_memory_of_gone_graphs_is_given_back_beyond_a_limit():
     cuda = torch.device("cuda", 0)
     torch.cuda.empty_cache()
     account = GraphMemory(cuda)
-    large = torch.empty(2**26, dtype=torch.uint8, device=cuda)
+    large = torch.empty(2**31, dtype=torch.uint8, device=cuda)
     del large
     before = torch.cuda.memory_reserved(cuda)
-    account.give_back(2**30)
+    account.give_back(2**33)
     assert torch.cuda.memory_reserved(cuda) == before > account.reserved
     account.give_back(0)
     assert torch.cuda.memory_reserved(cuda) < before and account.reserved == torch.cuda.memory_reserved(cuda)
