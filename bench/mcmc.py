@@ -1,4 +1,4 @@
-"""Strategy `mcmc` beside preset `3dgs` and gsplat's own MCMC: held-out PSNR from the same images, cameras, split and points.
+"""Preset `mcmc` beside preset `3dgs` and gsplat's own MCMC: held-out PSNR from the same images, cameras, split and points.
 
 usage: python -m bench.mcmc SCENE [--seeds 3] [--steps 7000] [--split every:8] [--downscale 1] [--device cuda] --out FILE.json
 
@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from bench import gsplat_trainer, result_file
-from bench.training import Trainer, finish, make_trainer, with_cap, with_strategy
+from bench.training import Trainer, finish, make_trainer, with_cap
 from warpgs import load_scene
 from warpgs.io.splits import split_views
 from warpgs.pipeline.metrics.evaluate import render_view, score
@@ -32,7 +32,7 @@ from warpgs.pipeline.runs.results import options_for
 from warpgs.pipeline.train.config import PRESETS, FitConfig
 from warpgs.scene import Scene, View
 
-WHAT = "held-out PSNR of preset 3dgs, of strategy mcmc and of gsplat's MCMC under the same cap, by seed"
+WHAT = "held-out PSNR of preset 3dgs, of preset mcmc and of gsplat's MCMC under the same cap, by seed"
 BASE, OURS, PEER, PEER_OWN = "warpgs 3dgs", "warpgs mcmc", "gsplat mcmc", "gsplat mcmc, own units"
 PROGRAMS = (BASE, OURS, PEER, PEER_OWN)
 
@@ -102,7 +102,8 @@ def measure(study: Study, program: str, seed: int, cap: int | None) -> dict:
     if program == BASE:
         return our_row(study, config)
     if program == OURS:
-        return our_row(study, with_strategy(with_cap(config, cap), "mcmc"))
+        ours = dataclasses.replace(PRESETS["mcmc"], steps=study.steps, seed=seed)
+        return our_row(study, with_cap(ours, cap))
     return peer_row(study, seed, cap, program == PEER_OWN)
 
 
