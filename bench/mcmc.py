@@ -129,7 +129,7 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def run(study: Study, seeds: int, programs: tuple[str, ...], facts: dict, out: Path) -> list[dict]:
+def run(study: Study, seeds: range, programs: tuple[str, ...], facts: dict, out: Path) -> list[dict]:
     """Measure what the file lacks, seed by seed, and write it after each row.
 
     Raises:
@@ -139,7 +139,7 @@ def run(study: Study, seeds: int, programs: tuple[str, ...], facts: dict, out: P
     if any(stored.get(k) != v for k, v in facts.items()):
         raise ValueError(f"{out}: holds a study of { ({k: stored.get(k) for k in facts}) }, not {facts}; choose another --out")
     rows = stored["rows"]
-    for seed in range(seeds):
+    for seed in seeds:
         for program in (BASE, *(p for p in programs if p != BASE)):
             if any((r["program"], r["seed"]) == (program, seed) for r in rows):
                 continue
@@ -158,6 +158,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene")
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--first-seed", type=int, default=0, help="so that several processes can share the work")
     parser.add_argument("--steps", type=int, default=7000)
     parser.add_argument("--split", default="every:8")
     parser.add_argument("--downscale", type=int, default=1)
@@ -172,7 +173,7 @@ def main(arguments: list[str] | None = None) -> int:
     camera = train[0].camera
     print(f"{len(train)} training and {len(test)} held-out views, {camera.width} x {camera.height} px")
     facts = {"scene": Path(a.scene).resolve().name, "split": a.split, "downscale": a.downscale, "steps": a.steps}
-    print(table(run(study, a.seeds, tuple(a.only), facts, a.out)))
+    print(table(run(study, range(a.first_seed, a.first_seed + a.seeds), tuple(a.only), facts, a.out)))
     return 0
 
 
