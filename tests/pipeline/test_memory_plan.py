@@ -119,7 +119,7 @@ def bytes_of_tensors(tensors) -> int:
 
 @pytest.mark.parametrize("strategy", ["clone_split", "importance_sampling", "holdout", "mcmc"])
 def test_plan_counts_what_lasts(strategy):
-    """To the byte: every column of the strategy, each view once though steps take it from a stack, and whole views of holdout."""
+    """To the byte: every column of a strategy, each view once though steps take it from a stack, and holdout's whole views."""
     views = masked(photos(4, 200, 150))
     config = dataclasses.replace(
         STEADY, steps=60, strategy=strategy, strategy_config=None, method=MethodConfig(events=True), phases=PhaseConfig(4, 6),

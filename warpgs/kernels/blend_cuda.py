@@ -209,8 +209,8 @@ def forward(
     """Return what `blend.composite` returns for projected Gaussians [C, N, 12] and backgrounds [C, 3], on CUDA.
 
     Returns:
-        rgb [C, H, W, 3]; alpha, depth, transmittances, weights and ends [C, H, W]; and states, a row [S, B] for each chunk of
-        instances, of the values `STATE` for each pixel of a tile.
+        rgb [C, H, W, 3]; alpha, depth, transmittances, weights and ends [C, H, W]; and states [S, P], with a row for each chunk
+        of instances and `STATE` numbers for each pixel of a tile.
     """
     device, rule = projected.device, settings.rule
     shape = (backgrounds.shape[0], settings.height, settings.width)
