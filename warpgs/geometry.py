@@ -55,7 +55,11 @@ def quaternions(rotations: torch.Tensor) -> torch.Tensor:
 
 
 def check_pinhole(camera: Camera) -> None:
-    """Raise UsageError for a camera that is no pinhole: its model is known to the kernels alone."""
+    """Check that a camera is a pinhole: other models are known to the kernels alone.
+
+    Raises:
+        UsageError: It is not.
+    """
     if camera.model != "pinhole":
         raise UsageError(
             f"points are projected outside of the rasterizer for pinhole cameras only, and this one is {camera.model!r}; "

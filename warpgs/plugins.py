@@ -63,6 +63,10 @@ class Registry(Generic[T]):
             self._searched = True
         return sorted(n for n in self._classes if ":" not in n)
 
+    def has(self, cls: type) -> bool:
+        """Return whether a class itself, not only a base of it, is registered by its ``name``."""
+        return self._classes.get(getattr(cls, "name", "")) is cls
+
     def find(self, name: str | type[T]) -> type[T]:
         """Return the class of a name, or the class itself.
 

@@ -33,7 +33,7 @@ CUDA_FUNCTIONS = {
 """Code that only a CUDA device runs, beside the branches that `sides` finds."""
 
 CUDA_ARGUMENTS = {"deterministic", "block_dim"}
-"""Arguments that mean something on CUDA alone: their defaults, and what is passed for them, are judged there."""
+"""Arguments that mean something on CUDA alone, where their defaults, and what is passed for them, are tested."""
 
 LIMITS, LIMITS_PROJECT, LIMITS_BLEND = (f"kernels/test_limits{what}.py" for what in ("", "_project", "_blend"))
 SPANS, CUTS = "kernels/test_spans.py", "runtime/test_interop.py"

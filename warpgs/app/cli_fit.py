@@ -15,7 +15,7 @@ from warpgs.app.flags import flags_of, settings_of, word_after
 from warpgs.errors import UsageError, WarpgsError
 from warpgs.io.readers import READERS
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device
-from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESETS, FitConfig
+from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESET_NOTES, PRESETS, FitConfig
 from warpgs.pipeline.train.loss import LOSS_TERMS
 from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.pipeline.train.time_budget import check_budget
@@ -121,6 +121,11 @@ def _preset(arguments: list[str]) -> tuple[FitConfig, str]:
     return dataclasses.replace(base, strategy=strategy, strategy_config=None if own is None else own()), kind
 
 
+def _presets() -> str:
+    """Return the presets and what they are, for people."""
+    return "presets:\n" + "\n".join(f"  {name}: {note}" for name, note in PRESET_NOTES.items())
+
+
 def _size() -> Any:
     """Return the specification of a flag for a size in bytes, such as 2GiB."""
     import tyro
@@ -202,7 +207,7 @@ def fit(arguments: list[str], description: str) -> FitRequest:
 
     base, kind = _preset(arguments)
     terms = _terms(arguments, base)
-    a: Any = tyro.cli(_flags(base, terms), args=arguments, prog="warpgs fit", description=description)
+    a: Any = tyro.cli(_flags(base, terms), args=arguments, prog="warpgs fit", description=f"{description}\n\n{_presets()}")
     if a.reader is not None:
         _load(READERS, a.reader)
     if a.threads < 0:

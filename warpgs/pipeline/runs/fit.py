@@ -30,7 +30,7 @@ from warpgs.pipeline.train.complexity import complexity_figures, complexity_summ
 from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESETS, FitConfig
 from warpgs.pipeline.train.time_budget import within_budget
 from warpgs.pipeline.train.trainer import StepReport, Trainer, run, train_views
-from warpgs.pipeline.train.warmup import rehearsal
+from warpgs.pipeline.train.warmup import background_warmup
 from warpgs.report.events import EventLog
 from warpgs.report.progress import Progress
 from warpgs.scene import Scene, View
@@ -189,7 +189,7 @@ def _prepare(job: _Job, resumed: Path | None) -> tuple[Trainer, State | None, di
         if (resumed / TENSORS).is_file():
             state = load_checkpoint(resumed)
     c = job.config
-    with rehearsal(c, job.device) as ready:
+    with background_warmup(c, job.device) as ready:
         trainer = Trainer(job.train, job.scene.points, c, job.device, job.scene.background, ready=ready)
     if job.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(job.device)  # the steps' need is told, not the start's or an earlier fit's
@@ -228,7 +228,7 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
 
 def _announce(job: _Job, trainer: Trainer) -> None:
     """Print what is fitted and every choice made for the user."""
-    job.notes += [*trainer.notes, trainer.memory.sentence()]
+    job.notes += [*trainer.notes, trainer.memory.summary()]
     train, test = job.train, job.test
     size = f"{train[0].camera.width} x {train[0].camera.height} px"
     job.say(f"{job.scene.path}: {job.scene.format}, {len(train)} views to fit, {len(test)} held out, {size}, {job.where}")
