@@ -2,6 +2,12 @@
 
 import pytest
 import torch
+from hypothesis import settings
+
+# Examples of a property: few where every change waits for them, more with `--hypothesis-profile many` (make test-slow).
+settings.register_profile("few", max_examples=4)
+settings.register_profile("many", max_examples=40)
+settings.load_profile("few")
 
 DEVICES = [pytest.param("cpu")]
 if torch.cuda.is_available():
@@ -24,6 +30,15 @@ def device(request) -> torch.device:
 @pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
 def dtype(request) -> torch.dtype:
     return request.param
+
+
+@pytest.fixture(autouse=True, scope="session")
+def no_overview_in_reports():
+    """Leave the 3D overview out of reports: it starts a process of its own, which tests/report/test_overview.py looks at."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr("warpgs.pipeline.runs.results.render_overview", lambda *_: (None, "no overview image: this is a test"))
+    yield
+    patch.undo()
 
 
 @pytest.fixture(autouse=True)
