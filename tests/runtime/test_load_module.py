@@ -1,9 +1,11 @@
 """A module is compiled by one process while another that needs it waits; nothing is locked once it is loaded."""
 
+import errno
 import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -75,3 +77,19 @@ def test_a_file_system_without_locks_is_no_obstacle(tmp_path, monkeypatch):
         pass
     with pytest.raises(OSError, match="of the body"), load_module.exclusive(tmp_path / "lock"):
         raise OSError("of the body")
+
+
+def test_windows_has_other_calls(tmp_path, monkeypatch):
+    """Its lock is asked for again where it gives up after ten seconds, and is on the first byte both times."""
+    calls = []
+
+    def locking(descriptor, mode, count):
+        calls.append((mode, os.lseek(descriptor, 0, os.SEEK_CUR), count))
+        if len(calls) == 1:
+            raise OSError(errno.EDEADLOCK, "given up")
+
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(locking=locking, LK_LOCK="lock", LK_UNLCK="unlock"))
+    with load_module.exclusive(tmp_path / "lock"):
+        assert calls == [("lock", 0, 1)] * 2
+    assert calls[2:] == [("unlock", 0, 1)]

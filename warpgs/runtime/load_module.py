@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import os
+import errno
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
@@ -45,28 +46,31 @@ def exclusive(path: Path) -> Iterator[None]:
         yield
 
 
-if os.name == "nt":
+def _acquire(file: IO[bytes]) -> None:
+    if sys.platform != "win32":
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX)
+        return
     import msvcrt
 
-    def _acquire(file: IO[bytes]) -> None:
-        file.seek(0)
-        while True:
-            try:
-                msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)
-                return
-            except OSError as e:  # it gives up after ten seconds
-                if e.errno != 36:  # EDEADLOCK
-                    raise
+    file.seek(0)
+    while True:
+        try:
+            msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)
+            return
+        except OSError as e:  # it gives up after ten seconds
+            if e.errno != errno.EDEADLOCK:
+                raise
 
-    def _release(file: IO[bytes]) -> None:
-        file.seek(0)
-        msvcrt.locking(file.fileno(), msvcrt.LK_UNLCK, 1)
 
-else:
-    import fcntl
+def _release(file: IO[bytes]) -> None:
+    if sys.platform != "win32":
+        import fcntl
 
-    def _acquire(file: IO[bytes]) -> None:
-        fcntl.flock(file, fcntl.LOCK_EX)
-
-    def _release(file: IO[bytes]) -> None:
         fcntl.flock(file, fcntl.LOCK_UN)
+        return
+    import msvcrt
+
+    file.seek(0)
+    msvcrt.locking(file.fileno(), msvcrt.LK_UNLCK, 1)
