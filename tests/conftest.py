@@ -1,5 +1,10 @@
 """Fixtures that every op's tests share: the devices there are, and both scalar types."""
 
+import os
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ["OMP_NUM_THREADS"] = "1"  # workers share the cores; tests that are about threads set their number
+
 import pytest
 import torch
 from hypothesis import settings
