@@ -190,13 +190,13 @@ def test_a_run_folder_never_decides_what_code_is_loaded(plugged):
     assert scored[0] == 0 and resumed[0] == 0 and "continued from step 3" in resumed[2]
 
 
-def test_the_current_folder_is_not_searched(plugged):
+@pytest.mark.parametrize("found", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_the_current_folder_is_not_searched(plugged, found):
     """`python -m warpgs` finds module:Class on PYTHONPATH, where its user put it, and not by standing beside it."""
     folder, _, _ = plugged
     command = [sys.executable, "-m", "warpgs", "fit", *BASE, "--strategy", "mine:SlowGrowth", "--help"]
     root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    for path, found in ((root, False), (f"{root}{os.pathsep}{folder}", True)):
-        environment = {**os.environ, "PYTHONPATH": path}
-        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-        assert ("--slow-growth.rate" in done.stdout) == found and (done.returncode == 0) == found, done.stderr
-        assert found or "'mine:SlowGrowth' cannot be imported" in done.stderr
+    environment = {**os.environ, "PYTHONPATH": f"{root}{os.pathsep}{folder}" if found else root}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert ("--slow-growth.rate" in done.stdout) == found and (done.returncode == 0) == found, done.stderr
+    assert found or "'mine:SlowGrowth' cannot be imported" in done.stderr
