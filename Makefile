@@ -9,6 +9,8 @@ BIN := $(VENV)/bin
 endif
 # files and pipes are UTF-8 on Windows too
 export PYTHONUTF8 := 1
+# compiled modules are kept, or each of the many processes that tests start compiles them anew
+export PYTHONDONTWRITEBYTECODE :=
 OUT ?= runs/demo
 
 .PHONY: demo install lint types docs test test-slow test-fault test-browser test-audit test-cuda clean
@@ -35,7 +37,7 @@ PYTEST := $(BIN)/python -m pytest -q
 
 test: lint types docs
 	$(BIN)/python -m coverage erase
-	$(PYTEST) -n 2 -m "not slow and not fault and not browser and not audit and not cuda" --cov --cov-config=pyproject.toml --cov-report=term:skip-covered --cov-fail-under=90
+	$(PYTEST) -n 2 --dist worksteal -m "not slow and not fault and not browser and not audit and not cuda" --cov --cov-config=pyproject.toml --cov-report=term:skip-covered --cov-fail-under=90
 
 # Style and the import layers.
 lint: install
@@ -52,9 +54,11 @@ types: install
 docs: install
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-# Run these before a change is called done: CONTRIBUTING.md says which one when.
+# Run these before a change is called done: CONTRIBUTING.md says which one when. Properties get more examples here.
 test-slow test-fault test-browser test-audit test-cuda: test-%: install
 	$(PYTEST) -m $*
+	$(if $(filter slow,$*),$(PYTEST) -m "not slow and not cuda" --hypothesis-profile=many $(PROPERTIES))
+PROPERTIES := $(addprefix tests/,numerics/test_properties.py numerics/test_extreme_training.py io/test_fuzz.py export/test_ply.py)
 
 clean:
 	rm -rf runs site .coverage .pytest_cache .ruff_cache .mypy_cache

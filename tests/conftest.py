@@ -1,18 +1,18 @@
 """Fixtures that every op's tests share: the devices there are, and both scalar types."""
 
 import os
-import tempfile
-from pathlib import Path
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ["OMP_NUM_THREADS"] = "1"  # workers share the cores; tests that are about threads set their number
 
 import pytest
 import torch
+from hypothesis import settings
 
-# Two processes that compile one kernel for the first time can get in each other's way: each worker has a cache of its own.
-if worker := os.environ.get("PYTEST_XDIST_WORKER"):
-    base = os.environ.get(
-        "WARP_CACHE_PATH", Path(tempfile.gettempdir()) / f"warpgs-test-kernels-{getattr(os, 'getuid', int)()}"
-    )
-    os.environ["WARP_CACHE_PATH"] = str(Path(base) / worker)
+# Examples of a property: few where every change waits for them, more with `--hypothesis-profile many` (make test-slow).
+settings.register_profile("few", max_examples=4)
+settings.register_profile("many", max_examples=40)
+settings.load_profile("few")
 
 DEVICES = [pytest.param("cpu")]
 if torch.cuda.is_available():
@@ -35,6 +35,15 @@ def device(request) -> torch.device:
 @pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
 def dtype(request) -> torch.dtype:
     return request.param
+
+
+@pytest.fixture(autouse=True, scope="session")
+def no_overview_in_reports():
+    """Leave the 3D overview out of reports: it starts a process of its own, which tests/report/test_overview.py looks at."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr("warpgs.pipeline.runs.results.render_overview", lambda *_: (None, "no overview image: this is a test"))
+    yield
+    patch.undo()
 
 
 @pytest.fixture(autouse=True)

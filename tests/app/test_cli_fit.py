@@ -169,33 +169,34 @@ def test_settings_of_plug_ins_reach_the_run(plugged, capsys):
 def test_a_run_folder_never_decides_what_code_is_loaded(plugged):
     """In a new process: eval asks for the reader by name, --resume for strategy and term, and go on once they are named."""
     folder, command, named = plugged
-    probe = (
-        "import sys\nfrom warpgs.app.cli import main\ncode = main(sys.argv[1:])\n"
-        "print('loaded', [n for n in sys.modules if 'mine' in n.rpartition('_warpgs_')[2] and '_warpgs_' in n])\nsys.exit(code)"
-    )
-
-    def run(*arguments):
-        return subprocess.run([sys.executable, "-c", probe, *arguments], capture_output=True, text=True, check=False)
-
     reader = f"{folder}/mine.py:Folder"
-    done = run("eval", str(folder / "run"), "--device", "cpu")
-    assert done.returncode == 2 and "loaded []" in done.stdout and f"--reader {reader}" in done.stderr
-    assert run("eval", str(folder / "run"), "--device", "cpu", "--reader", reader).returncode == 0
-    done = run(*command, "--resume")
-    assert done.returncode == 2 and "loaded []" in done.stdout and f"--strategy {named[1]}" in done.stderr
-    done = run(*command, "--resume", *named[:4])
-    assert done.returncode == 2 and f"--loss-terms {named[5]}" in done.stderr
-    done = run(*command, "--resume", *named)
-    assert done.returncode == 0 and "continued from step 3" in done.stdout
+    score = ["eval", str(folder / "run"), "--device", "cpu"]
+    commands = [
+        score, [*command, "--resume"], [*command, "--resume", *named[:4]], [*score, "--reader", reader],
+        [*command, "--resume", *named],
+    ]  # fmt: skip
+    probe = (
+        "import contextlib, io, json, sys\nfrom warpgs.app.cli import main\nfor words in json.load(sys.stdin):\n"
+        "    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as err:\n"
+        "        code = main(words)\n"
+        "    loaded = any('mine' in n.rpartition('_warpgs_')[2] and '_warpgs_' in n for n in sys.modules)\n"
+        "    print(json.dumps([code, loaded, out.getvalue(), err.getvalue()]))"
+    )
+    done = subprocess.run([sys.executable, "-c", probe], input=json.dumps(commands), capture_output=True, text=True, check=True)
+    unread, unnamed, half, scored, resumed = map(json.loads, done.stdout.splitlines())
+    assert unread[:2] == [2, False] and f"--reader {reader}" in unread[3]
+    assert unnamed[:2] == [2, False] and f"--strategy {named[1]}" in unnamed[3]
+    assert half[:2] == [2, True] and f"--loss-terms {named[5]}" in half[3]
+    assert scored[0] == 0 and resumed[0] == 0 and "continued from step 3" in resumed[2]
 
 
-def test_the_current_folder_is_not_searched(plugged):
+@pytest.mark.parametrize("found", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_the_current_folder_is_not_searched(plugged, found):
     """`python -m warpgs` finds module:Class on PYTHONPATH, where its user put it, and not by standing beside it."""
     folder, _, _ = plugged
     command = [sys.executable, "-m", "warpgs", "fit", *BASE, "--strategy", "mine:SlowGrowth", "--help"]
     root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    for path, found in ((root, False), (f"{root}{os.pathsep}{folder}", True)):
-        environment = {**os.environ, "PYTHONPATH": path}
-        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-        assert ("--slow-growth.rate" in done.stdout) == found and (done.returncode == 0) == found, done.stderr
-        assert found or "'mine:SlowGrowth' cannot be imported" in done.stderr
+    environment = {**os.environ, "PYTHONPATH": f"{root}{os.pathsep}{folder}" if found else root}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert ("--slow-growth.rate" in done.stdout) == found and (done.returncode == 0) == found, done.stderr
+    assert found or "'mine:SlowGrowth' cannot be imported" in done.stderr

@@ -1,15 +1,15 @@
 """Warming the kernel cache: all that a fit launches, compiled once."""
 
 import dataclasses
-import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 from tests.scenes import photos, priors, seeds
+from warpgs.app import precompile
+from warpgs.app.cli import main
 from warpgs.app.precompile import fit_kernels
 from warpgs.pipeline.metrics.evaluate import render_view, score
 from warpgs.pipeline.model.init import InitConfig
@@ -22,6 +22,10 @@ from warpgs.pipeline.train.strategies.sampler import SamplerConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.runtime import interop
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def nothing(begin: int): ...
 
 
 @pytest.mark.parametrize("recorded", [True, False])
@@ -55,21 +59,18 @@ def test_a_fit_launches_nothing_else(device, strategy, recorded, monkeypatch):
     assert len(launched) > 8 and launched <= warmed
 
 
-def test_the_second_call_finds_all_in_the_cache(tmp_path):
-    """One small module in an empty cache: compiled by the first process, found by the second."""
-    code = (
-        "import sys; from warpgs.app import precompile; from warpgs.app.cli import main; "
-        "from warpgs.kernels import tiles; import warp as wp; "
-        "precompile.fit_kernels = lambda cuda: [] if cuda else [(tiles.make_kernels(wp.float32, cuda).find_ranges, 1)]; "
-        "sys.exit(main(['doctor', '--warm']))"
-    )
-    environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path), "CUDA_VISIBLE_DEVICES": ""}
-    said = [
-        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment).stdout
-        for _ in range(2)
-    ]
-    assert "cpu: tiles.find_ranges, " in said[0] and "1 modules: 1 compiled, 0 were there" in said[0]
-    assert "find_ranges" not in said[1] and "1 modules: 0 compiled, 1 were there" in said[1]
+def test_the_second_call_finds_all_in_the_cache(tmp_path, monkeypatch, capsys):
+    """One small module in an empty cache: compiled by the first call, found by the second, which knows nothing of the first."""
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    monkeypatch.setattr(precompile, "fit_kernels", lambda cuda: [(nothing, 1)])
+    said = []
+    for _ in range(2):
+        assert main(["doctor", "--warm"]) == 0
+        said.append(capsys.readouterr().out)
+        nothing.module.unload()
+    assert "cpu: test_precompile.nothing, " in said[0] and "1 modules: 1 compiled, 0 were there" in said[0]
+    assert "test_precompile.nothing" not in said[1] and "1 modules: 0 compiled, 1 were there" in said[1]
 
 
 def test_kernels_of_both_kinds_of_device_are_named():

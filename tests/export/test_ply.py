@@ -198,7 +198,9 @@ def good(tmp_path_factory):
     return path.read_bytes()
 
 
-@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=10 * settings.default.max_examples, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(
     edits=st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), max_size=6),
     cut=st.one_of(st.none(), st.integers(0, 10_000)),
@@ -219,7 +221,9 @@ def test_damaged_bytes_give_gaussians_or_a_data_error(good, tmp_path, edits, cut
     assert len(model) * 56 <= len(data)
 
 
-@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=5 * settings.default.max_examples, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(data=st.binary(max_size=200))
 def test_noise_behind_the_magic_is_a_data_error(tmp_path, data):
     path = tmp_path / "noise.ply"

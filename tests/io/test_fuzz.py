@@ -17,7 +17,9 @@ from warpgs.io.images import decode
 from warpgs.io.load import load_scene
 from warpgs.io.splits import split_views
 
-FUZZ = settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+FUZZ = settings(
+    max_examples=4 * settings.default.max_examples, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck)
+)
 FILES = {**scenes.colmap_bin(), **scenes.colmap_txt()}
 READERS = {
     "cameras": colmap.read_cameras,

@@ -8,8 +8,13 @@ from tests.numerics.scenes import SCENES
 from tests.numerics.split import gradient_errors, split
 from warpgs.constants import RULES
 
+QUICK = {("exact", "wall"), ("exact", "random_cloud"), ("exact", "faint_fog"), ("inria", "wall")}
+"""Cases without a mark: an ordinary scene, a stress scene, the most layers, and another rule."""
 
-@pytest.mark.parametrize(("rule", "name"), CASES, ids=[f"{r}-{n}" for r, n in CASES])
+
+@pytest.mark.parametrize(
+    ("rule", "name"), [pytest.param(*c, id="-".join(c), marks=() if c in QUICK else pytest.mark.slow) for c in CASES]
+)
 def test_budget(device, rule, name):
     """E of pictures and gradients beside P32 and below the caps; bands counted, what happens in them bounded."""
     scene = SCENES[name]()

@@ -36,9 +36,7 @@ from warpgs.render.rasterize import rasterize
 from warpgs.scene import Normalization, PointCloud, View
 
 POINTS = InitConfig(source="points", max_sh_degree=0)
-few = settings(
-    max_examples=40, derandomize=True, deadline=None, database=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+few = settings(derandomize=True, deadline=None, database=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def gray(points) -> PointCloud:

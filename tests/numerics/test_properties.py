@@ -25,7 +25,7 @@ from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians, Normalization, Render
 
 few = settings(
-    max_examples=8, derandomize=True, deadline=None, database=None,
+    derandomize=True, deadline=None, database=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )  # fmt: skip
 RULE_NAMES = st.sampled_from(["exact", "gsplat", "inria"])

@@ -104,6 +104,7 @@ print(digest.hexdigest())
 """
 
 
+@pytest.mark.slow
 def test_processes_agree():
     """Neither the order of hashes nor the number of threads nor the process shows in a fit from random points."""
     digests = set()

@@ -160,10 +160,19 @@ def test_full_fine_layer_frees_its_least_contributors():
     assert bool((~fit.strategy.fine)[old.change.keep].all())
 
 
-def test_all_switch_combinations_run():
-    """2^7 fits of a 32 x 32 scene: every one samples, protects or not as asked, and stays finite."""
+SOME = [(True,) * 7, (False,) * 7, *(tuple(i != j for i in range(7)) for j in range(7))]
+"""All parts, none, and each part switched off alone."""
+
+
+@pytest.mark.parametrize(
+    "combinations",
+    [SOME, pytest.param([*itertools.product((False, True), repeat=7)], marks=pytest.mark.slow)],
+    ids=["some", "all"],
+)
+def test_switch_combinations_run(combinations):
+    """Fits of a 32 x 32 scene, 2^7 of them in all: every one samples, protects or not as asked, and stays finite."""
     config = dataclasses.replace(CONFIG, steps=6, phases=PhaseConfig(2, 1, every=2))
-    for values in itertools.product((False, True), repeat=7):
+    for values in combinations:
         method = dataclasses.replace(METHOD, **dict(zip(SWITCHES, values)))
         fit = fitted(dataclasses.replace(config, method=method), size=(32, 32))
         assert all(bool(torch.isfinite(t).all()) for t in fit.gaussians.tensors().values()), values

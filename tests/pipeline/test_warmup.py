@@ -2,7 +2,6 @@
 
 import dataclasses
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -66,20 +65,20 @@ def test_what_goes_wrong_is_raised(monkeypatch):
 
 def test_nothing_goes_on_after_the_block(monkeypatch):
     """An error in the block, such as a scene with nothing to start from, ends the warmup after the step it is in."""
-    steps = []
+    began, ended = threading.Event(), []
 
     def endless(config, device, stopped):
+        began.set()
         while not stopped():
-            steps.append(1)
-            time.sleep(0.01)
+            pass
+        ended.append(threading.current_thread())
 
     monkeypatch.setattr(warmups, "warm_up", endless)
     monkeypatch.setattr(torch.cuda, "device", lambda _: torch.no_grad())
     with pytest.raises(DataError), background_warmup(PRESETS["paper"], CUDA):
+        began.wait()
         raise DataError("nothing to start from")
-    done = len(steps)
-    time.sleep(0.05)
-    assert len(steps) == done and not any(t.name.startswith("warmup") for t in threading.enumerate())
+    assert len(ended) == 1 and not ended[0].is_alive()
 
 
 def test_a_warmup_that_nobody_waits_for_stops():

@@ -44,7 +44,7 @@ def test_the_trap_works(trap):
     assert "pyvista.py" in mark.read_text()
 
 
-@pytest.mark.parametrize("command", ["doctor", "fit"])
+@pytest.mark.parametrize("command", [pytest.param("doctor", marks=pytest.mark.slow), "fit"])
 def test_no_command_runs_what_lies_beside_a_scene(trap, tmp_path, command):
     """Neither the command itself nor the process that draws the overview; `python -m` would, `warpgs` is the safer case."""
     _, mark = trap

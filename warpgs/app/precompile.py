@@ -31,6 +31,7 @@ from warpgs.kernels.native import BLOCK
 from warpgs.pipeline.train.strategies import mcmc
 from warpgs.runtime import interop
 from warpgs.runtime.byte_units import format_bytes
+from warpgs.runtime.load_module import load_module
 
 TILE = 16
 """Side of a tile in a fit [px]."""
@@ -91,7 +92,7 @@ class Precompiled:
 
 def _load(device: torch.device, kernel: wp.Kernel, block: int) -> Precompiled:
     began, name = time.time(), f"{kernel.func.__module__.rpartition('.')[2]}.{kernel.func.__name__}"
-    path = Path(kernel.module.load(interop.warp_device(device), block_dim=block).binary_path)
+    path = Path(load_module(kernel.module, interop.warp_device(device), block).binary_path)
     return Precompiled(str(device), name, block, path.stat().st_mtime >= began, time.time() - began)
 
 

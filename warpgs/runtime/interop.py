@@ -16,6 +16,7 @@ import warp as wp
 
 from warpgs.errors import ResourceError
 from warpgs.runtime.kernel_cache import prepare_kernel_cache
+from warpgs.runtime.load_module import load_module
 
 wp.config.log_level = wp.LOG_WARNING  # its banner and compile notes are not for users
 
@@ -179,6 +180,7 @@ class _Recorded:
     def launch(self, count: int, inputs: Sequence, stream: wp.Stream) -> None:
         with self.lock:
             if self.command is None:
+                load_module(self.kernel.module, self.device, self.block_dim)
                 arrays = [a.array() if isinstance(a, View) else a for a in inputs]
                 self.command = wp.launch(
                     self.kernel, count, inputs=[0, *arrays], device=self.device, block_dim=self.block_dim, record_cmd=True
@@ -246,7 +248,7 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
         return
     inputs = [a.array() if isinstance(a, View) else a for a in inputs]
     with _LOADING:  # launches on a CPU are compiled for blocks of one thread
-        kernel.module.load("cpu", block_dim=1)
+        load_module(kernel.module, warp_device(device), 1)
     threads = torch.get_num_threads()
     # A kernel of Warp 1.19 for x86 keeps a pointer into its stack in a static variable, which only optimised code leaves out.
     debugging = wp.config.mode == "debug"

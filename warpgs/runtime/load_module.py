@@ -1,0 +1,76 @@
+"""Loading of Warp modules: each is compiled by one process, and one thread of it, while all others that need it wait."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+import warp as wp
+
+_LOADED: set[tuple[wp.Module, object, int]] = set()
+"""Modules that this process has loaded, with the context of the device and the threads of a block."""
+
+
+def load_module(module: wp.Module, device: wp.Device, block_dim: int):
+    """Load a module for blocks of that many threads and return Warp's handle of it; compile it where the cache lacks it.
+
+    Several fits that start at once on a fresh machine need the same modules. A file lock beside the cache's folders makes one
+    of them compile; the others find the result. Once a module is loaded no lock is taken.
+    """
+    key = (module, device.context, block_dim)
+    if key in _LOADED:  # Warp sees by its hash whether a kernel has joined the module since
+        return module.load(device, block_dim=block_dim)
+    locks = Path(wp.config.kernel_cache_dir) / "locks"
+    locks.mkdir(exist_ok=True, parents=True)
+    with exclusive(locks / f"{module.get_module_identifier(block_dim)}.{device.is_cuda:d}"):
+        loaded = module.load(device, block_dim=block_dim)
+    _LOADED.add(key)
+    return loaded
+
+
+@contextlib.contextmanager
+def exclusive(path: Path) -> Iterator[None]:
+    """Hold a file, which is made if it is not there, so that one thread of one process at a time runs the body.
+
+    The system gives the file free when its holder ends, killed or not. A file system without locks is passed over: Warp puts a
+    compiled module in place by renaming, so that two that compile it lose time and nothing else.
+    """
+    with path.open("ab") as file, contextlib.ExitStack() as held:
+        with contextlib.suppress(OSError):
+            _acquire(file)
+            held.callback(_release, file)
+        yield
+
+
+def _acquire(file: IO[bytes]) -> None:
+    if sys.platform != "win32":
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX)
+        return
+    import msvcrt
+
+    file.seek(0)
+    while True:
+        try:
+            msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)
+            return
+        except OSError as e:  # it gives up after ten seconds
+            if e.errno != errno.EDEADLOCK:
+                raise
+
+
+def _release(file: IO[bytes]) -> None:
+    if sys.platform != "win32":
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_UN)
+        return
+    import msvcrt
+
+    file.seek(0)
+    msvcrt.locking(file.fileno(), msvcrt.LK_UNLCK, 1)
