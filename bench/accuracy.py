@@ -1,13 +1,15 @@
-"""Put the measured error budget and the needles into docs/accuracy.md: usage: python -m bench.accuracy.
+"""Put the measured error budget, needles and bits into docs/accuracy.md: usage: python -m bench.accuracy.
 
 The figures are those of bench/results/budget_*.json (`python -m tests.numerics.report`) and bench/results/needles_*.json
-(`python -m bench.needles`), a table for each machine.
+(`python -m bench.needles`), a table for each machine, and of bench/results/same_bits.json (`python -m bench.same_bits`).
 """
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+
+from bench import same_bits
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs/accuracy.md"
@@ -82,7 +84,9 @@ def needles_text(results: dict[str, dict]) -> str:
 
 def filled(page: str) -> str:
     """The page with the text between each pair of marks made anew."""
-    for name, text in (("budget", budget_text(_results("budget"))), ("needles", needles_text(_results("needles")))):
+    bits = same_bits.table(json.loads(same_bits.RESULTS.read_text("utf-8")))
+    texts = {"budget": budget_text(_results("budget")), "needles": needles_text(_results("needles")), "same bits": bits}
+    for name, text in texts.items():
         begin, end = f"<!-- {name}: written by bench.accuracy -->\n", f"<!-- end of {name} -->"
         before, rest = page.split(begin)
         page = before + begin + "\n" + text + "\n" + end + rest.split(end)[1]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from warpgs.priors.opencv import alone
+
 SMOOTHNESS = (1e2, 1e4, 1e6)
 """Strengths tried in turn; a stronger one reaches farther, and a pixel takes the first that reaches it."""
 COLOR_SIGMA = 8.0
@@ -35,11 +37,12 @@ def complete(depth: np.ndarray, valid: np.ndarray, image: np.ndarray) -> np.ndar
     guide = (image * 255).round().clip(0, 255).astype(np.uint8)
     filled = np.full(depth.shape, np.median(inverse[valid]))
     left = np.ones(depth.shape, bool)
-    for strength in SMOOTHNESS:
-        smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, strength, COLOR_SIGMA)
-        share = smoother.filter(valid.astype(np.float32))
-        reached = left & (share > REACHED)
-        filled[reached] = smoother.filter(inverse)[reached] / share[reached]
-        left &= ~reached
+    with alone():
+        for strength in SMOOTHNESS:
+            smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, strength, COLOR_SIGMA)
+            share = smoother.filter(valid.astype(np.float32))
+            reached = left & (share > REACHED)
+            filled[reached] = smoother.filter(inverse)[reached] / share[reached]
+            left &= ~reached
     low, high = inverse[valid].min(), inverse[valid].max()
     return np.where(valid, depth, 1 / filled.clip(low, high)).astype(np.float32)

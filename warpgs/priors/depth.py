@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from warpgs.errors import DataError
+from warpgs.priors.opencv import alone
 from warpgs.priors.preprocess import HALF, Preprocessing, resize
 from warpgs.priors.session import Network
 
@@ -109,9 +110,10 @@ def _spread(image: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.nda
     guide = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
     received = np.full(values.shape, FLOOR)
     total = received * np.average(values, weights=weight)
-    for reach, share in REACHES:
-        # in one dimension the smoother's response falls as exp(-x / sqrt(lambda))
-        smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, reach**2, COLOR_SIGMA)
-        total += share * smoother.filter(weight * values)
-        received += share * smoother.filter(weight)
+    with alone():
+        for reach, share in REACHES:
+            # in one dimension the smoother's response falls as exp(-x / sqrt(lambda))
+            smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, reach**2, COLOR_SIGMA)
+            total += share * smoother.filter(weight * values)
+            received += share * smoother.filter(weight)
     return total / received

@@ -7,7 +7,6 @@ where another view's own sweep agrees. Compared with optical flow in docs/decisi
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,9 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from warpgs import geometry
 from warpgs.errors import UsageError
+from warpgs.geometry import matmul
 from warpgs.kernels.tiles import installed_bytes
 from warpgs.priors.epipolar import nearest_views, pixel_grid
+from warpgs.priors.opencv import alone, own_code
 from warpgs.scene import Camera, View, ViewDepth
 from warpgs.sizes import format_bytes
 
@@ -78,9 +80,9 @@ class SweepConfig:
 
 def project_inverse(first: Camera, second: Camera, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     """Positions in the second image [px], shape [N, 2], of pixels [N, 2] at inverse depths [N] [1/u]; NaN behind the camera."""
-    relative = second.viewmat @ np.linalg.inv(first.viewmat)
-    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1) @ np.linalg.inv(first.K).T
-    p = (rays @ relative[:3, :3].T + inverse[:, None] * relative[:3, 3]) @ second.K.T
+    rotation, translation = geometry.relative_pose(first, second)
+    rays = matmul(np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1), geometry.inverse(first.K).T)
+    p = matmul(matmul(rays, rotation.T) + inverse[:, None] * translation, second.K.T)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(p[:, 2:] > 1e-9, p[:, :2] / p[:, 2:], np.nan)
 
@@ -113,10 +115,11 @@ def plane_inverses(
 
 def plane_homography(first: Camera, second: Camera, inverse: float) -> np.ndarray:
     """H [3, 3] from first to second by the plane z = 1 / inverse, for pixels whose centres are whole numbers (OpenCV)."""
-    relative = second.viewmat @ np.linalg.inv(first.viewmat)
-    H = second.K @ (relative[:3, :3] + inverse * np.outer(relative[:3, 3], [0, 0, 1])) @ np.linalg.inv(first.K)
-    shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
-    return np.linalg.inv(shift) @ H @ shift
+    rotation, translation = geometry.relative_pose(first, second)
+    moved = rotation + inverse * np.outer(translation, [0, 0, 1])
+    H = matmul(matmul(second.K, moved), geometry.inverse(first.K))
+    back, shift = (np.array([[1, 0, s], [0, 1, s], [0, 0, 1]]) for s in (-0.5, 0.5))
+    return matmul(matmul(back, H), shift)
 
 
 def gray_of(view: View) -> np.ndarray:
@@ -173,7 +176,7 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
 
 def step_limits(colors: np.ndarray, small_step: float, large_step: float) -> np.ndarray:
     """P2 of the steps along the first axis of a picture [L, B, 3], in units of 1 / `UNIT`, int16, shape [L - 1, B]."""
-    jumps = np.abs(np.diff(colors, axis=0)).max(2)
+    jumps = np.abs(np.diff(colors, axis=0)).max(2).astype(float)  # float32's exp has other last digits on other processors
     return np.rint(np.maximum(large_step * np.exp(-jumps / EDGE), 1.5 * small_step) * UNIT).astype(np.int16)
 
 
@@ -245,8 +248,8 @@ def confirm(views: Sequence[View], inverses: Sequence[np.ndarray], index: int, c
     view, own = views[index], inverses[index]
     camera, pixels, w = view.camera, pixel_grid(view.camera), own.ravel()
     sensitivity = np.full(len(pixels), np.inf)
-    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ np.linalg.inv(camera.K).T
-    world = (rays / w[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+    rays = matmul(np.concatenate([pixels, np.ones((len(pixels), 1))], 1), geometry.inverse(camera.K).T)
+    world = matmul(rays / w[:, None] - camera.viewmat[:3, 3], camera.viewmat[:3, :3])
     notes, own_direction = [], world - camera.center
     own_direction /= np.linalg.norm(own_direction, axis=1, keepdims=True)
     for j in nearest_views(views, index, config.near_count):
@@ -272,19 +275,6 @@ def confirm(views: Sequence[View], inverses: Sequence[np.ndarray], index: int, c
     return ViewDepth(
         np.where(valid, 1 / own, 0).astype(np.float32), valid, sensitivity.astype(np.float32).reshape(own.shape), tuple(notes)
     )
-
-
-@contextlib.contextmanager
-def _alone():
-    """OpenCV without threads of its own: its calls here are so short that starting threads takes longer than they save."""
-    import cv2
-
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)
 
 
 def _swept(views: Sequence[View], others: dict[int, list[View]], planes: dict[int, np.ndarray], config: SweepConfig, pool):
@@ -357,7 +347,7 @@ def sweep_depths(
     import cv2
 
     small = [_reduced(v, config.max_pixels) for v in views]
-    with _alone(), ThreadPoolExecutor(torch.get_num_threads()) as pool:
+    with alone(), ThreadPoolExecutor(torch.get_num_threads(), initializer=own_code) as pool:
         inverses, said = _inverses(small, bounds, config, device, pool)
         confirmed = list(pool.map(lambda i: confirm(small, inverses, i, config), range(len(views))))
     out = []
