@@ -115,10 +115,11 @@ def function_stages() -> Iterator[Stage]:
     image = f[: 240 * 240].reshape(240, 240)
     bytes3 = (255 * np.stack([image] * 3, 2)).astype(np.uint8)
     H = np.array([[1.01, 0.02, 3.3], [-0.01, 0.98, 1.7], [1e-5, -2e-5, 1]])
+    linear = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     yield "cv2.blur", digest(cv2.blur(image, (7, 7)))
     yield (
         "cv2.warpPerspective",
-        digest(cv2.warpPerspective(image, H, (240, 240), flags=cv2.WARP_INVERSE_MAP)),
+        digest(cv2.warpPerspective(image, H, (240, 240), flags=linear)),
     )
     yield "cv2.cvtColor", digest(cv2.cvtColor(np.stack([image, image.T, image[::-1]], 2), cv2.COLOR_RGB2GRAY))
     yield "cv2.resize", digest(cv2.resize(image, (100, 90), interpolation=cv2.INTER_AREA))
