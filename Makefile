@@ -1,10 +1,17 @@
-# Everything a fresh machine needs: Python 3.11 to 3.13, and `make demo` or `make test`.
-PYTHON ?= python3
+# Everything a fresh machine needs: Python 3.11 to 3.13, and `make demo` or `make test`. On Windows call it from Git's bash.
 VENV := .venv
+ifeq ($(OS),Windows_NT)
+PYTHON ?= python
+BIN := $(VENV)/Scripts
+else
+PYTHON ?= python3
 BIN := $(VENV)/bin
+endif
+# files and pipes are UTF-8 on Windows too
+export PYTHONUTF8 := 1
 OUT ?= runs/demo
 
-.PHONY: demo test lint clean install
+.PHONY: demo install lint types docs test test-slow test-fault test-browser test-audit test-cuda clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -20,17 +27,34 @@ demo: install
 	rm -rf $(OUT)
 	mkdir -p $(OUT)
 	$(BIN)/warpgs demo $(OUT)/scene | tee $(OUT)/next.txt
-	$(BIN)/warpgs fit $(OUT)/scene --split "$$($(BIN)/python -c 'from warpgs.demo import split_spec; print(split_spec(24))')" --out $(OUT)/run
-	@echo "pictures: $(OUT)/run/renders    report: $(OUT)/run/report.html"
+	$(BIN)/warpgs fit $(OUT)/scene --split "$$($(BIN)/python -c 'from warpgs.synthetic.demo import split_spec; print(split_spec(24), end="")')" --out $(OUT)/run
+	@echo "images: $(OUT)/run/renders    report: $(OUT)/run/report.html"
 
-test: install lint
+# Everything that must pass before a change is offered. PYTEST are the words of one pytest run.
+PYTEST := $(BIN)/python -m pytest -q
+
+test: lint types docs
 	$(BIN)/python -m coverage erase
-	$(BIN)/python -m pytest -q -n 2 -m "not slow and not cuda" --cov --cov-config=pyproject.toml --cov-report=term:skip-covered --cov-fail-under=90
+	$(PYTEST) -n 2 -m "not slow and not fault and not browser and not audit and not cuda" --cov --cov-config=pyproject.toml --cov-report=term:skip-covered --cov-fail-under=90
 
+# Style and the import layers.
 lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-cache
 
+# The public names and the examples under strict rules.
+types: install
+	$(BIN)/mypy
+	$(if $(wildcard examples),$(BIN)/mypy examples)
+
+# The documents as a site in site/; a broken link or an unknown formula fails. (With --quiet mkdocs counts no warnings.)
+docs: install
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# Run these before a change is called done: CONTRIBUTING.md says which one when.
+test-slow test-fault test-browser test-audit test-cuda: test-%: install
+	$(PYTEST) -m $*
+
 clean:
-	rm -rf runs .coverage .pytest_cache .ruff_cache
+	rm -rf runs site .coverage .pytest_cache .ruff_cache .mypy_cache

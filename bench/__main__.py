@@ -1,221 +1,50 @@
-"""All ops, the whole picture and the training step, forward and backward over sizes, with a roofline of the machine.
-
-Points are measured from the lightest to the heaviest, all ops at each, so that what a time budget cuts off is the far end
-of every series. `python -m bench.document` turns the results into docs/performance.md.
-"""
+"""List of what can be measured, and a way to start it: `python -m bench NAME ...` is `python -m bench.NAME ...`."""
 
 from __future__ import annotations
 
-import argparse
-import gc
-import importlib
-import json
-import time
-from collections.abc import Callable
+import ast
+import runpy
+import sys
 from pathlib import Path
 
-import torch
-
-from bench import machine, peers, predict, roofline
-from bench.harness import DISTURBED, OURS, REPEATS, Task, measure_in_turn, peak_bytes
-from bench.pairs import instances_and_pairs
-from bench.points import Point, growth, load, points
-from bench.series import SIZES
-from warpgs.errors import ResourceError
-from warpgs.kernels import bridge
-
-OPS = ("project", "sh", "tiles", "blend", "ssim", "adam", "burst", "dropout", "knn", "scanlines", "render", "step")
-FAILURES = (ResourceError, RuntimeError, MemoryError)
-"""What running out of memory looks like, in our code, torch's and Warp's; one failure must not cost the other results."""
+FOLDER = Path(__file__).parent
 
 
-class Bench:
-    """A run: rows and skipped tasks so far, and the time that is left."""
-
-    def __init__(self, device: torch.device, repeats: int, budget: float | None, echo: Callable[[str], None]):
-        self.device, self.repeats, self.echo = device, repeats, echo
-        self.deadline = None if budget is None else time.monotonic() + budget
-        self.rows: list[dict] = []
-        self.skipped: list[dict] = []
-        self.stopped: list[tuple[str, str, str, dict]] = []
-
-    def _skip(self, head: dict, reason: str) -> None:
-        self.skipped.append(head | {"reason": reason})
-        self.echo(f"{_title(head)}  skipped: {reason}")
-
-    def _stop(self, op: str, program: str, direction: str, sizes: dict, reason: str) -> None:
-        """Note a task that was tried in vain, so that it is not tried at larger sizes."""
-        self.stopped.append((op, program, direction, sizes))
-        self._skip({"op": op, "program": program, "direction": direction, **sizes}, reason)
-
-    def _chosen(self, op: str, module, point: Point, sizes: dict) -> set[tuple[str, str]]:
-        """The tasks of an op at a point that can be expected to fit into time and memory; the others are noted."""
-        chosen, predicted, free = set(), 0.0, predict.free_bytes(self.device)
-        for program, directions in module.PROGRAMS.items():
-            largest = getattr(module, "LARGEST", {}).get(program, point.count)
-            if program in peers.absent(self.device) or point.count > largest:
-                continue
-            for direction in directions:
-                head = {"op": op, "program": program, "direction": direction, **sizes}
-                reason = predict.reason_to_skip(self.rows, op, program, direction, point, sizes, free)
-                stopped = [s for o, p, d, s in self.stopped if (o, p, d) == (op, program, direction)]
-                if reason is None and any(growth(s, sizes) is not None for s in stopped):
-                    reason = "did not get through at a smaller size"
-                if reason:
-                    self._skip(head, reason)
-                    continue
-                chosen.add((program, direction))
-                predicted += predict.time_ms(self.rows, op, program, direction, sizes) or 0.0
-        if self.deadline is not None and chosen:
-            needed, left = predicted / 1000 * (self.repeats + 5), self.deadline - time.monotonic()
-            if left <= 0 or needed > left:
-                for program, direction in sorted(chosen):
-                    head = {"op": op, "program": program, "direction": direction, **sizes}
-                    self._skip(head, f"predicted {needed:.2g} s in all, {max(left, 0):.2g} s left of the time given")
-                return set()
-        return chosen
-
-    def measure(self, op: str, module, point: Point, roof: dict | None) -> None:
-        """All programs and directions of an op at one point, in turn; ours alone if it does not work together."""
-        sizes = point.sizes(module.AXES)
-        chosen = self._chosen(op, module, point, sizes)
-        ours = {task for task in chosen if task[0] == OURS}
-        for attempt in (chosen, ours) if chosen > ours else (ours,):
-            reason = self._attempt(op, module, point, sizes, attempt, None if point.threads else roof)
-            if reason is None:
-                return
-            for program, direction in sorted(attempt if attempt == ours else attempt - ours):
-                self._stop(op, program, direction, sizes, reason)
-
-    def _attempt(self, op: str, module, point: Point, sizes: dict, chosen: set, roof: dict | None) -> str | None:
-        """Measure the chosen tasks; the reason if that fails before any row is made."""
-        if not chosen:
-            return None
-        everything = torch.get_num_threads()
-        if point.threads:
-            bridge.set_threads(point.threads)
-        tasks: list[Task] = []
-        try:
-            tasks += module.tasks(point, self.device, lambda p, d: (p, d) in chosen)
-            timings = measure_in_turn([t.run for t in tasks], self.device, self.repeats, predict.LIMIT_MS)
-            rows = [self._row(op, task, sizes, timing, roof) for task, timing in zip(tasks, timings)]
-        except FAILURES as e:
-            return " ".join(str(e).split())[:200] or type(e).__name__
-        finally:
-            bridge.set_threads(everything)
-            tasks.clear()
-            gc.collect()
-            if self.device.type == "cuda":
-                torch.cuda.empty_cache()
-        self._keep([row for row in rows if "median_ms" in row])
-        for row in rows:
-            if "median_ms" in row:
-                low, high = row["quartiles_ms"]
-                self.echo(f"{_title(row)} {row['median_ms']:>10.3f} ms  ({low:.3f} to {high:.3f})")
-            else:
-                self._stop(op, row["program"], row["direction"], sizes, f"took {row['warm_up_ms'] / 1000:.2g} s a repeat")
-        return None
-
-    def _keep(self, rows: list[dict]) -> None:
-        """Add the rows of an op at one point; rows of an earlier try stay or go together, so that ratios are of one run."""
-        before = {_key(r): r for r in self.rows}
-        both = [r for r in rows if _key(r) in before]
-        faster = sum(r["median_ms"] for r in both) < sum(before[_key(r)]["median_ms"] for r in both)
-        for row in rows:
-            if _key(row) not in before:
-                self.rows.append(row)
-            elif faster:
-                self.rows[self.rows.index(before[_key(row)])] = row
-
-    def open(self, op: str, sizes: dict) -> bool:
-        """Whether an op at some sizes has no row yet, or one during which other programs kept the cores busy."""
-        own = [r for r in self.rows if r["op"] == op and {s: r[s] for s in SIZES if s in r} == sizes]
-        return not own or any(r.get("others_cores", 0.0) > DISTURBED for r in own)
-
-    def _row(self, op: str, task: Task, sizes: dict, timing: dict, roof: dict | None) -> dict:
-        row = {"op": op, "program": task.program, "direction": task.direction, **sizes, **task.facts, **timing}
-        if "median_ms" in row and self.device.type == "cuda":
-            row["peak_bytes"] = peak_bytes(task, self.device)
-        if "median_ms" in row and roof and task.cost:
-            row |= roofline.against_roof(task.cost, row.get("gpu_ms", row["median_ms"]) / 1000, roof)
-        return row
+def programs(folder: Path) -> dict[str, str]:
+    """Return the programs of a folder by name, each with the first sentence of its docstring."""
+    found = {}
+    for path in sorted(folder.glob("*.py")):
+        tree = ast.parse(path.read_text("utf-8"))
+        if path.stem != "__main__" and any(isinstance(n, ast.FunctionDef) and n.name == "main" for n in tree.body):
+            found[path.stem] = ast.get_docstring(tree).split("\n", maxsplit=1)[0]
+    return found
 
 
-def _key(row: dict) -> tuple:
-    return tuple(row.get(n) for n in ("op", "program", "direction", *SIZES))
+def listing() -> str:
+    """Return the programs, one line each: the suite first, then the experiments."""
+    suite, experiments = programs(FOLDER), programs(FOLDER / "experiments")
+    width = max(len(name) for name in [*suite, *(f"experiments.{name}" for name in experiments)])
+    lines = ["usage: python -m bench NAME [--help] ...", "", "Rerun for every release:"]
+    lines += [f"  {name:<{width}}  {what}" for name, what in suite.items()]
+    lines += ["", "Studies of one question each:"]
+    lines += [f"  {'experiments.' + name:<{width}}  {what}" for name, what in experiments.items()]
+    return "\n".join(lines)
 
 
-def _title(row: dict) -> str:
-    sizes = (f"{k} {row[k]}" for k in ("N", "width", "height", "degree", "cameras", "threads") if k in row)
-    return f"{row['op']:<8} {row['program']:<12} {row['direction']:<9} {'  '.join(sizes):<58}"
-
-
-def run(
-    device: torch.device,
-    *,
-    tiny: bool = False,
-    ops: tuple[str, ...] = OPS,
-    budget: float | None = None,
-    note: str = "",
-    earlier: dict | None = None,
-    echo: Callable[[str], None] = lambda line: print(line, flush=True),
-) -> dict:
-    """Measure the ops named; returns the machine, its roofline, a row per task, and what was skipped and why.
-
-    Args:
-        device: Where to measure.
-        tiny: Sizes and repeats that only show that it runs.
-        ops: Names out of `OPS`.
-        budget: Time for all of it [s]; what is predicted not to fit is skipped. None for no limit.
-        note: Words about the machine that belong in the results.
-        earlier: Results of the same code on the same machine; only what they lack or what was disturbed is measured.
-        echo: Takes a line per task.
-    """
-    if device.type == "cuda" and device.index is None:
-        device = torch.device("cuda", torch.cuda.current_device())  # Warp asks for the number
-    record = machine.describe(device) | ({"note": note} if note else {})
-    bench = Bench(device, 3 if tiny else REPEATS, budget, echo)
-    if earlier:
-        record = {name: earlier[name] for name in (*record, "note") if name in earlier}
-        bench.rows = list(earlier["rows"])
-    roof = earlier["roofline"] if earlier else roofline.ceilings(device, tiny)
-    echo(f"roof: {roof['bytes_per_s'] / 1e9:.4g} GB/s, {roof['operations_per_s'] / 1e9:.4g} Gop/s")
-    modules = {op: importlib.import_module(f"bench.kernels.bench_{op}") for op in ops}
-    grid = [(p, op) for op, module in modules.items() for p in points(module.AXES, device, tiny)]
-    grid.sort(key=lambda pair: load(pair[0]))
-    for point, op in grid:
-        if bench.open(op, point.sizes(modules[op].AXES)):
-            bench.measure(op, modules[op], point, roof)
-    # what met other programs gets a second chance; what was skipped is not tried again
-    once = list(bench.skipped)
-    for point, op in grid:
-        sizes = point.sizes(modules[op].AXES)
-        if not tiny and bench.open(op, sizes) and any(r["op"] == op and r.items() >= sizes.items() for r in bench.rows):
-            bench.measure(op, modules[op], point, roof)
-    done = {_key(r) for r in bench.rows}
-    skipped = {_key(s): s for s in (*(earlier["skipped"] if earlier else ()), *once) if _key(s) not in done}
-    instances_and_pairs.cache_clear()
-    record |= {"repeats": bench.repeats, "absent": peers.absent(device), "roofline": roof}
-    return record | {"rows": bench.rows, "skipped": list(skipped.values())}
-
-
-def main() -> None:
-    """Parse, measure, write."""
-    parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--tiny", action="store_true", help="sizes that only show that it runs")
-    parser.add_argument("--out", type=Path, help="bench/results/ops_MACHINE.json")
-    parser.add_argument("--op", nargs="+", choices=OPS, default=OPS, metavar="NAME", help=f"some of {', '.join(OPS)}")
-    parser.add_argument("--budget", type=float, help="seconds for all of it; what does not fit is skipped and listed")
-    parser.add_argument("--note", default="", help="words about the machine that belong in the results")
-    parser.add_argument("--again", action="store_true", help="measure only what --out lacks, or what other programs disturbed")
-    a = parser.parse_args()
-    earlier = json.loads(a.out.read_text("utf-8")) if a.again and a.out and a.out.exists() else None
-    result = run(torch.device(a.device), tiny=a.tiny, ops=tuple(a.op), budget=a.budget, note=a.note, earlier=earlier)
-    if a.out:
-        a.out.parent.mkdir(parents=True, exist_ok=True)
-        a.out.write_text(json.dumps(result, indent=1) + "\n")
+def main() -> int:
+    """Print the list, or run the program named first; return the exit code."""
+    name = sys.argv[1] if len(sys.argv) > 1 else "--help"
+    if name in ("-h", "--help"):
+        print(listing())
+        return 0
+    known = [*programs(FOLDER), *(f"experiments.{n}" for n in programs(FOLDER / "experiments"))]
+    if name not in known:
+        print(f"bench: {name!r} is no program; `python -m bench --help` lists them", file=sys.stderr)
+        return 2
+    del sys.argv[1]
+    runpy.run_module(f"bench.{name}", run_name="__main__", alter_sys=True)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -1,4 +1,6 @@
-"""Put the measured error budget, needles and bits into docs/accuracy.md: usage: python -m bench.accuracy.
+"""Put the measured error budget, the needles and the same bits into docs/accuracy.md.
+
+usage: python -m bench.accuracy
 
 The figures are those of bench/results/budget_*.json (`python -m tests.numerics.report`) and bench/results/needles_*.json
 (`python -m bench.needles`), a table for each machine, and of bench/results/same_bits.json (`python -m bench.same_bits`).
@@ -6,18 +8,9 @@ The figures are those of bench/results/budget_*.json (`python -m tests.numerics.
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
+from bench import result_file, same_bits
 
-from bench import same_bits
-
-ROOT = Path(__file__).resolve().parent.parent
-PAGE = ROOT / "docs/accuracy.md"
-
-
-def _results(kind: str) -> dict[str, dict]:
-    paths = sorted((ROOT / "bench/results").glob(f"{kind}_*.json"))
-    return {p.stem.removeprefix(f"{kind}_"): json.loads(p.read_text("utf-8")) for p in paths}
+PAGE = result_file.ROOT / "docs/accuracy.md"
 
 
 def _table(head: list[str], rows: list[list[str]]) -> str:
@@ -30,20 +23,19 @@ def _e(value: float) -> str:
 
 
 def _machine(stem: str, result: dict) -> str:
-    m = result["machine"]
-    return f"**{m['name']}** ({stem}, commit {m['commit']}, {m['date']})."
+    return f"**{result['machine']['name']}** ({stem}, commit {result['commit']}, {result['date']})."
 
 
 def budget_text(results: dict[str, dict]) -> str:
-    """Two tables a machine: pictures and gradients."""
+    """Two tables a machine: images and gradients."""
     parts = []
     for stem, result in results.items():
-        pictures, gradients = [], []
+        images, gradients = [], []
         for row in result["rows"]:
             name = row["scene"] + ("" if row["rule"] == "exact" else f", `{row['rule']}`")
             rgb, alpha, depth = (row["pictures"][n] for n in ("rgb", "alpha", "depth"))
             both = {k: max(rgb[k], alpha[k]) for k in ("E mean", "E max", "P32 max", "A mean", "A max")}
-            pictures.append([
+            images.append([
                 name, _e(both["E mean"]), _e(both["E max"]), _e(max(rgb["allowed"], alpha["allowed"])), _e(both["P32 max"]),
                 _e(depth["E max"]), _e(both["A mean"]), _e(both["A max"]),
                 f"{row['in band']} of {row['pixels']}", str(row["flips"]),
@@ -57,8 +49,8 @@ def budget_text(results: dict[str, dict]) -> str:
                 str(sum(e["wrong zeros"] for e in v.values())),
             ])  # fmt: skip
         kept = "Every line is kept." if not result["broken"] else "Broken: " + "; ".join(result["broken"]) + "."
-        head = ["pictures", "mean E", "max E", "allowed", "max P32", "max E depth", "mean A", "max A", "band", "flips"]
-        parts += [f"{_machine(stem, result)} {kept}\n", _table(head, pictures)]
+        head = ["images", "mean E", "max E", "allowed", "max P32", "max E depth", "mean A", "max A", "band", "flips"]
+        parts += [f"{_machine(stem, result)} {kept}\n", _table(head, images)]
         head = ["gradients", "relative L2", "1 - cosine", "bias", "max E", "max P32", "max A", "wrong zeros"]
         parts.append(_table(head, gradients))
     return "\n".join(parts)
@@ -71,22 +63,25 @@ def needles_text(results: dict[str, dict]) -> str:
         rows = []
         for row in result["rows"]:
             line = [f"{row['sigma']:,}"]
-            for what, peers in (("weight", ("conic", "plain")), ("picture", ("conic", "plain")), ("gradient", ("plain",))):
+            for what, peers in (("weight", ("conic", "plain")), ("image", ("conic", "plain")), ("gradient", ("plain",))):
                 e = row[what]
                 line += [" / ".join(_e(e[n][k]) for k in ("max", "mean")) for n in ("factor", *peers)]
                 line.append(f"{min(e[n]['max'] / e['factor']['max'] for n in peers):,.0f}")
             rows.append(line)
-        head = ["length [px]", "weight: factor", "conic", "plain", "times", "picture: factor", "conic", "plain", "times"]
-        of = f"Max / mean over {result['needles']} needles (weight) and {result['pictures']} (picture, gradient)."
+        head = ["length [px]", "weight: factor", "conic", "plain", "times", "image: factor", "conic", "plain", "times"]
+        of = f"Max / mean over {result['needles']} needles (weight) and {result['images']} (image, gradient)."
         parts += [f"{_machine(stem, result)} {of}\n", _table([*head, "gradient: factor", "plain", "times"], rows)]
     return "\n".join(parts)
 
 
 def filled(page: str) -> str:
     """The page with the text between each pair of marks made anew."""
-    bits = same_bits.table(json.loads(same_bits.RESULTS.read_text("utf-8")))
-    texts = {"budget": budget_text(_results("budget")), "needles": needles_text(_results("needles")), "same bits": bits}
-    for name, text in texts.items():
+    bits = same_bits.table(result_file.read(same_bits.RESULTS)["rows"])
+    for name, text in (
+        ("budget", budget_text(result_file.stored("budget"))),
+        ("needles", needles_text(result_file.stored("needles"))),
+        ("same bits", bits),
+    ):
         begin, end = f"<!-- {name}: written by bench.accuracy -->\n", f"<!-- end of {name} -->"
         before, rest = page.split(begin)
         page = before + begin + "\n" + text + "\n" + end + rest.split(end)[1]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import gc
-import json
 import statistics
 import time
 from collections import Counter
@@ -17,17 +16,16 @@ from pathlib import Path
 import torch
 import warp as wp
 
+from bench import result_file
 from bench.garden import garden_inputs
 from bench.harness import recorded
-from warpgs import RasterizeOptions, rasterize
+from bench.training import Steps
+from warpgs import RasterizeOptions, clear_graph_cache, rasterize
 from warpgs.constants import RULES
 from warpgs.kernels.project import project
-from warpgs.pipeline.graph import BURST, Burst, StepGraph, Views
-from warpgs.pipeline.loss import LossConfig
-from warpgs.pipeline.optimizer import Optimizer, OptimizerConfig
-from warpgs.recording import CALLS, recorder
 from warpgs.scene import Camera, Gaussians
 
+WHAT = "rendering, its gradients and a training step beside gsplat on the same inputs in the same run"
 CONFIGURATIONS = {
     "112k at 504x378": (1, 504, 378),
     "112k at 1920x1080": (1, 1920, 1080),
@@ -70,32 +68,12 @@ def peer(gaussians: Gaussians, camera: Camera, upstream: torch.Tensor, packed: b
 
 
 def count_instances(gaussians: Gaussians, camera: Camera) -> int:
-    """(Gaussian, tile) instances of a picture."""
+    """Return the (Gaussian, tile) instances of an image."""
     size = {"width": camera.width, "height": camera.height}
     with torch.no_grad():
         tensors = gaussians.tensors().values()
         counts = project(*tensors, camera.viewmat, camera.K, **size, degree=0, rule=RULES["gsplat"])[1]
     return int(counts.sum())
-
-
-def our_step(gaussians: Gaussians, camera: Camera, target: torch.Tensor):
-    """Work: render, L1 + SSIM, backward, Adam as the fit records them."""
-    device = target.device
-    optimizer, burst = Optimizer(gaussians, OptimizerConfig(), 1.0), Burst(device)
-    views = Views(camera.viewmat, camera.K, target[None], None)
-    graph = StepGraph(
-        views, optimizer, None, burst, degree=gaussians.sh_degree, rule="gsplat", loss=LossConfig(),
-        background=torch.zeros(3, device=device),
-    )  # fmt: skip
-    steps = range(1, BURST + 1)
-    burst.load([0] * BURST, [optimizer.schedule(0.0, k) for k in steps], [(0.0, k) for k in steps])
-
-    def work():
-        burst.counter.zero_()
-        graph.replay()
-        return graph
-
-    return work
 
 
 def in_calling_thread(work):
@@ -191,32 +169,33 @@ def gpu_times(work, repeats: int = REPEATS) -> tuple[dict, Counter]:
     return {"median": round(statistics.median(totals), 4), "spread": [round(min(totals), 4), round(max(totals), 4)]}, kernels
 
 
-def peak_memory(work) -> float:
-    """Memory above what was loaded before [MiB]: torch's high-water mark, and that of Warp's pool where it grew.
+def _set_aside() -> int:
+    """Return the bytes that captured graphs hold and torch counts as free, in whole segments."""
+    segments = [s for s in torch.cuda.memory_snapshot() if tuple(s["segment_pool_id"]) != (0, 0)]
+    return sum(s["total_size"] - s["active_size"] for s in segments)
 
-    Where a loop of ``work`` is recorded, all memory counts that is set aside for graphs, which that mark does not show: in
+
+def peak_memory(work) -> float:
+    """Return the memory above what was loaded before [MiB]: torch's high-water mark, and that of Warp's pool where it grew.
+
+    Where a loop of ``work`` is captured, all memory counts that is set aside for graphs, which that mark does not show: in
     whole segments, so rather too much.
     """
-    own = recorder(torch.device("cuda", torch.cuda.current_device()))
-    own.forget()
+    clear_graph_cache()
     gc.collect()
     torch.cuda.synchronize()
     torch.cuda.empty_cache()
     device = wp.device_from_torch(torch.device("cuda", torch.cuda.current_device()))
-    loaded, pool = torch.cuda.memory_allocated(), wp.get_mempool_used_mem_current(device)
-    for _ in range(CALLS + 2):
+    loaded, pool, aside = torch.cuda.memory_allocated(), wp.get_mempool_used_mem_current(device), _set_aside()
+    for _ in range(WARM_UP):
         work()
     torch.cuda.synchronize()
     torch.cuda.reset_peak_memory_stats()
     work()
     torch.cuda.synchronize()
     highest, warp_peak = torch.cuda.max_memory_allocated() - loaded, wp.get_mempool_used_mem_high(device) - pool
-    unseen = 0
-    mine = own.graphs.pool()
-    if mine is not None:
-        segments = [s for s in torch.cuda.memory_snapshot() if tuple(s["segment_pool_id"]) == tuple(mine)]
-        unseen = sum(s["total_size"] - s["active_size"] for s in segments)
-    own.forget()
+    unseen = max(0, _set_aside() - aside)
+    clear_graph_cache()
     return (highest + unseen + max(0, warp_peak)) / 2**20
 
 
@@ -226,12 +205,12 @@ def compare(path: str, name: str, kernels: bool) -> dict:
     gaussians, cameras = garden_inputs(path, tiles=tiles, sh_degree=3, width=width, height=height)
     camera = first_camera(cameras)
     upstream = torch.rand(1, height, width, 3, device="cuda", generator=torch.Generator("cuda").manual_seed(1))
-    room = int(1.3 * count_instances(gaussians, camera))
+    capacity = int(1.3 * count_instances(gaussians, camera))
     works = {
         "warpgs": ours(gaussians, camera, upstream),
         "warpgs, never recorded": ours(gaussians, camera, upstream, record=False),
         "warpgs atomic": ours(gaussians, camera, upstream, deterministic=False),
-        "warpgs graph": recorded(ours(gaussians, camera, upstream, capacity=room)),
+        "warpgs graph": recorded(ours(gaussians, camera, upstream, capacity=capacity)),
     }
     works |= {f"gsplat {kind}": peer(gaussians, camera, upstream, kind == "packed") for kind in ("dense", "packed")}
     one = {f"{who}, one thread": in_calling_thread(works[who]) for who in ("warpgs", "warpgs, never recorded", "gsplat dense")}
@@ -253,7 +232,10 @@ def compare(path: str, name: str, kernels: bool) -> dict:
     row["peak_ratio"] = {w: round(mib / least, 3) for w, mib in row["peak_mib"].items() if w not in peers}
     del works, work
     target = torch.rand(height, width, 3, device="cuda", generator=torch.Generator("cuda").manual_seed(2))
-    steps = {"warpgs graph": our_step(gaussians, camera, target), "gsplat": peer_step(gaussians, camera, target)}
+    steps = {
+        "warpgs graph": Steps(gaussians, camera, target, "gsplat").replay,
+        "gsplat": peer_step(gaussians, camera, target),
+    }
     row["step_wall_ms"] = wall_times(steps)
     row["step_ratio"] = round(row["step_wall_ms"]["warpgs graph"]["median"] / row["step_wall_ms"]["gsplat"]["median"], 3)
     if kernels:
@@ -290,9 +272,7 @@ def main() -> None:
         ratios = f"wall {row['wall_ms_ratio']}, GPU {row['gpu_ms_ratio']}, memory {row['peak_ratio']}, step {row['step_ratio']}"
         print(f"{name:<18} ratios: {ratios}", flush=True)
         torch.cuda.empty_cache()
-    if a.out:
-        result = {"device": torch.cuda.get_device_name(), "torch": torch.__version__, "warp": wp.config.version, "rows": rows}
-        a.out.write_text(json.dumps(result, indent=1) + "\n")
+    result_file.write(a.out, result_file.result(WHAT, torch.device("cuda"), rows))
 
 
 if __name__ == "__main__":

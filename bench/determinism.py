@@ -8,16 +8,15 @@ On a CPU both modes are the same code, and so is what they measure; the program 
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import torch
 
+from bench import result_file
 from bench.harness import Task, measure_in_turn, peak_bytes
 from bench.inputs import camera, gaussians
-from bench.machine import describe
-from warpgs.pipeline.run import choose_device
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.pipeline.runs.request import choose_device
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
 
 MODES = {"deterministic": True, "atomic": False}
@@ -37,7 +36,7 @@ def gradients_of(g: Gaussians, cam: Camera, *, deterministic: bool) -> list[torc
 
 
 def ulps(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """How many float32 numbers lie between the entries of two tensors, int64."""
+    """Return the number of float32 values between the entries of two tensors, int64."""
 
     def ordered(t: torch.Tensor) -> torch.Tensor:
         bits = t.contiguous().view(torch.int32).long()
@@ -47,7 +46,7 @@ def ulps(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def atomic_spread(g: Gaussians, cam: Camera, repeats: int) -> dict[str, dict]:
-    """How far the gradients of repeated atomic sums lie from the ordered ones, by parameter.
+    """Return the distance of the gradients of repeated atomic sums from the ordered ones, by parameter.
 
     ``rel_l2``: largest relative L2 distance of a repeat from the ordered sum. ``max_ulp``: largest distance of an entry that
     is at least a thousandth of its tensor's largest, in units in the last place. ``repeats_that_differ``: how many repeats
@@ -69,7 +68,7 @@ def atomic_spread(g: Gaussians, cam: Camera, repeats: int) -> dict[str, dict]:
     return rows
 
 
-def price(g: Gaussians, cam: Camera, repeats: int, device: torch.device) -> dict[str, dict]:
+def cost(g: Gaussians, cam: Camera, repeats: int, device: torch.device) -> dict[str, dict]:
     """Time [ms] of forward and backward in both modes, in turns, and on CUDA the memory that a run takes [bytes]."""
     tasks = [
         Task("warpgs", "both", lambda d=d: gradients_of(g, cam, deterministic=d), facts={"mode": name})
@@ -98,7 +97,7 @@ def main() -> None:
     for count in a.gaussians:
         g, cam = scene(count, *a.size, device)
         row = {"gaussians": count, "width": a.size[0], "height": a.size[1]}
-        row |= {"price": price(g, cam, a.repeats, device), "spread": atomic_spread(g, cam, a.repeats)}
+        row |= {"price": cost(g, cam, a.repeats, device), "spread": atomic_spread(g, cam, a.repeats)}
         rows.append(row)
         print(f"{count:,} Gaussians, {a.size[0]} x {a.size[1]} px, {where}")
         for mode, figures in row["price"].items():
@@ -106,8 +105,8 @@ def main() -> None:
             print(f"  {mode:<14} {figures['median_ms']:.3f} ms {figures['quartiles_ms']}{memory}")
         for name, figures in row["spread"].items():
             print(f"  {name:<16} " + "  ".join(f"{k} {v:.3g}" for k, v in figures.items()))
-    if a.out:
-        a.out.write_text(json.dumps({"machine": describe(device), "repeats": a.repeats, "rows": rows}, indent=1) + "\n")
+    what = "forward and backward with ordered and with atomic sums of gradients: time, memory and spread"
+    result_file.write(a.out, result_file.result(what, device, rows, repeats=a.repeats))
 
 
 if __name__ == "__main__":

@@ -5,15 +5,12 @@ usage: python -m bench.document
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
+from bench import result_file
 from bench.harness import DISTURBED, OURS
 from bench.plot import Line, Panel, chart
 from bench.points import BASE
 from bench.series import SIZES, Series, along, diagonal, exponent, tasks
 
-ROOT = Path(__file__).parent.parent
 COLORS = {
     "project": 0, "sh": 1, "tiles": 2, "blend": 3, "ssim": 4, "adam": 5, "knn": 6,
     "render forward": 0, "render both": 1, "step step": 2,
@@ -25,21 +22,21 @@ INTRODUCTION = """# Performance
 Written by `python -m bench.document` from `bench/results/ops_*.json`; do not edit. To measure a machine:
 
 ```bash
-python -m bench --out bench/results/ops_MACHINE.json   # CUDA where there is a device; --device cpu, --budget SECONDS
+python -m bench.ops --out bench/results/ops_MACHINE.json   # CUDA where there is a device; --device cpu, --budget SECONDS
 python -m bench.document
 ```
 
 Times are wall times in ms of one call with its inputs loaded, from an idle device to an idle device: the median, and in
 brackets the quartiles. Programs that are compared run in turn, one repeat each, unless one is over 30 times slower. `both`
-is forward and backward together, `step` a training step: picture, loss, backward pass, Adam. A star marks figures during
+is forward and backward together, `step` a training step: rendering, loss, backward pass, Adam. A star marks figures during
 which other programs kept more than 0.2 cores busy, also on a second try.
 
-The scene is a random cloud whose Gaussians shrink as their number grows, drawn under rule `exact`. One size varies at a time
+The scene is a random cloud whose Gaussians shrink as their number grows, rendered under rule `exact`. One size varies at a time
 around 100,000 Gaussians, 504 x 378 px, degree 3, one camera; a few points let Gaussians and image grow together.
 
 Other programs: `torch conv2d` is SSIM as most trainers write it, `torch dense` a rasterizer without tiles in plain torch, up
 to 1,000 Gaussians, `naive` a kernel with one thread per pixel, `numpy` the paths of a sweep as a fit on a CPU follows them,
-`gsplat` that package with `packed=False`, `gsplat + torch` a step made of its picture, the loss in plain torch and torch's
+`gsplat` that package with `packed=False`, `gsplat + torch` a step made of its rendering, the loss in plain torch and torch's
 fused Adam.
 """
 
@@ -134,7 +131,7 @@ def roof_table(rows: list[dict]) -> str:
         for r in {_key(r): r for r in chosen}.values():
             cells = [op, direction, *_sizes(r, ["N", "image", "degree", "cameras"])]
             cells += [figure(r["bytes"] / 1e6), figure(r["operations"] / 1e6), figure(r["roof_ms"]), r["bound"]]
-            body.append([*cells, figure(r.get("gpu_ms", r["median_ms"])), f"{figure(100 * r['share'])} %"])
+            body.append([*cells, figure(r.get("gpu_ms", r["median_ms"])), f"{figure(100 * r['fraction'])} %"])
     head = [
         "op",
         "direction",
@@ -147,7 +144,7 @@ def roof_table(rows: list[dict]) -> str:
         "roof [ms]",
         "bound by",
         "measured [ms]",
-        "share",
+        "fraction",
     ]
     return table(head, body)
 
@@ -168,7 +165,7 @@ def exponent_table(rows: list[dict]) -> str:
 
 
 def skipped_table(skipped: list[dict]) -> str:
-    """What was not measured, and why."""
+    """Return a table of the tasks not measured, with the reasons."""
     columns = _columns(skipped)
     body = [[s["op"], s["program"], s["direction"], *_sizes(s, columns), s["reason"]] for s in skipped]
     return table(["op", "program", "direction", *columns, "reason"], body)
@@ -183,13 +180,13 @@ def _lines(series: list[Series], name) -> tuple[Line, ...]:
 
 
 def charts(title: str, rows: list[dict]) -> dict[str, str]:
-    """Charts of one machine by the end of their names: over N, over pixels, and of the whole picture and step."""
+    """Charts of one machine by the end of their names: over N, over pixels, and of the whole image and step."""
 
     def op_name(s: Series) -> str:
         return s.op if s.program == OURS else s.program
 
     def whole_name(s: Series) -> str:
-        own = {"forward": "picture", "both": "picture + gradients", "step": "training step"}[s.direction]
+        own = {"forward": "image", "both": "image + gradients", "step": "training step"}[s.direction]
         return own if s.program == OURS else {"forward": s.program, "both": f"{s.program} + gr."}.get(s.direction, s.program)
 
     whole = ("render", "step")
@@ -213,19 +210,20 @@ def charts(title: str, rows: list[dict]) -> dict[str, str]:
             [s for s in both if s.op in whole], whole_name)),
     ]  # fmt: skip
     if any(p.lines for p in panels):
-        made["whole"] = chart(f"{title}: picture and training step", panels)
+        made["whole"] = chart(f"{title}: image and training step", panels)
     return made
 
 
 def machine_text(stem: str, result: dict, plots: list[str]) -> str:
     """The section of one machine."""
     versions = ", ".join(f"{k} {v}" for k, v in result["versions"].items())
-    facts = f"{result['processor']}, {result['cores']} cores, {result['threads']} threads, {result['memory_gib']} GiB"
-    if result["device"] == "cuda":
-        facts = f"{result['name']} ({result['device_memory_gib']} GiB) beside {facts}"
+    machine = result["machine"]
+    facts = f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} threads, {machine['memory_gib']} GiB"
+    if machine["device"] == "cuda":
+        facts = f"{machine['name']} ({machine['device_memory_gib']} GiB) beside {facts}"
     roof, rows = result["roofline"], result["rows"]
     parts = [
-        f"## {result['name']} ({stem})\n",
+        f"## {machine['name']} ({stem})\n",
         f"{facts}. {versions}. Commit {result['commit']}, {result['date']}, {result['repeats']} repeats."
         + (f" {result['note'].rstrip('.')}." if result.get("note") else "")
         + f" Results: `bench/results/ops_{stem}.json`.\n",
@@ -245,8 +243,8 @@ def machine_text(stem: str, result: dict, plots: list[str]) -> str:
         "### Roofline\n",
         f"Ceilings measured at the start: {roof['bytes_per_s'] / 1e9:,.1f} GB/s and {roof['operations_per_s'] / 1e9:,.0f} "
         f"Gop/s ({roof['how']}). Bytes and operations are the least a stage has to do, counted as `bench/roofline.py` says; "
-        "the share is the time at the roof over the time measured"
-        + (" by GPU events" if result["device"] == "cuda" else "")
+        "the fraction is the time at the roof over the time measured"
+        + (" by GPU events" if machine["device"] == "cuda" else "")
         + ". Data that fits into caches can exceed 100 %.\n",
         roof_table(rows),
     ]
@@ -259,7 +257,8 @@ def generate(results: dict[str, dict]) -> dict[str, str]:
     """All files, by path under docs/, from results by machine."""
     files, sections = {}, [INTRODUCTION]
     for stem, result in sorted(results.items()):
-        name = result["name"] if result["device"] == "cuda" else f"{result['name']}, {result['threads']} threads"
+        machine = result["machine"]
+        name = machine["name"] if machine["device"] == "cuda" else f"{machine['name']}, {machine['threads']} threads"
         plots = charts(name, result["rows"])
         files |= {f"plots/{stem}_{kind}.svg": svg for kind, svg in plots.items()}
         sections.append(machine_text(stem, result, list(plots)))
@@ -267,15 +266,14 @@ def generate(results: dict[str, dict]) -> dict[str, str]:
 
 
 def committed() -> dict[str, dict]:
-    """The results in bench/results, by machine."""
-    paths = sorted((ROOT / "bench/results").glob("ops_*.json"))
-    return {p.stem.removeprefix("ops_"): json.loads(p.read_text("utf-8")) for p in paths}
+    """Return the kept results by machine."""
+    return result_file.stored("ops")
 
 
 def main() -> None:
     """Write the files."""
     for path, text in generate(committed()).items():
-        target = ROOT / "docs" / path
+        target = result_file.ROOT / "docs" / path
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text(text, "utf-8", newline="\n")
 

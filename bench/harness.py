@@ -1,4 +1,4 @@
-"""How things are timed here: warm-up, then repeats that go round all programs, median and quartiles, one row per task.
+"""Timing: warm-up, then repeats that go round all programs, median and quartiles, one row per task.
 
 Programs that are compared run in turn, one repeat each, so that whatever else the machine does meets all of them alike;
 only programs far slower than the others run after them.
@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import gc
 import math
-import os
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
+import psutil
 import torch
 import warp as wp
 
 from bench.roofline import Cost
-from warpgs.kernels import bridge
+from warpgs.runtime import interop
 
 REPEATS = 30
 WARM_UP = 3
@@ -40,14 +40,14 @@ class Task:
     """One thing to time, inputs loaded."""
 
     program: str
-    """Whose code runs: warpgs, or a peer."""
+    """Name of the program: warpgs, or a peer."""
     direction: str
     """forward, backward, both (one after the other) or step."""
     run: Callable[[], object]
     cost: Cost | None = None
     """The least it has to do, where that is known."""
     facts: dict = field(default_factory=dict)
-    """What else belongs in the row, such as the number of instances."""
+    """Other entries of the row, such as the number of instances."""
 
 
 def _drain(device: torch.device) -> None:
@@ -85,14 +85,13 @@ def _warm_up(work: Callable[[], object], device: torch.device, limit_ms: float, 
 
 
 def others_seconds() -> float | None:
-    """CPU time that everything but this process has used since the machine started [s]; None where Linux does not say."""
+    """Return the CPU time that everything but this process has used since the machine started [s]; None if unknown."""
     try:
-        with open("/proc/stat") as f:
-            user, nice, system, _, _, irq, soft, steal = map(int, f.readline().split()[1:9])
-    except (OSError, ValueError):
+        times = psutil.cpu_times()
+    except (OSError, RuntimeError):
         return None
-    busy = user + nice + system + irq + soft + steal
-    return busy / os.sysconf("SC_CLK_TCK") - time.process_time()
+    busy = sum(getattr(times, name, 0.0) for name in ("user", "nice", "system", "irq", "softirq", "steal"))
+    return busy - time.process_time()
 
 
 def measure_in_turn(
@@ -173,7 +172,7 @@ def recorded(work: Callable[[], object]) -> Callable[[], object]:
     torch.cuda.current_stream().wait_stream(stream)
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph, stream=stream):
-        here = bridge.warp_stream(torch.device("cuda"))
+        here = interop.warp_stream(torch.device("cuda"))
         wp.capture_begin(stream=here, external=True)
         held = work()
         lent = wp.capture_end(stream=here)

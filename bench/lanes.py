@@ -55,19 +55,19 @@ def cloud(count: int) -> tuple[torch.Tensor, Tiles]:
         torch.randn(count, 1, 3, generator=g) * 0.3,
     ]
     size, rule = {"width": WIDTH, "height": HEIGHT}, RULES["exact"]
-    splats, counts = project(*tensors, cam.viewmat, cam.K, **size, degree=0, rule=rule)
-    return splats, bin_tiles(splats, counts, **size, rule=rule)
+    projected, counts = project(*tensors, cam.viewmat, cam.K, **size, degree=0, rule=rule)
+    return projected, bin_tiles(projected, counts, **size, rule=rule)
 
 
-def lanes(splats: torch.Tensor, tiles: Tiles, pixel_ends: torch.Tensor) -> tuple[int, int]:
-    """Lanes evaluated and boxed lanes, by the formulas of the kernels; ``pixel_ends`` has the shape of the picture."""
+def lanes(projected: torch.Tensor, tiles: Tiles, pixel_ends: torch.Tensor) -> tuple[int, int]:
+    """Lanes evaluated and boxed lanes, by the formulas of the kernels; ``pixel_ends`` has the shape of the image."""
     side, strips = tiles.size, tiles.size // STRIP
     ends = pixel_ends.view(HEIGHT // side, side, WIDTH // side, strips, STRIP).amax(4).permute(0, 2, 1, 3).flatten(0, 1)
     first, last = tiles.ranges.long().unbind(1)
     count = (torch.minimum(last, ends.amax((1, 2))) - first).clamp(min=0)
     tile = torch.repeat_interleave(torch.arange(len(first)), count)
     instance = torch.arange(len(tile)) - (torch.cumsum(count, 0) - count - first)[tile]
-    mx, my, u11, u12, u22, *_, half_width, half_height = splats[0, tiles.splat_ids[instance].long()].unbind(1)
+    mx, my, u11, u12, u22, *_, half_width, half_height = projected[0, tiles.gaussian_ids[instance].long()].unbind(1)
     top, left = tile // (WIDTH // side) * side + 0.5, tile % (WIDTH // side) * side + 0.5
     margin, slack = (0.01 + 2e-6 * (m.abs() + half) for m, half in ((mx, half_width), (my, half_height)))
     evaluated = boxed = 0
@@ -100,13 +100,13 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=20_000)
     a = parser.parse_args()
     size, rule, background = {"width": WIDTH, "height": HEIGHT}, RULES["exact"], torch.zeros(1, 3)
-    splats, tiles = cloud(a.gaussians)
-    leaf = splats.detach().requires_grad_()
+    projected, tiles = cloud(a.gaussians)
+    leaf = projected.detach().requires_grad_()
     rgb, alpha, _ = blend(leaf, tiles, background, **size, rule=rule)
-    naive = Naive(splats, tiles, background, **size, rule=rule)
+    naive = Naive(projected, tiles, background, **size, rule=rule)
     v_rgb = torch.rand(rgb.shape, generator=torch.Generator().manual_seed(1))
     naive.forward()
-    evaluated, boxed = lanes(splats.detach(), tiles, naive.kept[1].long())
+    evaluated, boxed = lanes(projected.detach(), tiles, naive.kept[1].long())
     instances = len(tiles.slots)
     print(
         f"{a.gaussians:,} Gaussians on {WIDTH} x {HEIGHT} px: sigma {SIGMAS[0]:g} to {SIGMAS[1]:g} px, "

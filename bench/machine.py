@@ -1,4 +1,4 @@
-"""What a measurement was made on."""
+"""Description of the machine, the versions and the commit of a measurement."""
 
 from __future__ import annotations
 
@@ -12,13 +12,8 @@ from pathlib import Path
 import torch
 import warp
 
-
-def _processor() -> str:
-    try:
-        with open("/proc/cpuinfo") as f:
-            return next(line.split(":", 1)[1].strip() for line in f if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
+from warpgs.runtime.device_memory import installed_bytes
+from warpgs.runtime.processor import processor_name
 
 
 def _commit() -> str | None:
@@ -40,12 +35,12 @@ def describe(device: torch.device) -> dict:
         pass
     record = {
         "device": device.type,
-        "name": torch.cuda.get_device_name(device) if device.type == "cuda" else _processor(),
-        "processor": _processor(),
+        "name": torch.cuda.get_device_name(device) if device.type == "cuda" else processor_name(),
+        "processor": processor_name(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "omp_wait_policy": os.environ.get("OMP_WAIT_POLICY"),
-        "memory_gib": round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30, 1),
+        "memory_gib": round(installed_bytes(torch.device("cpu")) / 2**30, 1),
     }
     if device.type == "cuda":
         record["device_memory_gib"] = round(torch.cuda.get_device_properties(device).total_memory / 2**30, 1)

@@ -1,4 +1,4 @@
-"""Ten million Gaussians at 3840x2160: does it train, in what memory, at what speed?
+"""Training of ten million Gaussians at 3840x2160: loss, memory and time of a step.
 
 usage: python -m bench.many GARDEN.npz [--count 10000000] [--width 3840] [--height 2160] [--steps 100] [--out FILE.json]
 """
@@ -7,23 +7,21 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import math
 import time
 from pathlib import Path
 
 import torch
 
+from bench import result_file
 from bench.against_gsplat import first_camera
 from bench.garden import garden_inputs
-from warpgs.pipeline.graph import BURST, Burst, StepGraph, Views
-from warpgs.pipeline.loss import LossConfig
-from warpgs.pipeline.optimizer import Optimizer, OptimizerConfig
+from bench.training import Steps
 from warpgs.scene import Gaussians
 
 
-def smooth_picture(width: int, height: int, device: torch.device) -> torch.Tensor:
-    """A picture to train towards: three slow waves, shape [H, W, 3]."""
+def smooth_image(width: int, height: int, device: torch.device) -> torch.Tensor:
+    """Return an image to train towards: three slow waves, shape [H, W, 3]."""
     y, x = torch.meshgrid(
         torch.linspace(0, 6, height, device=device), torch.linspace(0, 9, width, device=device), indexing="ij"
     )
@@ -31,32 +29,19 @@ def smooth_picture(width: int, height: int, device: torch.device) -> torch.Tenso
 
 
 def train(path: str, count: int, width: int, height: int, steps: int) -> dict:
-    """Recorded steps on one view; losses, memory and time."""
+    """Train on one view with recorded steps; return losses, memory and time."""
     device = torch.device("cuda", torch.cuda.current_device())
     cells = math.ceil(math.sqrt(count / 111_000))
     gaussians, cameras = garden_inputs(path, tiles=cells, sh_degree=3, width=width, height=height)
     gaussians = Gaussians(**{n: t.detach()[:count].clone() for n, t in gaussians.tensors().items()})
-    camera, burst = first_camera(cameras), Burst(device)
-    optimizer = Optimizer(gaussians, OptimizerConfig(), 1.0)
-    views = Views(camera.viewmat, camera.K, smooth_picture(width, height, device)[None], None)
-    graph = StepGraph(
-        views, optimizer, None, burst, degree=3, rule="exact", loss=LossConfig(), background=torch.zeros(3, device=device)
-    )
-    losses, begin = [], time.perf_counter()
-    while len(losses) < steps:
-        wanted = min(BURST, steps - len(losses))
-        numbers = range(len(losses) + 1, len(losses) + wanted + 1)
-        burst.load([0] * wanted, [optimizer.schedule(0.0, n) for n in numbers], [(0.0, n) for n in numbers])
-        for _ in range(wanted):
-            graph.replay()
-        done, stop, history = burst.result()
-        if stop:
-            raise RuntimeError(f"stopped after {len(losses) + done} steps")
-        losses += [loss for loss, _ in history[:done]]
+    target = smooth_image(width, height, device)
+    trainer = Steps(gaussians, first_camera(cameras), target, "exact")
+    begin = time.perf_counter()
+    losses = trainer.train(steps)
     seconds = time.perf_counter() - begin
     return {
-        "device": torch.cuda.get_device_name(), "gaussians": len(gaussians), "width": width, "height": height, "steps": steps,
-        "capacity": graph.capacity, "loss_first": losses[0], "loss_last": losses[-1],
+        "gaussians": len(gaussians), "width": width, "height": height, "steps": steps,
+        "loss_first": losses[0], "loss_last": losses[-1],
         "falling_pairs": sum(a > b for a, b in itertools.pairwise(losses)), "ms_per_step": 1000 * seconds / steps,
         "peak_gib": torch.cuda.max_memory_allocated() / 2**30, "reserved_gib": torch.cuda.max_memory_reserved() / 2**30,
     }  # fmt: skip
@@ -71,9 +56,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     a = parser.parse_args()
     result = train(a.garden, a.count, a.width, a.height, a.steps)
-    print(json.dumps(result, indent=1))
-    if a.out:
-        a.out.write_text(json.dumps(result, indent=1) + "\n")
+    print(*(f"{name}: {value}" for name, value in result.items()), sep="\n")
+    what = "many Gaussians trained on one image by recorded steps: loss, memory and time"
+    result_file.write(a.out, result_file.result(what, torch.device("cuda"), [result]))
 
 
 if __name__ == "__main__":

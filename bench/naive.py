@@ -4,32 +4,32 @@ The rule is `exact`, in float32. On a CPU Warp's atomics are plain additions, so
 """
 
 import functools
-from types import SimpleNamespace
 
 import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
 from warpgs.constants import RULES, Rule
-from warpgs.kernels import bridge
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import Tiles, bin_tiles, grid
+from warpgs.runtime import interop
 from warpgs.scene import Camera, Gaussians
 
 
-@functools.cache
-def make_kernels():
-    """Forward and backward kernel."""
+@wp.func
+def tile_of(i: wp.int32, width: wp.int32, height: wp.int32, columns: wp.int32, tiles: wp.int32, side: wp.int32):
+    camera = i // (width * height)
+    y = (i // width) % height
+    return camera * tiles + (y // side) * columns + (i % width) // side
 
-    @wp.func
-    def tile_of(i: wp.int32, width: wp.int32, height: wp.int32, columns: wp.int32, tiles: wp.int32, side: wp.int32):
-        camera = i // (width * height)
-        y = (i // width) % height
-        return camera * tiles + (y // side) * columns + (i % width) // side
+
+@functools.cache
+def forward_kernel():
+    """Return the kernel that blends, a thread per pixel."""
 
     @wp.kernel(enable_backward=False, module="bench.naive")
     def forward(
-        splats: wp.array2d(dtype=float), ranges: wp.array2d(dtype=int), ids: wp.array(dtype=int),
+        projected: wp.array2d(dtype=float), ranges: wp.array2d(dtype=int), ids: wp.array(dtype=int),
         backgrounds: wp.array2d(dtype=float), width: int, height: int, columns: int, tiles: int, side: int,
         alpha_cut: float, alpha_max: float, stop: float,
         # outputs
@@ -46,17 +46,17 @@ def make_kernels():
         end = int(0)
         for k in range(ranges[tile, 0], ranges[tile, 1]):
             s = ids[k]
-            dx = x - splats[s, 0]
-            dy = y - splats[s, 1]
-            e1 = splats[s, 2] * dx + splats[s, 3] * dy
-            e2 = splats[s, 4] * dy
-            alpha = wp.min(alpha_max, splats[s, 5] * wp.exp(-0.5 * (e1 * e1 + e2 * e2)))
+            dx = x - projected[s, 0]
+            dy = y - projected[s, 1]
+            e1 = projected[s, 2] * dx + projected[s, 3] * dy
+            e2 = projected[s, 4] * dy
+            alpha = wp.min(alpha_max, projected[s, 5] * wp.exp(-0.5 * (e1 * e1 + e2 * e2)))
             if alpha < alpha_cut:
                 continue
             w = alpha * t
-            red += w * splats[s, 6]
-            green += w * splats[s, 7]
-            blue += w * splats[s, 8]
+            red += w * projected[s, 6]
+            green += w * projected[s, 7]
+            blue += w * projected[s, 8]
             t = t * (1.0 - alpha)
             end = k + 1
             if t < stop:
@@ -68,14 +68,21 @@ def make_kernels():
         transmittances[i] = t
         ends[i] = end
 
-    @wp.kernel(enable_backward=False, module="bench.naive")
+    return forward
+
+
+@functools.cache
+def backward_kernel():
+    """Return the kernel of the gradients, which are added by float atomics."""
+
+    @wp.kernel(enable_backward=False, module="bench.naive.backward")
     def backward(
-        splats: wp.array2d(dtype=float), ranges: wp.array2d(dtype=int), ids: wp.array(dtype=int),
+        projected: wp.array2d(dtype=float), ranges: wp.array2d(dtype=int), ids: wp.array(dtype=int),
         backgrounds: wp.array2d(dtype=float), width: int, height: int, columns: int, tiles: int, side: int,
         alpha_cut: float, alpha_max: float, transmittances: wp.array(dtype=float), ends: wp.array(dtype=int),
         v_rgb: wp.array2d(dtype=float),
         # outputs, zero on entry
-        v_splats: wp.array2d(dtype=float),
+        v_projected: wp.array2d(dtype=float),
     ):  # fmt: skip
         i = wp.tid()
         x = float(i % width) + 0.5
@@ -91,80 +98,83 @@ def make_kernels():
         while k > ranges[tile, 0]:
             k -= 1
             s = ids[k]
-            dx = x - splats[s, 0]
-            dy = y - splats[s, 1]
-            e1 = splats[s, 2] * dx + splats[s, 3] * dy
-            e2 = splats[s, 4] * dy
+            dx = x - projected[s, 0]
+            dy = y - projected[s, 1]
+            e1 = projected[s, 2] * dx + projected[s, 3] * dy
+            e2 = projected[s, 4] * dy
             g = wp.exp(-0.5 * (e1 * e1 + e2 * e2))
-            alpha = wp.min(alpha_max, splats[s, 5] * g)
+            alpha = wp.min(alpha_max, projected[s, 5] * g)
             if alpha < alpha_cut:
                 continue
             t = t / (1.0 - alpha)
             w = alpha * t
-            d = splats[s, 6] * g0 + splats[s, 7] * g1 + splats[s, 8] * g2
+            d = projected[s, 6] * g0 + projected[s, 7] * g1 + projected[s, 8] * g2
             v = t * d - behind / (1.0 - alpha)
             behind += w * d
-            wp.atomic_add(v_splats, s, 6, w * g0)
-            wp.atomic_add(v_splats, s, 7, w * g1)
-            wp.atomic_add(v_splats, s, 8, w * g2)
-            if splats[s, 5] * g <= alpha_max:
+            wp.atomic_add(v_projected, s, 6, w * g0)
+            wp.atomic_add(v_projected, s, 7, w * g1)
+            wp.atomic_add(v_projected, s, 8, w * g2)
+            if projected[s, 5] * g <= alpha_max:
                 v_e1 = -alpha * v * e1
                 v_e2 = -alpha * v * e2
-                wp.atomic_add(v_splats, s, 0, -splats[s, 2] * v_e1)
-                wp.atomic_add(v_splats, s, 1, -splats[s, 3] * v_e1 - splats[s, 4] * v_e2)
-                wp.atomic_add(v_splats, s, 2, v_e1 * dx)
-                wp.atomic_add(v_splats, s, 3, v_e1 * dy)
-                wp.atomic_add(v_splats, s, 4, v_e2 * dy)
-                wp.atomic_add(v_splats, s, 5, v * g)
+                wp.atomic_add(v_projected, s, 0, -projected[s, 2] * v_e1)
+                wp.atomic_add(v_projected, s, 1, -projected[s, 3] * v_e1 - projected[s, 4] * v_e2)
+                wp.atomic_add(v_projected, s, 2, v_e1 * dx)
+                wp.atomic_add(v_projected, s, 3, v_e1 * dy)
+                wp.atomic_add(v_projected, s, 4, v_e2 * dy)
+                wp.atomic_add(v_projected, s, 5, v * g)
 
-    return SimpleNamespace(forward=forward, backward=backward)
+    return backward
 
 
 class Naive:
     """The kernels bound to one set of inputs; colour only, neither alpha nor depth."""
 
-    def __init__(self, splats: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, width: int, height: int, rule: Rule):
+    def __init__(self, projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, width: int, height: int, rule: Rule):
         if not rule.inclusive_stop or rule.square_sigma:
             raise ValueError("the naive kernels know only the rule `exact`")
         cameras, pixels = len(backgrounds), len(backgrounds) * height * width
-        self.splats, self.device, self.pixels = splats.detach().contiguous(), wp.device_from_torch(splats.device), pixels
-        self.rgb = splats.new_empty(cameras, height, width, 3)
-        self.v_splats = torch.zeros_like(self.splats)
-        transmittances = splats.new_empty(pixels)
-        ends = torch.empty(pixels, dtype=torch.int32, device=splats.device)
+        self.projected, self.device, self.pixels = (
+            projected.detach().contiguous(),
+            wp.device_from_torch(projected.device),
+            pixels,
+        )
+        self.rgb = projected.new_empty(cameras, height, width, 3)
+        self.v_projected = torch.zeros_like(self.projected)
+        transmittances = projected.new_empty(pixels)
+        ends = torch.empty(pixels, dtype=torch.int32, device=projected.device)
         columns, rows = grid(width, height, tiles.size)
         self.inputs = [
-            bridge.view(self.splats.view(-1, 12), wp.float32), bridge.view(tiles.ranges, wp.int32),
-            bridge.view(tiles.splat_ids, wp.int32), bridge.view(backgrounds, wp.float32), width, height, columns,
+            interop.view(self.projected.view(-1, 12), wp.float32), interop.view(tiles.ranges, wp.int32),
+            interop.view(tiles.gaussian_ids, wp.int32), interop.view(backgrounds, wp.float32), width, height, columns,
             columns * rows, tiles.size, rule.alpha_cut, rule.alpha_max,
         ]  # fmt: skip
         self.stop, self.kept = rule.transmittance_stop, [transmittances, ends]
-        self.state = [bridge.view(transmittances, wp.float32), bridge.view(ends, wp.int32)]
-        self.kernels = make_kernels()
+        self.state = [interop.view(transmittances, wp.float32), interop.view(ends, wp.int32)]
 
     def _launch(self, kernel, inputs: list) -> None:
-        inputs = [a.array() if isinstance(a, bridge.View) else a for a in inputs]
-        with bridge.stream_of(self.rgb.device):
+        inputs = [a.array() if isinstance(a, interop.View) else a for a in inputs]
+        with interop.stream_of(self.rgb.device):
             wp.launch(kernel, self.pixels, inputs=inputs, device=self.device, record_tape=False)
 
     def forward(self) -> torch.Tensor:
         """The image, shape [C, H, W, 3]."""
-        outputs = [bridge.view(self.rgb.view(-1, 3), wp.float32), *self.state]
-        self._launch(self.kernels.forward, [*self.inputs, self.stop, *outputs])
+        outputs = [interop.view(self.rgb.view(-1, 3), wp.float32), *self.state]
+        self._launch(forward_kernel(), [*self.inputs, self.stop, *outputs])
         return self.rgb
 
     def backward(self, v_rgb: torch.Tensor) -> torch.Tensor:
         """Gradient of the records for an upstream gradient, after `forward`; shape [C, N, 12]."""
-        self.v_splats.zero_()
-        arrays = [bridge.view(t.view(-1, t.shape[-1]), wp.float32) for t in (v_rgb.contiguous(), self.v_splats)]
-        self._launch(self.kernels.backward, [*self.inputs, *self.state, *arrays])
-        return self.v_splats
+        self.v_projected.zero_()
+        arrays = [interop.view(t.view(-1, t.shape[-1]), wp.float32) for t in (v_rgb.contiguous(), self.v_projected)]
+        self._launch(backward_kernel(), [*self.inputs, *self.state, *arrays])
+        return self.v_projected
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, splats, tiles, width, height):
-        ctx.naive = Naive(splats, tiles, splats.new_zeros(len(splats), 3), width, height, RULES["exact"])
+    def forward(ctx, projected, tiles, width, height):
+        ctx.naive = Naive(projected, tiles, projected.new_zeros(len(projected), 3), width, height, RULES["exact"])
         return ctx.naive.forward()
 
     @staticmethod
@@ -174,8 +184,8 @@ class _Blend(torch.autograd.Function):
 
 
 def rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
-    """Pictures [C, H, W, 3] of a batch of cameras over black: our projection and lists, the naive blending."""
+    """Images [C, H, W, 3] of a batch of cameras over black: our projection and lists, the naive blending."""
     size = {"width": camera.width, "height": camera.height}
     how = {"degree": gaussians.sh_degree, "rule": RULES["exact"]}
-    splats, counts = project(*gaussians.tensors().values(), camera.viewmat, camera.K, **size, **how)
-    return _Blend.apply(splats, bin_tiles(splats, counts, **size, rule=RULES["exact"]), *size.values())
+    projected, counts = project(*gaussians.tensors().values(), camera.viewmat, camera.K, **size, **how)
+    return _Blend.apply(projected, bin_tiles(projected, counts, **size, rule=RULES["exact"]), *size.values())

@@ -1,16 +1,16 @@
-"""What storing a triangular factor is worth: errors of needles in its form and in that of an inverse covariance ("conic").
+"""Errors of needles in the form of a triangular factor, in that of an inverse covariance ("conic") and in textbook form.
 
 usage: python -m bench.needles [--device cuda] [--out bench/results/needles_cpu.json]
 
-Needles of one length lie in the middle of a picture at many angles, tilted out of the image plane, their other axes at the
-pixel filter. Truth is the float64 twin of the same float32 parameters. Three programs in float32:
+Needles of one length lie in the middle of an image at many angles, tilted out of the image plane, their other axes at the
+pixel filter. The reference is the float64 reference of the same float32 parameters. Three programs in float32:
 
 * factor: the kernels.
 * conic: the kernels' own factor multiplied out to an inverse covariance, so that nothing but the form differs.
-* plain: the whole projection as textbooks have it, with determinant a c - b^2 (tests/reference/twins.py, P32).
+* plain: the whole projection as textbooks have it, with determinant a c - b^2 (tests/reference/low_precision.py, P32).
 
-Errors: of the weight exp(-power / 2) at places along the needle up to two standard deviations; of alpha in a picture; and of
-the gradient of the projected mean, relative, for a random gradient of that picture (there is no conic kernel to ask).
+Errors: of the weight exp(-power / 2) at places along the needle up to two standard deviations; of alpha in an image; and of
+the gradient of the projected mean, relative, for a random gradient of that image (there is no conic kernel to ask).
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from pathlib import Path
 
 import torch
 
-from bench.machine import describe
-from tests.reference.twins import Frame, Inputs, Splats, layers, pixel_centers, splats_of
+from bench import result_file
+from tests.reference.low_precision import Frame, Inputs, ProjectedGaussians, layers, pixel_centers, projected_of
 from warpgs.constants import RULES
-from warpgs.files import write_json
 from warpgs.kernels.project import project
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
 
+WHAT = "errors of needles in the form of a triangular factor and in that of an inverse covariance"
 LENGTHS = (1, 3, 10, 30, 100, 300, 1000, 3000, 10000)
 """Standard deviations of the long axis [px]."""
 SIDE = 256
-"""Width and height of the picture [px]."""
-ANGLES, PICTURES = 400, 24
+"""Width and height of the image [px]."""
+ANGLES, IMAGES = 400, 24
 """Needles whose weight is sampled, and needles that are drawn."""
 FREE = dataclasses.replace(RULES["exact"], name="free", alpha_cut=0.0, transmittance_stop=0.0)
 """No cut-off, so that no pixel is decided by rounding."""
@@ -42,7 +42,7 @@ OPACITY = 0.9
 
 
 def needles(length: float, count: int) -> Inputs:
-    """Needles through the middle of the picture as float32 parameters on the CPU; pose and intrinsics of one camera."""
+    """Needles through the middle of the image as float32 parameters on the CPU; pose and intrinsics of one camera."""
     focal = 1.2 * SIDE
     generator = torch.Generator().manual_seed(int(length))
     turn = math.pi * (torch.arange(count, dtype=torch.float64) + torch.rand(count, generator=generator)) / count
@@ -79,8 +79,8 @@ def _figures(errors: list[torch.Tensor] | torch.Tensor) -> dict[str, float]:
 def _record(inputs: Inputs, device: torch.device) -> torch.Tensor:
     """Factors [N, 3] and means [N, 2] as the kernels store them, [N, 5]."""
     there = [t.detach().to(device) for t in inputs]
-    splats, _ = project(*there[:5], there[5][None], there[6][None], width=SIDE, height=SIDE, degree=0, rule=FREE)
-    return splats[0, :, :5]
+    projected, _ = project(*there[:5], there[5][None], there[6][None], width=SIDE, height=SIDE, degree=0, rule=FREE)
+    return projected[0, :, :5]
 
 
 def _powers(record: torch.Tensor, dx: torch.Tensor, dy: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -91,8 +91,8 @@ def _powers(record: torch.Tensor, dx: torch.Tensor, dy: torch.Tensor) -> dict[st
     return {"factor": e1 * e1 + e2 * e2, "conic": xx * dx * dx + 2 * (xy * dx * dy) + yy * dy * dy}
 
 
-def _plain_power(splats: Splats, dx: torch.Tensor, dy: torch.Tensor) -> torch.Tensor:
-    xx, xy, yy = (splats.conics[:, k, None] for k in range(3))
+def _plain_power(projected: ProjectedGaussians, dx: torch.Tensor, dy: torch.Tensor) -> torch.Tensor:
+    xx, xy, yy = (projected.conics[:, k, None] for k in range(3))
     return xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy
 
 
@@ -104,9 +104,17 @@ def _weight(power: torch.Tensor) -> torch.Tensor:
 def weight_errors(length: float, device: torch.device) -> dict[str, dict[str, float]]:
     """Error of the weight at 40 places of each of 400 needles."""
     inputs = needles(length, ANGLES)
-    truth = splats_of(inputs.to(torch.float64), _frame(), FREE)
-    plain = splats_of(inputs.to(torch.float32), _frame(), FREE)
-    inverse = torch.stack([truth.conics[:, 0], truth.conics[:, 1], truth.conics[:, 1], truth.conics[:, 2]], -1).view(-1, 2, 2)
+    exact_projection = projected_of(inputs.to(torch.float64), _frame(), FREE)
+    plain = projected_of(inputs.to(torch.float32), _frame(), FREE)
+    inverse = torch.stack(
+        [
+            exact_projection.conics[:, 0],
+            exact_projection.conics[:, 1],
+            exact_projection.conics[:, 1],
+            exact_projection.conics[:, 2],
+        ],
+        -1,
+    ).view(-1, 2, 2)
     strengths, axes = torch.linalg.eigh(inverse.detach())  # the long axis first
     sigmas = strengths.rsqrt()
     along = torch.tensor([-2.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 2.0], dtype=torch.float64)
@@ -117,11 +125,11 @@ def weight_errors(length: float, device: torch.device) -> dict[str, dict[str, fl
         + s[None, :, None] * (sigmas[:, 1:] * axes[:, :, 1])[:, None]
     )
     dx, dy = d.float().unbind(-1)
-    exact = _weight(_plain_power(truth, dx.double(), dy.double()).detach())
-    record = _record(inputs, device)[truth.ids.to(device)]
+    exact = _weight(_plain_power(exact_projection, dx.double(), dy.double()).detach())
+    record = _record(inputs, device)[exact_projection.ids.to(device)]
     found = {n: _weight(p) for n, p in _powers(record, dx.to(device), dy.to(device)).items()}
     # where rounding left no inverse covariance, nothing is drawn
-    kept = torch.isin(truth.ids, plain.ids)
+    kept = torch.isin(exact_projection.ids, plain.ids)
     found["plain"] = torch.zeros_like(exact)
     found["plain"][kept] = _weight(_plain_power(plain, dx[kept], dy[kept]).detach())
     return {n: _figures((w - exact).abs()) for n, w in found.items()}
@@ -129,39 +137,39 @@ def weight_errors(length: float, device: torch.device) -> dict[str, dict[str, fl
 
 def _twin(inputs: Inputs, upstream: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Alpha [P] and the gradient of the projected mean [2] in the precision of the inputs; zero where nothing is drawn."""
-    splats = Splats(*(t.detach() for t in splats_of(inputs, _frame(), FREE)))
-    if len(splats.ids) == 0:
+    projected = ProjectedGaussians(*(t.detach() for t in projected_of(inputs, _frame(), FREE)))
+    if len(projected.ids) == 0:
         return torch.zeros_like(upstream), torch.zeros(2, dtype=torch.float64)
-    means = splats.means.clone().requires_grad_()
-    splats = splats._replace(means=means)
+    means = projected.means.clone().requires_grad_()
+    projected = projected._replace(means=means)
     pixels = pixel_centers(_frame(), means.dtype)
-    alpha = layers(pixels, None, splats, FREE).alpha[0]
+    alpha = layers(pixels, None, projected, FREE).alpha[0]
     (alpha * upstream.to(alpha)).sum().backward()
     return alpha.detach().double(), means.grad[0].double()
 
 
-def picture_errors(length: float, device: torch.device) -> tuple[dict, dict]:
-    """Error of alpha in pictures of one needle each, and relative error of the gradient of the projected mean."""
-    inputs = needles(length, PICTURES)
+def image_errors(length: float, device: torch.device) -> tuple[dict, dict]:
+    """Error of alpha in images of one needle each, and relative error of the gradient of the projected mean."""
+    inputs = needles(length, IMAGES)
     upstream = torch.randn(SIDE * SIDE, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     images: dict[str, list[torch.Tensor]] = {"factor": [], "conic": [], "plain": []}
     gradients: dict[str, list[torch.Tensor]] = {"factor": [], "plain": []}
     pixels = pixel_centers(_frame(), torch.float32).to(device)
-    for i in range(PICTURES):
+    for i in range(IMAGES):
         one = _only(inputs, i)
         exact, v_exact = _twin(one.to(torch.float64), upstream)
         plain, v_plain = _twin(one.to(torch.float32), upstream)
         there = [t.detach().to(device) for t in one]
         there[0].requires_grad_()
         r = rasterize(Gaussians(*there[:5]), Camera(there[5], there[6], SIDE, SIDE), RasterizeOptions(rule=FREE))
-        r.splats.retain_grad()
+        r.projected.retain_grad()
         (r.alpha.flatten() * upstream.to(r.alpha)).sum().backward()
-        record = r.splats.detach()[0, :, :5]
+        record = r.projected.detach()[0, :, :5]
         power = _powers(record, pixels[None, :, 0] - record[:, :1], pixels[None, :, 1] - record[:, 1:2])["conic"]
         drawn = {"factor": r.alpha.detach().flatten().double().cpu(), "conic": OPACITY * _weight(power)[0], "plain": plain}
         for name, alpha in drawn.items():
             images[name].append((alpha - exact).abs())
-        for name, v in (("factor", r.splats.grad[0, 0, :2].double().cpu()), ("plain", v_plain)):
+        for name, v in (("factor", r.projected.grad[0, 0, :2].double().cpu()), ("plain", v_plain)):
             gradients[name].append((v - v_exact).norm() / v_exact.norm())
     return {n: _figures(e) for n, e in images.items()}, {n: _figures(e) for n, e in gradients.items()}
 
@@ -170,8 +178,8 @@ def measure(device: torch.device, lengths=LENGTHS) -> list[dict]:
     """One row a length."""
     rows = []
     for length in lengths:
-        picture, gradient = picture_errors(length, device)
-        rows.append({"sigma": length, "weight": weight_errors(length, device), "picture": picture, "gradient": gradient})
+        image, gradient = image_errors(length, device)
+        rows.append({"sigma": length, "weight": weight_errors(length, device), "image": image, "gradient": gradient})
     return rows
 
 
@@ -185,9 +193,8 @@ def main() -> None:
     rows = measure(device)
     for row in rows:
         print(row["sigma"], *(f"{what} " + " ".join(f"{n} {e['max']:.1e}" for n, e in row[what].items())
-                              for what in ("weight", "picture", "gradient")), sep=" | ")  # fmt: skip
-    if a.out:
-        write_json(a.out, {"machine": describe(device), "needles": ANGLES, "pictures": PICTURES, "side": SIDE, "rows": rows})
+                              for what in ("weight", "image", "gradient")), sep=" | ")  # fmt: skip
+    result_file.write(a.out, result_file.result(WHAT, device, rows, needles=ANGLES, images=IMAGES, side=SIDE))
 
 
 if __name__ == "__main__":

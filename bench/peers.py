@@ -94,20 +94,20 @@ def _composite(pixels, means, inverses, opacities, colors):
 
 
 def dense_rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
-    """Rule `exact` in plain torch, without tiles: pictures [C, H, W, 3] over black, for small N only."""
+    """Rule `exact` in plain torch, without tiles: images [C, H, W, 3] over black, for small N only."""
     device = gaussians.means.device
     y, x = torch.meshgrid(torch.arange(camera.height, device=device), torch.arange(camera.width, device=device), indexing="ij")
     centers = torch.stack([x, y], -1).reshape(-1, 2) + 0.5
-    pictures = []
+    images = []
     for view, K in zip(camera.viewmat, camera.K):
-        splats = _projected(gaussians, view, K, camera.width, camera.height)
-        parts = [checkpoint(_composite, part, *splats, use_reentrant=False) for part in centers.split(PIXELS_AT_ONCE)]
-        pictures.append(torch.cat(parts).view(camera.height, camera.width, 3))
-    return torch.stack(pictures)
+        projected = _projected(gaussians, view, K, camera.width, camera.height)
+        parts = [checkpoint(_composite, part, *projected, use_reentrant=False) for part in centers.split(PIXELS_AT_ONCE)]
+        images.append(torch.cat(parts).view(camera.height, camera.width, 3))
+    return torch.stack(images)
 
 
 def gsplat_rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
-    """The same pictures by gsplat, activations applied outside as its interface asks."""
+    """The same images by gsplat, activations applied outside as its interface asks."""
     from gsplat import rasterization
 
     rgb, _, _ = rasterization(
@@ -118,23 +118,23 @@ def gsplat_rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
 
 
 def naive_rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
-    """The same pictures by the straightforward kernel, one thread per pixel."""
+    """The same images by the straightforward kernel, one thread per pixel."""
     return naive.rasterize(gaussians, camera)
 
 
 RASTERIZERS = {DENSE: dense_rasterize, NAIVE: naive_rasterize, GSPLAT: gsplat_rasterize}
-"""Peers that draw: Gaussians and a batch of cameras in, pictures [C, H, W, 3] out."""
+"""Peers that draw: Gaussians and a batch of cameras in, images [C, H, W, 3] out."""
 
 
 @functools.cache
 def absent(device: torch.device) -> dict[str, str]:
-    """Peers that cannot draw a picture and its gradient on a device, each with the reason."""
+    """Peers that cannot draw an image and its gradient on a device, each with the reason."""
     reasons = {}
     for name, draw in RASTERIZERS.items():
         try:
             gaussians = inputs.gaussians(10, device)
-            picture = draw(gaussians, inputs.camera(32, 32, device))
-            torch.autograd.grad(picture.sum(), [gaussians.means])
+            image = draw(gaussians, inputs.camera(32, 32, device))
+            torch.autograd.grad(image.sum(), [gaussians.means])
         except Exception as e:  # whatever a foreign program fails with, the bench goes on without it
             reasons[name] = " ".join(f"{type(e).__name__}: {e}".split())[:200]
     if GSPLAT in reasons:

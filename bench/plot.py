@@ -103,7 +103,7 @@ def _panel(panel: Panel, left: float, y_range: tuple[int, int], x_range: tuple[f
     out.append(f'<path d="M{left:.1f} {bottom}h{PLOT_WIDTH}" stroke="#999999"/>')
     out.append(_text(left + PLOT_WIDTH / 2, bottom + 40, panel.x_label, anchor="middle", size=11, color="#666666"))
 
-    # a short line of slope 1 in the lower right corner, where growing series leave room
+    # a short line of slope 1 in the lower right corner, where growing series leave space
     run = min(1.0, 0.4 * (x_range[1] - x_range[0]), 0.4 * (y_range[1] - y_range[0]))
     along, rise = run * PLOT_WIDTH / (x_range[1] - x_range[0]), run * PLOT_HEIGHT / (y_range[1] - y_range[0])
     end = left + PLOT_WIDTH - 44

@@ -1,4 +1,4 @@
-"""Where the ops are measured: a base point, one axis varied at a time, and the diagonal along which all grows together."""
+"""Sizes at which ops are measured: a base point, one axis varied at a time, and the diagonal along which all grows together."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def points(axes: tuple[str, ...], device: torch.device, tiny: bool) -> list[Poin
 
 
 def load(p: Point) -> float:
-    """How heavy a point is beside the base point, roughly: Gaussians with their colours, and pixels, count alike."""
+    """Return the weight of a point beside the base point, roughly: Gaussians with their colours, and pixels, count alike."""
     return p.cameras * (p.count / BASE.count * (0.5 + (p.degree + 1) ** 2 / 32) + p.pixels / BASE.pixels)
 
 

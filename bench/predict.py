@@ -1,14 +1,11 @@
-"""What a measurement will take, foretold from smaller ones, so that hopeless ones are left out and said to be."""
+"""Prediction of time and memory from smaller measurements, so that hopeless ones are left out and listed."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
 
-import torch
-
 from bench.points import Point, growth
-from warpgs.kernels.tiles import available_bytes
 
 LIMIT_MS = 2000.0
 """Longest time of one repeat that is still measured [ms]."""
@@ -69,7 +66,7 @@ def memory_bytes(rows: list[dict], op: str, program: str, direction: str, point:
 def reason_to_skip(
     rows: list[dict], op: str, program: str, direction: str, point: Point, sizes: dict, free: float
 ) -> str | None:
-    """Why a task should not run, or None."""
+    """Return why a task should not run, or None."""
     predicted = time_ms(rows, op, program, direction, sizes)
     if predicted is not None and predicted > LIMIT_MS:
         return f"predicted {predicted / 1000:.2g} s a repeat, above {LIMIT_MS / 1000:g} s"
@@ -77,14 +74,3 @@ def reason_to_skip(
     if needed > free:
         return f"predicted {needed / 2**30:.2g} GiB, free {free / 2**30:.2g} GiB"
     return None
-
-
-def free_bytes(device: torch.device) -> int:
-    """Memory that is free now [bytes]; that of files kept in memory counts as free on a CPU where the system says so."""
-    if device.type == "cpu":
-        try:
-            with open("/proc/meminfo") as f:
-                return next(int(line.split()[1]) * 1024 for line in f if line.startswith("MemAvailable"))
-        except (OSError, StopIteration):
-            pass
-    return available_bytes(device)

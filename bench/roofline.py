@@ -1,4 +1,4 @@
-"""What a stage must move and compute, and what the machine could move and compute at best.
+"""Bytes and operations that a stage needs at least, and what the machine could move and compute at best.
 
 How bytes are counted: every input read once and every output written once, in float32, as if caches were perfect; what a
 stage stores for its backward pass counts, scratch memory does not. Two exceptions, because no known method does without:
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 
-from warpgs.kernels import bridge
+from warpgs.runtime import interop
 
 REAL = 4
 """Bytes of a number."""
@@ -56,16 +56,6 @@ def project(count: int, cameras: int, degree: int) -> tuple[Cost, Cost]:
     parameters, records = REAL * count * _numbers(degree), REAL * views * RECORD
     forward = Cost(parameters + records + 4 * views, views * (300 + 6 * coefficients))
     return forward, Cost(2 * parameters + 2 * records, views * (700 + 18 * coefficients))
-
-
-def sh(count: int, degree: int) -> tuple[Cost, Cost]:
-    """Forward: coefficients and directions in, colours out. Backward: those and a colour gradient in, two gradients out."""
-    coefficients = (degree + 1) ** 2
-    numbers = 3 * coefficients
-    return (
-        Cost(REAL * count * (numbers + 6), count * (6 * coefficients + 40)),
-        Cost(REAL * count * (2 * numbers + 9), count * (18 * coefficients + 100)),
-    )
 
 
 def tiles(count: int, cameras: int, instances: int, tiles_in_all: int) -> Cost:
@@ -114,7 +104,7 @@ def dropout(count: int) -> Cost:
     return Cost(REAL * count, 20 * count)
 
 
-def burst(pixels: int) -> Cost:
+def buffers(pixels: int) -> Cost:
     """A photograph in and out."""
     return Cost(6 * REAL * pixels, 0)
 
@@ -192,8 +182,8 @@ def ceilings(device: torch.device, tiny: bool = False) -> dict:
     out = torch.empty(tasks, device=device)
 
     def compute():
-        with bridge.stream_of(device):
-            bridge.launch(multiply_add, tasks, [0.999, steps, bridge.view(out, wp.float32)], device, cost=steps)
+        with interop.stream_of(device):
+            interop.launch(multiply_add, tasks, [0.999, steps, interop.view(out, wp.float32)], device, cost=steps)
 
     return {
         "bytes_per_s": 12 * length / triad,
@@ -203,7 +193,7 @@ def ceilings(device: torch.device, tiny: bool = False) -> dict:
 
 
 def against_roof(cost: Cost, seconds: float, roof: dict) -> dict:
-    """The least time the two ceilings allow [ms], which of them binds, and the share of it that was reached."""
+    """The least time the two ceilings allow [ms], which of them binds, and the fraction of it that was reached."""
     memory, compute = cost.bytes / roof["bytes_per_s"], cost.operations / roof["operations_per_s"]
     least = max(memory, compute)
     return {
@@ -211,5 +201,5 @@ def against_roof(cost: Cost, seconds: float, roof: dict) -> dict:
         "operations": round(cost.operations),
         "roof_ms": float(f"{1000 * least:.4g}"),
         "bound": "bytes" if memory >= compute else "operations",
-        "share": float(f"{least / seconds:.4g}"),
+        "fraction": float(f"{least / seconds:.4g}"),
     }

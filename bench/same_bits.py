@@ -1,11 +1,12 @@
-"""Which bits a fit gives on this processor: a SHA-256 of every stage from photographs to PLY; the first that differs shows.
-
-Makes the demo scene, then fits it by two presets: ``3dgs`` from the points of the scene and ``quick`` from swept depths, with
-saliency and sampling events. Prints a stage a line with the first 12 digits of its SHA-256, puts a row into the table
-``--out``, and names the stages that differ from the table's first row of the same arguments. Stages of single functions
-(``torch.exp``, ``cv2.SIFT``, ...) come first: they work on fixed numbers, so one that differs did not inherit it.
+"""The bits that a fit gives on this processor: the SHA-256 of every stage from photographs to PLY, beside other processors.
 
 usage: python -m bench.same_bits [--out bench/results/same_bits.json] [--device cpu] [--threads N] [--avx2] [--label WORDS]
+
+Makes the demo scene, then fits it by three presets: ``3dgs`` from the points of the scene, ``quick`` from swept depths, with
+saliency and sampling events, and ``fsgs`` with a depth term. Prints a line for each stage with the first 12 digits of its
+SHA-256, puts a row into the result ``--out`` (in the place of one of the same label, processor and arguments), and names the
+stages that differ from the first row of the same arguments and kind of device. Stages of single functions (``torch.exp``,
+``cv2.SIFT``, ...) come first: they work on fixed numbers, so one that differs did not inherit it.
 
 With ``--avx2`` every library takes the code that it has for processors without AVX-512, and Warp compiles for Haswell.
 `python -m bench.accuracy` puts the table into docs/accuracy.md.
@@ -17,7 +18,6 @@ import argparse
 import dataclasses
 import hashlib
 import importlib.metadata
-import json
 import os
 import platform
 import subprocess
@@ -30,22 +30,26 @@ import numpy as np
 import torch
 import warp
 
-from bench.machine import describe
-from warpgs.demo import split_spec, write_demo
+from bench import result_file
 from warpgs.export.ply import write_ply
 from warpgs.io.load import load_scene
 from warpgs.io.splits import split_views
-from warpgs.kernels.bridge import set_threads
 from warpgs.kernels.compiler import ROLLED
-from warpgs.pipeline.config import PRESETS, FitConfig
-from warpgs.pipeline.fit import Fit, train_views
-from warpgs.pipeline.loss import training_loss
+from warpgs.pipeline.train.config import PRESETS, FitConfig
+from warpgs.pipeline.train.loss import Target
+from warpgs.pipeline.train.step import total_loss
+from warpgs.pipeline.train.strategies.base import find_strategy
+from warpgs.pipeline.train.trainer import Trainer, train_views
 from warpgs.priors.matches import triangulate_matches
 from warpgs.priors.semantics import classical_maps
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.runtime.interop import set_threads
 from warpgs.scene import Gaussians, Scene, View
+from warpgs.synthetic.demo import split_spec, write_demo
 
-RESULTS = Path(__file__).parent / "results" / "same_bits.json"
+WHAT = "SHA-256, first 12 digits, of every stage from photographs to the PLY of a fit, and of single library functions"
+RESULTS = result_file.FOLDER / "same_bits.json"
+PRESET_NAMES = ("3dgs", "quick", "fsgs")
 DIGITS = 12
 AVX2 = {
     "ATEN_CPU_CAPABILITY": "avx2",
@@ -57,14 +61,14 @@ AVX2 = {
 }
 """Environment variables by which libraries take their code for processors without AVX-512."""
 VARIABLES = (*AVX2, "MKL_CBWR", "GLIBC_TUNABLES")
-"""All of that kind that a row records."""
+"""All variables of that kind that a row records."""
 FEATURES = ("sse4_2", "avx", "fma", "avx2", "avx512f", "avx512_bf16", "avx512_fp16", "amx_tile")
 
 LIBRARIES = ("torch.", "numpy.", "cv2.")
-"""How the names of stages of single functions begin."""
+"""Beginnings of the names of stages of single functions."""
 SHOWN = (
     ("demo", "decoded images"), ("`3dgs`: first PLY", "3dgs: first PLY"), ("last PLY", "3dgs: last PLY"),
-    ("`quick`: depths", "quick: depths that views confirm"), ("first PLY", "quick: first PLY"), ("last PLY", "quick: last PLY"),
+    ("`quick`: depths", "quick: consistent depths"), ("first PLY", "quick: first PLY"), ("last PLY", "quick: last PLY"),
 )  # fmt: skip
 """Columns of the table in docs/accuracy.md, and their stages."""
 
@@ -99,28 +103,24 @@ def function_stages() -> Iterator[Stage]:
         yield f"torch.{name}", digest(getattr(torch, name)(t.abs() if name in ("log", "sqrt", "log1p") else t))
     yield "torch.hypot", digest(torch.hypot(t[:-1], t[1:]))
     yield "torch.norm of 3", digest(t[:-2].view(-1, 3).norm(dim=-1))
-    yield "torch.sum", digest(t.sum())
-    yield "torch.sum of rows", digest(t[:-1].view(-1, 32).sum(0), t[:-1].view(-1, 32).sum(1))
+    cubes = t * t * t  # whose sums are rounded
+    yield "torch.sum", digest(cubes.sum())
+    yield "torch.sum of rows", digest(cubes[:-1].view(-1, 32).sum(1))
     yield "torch.randn", digest(torch.randn(10_001, generator=torch.Generator().manual_seed(0)))
     yield "torch.matmul", digest(t[:4096].view(64, 64) @ t[4096:8192].view(64, 64))
     f = x.astype(np.float32)
     for name in ("exp", "log", "sin", "sqrt"):
         yield f"numpy.{name}", digest(getattr(np, name)(x + 0.5), getattr(np, name)(f + np.float32(0.5)))
     yield "numpy.sum", digest(x.sum(), f.sum(), (f - x).std())
-    yield (
-        "numpy.matmul",
-        digest(x[:4096].reshape(64, 64) @ x[4096:8192].reshape(64, 64), x[:30_000].reshape(-1, 3) @ x[:9].reshape(3, 3)),
-    )
+    products = x[:4096].reshape(64, 64) @ x[4096:8192].reshape(64, 64), x[:30_000].reshape(-1, 3) @ x[:9].reshape(3, 3)
+    yield "numpy.matmul", digest(*products)
     yield "numpy.linalg.inv", digest(np.linalg.inv(x[:16].reshape(4, 4) + np.eye(4)))
     image = f[: 240 * 240].reshape(240, 240)
     bytes3 = (255 * np.stack([image] * 3, 2)).astype(np.uint8)
     H = np.array([[1.01, 0.02, 3.3], [-0.01, 0.98, 1.7], [1e-5, -2e-5, 1]])
     linear = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     yield "cv2.blur", digest(cv2.blur(image, (7, 7)))
-    yield (
-        "cv2.warpPerspective",
-        digest(cv2.warpPerspective(image, H, (240, 240), flags=linear)),
-    )
+    yield "cv2.warpPerspective", digest(cv2.warpPerspective(image, H, (240, 240), flags=linear))
     yield "cv2.cvtColor", digest(cv2.cvtColor(np.stack([image, image.T, image[::-1]], 2), cv2.COLOR_RGB2GRAY))
     yield "cv2.resize", digest(cv2.resize(image, (100, 90), interpolation=cv2.INTER_AREA))
     smooth = cv2.GaussianBlur(bytes3[..., 0], (0, 0), 3)
@@ -128,10 +128,8 @@ def function_stages() -> Iterator[Stage]:
     found, descriptors = cv2.SIFT_create().detectAndCompute(np.ascontiguousarray(smooth), None)
     yield "cv2.SIFT", digest(np.array([(*k.pt, k.size, k.angle) for k in found]), descriptors)
     yield "cv2.l0Smooth", digest(cv2.ximgproc.l0Smooth(bytes3[:120, :120], None, 0.04, 2.0))
-    yield (
-        "cv2.distanceTransform",
-        digest(cv2.distanceTransform((image > 0.01).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)),
-    )
+    distances = cv2.distanceTransform((image > 0.01).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    yield "cv2.distanceTransform", digest(distances)
     yield "cv2.fastGlobalSmoother", digest(cv2.ximgproc.fastGlobalSmootherFilter(bytes3, image, 1e4, 8.0))
 
 
@@ -160,16 +158,15 @@ def _ply(gaussians: Gaussians, scene: Scene, folder: Path) -> str:
     return digest(path.read_bytes())
 
 
-def _first_step(fit: Fit) -> Iterator[Stage]:
+def _first_step(trainer: Trainer) -> Iterator[Stage]:
     """Yield the first render, its loss and the gradients, without a change to the fit."""
-    view, config = fit.views[0], fit.config
-    leaves = Gaussians(**{n: t.clone().requires_grad_() for n, t in fit.gaussians.tensors().items()})
-    options = RasterizeOptions(rule=config.rule, sh_degree=0, background=fit.background)
+    view, plan = trainer.views[0], trainer.plan_of(1)
+    leaves = Gaussians(**{n: t.clone().requires_grad_() for n, t in trainer.gaussians.tensors().items()})
+    options = RasterizeOptions(rule=trainer.config.rule, sh_degree=plan.degree, background=trainer.background)
     render = rasterize(leaves, view.camera, options)
-    images = (render.rgb, render.alpha, render.depth)
-    for name, image in zip(("colour", "alpha", "depth"), images):
+    for name, image in (("colour", render.rgb), ("alpha", render.alpha), ("depth", render.depth)):
         yield f"first render: {name}", digest(image)
-    loss = training_loss(images, view.photo, view.mask, None, config.loss)
+    loss = total_loss(plan.terms, render, Target(view.image, view.mask, view.maps, {}), leaves, trainer.strategy)
     yield "first loss", digest(loss)
     loss.backward()
     for name, leaf in leaves.tensors().items():
@@ -178,21 +175,25 @@ def _first_step(fit: Fit) -> Iterator[Stage]:
 
 def fit_stages(scene: Scene, train: list[View], config: FitConfig, device: torch.device, folder: Path) -> Iterator[Stage]:
     """Yield the stages of one fit: its start, the first step, parameters after 1, 10 and all steps, and both PLY files."""
-    fit = Fit(train, scene.points, config, device, scene.background)
-    if config.method.events:
-        yield "depths that views confirm", digest(*(v.confirmed for v in fit.views))
-        yield "disparities", digest(*fit.disparities)
-        yield "semantic score", digest(*(v.semantic for v in fit.views))
-        yield "geometric score", digest(*(v.geometry for v in fit.views))
-    yield "first points", digest(fit.gaussians.means, fit.gaussians.sh[:, 0])
-    yield "first Gaussians", digest(*fit.gaussians.tensors().values())
-    yield "first PLY", _ply(fit.gaussians, scene, folder)
-    yield from _first_step(fit)
+    trainer = Trainer(train, scene.points, config, device, scene.background)
+    if find_strategy(config.strategy).samples(config):
+        yield "consistent depths", digest(*(v.consistent for v in trainer.views))
+        yield "disparities", digest(*trainer.disparities)
+        yield "semantic score", digest(*(v.semantic for v in trainer.views))
+        yield "geometric score", digest(*(v.geometry for v in trainer.views))
+    for name in sorted({name for v in trainer.views for name in v.maps}):
+        yield f"maps of the loss: {name}", digest(*(v.maps[name] for v in trainer.views))
+    yield "first points", digest(trainer.gaussians.means, trainer.gaussians.sh[:, 0])
+    yield "first Gaussians", digest(*trainer.gaussians.tensors().values())
+    yield "first PLY", _ply(trainer.gaussians, scene, folder)
+    yield from _first_step(trainer)
+    losses = []
     for step in sorted({1, min(10, config.steps), config.steps}):
-        while fit.step < step:
-            fit.burst(step - fit.step)
-        yield f"parameters after step {step}", digest(*fit.gaussians.tensors().values())
-    yield "last PLY", _ply(fit.gaussians, scene, folder)
+        while trainer.step < step:
+            losses += [report.loss for report in trainer.advance(step - trainer.step)]
+        yield f"parameters after step {step}", digest(*trainer.gaussians.tensors().values())
+    yield "losses", digest(np.array(losses))
+    yield "last PLY", _ply(trainer.gaussians, scene, folder)
 
 
 def stages(
@@ -209,7 +210,7 @@ def stages(
         train = train_views(scene, split_views(scene, split_spec(views)).train)
         yield from scene_stages(scene, source)
         yield from prior_stages(train)
-        for preset in ("3dgs", "quick"):
+        for preset in PRESET_NAMES:
             config = PRESETS[preset]
             # so that Gaussians are cloned, split and pruned in as few steps as these
             density = dataclasses.replace(config.density, start=steps // 6, every=max(1, steps // 6))
@@ -228,6 +229,7 @@ def _features() -> list[str]:
 
 
 def _versions() -> dict[str, str]:
+    """Return the versions of further libraries that decide bits."""
     names = ("numpy", "opencv-contrib-python-headless")
     found = {n: importlib.metadata.version(n) for n in names}
     return found | {"libc": " ".join(platform.libc_ver())}
@@ -235,18 +237,30 @@ def _versions() -> dict[str, str]:
 
 def row(device: torch.device, label: str, arguments: dict, given: Path | None = None, echo=print) -> dict:
     """Return one row of the table: the machine, what decides the code it runs, and the digest of each stage."""
-    record = describe(device)
-    record["versions"] |= _versions()
-    record |= {
-        "label": label, "arguments": arguments, "features": _features(),
-        "torch_capability": torch.backends.cpu.get_cpu_capability(), "warp_flags": warp.config.cpu_compiler_flags,
+    head = result_file.result(WHAT, device, [])
+    kept = {name: head[name] for name in ("command", "commit", "date", "machine", "versions")}
+    record = {"label": label, "arguments": arguments} | kept | {
+        "features": _features(), "torch_capability": torch.backends.cpu.get_cpu_capability(),
+        "warp_flags": warp.config.cpu_compiler_flags,
         "environment": {n: os.environ[n] for n in VARIABLES if n in os.environ},
     }  # fmt: skip
+    record["versions"] |= _versions()
     found = {}
     for name, value in stages(device, **arguments, given=given):
         found[name] = value
         echo(f"{value}  {name}")
     return record | {"stages": found}
+
+
+def placed(rows: list[dict], made: dict) -> list[dict]:
+    """Return the rows with the one just made, in the place of the row of the same label, processor and arguments."""
+
+    def key(r: dict) -> tuple:
+        return r["label"], r["machine"]["device"], r["machine"]["name"], r["arguments"]
+
+    if key(made) in map(key, rows):
+        return [made if key(r) == key(made) else r for r in rows]
+    return [*rows, made]
 
 
 def differing(one: dict, other: dict) -> list[str]:
@@ -255,16 +269,17 @@ def differing(one: dict, other: dict) -> list[str]:
 
 
 def table(rows: list[dict]) -> str:
-    """Return the table of docs/accuracy.md: a row a run, against the first run on the same kind of device."""
+    """Return the table of docs/accuracy.md: a row for each run, beside the first run on the same kind of device."""
     head = ["run", *(title for title, _ in SHOWN), "functions that differ", "first stage that differs"]
     lines = [head, ["---"] * len(head)]
     for r in rows:
-        first = next(f for f in rows if f["device"] == r["device"])
+        first = next(f for f in rows if f["machine"]["device"] == r["machine"]["device"])
         functions, others = [], []
         for name in differing(r, first):
             (functions if name.startswith(LIBRARIES) else others).append(name)
-        versions = f"{r['label']}, torch {r['versions']['torch']}, {r['threads']} threads"
-        cells = [f"**{r['name']}**, {versions}", *(f"`{r['stages'][stage]}`" for _, stage in SHOWN)]
+        threads = r["machine"]["threads"]
+        how = f"{r['label']}, torch {r['versions']['torch']}, {threads} thread{'s' if threads > 1 else ''}"
+        cells = [f"**{r['machine']['name']}**, {how}", *(f"`{r['stages'][stage]}`" for _, stage in SHOWN)]
         lines.append([*cells, ", ".join(functions) or "none", others[0] if others else "none"])
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
@@ -311,13 +326,12 @@ def main() -> None:
         _set_threads(a.threads)
     arguments = {"views": a.views, "width": a.size[0], "height": a.size[1], "steps": a.steps}
     made = row(torch.device(a.device), a.label, arguments, a.scene)
-    rows = json.loads(a.out.read_text("utf-8")) if a.out.exists() else []
-    first = next((r for r in rows if r["arguments"] == arguments and r["device"] == made["device"]), None)
-    if first is not None:
+    rows = placed(result_file.read(a.out)["rows"] if a.out.exists() else [], made)
+    first = next(r for r in rows if r["arguments"] == arguments and r["machine"]["device"] == a.device)
+    if first is not made:
         others = ", ".join(differing(made, first)) or "none"
-        print(f"of {len(made['stages'])} stages these differ from {first['name']}, {first['label']}: {others}")
-    a.out.parent.mkdir(parents=True, exist_ok=True)
-    a.out.write_text(json.dumps([*rows, made], indent=1) + "\n")
+        print(f"of {len(made['stages'])} stages these differ from {first['machine']['name']}, {first['label']}: {others}")
+    result_file.write(a.out, result_file.result(WHAT, torch.device(a.device), rows))
 
 
 if __name__ == "__main__":

@@ -6,68 +6,59 @@ usage: python -m bench.step SCENE [--split llff:3] [--downscale 1] [--gaussians 
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import torch
 
+from bench import result_file
 from bench.harness import measure
+from bench.training import Trainer, make_trainer, one_step, step_parts
 from warpgs import load_scene
 from warpgs.constants import RULES
 from warpgs.io.splits import split_views
 from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
-from warpgs.pipeline.config import FitConfig
-from warpgs.pipeline.fit import Fit, train_views
-from warpgs.pipeline.init import InitConfig
-from warpgs.pipeline.loss import LossConfig, photometric_loss
-from warpgs.pipeline.run import choose_device
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.runs.request import choose_device
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loss import photometric_loss
 
 
-def stages(fit: Fit) -> dict[str, dict[str, float]]:
-    """Time each stage on the first training view, with SH degree 3, and the whole step."""
-    device, rule = fit.device, RULES[fit.config.rule]
-    camera, target = fit.views[0].camera, fit.views[0].photo
+def stages(trainer: Trainer) -> tuple[list[dict], int]:
+    """Time each stage on the first training view, with SH degree 3, and the whole step; a row each, and the instances."""
+    device, parts = trainer.device, step_parts(trainer)
+    camera, target, rule = parts.camera, parts.target, RULES[parts.rule]
     size = {"width": camera.width, "height": camera.height}
-    inputs = [*fit.optimizer.gaussians.tensors().values(), camera.viewmat[None], camera.K[None]]
-    background = fit.background[None]
+    inputs = [*parts.parameters.values(), camera.viewmat[None], camera.K[None]]
+    background = parts.background[None]
 
     def run_project():
         return project(*inputs, **size, degree=3, rule=rule)
 
-    splats, counts = run_project()
-    tiles = bin_tiles(splats, counts, **size, rule=rule)
-    leaf = splats.detach().requires_grad_()
+    projected, counts = run_project()
+    tiles = bin_tiles(projected, counts, **size, rule=rule)
+    leaf = projected.detach().requires_grad_()
     rgb = blend(leaf, tiles, background, **size, rule=rule)[0][0]
     image = rgb.detach().requires_grad_()
-    v_splats, v_rgb = torch.rand_like(splats), torch.rand_like(rgb)
-    loss = LossConfig()
+    v_projected, v_rgb = torch.rand_like(projected), torch.rand_like(rgb)
 
     def backward_of(outputs, sources, upstream=None):
         return lambda: torch.autograd.grad(outputs, sources, upstream, retain_graph=True)
 
-    value = photometric_loss(image, target, None, loss)
-    params = list(fit.optimizer.params.values())
-
-    def optimize():
-        for p in params:
-            p.grad = torch.zeros_like(p)
-        fit.optimizer.step(0.5)
-
+    value = photometric_loss(image, target, None)
     result = {
         "project forward": measure(run_project, device),
-        "tiles": measure(lambda: bin_tiles(splats, counts, **size, rule=rule), device),
+        "tiles": measure(lambda: bin_tiles(projected, counts, **size, rule=rule), device),
         "blend forward": measure(lambda: blend(leaf, tiles, background, **size, rule=rule), device),
-        "loss forward": measure(lambda: photometric_loss(image, target, None, loss), device),
+        "loss forward": measure(lambda: photometric_loss(image, target, None), device),
         "loss backward": measure(backward_of(value, [image]), device),
         "blend backward": measure(backward_of(rgb, [leaf], v_rgb), device),
-        "project backward": measure(backward_of(splats, params, v_splats), device),
-        "adam": measure(optimize, device),
+        "project backward": measure(backward_of(projected, list(parts.parameters.values()), v_projected), device),
+        "adam": measure(parts.optimize, device),
+        "whole step": measure(lambda: one_step(trainer), device),
     }
-    result["whole step"] = measure(fit.advance, device)
-    result["instances"] = {"count": len(tiles.slots)}
-    return result
+    return [{"stage": name} | row for name, row in result.items()], len(tiles.slots)
 
 
 def main() -> None:
@@ -83,18 +74,18 @@ def main() -> None:
     a = parser.parse_args()
     device, where = choose_device(a.device)
     scene = load_scene(a.scene, downscale=a.downscale)
-    views = train_views(scene, split_views(scene, a.split).train)
+    views = [scene.view(name) for name in split_views(scene, a.split).train]
     config = FitConfig(steps=100_000, init=InitConfig(source="random", random_count=a.gaussians))
-    fit = Fit(views, scene.points, config, device)
+    trainer = make_trainer(views, scene.points, config, device)
     for _ in range(a.warm_steps):
-        fit.advance()
-    table = stages(fit)
-    print(f"{a.scene} {views[0].camera.width} x {views[0].camera.height} px, {len(fit.gaussians):,} Gaussians, {where}")
-    for name, row in table.items():
-        print(f"  {name:<18}" + "  ".join(f"{k} {v}" for k, v in row.items()))
-    if a.out:
-        record = {"device": where, "gaussians": len(fit.gaussians), "torch": torch.__version__, "stages": table}
-        a.out.write_text(json.dumps(record, indent=1) + "\n")
+        one_step(trainer)
+    rows, instances = stages(trainer)
+    count = len(trainer.gaussians)
+    print(f"{a.scene} {views[0].camera.width} x {views[0].camera.height} px, {count:,} Gaussians, {where}")
+    for row in rows:
+        print(f"  {row['stage']:<18}" + "  ".join(f"{k} {v}" for k, v in row.items() if k != "stage"))
+    what = f"one training step on {Path(a.scene).name}, stage by stage"
+    result_file.write(a.out, result_file.result(what, device, rows, gaussians=count, instances=instances))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,9 @@ import torch
 
 # Two processes that compile one kernel for the first time can get in each other's way: each worker has a cache of its own.
 if worker := os.environ.get("PYTEST_XDIST_WORKER"):
-    base = os.environ.get("WARP_CACHE_PATH", Path(tempfile.gettempdir()) / "warpgs-test-kernels")
+    base = os.environ.get(
+        "WARP_CACHE_PATH", Path(tempfile.gettempdir()) / f"warpgs-test-kernels-{getattr(os, 'getuid', int)()}"
+    )
     os.environ["WARP_CACHE_PATH"] = str(Path(base) / worker)
 
 DEVICES = [pytest.param("cpu")]

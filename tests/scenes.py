@@ -7,7 +7,7 @@ import torch
 
 from warpgs.geometry import look_at
 from warpgs.kernels.sh import C0
-from warpgs.rasterizer import rasterize
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians, PointCloud, Prior, View
 
 
@@ -33,7 +33,7 @@ def ring(count: int, width: int = 40, height: int = 32) -> list[Camera]:
     return cameras
 
 
-def photographs(count: int = 6, width: int = 40, height: int = 32) -> list[View]:
+def photos(count: int = 6, width: int = 40, height: int = 32) -> list[View]:
     """Views of the three Gaussians."""
     gaussians = three_gaussians()
     return [

@@ -8,9 +8,9 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PRODUCT = sorted((ROOT / "warpgs").rglob("*.py"))
 SHARED = {
-    "__init__", "bridge", "functions", "memory", "native", "compiler", "falloff",
-    "project_backward", "project_adam", "ssim_cpu", "ssim_cuda", "blend_cpu", "blend_cpu_backward",
-    "blend_cuda",
+    "__init__", "functions", "native", "compiler", "falloff",
+    "project_backward", "ssim_cpu", "ssim_cuda", "blend_cpu", "blend_cpu_backward",
+    "blend_cuda", "blend_settings", "sh",
 }  # fmt: skip
 
 

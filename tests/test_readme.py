@@ -1,7 +1,11 @@
 """The README's example does what it says."""
 
 import re
+import shutil
+import subprocess
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parent.parent
 
@@ -20,3 +24,23 @@ def test_links_lead_somewhere():
         text = (ROOT / document).read_text("utf-8")
         for target in re.findall(r"\]\((?!http)([^)#]+)\)", text):
             assert ((ROOT / document).parent / target).exists(), f"{document}: {target}"
+
+
+def test_the_hosted_checks_are_those_of_the_readme():
+    """Both commands, each system, and every Python that the package allows."""
+    text = (ROOT / ".github/workflows/test.yml").read_text("utf-8")
+    commands = re.findall(r"^(make \w+) ", (ROOT / "README.md").read_text("utf-8"), re.MULTILINE)
+    assert re.findall(r"- run: (make \w+)", text) == commands == ["make demo", "make test"]
+    assert all(f"{system}-latest" in text for system in ("ubuntu", "macos", "windows"))
+    low, high = re.search(r'requires-python = ">=3\.(\d+),<3\.(\d+)"', (ROOT / "pyproject.toml").read_text("utf-8")).groups()
+    assert re.search(r"python: \[(.*)\]", text)[1] == ", ".join(f'"3.{n}"' for n in range(int(low), int(high)))
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="there is no make")
+@pytest.mark.parametrize(("system", "folder"), [("Windows_NT", "Scripts"), ("", "bin")])
+def test_the_commands_call_what_a_virtual_environment_has(tmp_path, system, folder):
+    """On Windows programs lie in another folder, and what Python prints ends with a carriage return."""
+    command = ["make", "-n", "-f", str(ROOT / "Makefile"), "demo", "test", f"OS={system}"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert f".venv/{folder}/warpgs fit" in done.stdout and f".venv/{folder}/python -m pytest" in done.stdout
+    assert 'end=""' in done.stdout and ("/bin/" in done.stdout) == (folder == "bin")

@@ -1,6 +1,5 @@
 """The same bits on another processor: libraries take the code that they have for it, and a fit must not show it."""
 
-import json
 import os
 import platform
 import subprocess
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench import same_bits
+from bench import result_file, same_bits
 from warpgs import geometry
 from warpgs.io.poses import rigid
 
@@ -21,7 +20,7 @@ def rows(out: Path, *flags: str, **environment: str) -> dict:
     """The row of a run on a tiny scene, in a process of its own."""
     command = [sys.executable, "-m", "bench.same_bits", "--out", str(out), "--size", "64", "48", "--steps", "12", *flags]
     subprocess.run(command, cwd=ROOT, env=os.environ | environment, check=True, capture_output=True)
-    return json.loads(out.read_text("utf-8"))[-1]
+    return result_file.read(out)["rows"][-1]
 
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="chooses between code for processors of this kind")
@@ -37,15 +36,28 @@ def test_libraries_for_other_processors_and_other_thread_counts_give_the_same_fi
         assert [n for n in same_bits.differing(row, own) if not n.startswith(same_bits.LIBRARIES)] == []
 
 
+def row(label: str, stages: dict, device: str = "cpu", **more) -> dict:
+    """A row of a result."""
+    machine = {"device": device, "name": "P", "threads": 2}
+    return {"label": label, "machine": machine, "versions": {"torch": "2"}, "arguments": {}, "stages": stages} | more
+
+
 def test_the_table_names_the_first_stage_that_differs():
     """Functions of libraries apart from stages, which are compared with the first run on that kind of device."""
-    fixed = {"label": "x", "threads": 2, "versions": {"torch": "2"}, "name": "P"}
     stages = {"torch.exp": "1"} | {stage: "2" for _, stage in same_bits.SHOWN}
     changed = stages | {"torch.exp": "0", "3dgs: last PLY": "0", "quick: last PLY": "0"}
-    kinds = (("cpu", stages), ("cuda", changed), ("cpu", changed))
-    lines = same_bits.table([fixed | {"device": d, "stages": s} for d, s in kinds]).splitlines()[2:]
+    rows = [row("x", stages), row("x", changed, "cuda"), row("y", changed)]
+    lines = same_bits.table(rows).splitlines()[2:]
     assert [line.split(" | ")[-2:] for line in lines[:2]] == [["none", "none |"]] * 2
     assert lines[2].endswith("| torch.exp | 3dgs: last PLY |")
+
+
+def test_a_row_takes_the_place_of_the_same_run_before():
+    """One of another label, kind of device or size of the scene is added."""
+    rows = [row("x", {"a": "0"}), row("y", {"a": "0"})]
+    assert same_bits.placed(rows, row("x", {"a": "1"})) == [row("x", {"a": "1"}), rows[1]]
+    for other in (row("z", {}), row("x", {}, "cuda"), row("x", {}, arguments={"views": 2})):
+        assert same_bits.placed(rows, other) == [*rows, other]
 
 
 def test_small_matrices_agree_with_lapack():

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 
 RELATIVE_L2 = {
-    # quantity: (float32, float64); measured on the scenes of tests/splats.py, CPU, times about 4
+    # quantity: (float32, float64); measured on the scenes of tests/gaussians.py, CPU, times about 4
     "projection": (2e-6, 1e-13),  # measured 3.8e-7, 3.5e-16
     "image": (2e-6, 1e-13),  # measured 2.9e-7, 1.5e-16
     "gradient": (2e-5, 1e-12),  # measured 2.6e-6 (quats), 1.5e-14
@@ -15,12 +15,12 @@ RELATIVE_L2 = {
 
 
 @dataclass(frozen=True)
-class Limits:
+class ParameterBounds:
     """Largest E of one kind of scene (docs/accuracy.md says what each is and what was measured where)."""
 
-    picture_mean: float
+    image_mean: float
     """Of rgb, alpha, and depth over the largest depth."""
-    picture_max: float
+    image_max: float
     """The same, in one pixel; for ordinary scenes beside what storing means in float32 costs."""
     relative_l2: float
     """Of every gradient."""
@@ -34,18 +34,18 @@ class Limits:
     """Pixels in a band whose error exceeds what is allowed outside."""
 
 
-ORDINARY = Limits(
-    picture_mean=2e-6,  # measured 1.5e-6 (strip), 1.8e-7 (else)
-    picture_max=2e-6,  # measured 2.8e-5 of 1.9e-4 allowed (strip), 2.6e-6 of 8e-6 (else)
+ORDINARY = ParameterBounds(
+    image_mean=2e-6,  # measured 1.5e-6 (strip), 1.8e-7 (else)
+    image_max=2e-6,  # measured 2.8e-5 of 1.9e-4 allowed (strip), 2.6e-6 of 8e-6 (else)
     relative_l2=1e-4,  # measured 1.8e-5 (strip), 5.1e-6 (else)
     cosine=1e-9,  # measured 1.6e-10
     bias=2e-5,  # measured 5.4e-6
     band=0.01,  # measured 0.002
     flips=1,  # measured 0
 )
-STRESS = Limits(
-    picture_mean=2e-5,  # measured 6.3e-6 (far right), 4.4e-6 (far origin)
-    picture_max=1e-4,  # measured 5.1e-5 (far right), 3.7e-5 (far origin), 3.0e-6 (needles)
+STRESS = ParameterBounds(
+    image_mean=2e-5,  # measured 6.3e-6 (far right), 4.4e-6 (far origin)
+    image_max=1e-4,  # measured 5.1e-5 (far right), 3.7e-5 (far origin), 3.0e-6 (needles)
     relative_l2=1e-3,  # measured 3.6e-4 (far right), 4.4e-5 (far origin), 1.6e-5 (needles)
     cosine=1e-7,  # measured 1.5e-8
     bias=2e-4,  # measured 9.8e-5 (far right), 2.2e-5 (else)
@@ -55,7 +55,7 @@ STRESS = Limits(
 
 RATIO = 2.0
 """How many times the error of the plain float32 program is allowed, beside the floors below."""
-PICTURE_ULPS = 2.0
+IMAGE_ULPS = 2.0
 """Floor of a picture's error in ulps of its largest value, or of its mean for the mean; without it exact scenes would fail."""
 GRADIENT_ULPS = 8.0  # measured 4.2 (blobs: the background, three numbers that are sums of 3072 of either sign)
 """Floor of a gradient's error, the same way, beside what layers add."""

@@ -1,4 +1,9 @@
-"""Sparse-view Gaussian splatting on any machine: `warpgs fit scene/`, or `warpgs.rasterize` for the rasterizer alone."""
+"""Sparse-view Gaussian splatting on any machine: `warpgs fit scene/`, or `warpgs.rasterize` for the rasterizer alone.
+
+Units: Gaussians and cameras are in ``scene`` units, those of a `Scene` that `load_scene` returned (recentred and rescaled), or
+in ``file`` units, those of the scene's own files and of PLY. Every function and method through which they enter or leave has an
+argument ``units`` that says which.
+"""
 
 from __future__ import annotations
 
@@ -9,37 +14,93 @@ from typing import TYPE_CHECKING
 # faster than one. OpenMP reads this once, when torch is imported; whoever set it, or imported torch before us, has their way.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
-    "Camera", "Gaussians", "RasterizeOptions", "Render", "Scene", "choose_knobs", "forget_recordings", "load_scene",
+    "PRESETS",
+    "Camera",
+    "FitConfig",
+    "FitResult",
+    "Gaussians",
+    "LossTerm",
+    "Model",
+    "Normalization",
+    "PointCloud",
+    "RasterizeOptions",
+    "Reader",
+    "Render",
+    "Scene",
+    "StepReport",
+    "StoredRun",
+    "Strategy",
+    "View",
+    "ViewMetrics",
+    "clear_graph_cache",
+    "evaluate",
+    "fit",
+    "load",
+    "load_scene",
+    "open_run",
     "rasterize",
-]  # fmt: skip
+    "read_ply",
+    "render_path",
+    "save",
+    "select_rule",
+    "write_ply",
+]
 
 if TYPE_CHECKING:
+    from warpgs.export.ply import read_ply, write_ply
     from warpgs.io.load import load_scene
-    from warpgs.prices import choose_knobs
-    from warpgs.rasterizer import RasterizeOptions, rasterize
-    from warpgs.recording import forget_recordings
-    from warpgs.scene import Camera, Gaussians, Render, Scene
+    from warpgs.io.readers import Reader
+    from warpgs.pipeline.metrics.evaluate import ViewMetrics, evaluate
+    from warpgs.pipeline.runs.fit import FitResult, fit
+    from warpgs.pipeline.runs.folder import StoredRun, open_run
+    from warpgs.pipeline.runs.model_file import Model, load, save
+    from warpgs.pipeline.runs.paths import render_path
+    from warpgs.pipeline.train.config import PRESETS, FitConfig
+    from warpgs.pipeline.train.loss import LossTerm
+    from warpgs.pipeline.train.strategies.base import Strategy
+    from warpgs.pipeline.train.trainer import StepReport
+    from warpgs.render.graphed import clear_graph_cache
+    from warpgs.render.rasterize import RasterizeOptions, rasterize
+    from warpgs.render.rule_costs import select_rule
+    from warpgs.scene import Camera, Gaussians, Normalization, PointCloud, Render, Scene, View
 
 _HOMES = {
-    "Camera": "warpgs.scene",
-    "Gaussians": "warpgs.scene",
-    "Render": "warpgs.scene",
-    "Scene": "warpgs.scene",
-    "RasterizeOptions": "warpgs.rasterizer",
-    "rasterize": "warpgs.rasterizer",
-    "choose_knobs": "warpgs.prices",
-    "forget_recordings": "warpgs.recording",
-    "load_scene": "warpgs.io.load",
+    name: module
+    for module, names in {
+        "warpgs.export.ply": ("read_ply", "write_ply"),
+        "warpgs.io.load": ("load_scene",),
+        "warpgs.io.readers": ("Reader",),
+        "warpgs.pipeline.metrics.evaluate": ("ViewMetrics", "evaluate"),
+        "warpgs.pipeline.runs.fit": ("FitResult", "fit"),
+        "warpgs.pipeline.runs.folder": ("StoredRun", "open_run"),
+        "warpgs.pipeline.runs.model_file": ("Model", "load", "save"),
+        "warpgs.pipeline.runs.paths": ("render_path",),
+        "warpgs.pipeline.train.config": ("FitConfig", "PRESETS"),
+        "warpgs.pipeline.train.loss": ("LossTerm",),
+        "warpgs.pipeline.train.strategies.base": ("Strategy",),
+        "warpgs.pipeline.train.trainer": ("StepReport",),
+        "warpgs.render.graphed": ("clear_graph_cache",),
+        "warpgs.render.rasterize": ("RasterizeOptions", "rasterize"),
+        "warpgs.render.rule_costs": ("select_rule",),
+        "warpgs.scene": ("Camera", "Gaussians", "Normalization", "PointCloud", "Render", "Scene", "View"),
+    }.items()
+    for name in names
 }
+"""Module of each public name: they load on first use, since torch and Warp cost seconds that `warpgs --help` must not pay."""
 
 
-def __getattr__(name: str):
-    # Public names load on first use: torch and Warp cost seconds that `warpgs --help` must not pay.
-    if name in _HOMES:
-        import importlib
+def __getattr__(name: str) -> object:
+    """Import a public name on first use."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'warpgs' has no attribute {name!r}")
+    import importlib
 
-        return getattr(importlib.import_module(_HOMES[name]), name)
-    raise AttributeError(f"module 'warpgs' has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    """Return the public names and those with two underscores."""
+    return sorted([*__all__, *(n for n in globals() if n.startswith("__"))])

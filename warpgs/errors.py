@@ -1,13 +1,14 @@
-"""Errors that a user can mend, each with the exit code of its class."""
+"""Errors that a user can fix, each with the exit code of its class."""
 
 
 class WarpgsError(Exception):
     """Base of every error shown to a user without a traceback.
 
-    A message says what is wrong, where, why it matters, and how to mend it.
+    A message says what is wrong, where, why it matters, and how to fix it.
     """
 
     exit_code = 5
+    """Exit code of the program."""
 
 
 class UsageError(WarpgsError):
@@ -27,6 +28,6 @@ class NotFiniteError(WarpgsError):
 
 
 class ResourceError(WarpgsError):
-    """Memory, disk or a device does not suffice; the message names the need and what there is."""
+    """Memory, disk or a device does not suffice; the message names what is needed and what there is."""
 
     exit_code = 4

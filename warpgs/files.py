@@ -1,4 +1,4 @@
-"""Writing files so that nothing is lost: a new file appears whole or not at all."""
+"""Writing of files so that nothing is lost: a new file appears whole or not at all."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from warpgs.errors import ResourceError
 
 
 def write_bytes(path: Path, *chunks: bytes) -> None:
-    """Replace a file once its new contents are complete on disk.
+    """Replace a file by chunks of bytes, once all of them are on disk.
 
     Raises:
         ResourceError: The disk is full or the folder not writable; what was there before is untouched.
@@ -43,7 +43,7 @@ def write_json(path: Path, values: object) -> None:
 
 
 def plain(value: object) -> object:
-    """A value that JSON can hold: tuples become lists, NaN and infinity null."""
+    """Return a value that JSON can hold: tuples become lists, NaN and infinity null."""
     if isinstance(value, float) and not (value - value == 0):
         return None
     if isinstance(value, dict):

@@ -1,10 +1,66 @@
-"""Small geometry on numpy arrays: projecting and back-projecting points, the span of a set of cameras, camera paths."""
+"""Geometry: rotations, logit, projection and back-projection of points, the extent and focus of a set of cameras.
+
+Functions that take tensors import torch when they are called, so that readers of scenes need not load it.
+"""
 
 from __future__ import annotations
 
+import math
+from typing import TYPE_CHECKING
+
 import numpy as np
 
+from warpgs.errors import UsageError
 from warpgs.scene import Camera
+
+if TYPE_CHECKING:
+    import torch
+
+
+def logit(probability: float) -> float:
+    """Return log(p / (1 - p)), the inverse of the sigmoid, for p in (0, 1)."""
+    return math.log(probability / (1 - probability))
+
+
+def rotation_matrices(quats: np.ndarray | torch.Tensor) -> np.ndarray | torch.Tensor:
+    """Return the rotation matrices [..., 3, 3] of unit quaternions wxyz [..., 4], as numpy array or tensor like ``quats``."""
+    w, x, y, z = (quats[..., i] for i in range(4))
+    entries = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    if isinstance(quats, np.ndarray):
+        return np.stack(entries, -1).reshape(*quats.shape[:-1], 3, 3)
+    import torch
+
+    return torch.stack(entries, -1).reshape(*quats.shape[:-1], 3, 3)
+
+
+def quaternions(rotations: torch.Tensor) -> torch.Tensor:
+    """Return unit quaternions wxyz [N, 4] of rotations [N, 3, 3], from their largest component, so that nothing cancels."""
+    import torch
+
+    m = rotations
+    xx, yy, zz = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
+    # row i is 4 q_i q
+    outer = torch.stack([
+        torch.stack([1 + xx + yy + zz, m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], 1),
+        torch.stack([m[:, 2, 1] - m[:, 1, 2], 1 + xx - yy - zz, m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0]], 1),
+        torch.stack([m[:, 0, 2] - m[:, 2, 0], m[:, 0, 1] + m[:, 1, 0], 1 - xx + yy - zz, m[:, 1, 2] + m[:, 2, 1]], 1),
+        torch.stack([m[:, 1, 0] - m[:, 0, 1], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1], 1 - xx - yy + zz], 1),
+    ], 1)  # fmt: skip
+    largest = outer.diagonal(dim1=1, dim2=2).argmax(1)
+    return torch.nn.functional.normalize(outer[torch.arange(len(m), device=m.device), largest], dim=1)
+
+
+def check_pinhole(camera: Camera) -> None:
+    """Raise UsageError for a camera that is no pinhole: its model is known to the kernels alone."""
+    if camera.model != "pinhole":
+        raise UsageError(
+            f"points are projected outside of the rasterizer for pinhole cameras only, and this one is {camera.model!r}; "
+            "undistort the images first"
+        )
 
 
 def matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -41,7 +97,12 @@ def relative_pose(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray
 
 
 def project_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Project world points; returns pixels [N, 2] (pixel centres at +0.5) and z-depths [N] (points [N, 3])."""
+    """Return pixels [N, 2] (pixel centres at +0.5) and z-depths [N] [u] of world points [N, 3].
+
+    Raises:
+        UsageError: The camera is no pinhole.
+    """
+    check_pinhole(camera)
     in_camera = matmul(points, camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]
     z = in_camera[:, 2]
     safe = np.where(z == 0, np.finfo(float).tiny, z)
@@ -50,27 +111,57 @@ def project_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def back_project(camera: Camera, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """World points [N, 3] at pixels [N, 2] (centres at +0.5) and z-depths [N] [u]."""
+    """Return the world points [N, 3] at pixels [N, 2] (centres at +0.5) and z-depths [N] [u].
+
+    Raises:
+        UsageError: The camera is no pinhole.
+    """
+    check_pinhole(camera)
     homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
     in_camera = depths[:, None] * matmul(homogeneous, inverse(camera.K).T)
     return matmul(in_camera - camera.viewmat[:3, 3], camera.viewmat[:3, :3])
 
 
+def back_project_tensors(camera: Camera, pixels: torch.Tensor, depths: torch.Tensor) -> torch.Tensor:
+    """Return what `back_project` returns for tensors, R^T (d K^-1 [x y 1] - t), without a product of matrices.
+
+    Such a product would load another library on CUDA. Of K only focal lengths and principal point count, as in projection.
+
+    Args:
+        camera: Its tensors are float32 or float64, on the device of the others.
+        pixels: Positions (x, y) with centres at +0.5 [px], shape [S, 2].
+        depths: z-depths [u], shape [S].
+
+    Returns:
+        World points [u], shape [S, 3].
+
+    Raises:
+        UsageError: The camera is no pinhole.
+    """
+    import torch
+
+    check_pinhole(camera)
+    K, viewmat = camera.K, camera.viewmat
+    x, y = ((pixels[:, i] - K[i, 2]) / K[i, i] * depths for i in range(2))
+    moved = torch.stack([x, y, depths], 1) - viewmat[:3, 3]
+    return (moved[:, :, None] * viewmat[:3, :3]).sum(1)
+
+
 def in_image(camera: Camera, points: np.ndarray, near: float = 0.0) -> np.ndarray:
-    """True where a world point [N, 3] lies in front of the camera, beyond ``near`` [u], and inside its image."""
+    """Return a mask [N], True where a world point [N, 3] is beyond ``near`` [u] and inside the camera's image."""
     pixels, z = project_points(camera, points)
     inside = (pixels >= 0).all(1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
     return inside & (z > near)
 
 
 def camera_extent(cameras: list[Camera]) -> float:
-    """1.1 times the largest distance of a camera centre from their mean [u] (Kerbl et al. 2023); 0 for a single camera."""
+    """Return 1.1 times the largest distance of a camera centre from their mean [u] (Kerbl et al. 2023); 0 for one camera."""
     centers = np.array([c.center for c in cameras])
     return 1.1 * float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
 
 
 def focus_point(cameras: list[Camera]) -> np.ndarray:
-    """The point nearest to all optical axes in least squares [3]; for parallel axes, the mean camera centre."""
+    """Return the point [3] nearest to all optical axes in least squares; for parallel axes the mean camera centre."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
     for c in cameras:
         axis = c.viewmat[2, :3]
@@ -84,12 +175,12 @@ def focus_point(cameras: list[Camera]) -> np.ndarray:
 
 
 def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """camera_from_world [4, 4] of a camera at ``center`` that looks at ``target`` with ``up`` (all [3]) upwards."""
+    """Return camera_from_world [4, 4] of a camera at ``center`` that looks at ``target`` with ``up`` (all [3]) upwards."""
     z = (target - center) / np.linalg.norm(target - center)
     x = np.cross(-up, z)
     x /= np.linalg.norm(x)
     rotation = np.stack([x, np.cross(z, x), z])
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation
-    viewmat[:3, 3] = -rotation @ center
+    viewmat[:3, 3] = -matmul(rotation, center)
     return viewmat

@@ -19,9 +19,9 @@ def tasks(point, device, wanted):
     with torch.no_grad():
         tensors = inputs.gaussians(point.count, device, 0).tensors().values()
         camera = inputs.camera(point.width, point.height, device, point.cameras)
-        splats, tile_counts = project(*tensors, camera.viewmat, camera.K, **size, degree=0, rule=rule)
-        tiles = bin_tiles(splats, tile_counts, **size, rule=rule)
-    leaf, backgrounds = splats.detach().requires_grad_(), torch.zeros(point.cameras, 3, device=device)
+        projected, tile_counts = project(*tensors, camera.viewmat, camera.K, **size, degree=0, rule=rule)
+        tiles = bin_tiles(projected, tile_counts, **size, rule=rule)
+    leaf, backgrounds = projected.detach().requires_grad_(), torch.zeros(point.cameras, 3, device=device)
     instances, pairs = instances_and_pairs(point, device)
     costs = roofline.blend(point.count, point.cameras, point.pixels, instances, pairs)
 

@@ -1,4 +1,4 @@
-"""Time of a whole picture, forward and forward with backward, beside other rasterizers."""
+"""Time of a whole image, forward and forward with backward, beside other rasterizers."""
 
 import torch
 

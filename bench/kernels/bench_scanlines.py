@@ -1,4 +1,4 @@
-"""Time of the path costs of a picture's depth planes, beside numpy, which a fit on a CPU uses."""
+"""Time of the path costs of an image's depth planes, beside numpy, which a fit on a CPU uses."""
 
 import numpy as np
 import torch
@@ -6,7 +6,8 @@ import torch
 from bench import inputs, roofline
 from bench.harness import OURS, Task
 from warpgs.kernels.scanlines import scanline_costs
-from warpgs.priors.sweep import UNIT, path_costs
+from warpgs.priors.sweep_cpu import path_costs
+from warpgs.priors.sweep_planes import UNIT
 
 AXES = ("image",)
 NUMPY = "numpy"
@@ -18,8 +19,8 @@ def tasks(point, device, wanted):
     image = inputs.image(point.width, point.height, torch.device("cpu")).numpy()
     costs = np.random.default_rng(0).integers(0, UNIT + 1, (point.height, point.width, PLANES)).astype(np.int16)
     there = torch.from_numpy(costs).to(device)
-    limits = [torch.full(s, UNIT // 2, dtype=torch.int32, device=device)
+    bounds = [torch.full(s, UNIT // 2, dtype=torch.int32, device=device)
               for s in ((point.height - 1, point.width), (point.height, point.width - 1))]  # fmt: skip
-    yield Task(OURS, "forward", lambda: scanline_costs(there, *limits, 123), roofline.scanlines(point.pixels, PLANES))
+    yield Task(OURS, "forward", lambda: scanline_costs(there, *bounds, 123), roofline.scanlines(point.pixels, PLANES))
     if wanted(NUMPY, "forward"):
         yield Task(NUMPY, "forward", lambda: [path_costs(costs, image, 0.03, 0.5, down=down) for down in (True, False)])

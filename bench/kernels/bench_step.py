@@ -1,22 +1,18 @@
-"""Time of a training step: picture, photometric loss, backward pass, Adam over all parameters.
+"""Time of a training step: rendering, photometric loss, backward pass, Adam over all parameters.
 
-Learning rates are next to nothing, so that every repeat draws the same scene. The peer is what trainers are often made of:
-gsplat's picture, the loss in plain torch, torch's fused Adam.
+Learning rates are next to nothing, so that every repeat renders the same scene. The peer is what trainers are often made of:
+gsplat's rendering, the loss in plain torch, torch's fused Adam.
 """
 
 import torch
 
-from bench import inputs, peers, roofline
+from bench import inputs, peers, roofline, training
 from bench.harness import OURS, Task
 from bench.kernels.bench_render import costs
-from warpgs import rasterize
-from warpgs.pipeline.loss import LossConfig, photometric_loss
-from warpgs.pipeline.optimizer import Optimizer, OptimizerConfig
-from warpgs.scene import Camera
 
 AXES = ("count", "image", "degree", "threads")
 PROGRAMS = {OURS: ("step",), peers.GSPLAT_STEP: ("step",)}
-RATE = 1e-12
+LR = 1e-12
 
 
 def cost(point, device) -> roofline.Cost:
@@ -31,27 +27,18 @@ def cost(point, device) -> roofline.Cost:
 def tasks(point, device, wanted):
     gaussians = inputs.gaussians(point.count, device, point.degree)
     batch = inputs.camera(point.width, point.height, device)
-    target, loss = inputs.image(point.width, point.height, device), LossConfig()
+    target = inputs.image(point.width, point.height, device)
 
     if wanted(OURS, "step"):
-        camera = Camera(batch.viewmat[0], batch.K[0], point.width, point.height)
-        rates = {f"{n}_lr": RATE for n in ("means", "quats", "scales", "opacities", "sh")}
-        optimizer = Optimizer(gaussians, OptimizerConfig(means_lr_final=RATE, **rates), extent=1.0)
-
-        def step():
-            picture = rasterize(optimizer.gaussians, camera).rgb
-            photometric_loss(picture, target, None, loss).backward()
-            optimizer.step(0.5)
-
-        yield Task(OURS, "step", step, cost(point, device))
+        yield Task(OURS, "step", training.Steps(gaussians, batch, target, "exact", LR).eager, cost(point, device))
 
     if wanted(peers.GSPLAT_STEP, "step"):
-        adam = torch.optim.Adam(gaussians.tensors().values(), lr=RATE, eps=1e-15, fused=True)
+        adam = torch.optim.Adam(gaussians.tensors().values(), lr=LR, eps=1e-15, fused=True)
 
         def peer_step():
-            picture = peers.gsplat_rasterize(gaussians, batch)[0]
-            structural = peers.torch_ssim(picture, target).mean()
-            ((picture - target).abs().mean() * 0.8 + (1 - structural) * 0.2).backward()
+            image = peers.gsplat_rasterize(gaussians, batch)[0]
+            structural = peers.torch_ssim(image, target).mean()
+            ((image - target).abs().mean() * 0.8 + (1 - structural) * 0.2).backward()
             adam.step()
             adam.zero_grad(set_to_none=True)
 

@@ -17,11 +17,11 @@ def tasks(point, device, wanted):
     with torch.no_grad():
         tensors = inputs.gaussians(point.count, device, 0).tensors().values()
         camera = inputs.camera(point.width, point.height, device, point.cameras)
-        splats, tile_counts = project(*tensors, camera.viewmat, camera.K, **size, degree=0, rule=rule)
-    tiles = bin_tiles(splats, tile_counts, **size, rule=rule)
+        projected, tile_counts = project(*tensors, camera.viewmat, camera.K, **size, degree=0, rule=rule)
+    tiles = bin_tiles(projected, tile_counts, **size, rule=rule)
     cost = roofline.tiles(point.count, point.cameras, len(tiles.slots), len(tiles.ranges))
 
     def work():
-        return bin_tiles(splats, tile_counts, **size, rule=rule)
+        return bin_tiles(projected, tile_counts, **size, rule=rule)
 
     yield Task(OURS, "forward", work, cost, {"instances": len(tiles.slots)})

@@ -7,7 +7,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from warpgs.errors import DataError, ResourceError
-from warpgs.export.ply import HEADER_LIMIT, read_ply, write_ply
+from warpgs.export.ply import MAX_HEADER_BYTES, read_ply, write_ply
 from warpgs.scene import Gaussians, Normalization
 
 
@@ -149,12 +149,12 @@ def test_any_property_order_doubles_and_crlf(tmp_path):
     assert model.means.tolist() == [[1, 2, 3]] and model.log_scales.tolist() == [[8, 9, 10]]
 
 
-REST = [f"property float f_rest_{i}" for i in range(9)]
+RESET_FREE_STEPS = [f"property float f_rest_{i}" for i in range(9)]
 MALFORMED = {
     "empty": (b"", "start with 'ply'"),
     "not ply": (b"solid cube\n", "start with 'ply'"),
     "no end": (b"ply\nformat binary_little_endian 1.0\n", "no 'end_header'"),
-    "long header": (b"ply\n" + b"comment a\n" * (HEADER_LIMIT // 10) + b"end_header\n", "no 'end_header'"),
+    "long header": (b"ply\n" + b"comment a\n" * (MAX_HEADER_BYTES // 10) + b"end_header\n", "no 'end_header'"),
     "not ascii": (ply(["comment \u00e9"]), "not ASCII"),
     "ascii format": (ply([]).replace(b"binary_little_endian", b"ascii"), "its format is ascii"),
     "big endian": (ply([]).replace(b"little", b"big"), "its format is binary_big_endian"),
@@ -169,8 +169,8 @@ MALFORMED = {
     "odd type": (ply(["element vertex 0", "property half x"]), "makes no sense"),
     "twice": (ply(["element vertex 1", *PROPERTIES, "property float x"], ROW * 2), "appears twice"),
     "missing": (ply(["element vertex 1", *PROPERTIES[1:]], ROW), "missing: x"),
-    "half a degree": (ply(["element vertex 0", *PROPERTIES, *REST[:5]]), "5 f_rest"),
-    "gap": (ply(["element vertex 0", *PROPERTIES, *REST[:8], "property float f_rest_9"]), "missing: f_rest_8"),
+    "half a degree": (ply(["element vertex 0", *PROPERTIES, *RESET_FREE_STEPS[:5]]), "5 f_rest"),
+    "gap": (ply(["element vertex 0", *PROPERTIES, *RESET_FREE_STEPS[:8], "property float f_rest_9"]), "missing: f_rest_8"),
     "vertex list": (ply(["element vertex 0", *PROPERTIES, "property list uchar int i"]), "lists in element 'vertex'"),
     "list before": (
         ply(["element face 1", "property list uchar int i", "element vertex 0"]),

@@ -1,4 +1,4 @@
-"""Tiny scenes, five photographs of 16 x 12 px seen by the same cameras, written in every format that warpgs reads."""
+"""Tiny scenes, five images of 16 x 12 px seen by the same cameras, written in every format that warpgs reads."""
 
 import json
 import struct
@@ -21,7 +21,7 @@ TRACKS = ((0, 1, 2), (1, 4), (3,))
 
 
 def viewmat(i: int) -> np.ndarray:
-    """camera_from_world, OpenCV axes: on an arc around the origin, looking at it, a little tilted."""
+    """Return camera_from_world with OpenCV axes, on an arc around the origin, looking at it with a small roll."""
     angle = -0.6 + 0.3 * i
     center = np.array([3 * np.sin(angle), -0.4 + 0.1 * i, -3 * np.cos(angle)])
     z = -center / np.linalg.norm(center)
@@ -37,13 +37,13 @@ VIEWMATS = np.array([viewmat(i) for i in range(VIEWS)])
 
 
 def pixel(i: int, point: np.ndarray = POINT) -> np.ndarray:
-    """Where a point lands in view i [px], pixel centres at +0.5."""
+    """Return the position of a point in view i [px], pixel centres at +0.5."""
     x = VIEWMATS[i, :3, :3] @ point + VIEWMATS[i, :3, 3]
     return (K @ (x / x[2]))[:2]
 
 
-def picture(i: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
-    """RGB, uint8: red grows to the right, green downwards, blue with the view."""
+def image(i: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+    """Return RGB, uint8: red grows to the right, green downwards, blue with the view."""
     x, y = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
     red, green = np.meshgrid(x, y)
     return np.round(255 * np.stack([red, green, np.full_like(red, i / VIEWS)], axis=-1)).astype(np.uint8)
@@ -59,19 +59,19 @@ def save(path: Path, rgb: np.ndarray, *options) -> None:
     path.write_bytes(encoded.tobytes())
 
 
-def save_pictures(folder: Path, names=NAMES, width: int = WIDTH, height: int = HEIGHT) -> None:
+def save_images(folder: Path, names=NAMES, width: int = WIDTH, height: int = HEIGHT) -> None:
     for i, name in enumerate(names):
-        save(folder / name, picture(i, width, height))
+        save(folder / name, image(i, width, height))
 
 
 def quaternion(R: np.ndarray) -> np.ndarray:
-    """wxyz of a rotation whose trace is above -1."""
+    """Return the quaternion wxyz of a rotation whose trace is above -1."""
     w = np.sqrt(max(1 + np.trace(R), 1e-12)) / 2
     return np.array([w, *(np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (4 * w))])
 
 
 def pose_numbers(i: int) -> list[float]:
-    """Quaternion and translation of a view as COLMAP writes them."""
+    """Return quaternion and translation of a view as COLMAP writes them."""
     return [*quaternion(VIEWMATS[i, :3, :3]), *VIEWMATS[i, :3, 3]]
 
 
@@ -80,7 +80,7 @@ PINHOLE = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
 
 
 def colmap_bin(model="PINHOLE", parameters=PINHOLE, names=NAMES, size=(WIDTH, HEIGHT)) -> dict[str, bytes]:
-    """The three binary files; the first image carries two observations, so that records differ in length."""
+    """Return the three binary files; the first image has two observations, so that records differ in length."""
     cameras = struct.pack("<QiiQQ", 1, 1, MODEL_IDS[model], *size) + struct.pack(f"<{len(parameters)}d", *parameters)
     images = struct.pack("<Q", len(names))
     for i, name in enumerate(names):
@@ -95,7 +95,7 @@ def colmap_bin(model="PINHOLE", parameters=PINHOLE, names=NAMES, size=(WIDTH, HE
 
 
 def colmap_txt(model="PINHOLE", parameters=PINHOLE, names=NAMES, size=(WIDTH, HEIGHT)) -> dict[str, bytes]:
-    """The three text files."""
+    """Return the three text files."""
     cameras = f"# Camera list\n1 {model} {size[0]} {size[1]} {' '.join(map(repr, map(float, parameters)))}\n"
     images = "# Image list\n"
     for i, name in enumerate(names):
@@ -116,18 +116,18 @@ def write_files(folder: Path, files: dict[str, bytes]) -> None:
 
 def write_colmap(root: Path, **options) -> Path:
     write_files(root / "sparse" / "0", colmap_bin(**options))
-    save_pictures(root / "images", options.get("names", NAMES))
+    save_images(root / "images", options.get("names", NAMES))
     return root
 
 
 def write_colmap_txt(root: Path, **options) -> Path:
     write_files(root / "sparse", colmap_txt(**options))
-    save_pictures(root / "images", options.get("names", NAMES))
+    save_images(root / "images", options.get("names", NAMES))
     return root
 
 
 def opengl(i: int) -> list[list[float]]:
-    """Camera to world with OpenGL axes."""
+    """Return camera to world with OpenGL axes."""
     return (np.linalg.inv(VIEWMATS[i]) @ np.diag([1.0, -1, -1, 1])).tolist()
 
 
@@ -138,19 +138,19 @@ def transforms_json(names=NAMES, **shared) -> dict:
 
 
 def write_transforms(root: Path, content: dict | None = None, names=NAMES) -> Path:
-    save_pictures(root / "images", names)
+    save_images(root / "images", names)
     (root / "transforms.json").write_text(json.dumps(content or transforms_json(names)))
     return root
 
 
 def write_ngp(root: Path) -> Path:
-    """instant-ngp's way: field of view instead of focal lengths, no size."""
+    """Write instant-ngp's variant: field of view instead of focal lengths, no size."""
     angle = 2 * np.arctan(WIDTH / 2 / FOCAL)
     return write_transforms(root, transforms_json(w=None, h=None, fl_x=None, fl_y=None, cx=None, cy=None, camera_angle_x=angle))
 
 
 def write_blender(root: Path) -> Path:
-    """Three views in train, one each in val and test; transparent left halves; suffixes left out."""
+    """Write three views in train, one each in val and test: left halves transparent, suffixes left out."""
     angle = 2 * np.arctan(WIDTH / 2 / FOCAL)
     parts = {"train": (0, 1, 2), "val": (3,), "test": (4,)}
     for part, ids in parts.items():
@@ -158,7 +158,7 @@ def write_blender(root: Path) -> Path:
         for i in ids:
             alpha = np.full((HEIGHT, WIDTH, 1), 255, np.uint8)
             alpha[:, : WIDTH // 2] = 0
-            save(root / part / f"r_{i}.png", np.concatenate([picture(i), alpha], axis=2))
+            save(root / part / f"r_{i}.png", np.concatenate([image(i), alpha], axis=2))
         (root / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
     return root
 
@@ -173,7 +173,7 @@ def llff_rows() -> np.ndarray:
 
 
 def write_llff(root: Path) -> Path:
-    save_pictures(root / "images")
+    save_images(root / "images")
     np.save(root / "poses_bounds.npy", llff_rows())
     return root
 
@@ -193,7 +193,7 @@ def dtu_matrices() -> dict[str, np.ndarray]:
 
 
 def write_dtu(root: Path) -> Path:
-    save_pictures(root / "image", [f"{i:06d}.png" for i in range(VIEWS)])
+    save_images(root / "image", [f"{i:06d}.png" for i in range(VIEWS)])
     np.savez(root / "cameras.npz", **dtu_matrices())
     return root
 
@@ -207,7 +207,7 @@ def middlebury_text() -> str:
 
 
 def write_middlebury(root: Path) -> Path:
-    save_pictures(root)
+    save_images(root)
     (root / "tiny_par.txt").write_text(middlebury_text())
     return root
 
@@ -225,6 +225,6 @@ WRITERS = {
 
 
 def refused(root: Path, message: str, **options) -> None:
-    """The scene must end in a DataError whose text matches."""
+    """Assert that the scene ends in a DataError whose text matches."""
     with pytest.raises(DataError, match=message):
         load_scene(root, **options)

@@ -1,4 +1,4 @@
-"""The same cameras and photographs give the same scene, whatever the format."""
+"""The same cameras and images give the same scene, whatever the format."""
 
 import numpy as np
 import pytest
@@ -10,14 +10,14 @@ from warpgs.io.splits import split_views
 
 
 def landing(scene, i, point):
-    """Where a point in file coordinates lands in the i-th view [px], through everything that the scene says."""
+    """Return the position in the i-th view [px] of a point in file coordinates, by all that the scene holds."""
     camera, n = scene.views[i].camera, scene.normalization
     x = camera.viewmat[:3, :3] @ (n.scale * (point - n.offset)) + camera.viewmat[:3, 3]
     return (camera.K @ (x / x[2]))[:2]
 
 
 def by_index(scene):
-    """Positions of the views in the order of their cameras; only Blender's folders shuffle them."""
+    """Return the positions of the views in the order of their cameras; only Blender's folders change it."""
     return sorted(range(len(scene.views)), key=lambda j: scene.views[j].name.rpartition("/")[2])
 
 
@@ -39,7 +39,7 @@ def test_pixels_arrive_as_rgb(kind, tmp_path):
         view = scene.views[j]
         assert view.image.dtype == np.float32 and view.image.shape == (scenes.HEIGHT, scenes.WIDTH, 3)
         right = (slice(None), slice(scenes.WIDTH // 2, None))  # Blender's left halves are transparent
-        np.testing.assert_allclose(view.image[right], scenes.picture(i)[right] / 255, atol=1e-6)
+        np.testing.assert_allclose(view.image[right], scenes.image(i)[right] / 255, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", scenes.WRITERS)
@@ -119,7 +119,7 @@ def test_ply_points_of_nerfstudio_are_left_with_a_note(tmp_path):
 def test_fingerprint_follows_the_data(tmp_path):
     first = load_scene(scenes.write_colmap(tmp_path / "a")).fingerprint
     assert len(first) == 64 and first == load_scene(scenes.write_colmap(tmp_path / "b")).fingerprint
-    image = scenes.picture(1)
+    image = scenes.image(1)
     image[0, 0, 0] ^= 1
     scenes.save(tmp_path / "b" / "images" / "photo1.png", image)
     assert load_scene(tmp_path / "b").fingerprint != first
@@ -128,7 +128,7 @@ def test_fingerprint_follows_the_data(tmp_path):
 
 def test_ready_made_small_images_are_taken(tmp_path):
     scenes.write_colmap(tmp_path)
-    scenes.save_pictures(tmp_path / "images_2", width=8, height=6)
+    scenes.save_images(tmp_path / "images_2", width=8, height=6)
     scenes.save(tmp_path / "images_2" / "photo0.png", np.full((6, 8, 3), 7, np.uint8))
     scene = load_scene(tmp_path, downscale=2)
     assert (scene.views[0].image == np.float32(7 / 255)).all() and "images taken from images_2" in scene.notes
@@ -139,7 +139,7 @@ def test_ready_made_small_images_are_taken(tmp_path):
 def test_small_images_of_other_names_are_matched(other, tmp_path):
     scenes.write_colmap(tmp_path)
     names = [other.format(stem=n[:-4], i=i) for i, n in enumerate(scenes.NAMES)]
-    scenes.save_pictures(tmp_path / "images_2", names, 8, 6)
+    scenes.save_images(tmp_path / "images_2", names, 8, 6)
     scene = load_scene(tmp_path, downscale=2)
     assert [v.name for v in scene.views] == list(scenes.NAMES) and any("matched" in n for n in scene.notes)
     blues = [float(v.image[..., 2].mean()) for v in scene.views]
@@ -150,7 +150,7 @@ def test_small_images_of_other_names_are_matched(other, tmp_path):
 def test_llff_with_only_small_images(downscale, size, note, tmp_path):
     scenes.write_llff(tmp_path)
     (tmp_path / "images").rename(tmp_path / "gone")
-    scenes.save_pictures(tmp_path / "images_2", width=8, height=6)
+    scenes.save_images(tmp_path / "images_2", width=8, height=6)
     if size is None:  # 2 x 2 px would be left
         with pytest.raises(UsageError, match=note):
             load_scene(tmp_path, downscale=downscale)
@@ -164,7 +164,7 @@ def test_llff_small_images_are_resampled_further(tmp_path):
     rows = scenes.llff_rows()
     rows[:, [4, 9, 14]] *= 4  # made for 64 x 48
     np.save(tmp_path / "poses_bounds.npy", rows)
-    scenes.save_pictures(tmp_path / "images_4")
+    scenes.save_images(tmp_path / "images_4")
     scene = load_scene(tmp_path, downscale=2)
     assert scene.views[0].camera.width == 8 and scene.views[0].camera.K[0, 0] == 10
     assert any("images_4, area-resampled by 2" in n for n in scene.notes)
@@ -196,8 +196,8 @@ def test_rigs_and_frames_are_ignored(tmp_path):
 
 def test_images_without_a_pose_are_counted(tmp_path):
     scenes.write_colmap(tmp_path)
-    scenes.save(tmp_path / "images" / "extra.png", scenes.picture(0))
-    scenes.save(tmp_path / "images" / "._photo0.png", scenes.picture(0))
+    scenes.save(tmp_path / "images" / "extra.png", scenes.image(0))
+    scenes.save(tmp_path / "images" / "._photo0.png", scenes.image(0))
     assert any(n.startswith("1 images of images have no pose") for n in load_scene(tmp_path).notes)
 
 
@@ -205,7 +205,7 @@ def test_outside_images_need_permission_and_get_harmless_names(tmp_path):
     content = scenes.transforms_json()
     content["frames"][0]["file_path"] = "../elsewhere.png"
     root = scenes.write_transforms(tmp_path / "scene", content)
-    scenes.save(tmp_path / "elsewhere.png", scenes.picture(0))
+    scenes.save(tmp_path / "elsewhere.png", scenes.image(0))
     with pytest.raises(DataError, match=r"frame 0: '../elsewhere.png' leads out of the scene folder.*--allow-outside"):
         load_scene(root)
     scene = load_scene(root, allow_outside=True)

@@ -28,7 +28,7 @@ READERS = {
 
 @st.composite
 def damaged(draw, data: bytes) -> bytes:
-    """The data with a few bytes replaced, a stretch removed or inserted, or the tail cut off; now and then any bytes."""
+    """Change a few bytes of the data, remove, insert or cut a part; now and then return any bytes."""
     if draw(st.integers(0, 9)) == 0:
         return draw(st.binary(max_size=200))
     out = bytearray(data)
@@ -88,7 +88,7 @@ def test_damaged_files_of_the_other_formats(name, data):
     read, good = OTHERS[name]
     if good is None:
         with tempfile.TemporaryDirectory() as folder:
-            scenes.save(Path(folder) / "a.png", scenes.picture(0))
+            scenes.save(Path(folder) / "a.png", scenes.image(0))
             good = (Path(folder) / "a.png").read_bytes()
     survives(read, name, data.draw(damaged(good)))
 

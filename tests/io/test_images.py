@@ -10,7 +10,7 @@ from PIL import Image
 
 from tests.io import scenes
 from warpgs.errors import DataError, UsageError
-from warpgs.io.images import Lens, decode, load_photo
+from warpgs.io.images import Lens, decode, load_image
 from warpgs.io.load import load_scene
 
 
@@ -20,7 +20,7 @@ def lens(width, height, focal=20.0, distortion=(), model="PINHOLE"):
 
 
 def smooth(x, y):
-    """An analytic picture over pixel coordinates (centres at +0.5), three channels in [0, 1]."""
+    """Return an analytic image over pixel coordinates (centres at +0.5), three channels in [0, 1]."""
     return np.stack([0.5 + 0.4 * np.sin(x / 9), 0.5 + 0.4 * np.cos(y / 7), 0.5 + 0.3 * np.sin((x + y) / 11)], axis=-1)
 
 
@@ -30,7 +30,7 @@ def grid(width, height):
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "LA", "P", "1", "I;16"])
 def test_every_kind_of_png_is_decoded(mode, tmp_path):
-    rgb = scenes.picture(1)
+    rgb = scenes.image(1)
     if mode == "I;16":
         image = Image.fromarray(rgb[..., 0].astype(np.uint16) * 257)
     else:
@@ -79,10 +79,10 @@ def test_missing_and_non_finite_images(tmp_path):
 def test_exif_never_turns_a_raster_that_fits(orientation, tmp_path):
     exif = Image.Exif()
     exif[0x112] = orientation
-    Image.fromarray(scenes.picture(0)).save(tmp_path / "a.png", exif=exif)
-    photo = load_photo(tmp_path / "a.png", lens(16, 12))
-    np.testing.assert_allclose(photo.image, scenes.picture(0) / 255, atol=1e-6)
-    assert photo.done == ()
+    Image.fromarray(scenes.image(0)).save(tmp_path / "a.png", exif=exif)
+    loaded = load_image(tmp_path / "a.png", lens(16, 12))
+    np.testing.assert_allclose(loaded.image, scenes.image(0) / 255, atol=1e-6)
+    assert loaded.done == ()
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -92,27 +92,27 @@ def test_exif_turns_only_what_fits_turned(orientation, tmp_path):
     exif = Image.Exif()
     exif[0x112] = orientation
     path = tmp_path / "a.png"
-    Image.fromarray(scenes.picture(0)).save(path, exif=exif)
+    Image.fromarray(scenes.image(0)).save(path, exif=exif)
     mask = np.arange(12 * 16).reshape(12, 16) % 3 > 0
     if orientation < 5:
         with pytest.raises(DataError, match=r"a.png: the image is 16 x 12 px, its camera 12 x 16.*Give the images"):
-            load_photo(path, lens(12, 16))
+            load_image(path, lens(12, 16))
         return
-    photo = load_photo(path, lens(12, 16), mask=mask)
-    np.testing.assert_allclose(photo.image, np.array(ImageOps.exif_transpose(Image.open(path))) / 255, atol=1e-6)
+    loaded = load_image(path, lens(12, 16), mask=mask)
+    np.testing.assert_allclose(loaded.image, np.array(ImageOps.exif_transpose(Image.open(path))) / 255, atol=1e-6)
     stored = Image.fromarray(mask.astype(np.uint8) * 255)
     stored.getexif()[0x112] = orientation
-    assert (photo.mask == (np.array(ImageOps.exif_transpose(stored)) > 0)).all()
-    assert "turned by the EXIF tag, as the camera asks" in photo.done
+    assert (loaded.mask == (np.array(ImageOps.exif_transpose(stored)) > 0)).all()
+    assert "turned by the EXIF tag, as the camera asks" in loaded.done
 
 
 def test_size_within_a_pixel_is_rescaled_and_others_are_refused(tmp_path):
     path = tmp_path / "a.png"
-    scenes.save(path, scenes.picture(0, 33, 25))  # a half of 65 x 49, rounded up
-    K = load_photo(path, lens(65, 49, 40.0)).K
+    scenes.save(path, scenes.image(0, 33, 25))  # a half of 65 x 49, rounded up
+    K = load_image(path, lens(65, 49, 40.0)).K
     np.testing.assert_allclose(K[[0, 1, 0, 1], [0, 1, 2, 2]], [40 * 33 / 65, 40 * 25 / 49, 16.5, 12.5])
     with pytest.raises(DataError, match=r"a.png: the image is 33 x 25 px, its camera 60 x 60: the aspects differ"):
-        load_photo(path, lens(60, 60))
+        load_image(path, lens(60, 60))
 
 
 @pytest.mark.parametrize("factor", [2, 3, 4])
@@ -120,21 +120,21 @@ def test_resampling_is_an_area_mean_with_exact_intrinsics(factor, tmp_path):
     path = tmp_path / "a.png"
     rgb = np.random.default_rng(1).integers(0, 256, (24, 36, 3), np.uint8)
     scenes.save(path, rgb)
-    photo = load_photo(path, lens(36, 24, 30.0), downscale=factor)
+    loaded = load_image(path, lens(36, 24, 30.0), downscale=factor)
     mean = rgb.reshape(24 // factor, factor, 36 // factor, factor, 3).mean(axis=(1, 3)) / 255
-    np.testing.assert_allclose(photo.image, mean, atol=1e-5)
-    np.testing.assert_allclose(photo.K[[0, 1, 0, 1], [0, 1, 2, 2]], np.array([30, 30, 18, 12]) / factor)
+    np.testing.assert_allclose(loaded.image, mean, atol=1e-5)
+    np.testing.assert_allclose(loaded.K[[0, 1, 0, 1], [0, 1, 2, 2]], np.array([30, 30, 18, 12]) / factor)
 
 
 def test_uneven_resampling_scales_each_axis_by_itself(tmp_path):
-    scenes.save(tmp_path / "a.png", scenes.picture(0, 35, 26))
-    photo = load_photo(tmp_path / "a.png", lens(35, 26), downscale=3)
-    assert photo.image.shape == (9, 12, 3)
-    np.testing.assert_allclose(photo.K[[0, 1], [0, 1]], [20 * 12 / 35, 20 * 9 / 26])
+    scenes.save(tmp_path / "a.png", scenes.image(0, 35, 26))
+    loaded = load_image(tmp_path / "a.png", lens(35, 26), downscale=3)
+    assert loaded.image.shape == (9, 12, 3)
+    np.testing.assert_allclose(loaded.K[[0, 1], [0, 1]], [20 * 12 / 35, 20 * 9 / 26])
 
 
 def distort(x, y, k1, k2, p1, p2, k3=0.0):
-    """OpenCV's model, written out anew (image plane to image plane)."""
+    """Apply OpenCV's model, written anew, from image plane to image plane."""
     r2 = x * x + y * y
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
     return (
@@ -144,10 +144,10 @@ def distort(x, y, k1, k2, p1, p2, k3=0.0):
 
 
 @pytest.mark.parametrize("terms", [(0.1, 0, 0, 0), (-0.15, 0.04, 0, 0), (0.05, -0.02, 0.004, -0.006), (0.1, 0.02, 0, 0, 0.05)])
-def test_undistortion_agrees_with_the_analytic_picture(terms, tmp_path):
+def test_undistortion_agrees_with_the_analytic_image(terms, tmp_path):
     width, height, f, cx, cy = 64, 48, 50.0, 30.0, 26.0
     K = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1.0]])
-    # invert the model by fixed-point iteration: the photo shows at its pixel what a pinhole shows at the ideal one
+    # invert the model by fixed-point iteration: the image shows at its pixel what a pinhole shows at the ideal one
     u, v = grid(width, height)
     xd, yd = (u - cx) / f, (v - cy) / f
     x, y = xd, yd
@@ -156,27 +156,27 @@ def test_undistortion_agrees_with_the_analytic_picture(terms, tmp_path):
         x, y = x - (dx - xd), y - (dy - yd)
     path = tmp_path / "a.png"
     scenes.save(path, np.round(65535 * smooth(f * x + cx, f * y + cy)).astype(np.uint16))
-    photo = load_photo(path, Lens(K, width, height, tuple(terms), "OPENCV"))
-    mask = np.ones((height, width), bool) if photo.mask is None else photo.mask
+    loaded = load_image(path, Lens(K, width, height, tuple(terms), "OPENCV"))
+    mask = np.ones((height, width), bool) if loaded.mask is None else loaded.mask
     du, dv = distort((u - cx) / f, (v - cy) / f, *terms)
     du, dv = f * du + cx, f * dv + cy
     np.testing.assert_array_equal(mask, (du >= 0) & (du <= width) & (dv >= 0) & (dv <= height))
-    # in the outer half pixel the photo can only be continued; elsewhere interpolation costs 0.003, and half a pixel of a
+    # in the outer half pixel the image can only be continued; elsewhere interpolation costs 0.003, and half a pixel of a
     # wrong convention would cost 0.02
     inner = (du >= 0.5) & (du <= width - 0.5) & (dv >= 0.5) & (dv <= height - 0.5)
-    assert np.abs(photo.image - smooth(u, v))[inner].max() < 0.004
-    np.testing.assert_array_equal(photo.K, K)
-    assert photo.done == ("freed of lens distortion (OPENCV)",)
-    if terms[0] > 0.08:  # pincushion: the corners of the pinhole lie outside the photo
+    assert np.abs(loaded.image - smooth(u, v))[inner].max() < 0.004
+    np.testing.assert_array_equal(loaded.K, K)
+    assert loaded.done == ("freed of lens distortion (OPENCV)",)
+    if terms[0] > 0.08:  # pincushion: the corners of the pinhole lie outside the loaded
         assert not mask[0, 0] and mask[24, 32]
 
 
 def test_a_lens_that_folds_back_is_masked_there(tmp_path):
-    scenes.save(tmp_path / "a.png", scenes.picture(0, 64, 48))
-    photo = load_photo(tmp_path / "a.png", lens(64, 48, 30.0, (-0.5, 0.0, 0.0, 0.0), "RADIAL"))
+    scenes.save(tmp_path / "a.png", scenes.image(0, 64, 48))
+    loaded = load_image(tmp_path / "a.png", lens(64, 48, 30.0, (-0.5, 0.0, 0.0, 0.0), "RADIAL"))
     x, y = grid(64, 48)
     radius2 = ((x - 32) / 30) ** 2 + ((y - 24) / 30) ** 2
-    assert not photo.mask[radius2 > 1 / 1.5].any() and photo.mask[radius2 < 0.6].all()
+    assert not loaded.mask[radius2 > 1 / 1.5].any() and loaded.mask[radius2 < 0.6].all()
 
 
 @pytest.mark.parametrize(
@@ -234,10 +234,10 @@ def test_alpha_becomes_the_mask_outside_blender(tmp_path):
     scenes.write_colmap(tmp_path)
     alpha = np.full((12, 16, 1), 255, np.uint8)
     alpha[:, :4] = 100
-    scenes.save(tmp_path / "images" / "photo0.png", np.concatenate([scenes.picture(0), alpha], axis=2))
+    scenes.save(tmp_path / "images" / "photo0.png", np.concatenate([scenes.image(0), alpha], axis=2))
     scene = load_scene(tmp_path)
     assert (scene.views[0].mask == (alpha[..., 0] > 127)).all() and scene.background == (0, 0, 0)
-    np.testing.assert_allclose(scene.views[0].image, scenes.picture(0) / 255, atol=1e-6)  # straight, not multiplied
+    np.testing.assert_allclose(scene.views[0].image, scenes.image(0) / 255, atol=1e-6)  # straight, not multiplied
     assert "1 image masked by its alpha channel" in scene.notes
 
 

@@ -1,6 +1,7 @@
 """Broken scenes end in a message that names the file, the reason and the remedy, never in a traceback."""
 
 import json
+import os
 import struct
 
 import numpy as np
@@ -10,8 +11,7 @@ from tests.io import scenes
 from tests.io.scenes import refused
 from warpgs.errors import DataError
 from warpgs.io import colmap
-from warpgs.io.detect import detect
-from warpgs.io.load import load_scene
+from warpgs.io.load import detect, load_scene
 
 # ---- detection -------------------------------------------------------------------------------------------------------
 
@@ -42,25 +42,26 @@ def test_the_complete_format_is_taken_with_a_note(tmp_path):
 def test_a_complete_reconstruction_elsewhere_is_found(tmp_path):
     scenes.write_files(tmp_path / "sparse" / "0", {"points3D.bin": b""})
     scenes.write_colmap_txt(tmp_path)
-    assert colmap.model_folder(tmp_path) == tmp_path / "sparse" and detect(tmp_path)[0] == "colmap"
+    assert colmap.model_folder(tmp_path) == tmp_path / "sparse" and detect(tmp_path)[0].name == "colmap"
 
 
 def test_the_folder_itself_may_be_the_reconstruction(tmp_path):
     scenes.write_files(tmp_path, scenes.colmap_bin())
-    scenes.save_pictures(tmp_path / "images")
+    scenes.save_images(tmp_path / "images")
     assert len(load_scene(tmp_path).views) == 5
 
 
 def test_formats_passed_over_are_noted(tmp_path):
     scenes.write_transforms(scenes.write_colmap(tmp_path))
-    assert detect(tmp_path) == ("colmap", ["the folder also holds transforms: colmap is taken"])
+    reader, notes = detect(tmp_path)
+    assert (reader.name, notes) == ("colmap", ["the folder also holds transforms: colmap is taken"])
 
 
 @pytest.mark.parametrize("kind,lack", [("colmap", "images"), ("llff", "images"), ("dtu", "image")])
-def test_scenes_without_photographs(kind, lack, tmp_path):
+def test_scenes_without_images(kind, lack, tmp_path):
     scenes.WRITERS[kind](tmp_path)
     (tmp_path / lack).rename(tmp_path / "elsewhere")
-    refused(tmp_path, rf"lacks its photographs, a folder {lack}")
+    refused(tmp_path, rf"lacks its images, a folder {lack}")
 
 
 # ---- COLMAP, binary --------------------------------------------------------------------------------------------------
@@ -76,8 +77,8 @@ def read_all(folder, kind):
 def test_every_truncation_is_noticed(name, tmp_path):
     files = scenes.colmap_bin()
     scenes.write_files(tmp_path, files)
-    for length in range(len(files[name])):
-        (tmp_path / name).write_bytes(files[name][:length])
+    for length in reversed(range(len(files[name]))):
+        os.truncate(tmp_path / name, length)
         with pytest.raises(DataError, match=rf"{name}: .*(truncated|ends in the middle)"):
             read_all(tmp_path, "bin")
 
@@ -154,7 +155,7 @@ def test_no_points_are_a_note(tmp_path):
 
 
 def patched_pose(tmp_path, **changes):
-    """A scene whose second pose is changed: the value at an index of its seven numbers."""
+    """Write a scene in which some of the words of the second pose are replaced, by index."""
     scenes.write_colmap_txt(tmp_path)
     path = tmp_path / "sparse" / "images.txt"
     lines = path.read_text().split("\n")
@@ -216,7 +217,7 @@ def test_names_that_are_not_utf8(tmp_path):
 
 
 def test_one_view_is_too_few(tmp_path):
-    refused(scenes.write_colmap(tmp_path, names=scenes.NAMES[:1]), r"the scene has 1 usable view.*at least 2. Add photographs")
+    refused(scenes.write_colmap(tmp_path, names=scenes.NAMES[:1]), r"the scene has 1 usable view.*at least 2. Add images")
 
 
 # ---- transforms ------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Broken LLFF, DTU and Middlebury scenes, and broken photographs in any format, end in a message."""
+"""Broken LLFF, DTU and Middlebury scenes, and broken images in any format, end in a message."""
 
 import numpy as np
 import pytest
@@ -124,7 +124,7 @@ def test_middlebury_files(old, new, message, tmp_path):
 
 
 @pytest.mark.parametrize("kind", scenes.WRITERS)
-def test_corrupt_photographs_are_named(kind, tmp_path):
+def test_corrupt_images_are_named(kind, tmp_path):
     scenes.WRITERS[kind](tmp_path)
     path = sorted(tmp_path.rglob("*.png"))[2]
     path.write_bytes(path.read_bytes()[:60])

@@ -14,7 +14,7 @@ RECT = tuple(f"rect_{i + 1:03d}_3_r5000.png" for i in range(scenes.VIEWS))
 
 
 def mask_of(i: int) -> np.ndarray:
-    """A mask that says whose it is: row i is black."""
+    """Return a mask that names its id: row i is black."""
     mask = np.full((scenes.HEIGHT, scenes.WIDTH), 255, np.uint8)
     mask[i] = 0
     return mask
@@ -26,7 +26,7 @@ def write_masks(folder, ids=range(scenes.VIEWS), form="{:03d}.png"):
 
 
 def black_rows(scene):
-    """Which row each view's score mask leaves out."""
+    """Return the row that each view's score mask leaves out."""
     return [np.flatnonzero(~v.score_mask.any(1)).tolist() for v in scene.views]
 
 
@@ -43,7 +43,7 @@ def test_masks_of_a_scene_folder_are_found_and_matched_by_id(tmp_path, names, in
 
 
 def test_masks_elsewhere_of_more_views_than_there_are(tmp_path):
-    """Masks of 64 photographs serve a scan of five; a folder can be named."""
+    """Masks of 64 images serve a scan of five, also from a folder elsewhere."""
     scenes.write_colmap(tmp_path / "scene", names=RECT)
     write_masks(tmp_path / "scan8" / "mask", range(8), "{:05d}.png")
     scene = load_scene(tmp_path / "scene", score_masks=tmp_path / "scan8")
@@ -52,7 +52,7 @@ def test_masks_elsewhere_of_more_views_than_there_are(tmp_path):
 
 
 def test_a_missing_mask_is_named_by_its_id(tmp_path):
-    """Sorted order would give every later view its neighbour's mask."""
+    """Matching by sorted order would give every later view its neighbour's mask."""
     scenes.write_colmap(tmp_path, names=RECT)
     write_masks(tmp_path / "idrmasks", [0, 1, 3, 4])
     with pytest.raises(DataError, match=r"there is no mask for image id 2 .* rect_001_... is id 0"):
@@ -60,7 +60,7 @@ def test_a_missing_mask_is_named_by_its_id(tmp_path):
 
 
 def test_counting_from_one_is_not_guessed(tmp_path):
-    """Photographs 1 to 5 and masks 0 to 5 could be matched two ways."""
+    """Images 1 to 5 and masks 0 to 5 can be matched in two ways, so the scene is refused."""
     scenes.write_colmap(tmp_path, names=tuple(f"{i + 1:03d}.png" for i in range(scenes.VIEWS)))
     write_masks(tmp_path / "idrmasks", range(6))
     with pytest.raises(DataError, match="off by one"):
@@ -72,7 +72,7 @@ def test_counting_from_one_is_not_guessed(tmp_path):
 
 
 def test_masks_that_cannot_be_used_are_named(tmp_path):
-    """None, without numbers, of another shape, or all black."""
+    """No masks, masks without numbers, of another shape, or all black."""
     scenes.write_colmap(tmp_path / "scene")
     folder = tmp_path / "m"
 
@@ -87,12 +87,12 @@ def test_masks_that_cannot_be_used_are_named(tmp_path):
     shutil.rmtree(folder)
     write_masks(folder)
     scenes.save(folder / "002.png", np.full((20, 20), 255, np.uint8))
-    refused("002.png: the mask is 20 x 20 px, its photograph photo2.png 16 x 12")
+    refused("002.png: the mask is 20 x 20 px, its image photo2.png 16 x 12")
     scenes.save(folder / "002.png", np.zeros((12, 16), np.uint8))
     refused("leaves no pixel of photo2.png")
 
 
-def test_larger_masks_shrink_with_the_photographs(tmp_path):
+def test_larger_masks_shrink_with_the_images(tmp_path):
     """Masks of the original size serve at any downscale."""
     scenes.write_colmap(tmp_path)
     write_masks(tmp_path / "idrmasks")
@@ -102,7 +102,7 @@ def test_larger_masks_shrink_with_the_photographs(tmp_path):
 
 
 def test_masks_belong_to_the_fingerprint(tmp_path):
-    """Scores over other pixels are other scores."""
+    """Scores over other pixels do not compare, so the fingerprint differs."""
     scenes.write_colmap(tmp_path)
     plain = load_scene(tmp_path).fingerprint
     write_masks(tmp_path / "idrmasks")
@@ -120,14 +120,14 @@ def test_masks_belong_to_the_fingerprint(tmp_path):
     ],
 )
 def test_ids_of_names(names, ids):
-    """The number that differs from name to name."""
+    """The id is the number that differs from name to name."""
     assert image_ids(names) == ids
 
 
 def test_where_pixels_come_from(tmp_path):
-    """A ready-made folder and resampling are told apart."""
+    """A ready-made folder and resampling give different descriptions."""
     scenes.write_colmap(tmp_path)
     assert load_scene(tmp_path).pixels == "images as stored"
     assert load_scene(tmp_path, downscale=2).pixels == "images area-resampled by 2"
-    scenes.save_pictures(tmp_path / "images_2", width=8, height=6)
+    scenes.save_images(tmp_path / "images_2", width=8, height=6)
     assert load_scene(tmp_path, downscale=2).pixels == "images_2 as stored"

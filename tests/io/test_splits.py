@@ -8,12 +8,12 @@ import pytest
 from tests.io import scenes
 from warpgs.errors import DataError, UsageError
 from warpgs.io.load import load_scene
-from warpgs.io.splits import Split, default_split, split_views, twins
+from warpgs.io.splits import Split, coincident_views, default_split, split_views
 from warpgs.scene import Camera
 
 
 def scene_of(names):
-    """A stand-in: a split only looks at names."""
+    """Return a stand-in for a scene: a split only looks at names."""
     return SimpleNamespace(views=[SimpleNamespace(name=n) for n in names])
 
 
@@ -102,7 +102,7 @@ def test_dtu_ids_are_those_of_the_names(form):
 
 
 def test_dtu_scan_with_a_gap_is_refused():
-    """64 photographs less one would still be enough, with every id after the gap shifted by one."""
+    """64 images less one would still be enough, with every id after the gap shifted by one."""
     names = [f"rect_{i + 1:03d}_3_r5000.png" for i in range(64)]
     with pytest.raises(DataError, match=r"with the ids 10 are missing .* rect_001_3_r5000.png to rect_064"):
         split_views(scene_of(names[:10] + names[11:]), "dtu:3")
@@ -190,7 +190,7 @@ def test_a_split_of_a_real_folder(tmp_path):
     assert split_views(scene, "llff:3") == Split(("photo1.png", "photo3.png", "photo4.png"), ("photo0.png",))
 
 
-def test_twins_are_views_from_one_place():
+def test_coincident_views_are_views_from_one_place():
     """Equal poses across the split count, in any unit; equal poses within training and turned cameras do not."""
 
     def view(name, x, turned=False):
@@ -203,5 +203,5 @@ def test_twins_are_views_from_one_place():
     for unit in (1e-3, 1e3):
         views = [view("a", 0), view("b", 5e-4 * unit), view("c", unit), view("d", unit), view("e", unit, turned=True)]
         scene = SimpleNamespace(views=tuple(views))
-        assert twins(scene, Split(("b", "c", "e"), ("a", "d"))) == [("a", "b"), ("d", "c")]
-        assert twins(scene, Split(("c", "d", "e"), ("a", "b"))) == []
+        assert coincident_views(scene, Split(("b", "c", "e"), ("a", "d"))) == [("a", "b"), ("d", "c")]
+        assert coincident_views(scene, Split(("c", "d", "e"), ("a", "b"))) == []

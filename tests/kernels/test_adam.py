@@ -35,10 +35,10 @@ def test_steps_equal_torch(device, dtype):
 def test_head_of_a_row_takes_its_own_rate(device, dtype, shape):
     """The first columns move with head_lr, all others with lr; rows cross lanes, segments and groups of four."""
     param, grads = problem(dtype, device, shape)
-    rates = torch.full((shape[0], shape[1] * 3), 0.01, dtype=torch.float64)
-    rates[:, :3] = 0.2
+    lrs = torch.full((shape[0], shape[1] * 3), 0.01, dtype=torch.float64)
+    lrs[:, :3] = 0.2
     found, _, _ = run(param, grads, lr=0.01, head_lr=0.2, head=3)
-    wanted = adam_reference(param.cpu().double(), [g.cpu().double() for g in grads], rates.view(shape))
+    wanted = adam_reference(param.cpu().double(), [g.cpu().double() for g in grads], lrs.view(shape))
     assert torch.allclose(found.cpu().double(), wanted, atol=1e-5 if dtype == torch.float32 else 1e-12)
 
 

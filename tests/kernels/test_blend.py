@@ -1,32 +1,33 @@
-"""Compositing against a plain loop over Gaussians: pictures, gradients, rules, repeatability."""
+"""Compositing against a plain loop over Gaussians: images, gradients, rules, repeatability."""
 
 import dataclasses
 
 import pytest
 import torch
 
+from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference
-from tests.splats import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.tolerances import close
 from warpgs.constants import RULES
 from warpgs.kernels.blend import blend, contributions
 from warpgs.kernels.project import project
+from warpgs.kernels.sh import C0
 from warpgs.kernels.tiles import Tiles, bin_tiles
 
 
 def drawn(gaussians, cam, background, rule, tile_size=16, degree=1):
-    """Pictures of the kernels: rgb, alpha, depth, and what they were made of."""
+    """Return the images of the kernels, rgb, alpha, depth, and the projected Gaussians and tiles."""
     size = {"width": cam.width, "height": cam.height}
-    splats, counts = project(
+    projected, counts = project(
         *gaussians.tensors().values(), cam.viewmat, cam.K, **size, degree=degree, rule=rule, tile_size=tile_size
     )
-    tiles = bin_tiles(splats, counts, **size, tile_size=tile_size, rule=rule)
-    return *blend(splats, tiles, background, **size, rule=rule), splats, tiles
+    tiles = bin_tiles(projected, counts, **size, tile_size=tile_size, rule=rule)
+    return *blend(projected, tiles, background, **size, rule=rule), projected, tiles
 
 
-def twins(tensors, cam, background, rule, tile_size=16, degree=1):
-    """The same pictures by the references, stacked over cameras, and the weights [C, N, H, W]."""
+def coincident_views(tensors, cam, background, rule, tile_size=16, degree=1):
+    """Return the same images by the references, stacked over cameras, and the weights [C, N, H, W]."""
     *gaussians, viewmats, Ks = tensors
     means, covs, colors, depths, opacities = project_reference(
         *gaussians, viewmats, Ks, width=cam.width, height=cam.height, degree=degree, low_pass=rule.low_pass
@@ -58,31 +59,31 @@ def test_pictures_and_gradients_equal_reference(device, dtype, rule, tile_size):
     other = doubles(gaussians, cam)
     other_background = background.detach().cpu().double().requires_grad_()
     rgb, alpha, depth, _, _ = drawn(gaussians, cam, background, rule, tile_size, degree=3)
-    wanted = twins(other, cam, other_background, rule, tile_size, degree=3)
-    for found, twin in zip((rgb, alpha, depth), wanted):
-        close("image", found, twin)
+    wanted = coincident_views(other, cam, other_background, rule, tile_size, degree=3)
+    for found, reference_result in zip((rgb, alpha, depth), wanted):
+        close("image", found, reference_result)
     upstream = [torch.randn(t.shape, generator=torch.Generator().manual_seed(7), dtype=torch.float64) for t in wanted[:3]]
     sum((a * u.to(a)).sum() for a, u in zip((rgb, alpha, depth), upstream)).backward()
     sum((a * u).sum() for a, u in zip(wanted, upstream)).backward()
-    for t, twin in zip((*gaussians.tensors().values(), background), (*other[:5], other_background)):
+    for t, reference_result in zip((*gaussians.tensors().values(), background), (*other[:5], other_background)):
         assert bool(t.grad.any())
-        close("gradient", t.grad, twin.grad)
+        close("gradient", t.grad, reference_result.grad)
 
 
 def test_gradcheck(device):
-    """Finite differences agree with the backward kernel for every entry of the record and for the background."""
+    """Finite differences agree with the backward kernel for every value of a projected Gaussian and for the background."""
     gaussians, cam = hand_placed(device=device), camera(cameras=2, device=device)
     size = {"width": cam.width, "height": cam.height}
     background = backgrounds(2, torch.float64, device).requires_grad_()
-    splats, counts = project(*gaussians.tensors().values(), cam.viewmat, cam.K, **size, degree=3, rule=SMOOTH)
-    tiles = bin_tiles(splats, counts, **size, rule=SMOOTH)
-    tail = splats[..., 10:].detach()
+    projected, counts = project(*gaussians.tensors().values(), cam.viewmat, cam.K, **size, degree=3, rule=SMOOTH)
+    tiles = bin_tiles(projected, counts, **size, rule=SMOOTH)
+    tail = projected[..., 10:].detach()
 
-    def pictures(record, behind):
+    def images(record, behind):
         return blend(torch.cat([record, tail], -1), tiles, behind, **size, rule=SMOOTH)
 
-    record = splats[..., :10].detach().clone().requires_grad_()
-    assert torch.autograd.gradcheck(pictures, (record, background), eps=1e-6, atol=1e-7, rtol=1e-5, nondet_tol=0.0)
+    record = projected[..., :10].detach().clone().requires_grad_()
+    assert torch.autograd.gradcheck(images, (record, background), eps=1e-6, atol=1e-7, rtol=1e-5, nondet_tol=0.0)
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 17), (17, 1), (33, 47)])
@@ -91,7 +92,7 @@ def test_odd_image_sizes(device, dtype, width, height):
     gaussians, cam = cloud(40, dtype, device), camera(width, height, cameras=1, dtype=dtype, device=device)
     background = backgrounds(1, dtype, device)
     rgb, alpha, _, _, _ = drawn(gaussians, cam, background, SMOOTH)
-    wanted = twins(doubles(gaussians, cam), cam, background.cpu().double(), SMOOTH)
+    wanted = coincident_views(doubles(gaussians, cam), cam, background.cpu().double(), SMOOTH)
     close("image", rgb, wanted[0])
     close("image", alpha, wanted[1])
 
@@ -153,14 +154,14 @@ def test_many_layers_recover_their_transmittance(device):
     rgb.sum().backward()
     assert all(bool(torch.isfinite(t.grad).all()) for t in gaussians.tensors().values())
     # colour gradients are the weights: 16 pixels of total weight alpha each, times the basis constant and three channels
-    total = float(gaussians.sh.grad.double().sum()) / 0.28209479177387814 / 3
+    total = float(gaussians.sh.grad.double().sum()) / C0 / 3
     assert abs(total - float(alpha.detach().double().sum())) <= 1e-4 * total
 
 
 def test_partition_of_unity_and_linearity(device):
     """All colours equal to the background give that colour; colours add."""
     gaussians, cam = cloud(200, torch.float32, device, degree=0), camera(40, 30, cameras=1, dtype=torch.float32, device=device)
-    gaussians.sh[:] = (0.7 - 0.5) / 0.28209479177387814
+    gaussians.sh[:] = (0.7 - 0.5) / C0
     rgb = drawn(gaussians, cam, torch.full((1, 3), 0.7, device=device), RULES["exact"], degree=0)[0]
     assert float((rgb - 0.7).abs().max()) <= 1e-6
 
@@ -170,15 +171,15 @@ def test_contributions_are_the_weights(device, dtype):
     gaussians, cam = cloud(60, dtype, device), camera(40, 30, cameras=2, dtype=dtype, device=device)
     rule = dataclasses.replace(RULES["exact"], alpha_cut=0.0)
     background = backgrounds(2, dtype, device)
-    *_, splats, tiles = drawn(gaussians, cam, background, rule)
-    sums, maxima = contributions(splats, tiles, width=40, height=30, rule=rule)
-    weights = twins(doubles(gaussians, cam), cam, background.cpu().double(), rule)[3]
+    *_, projected, tiles = drawn(gaussians, cam, background, rule)
+    sums, maxima = contributions(projected, tiles, width=40, height=30, rule=rule)
+    weights = coincident_views(doubles(gaussians, cam), cam, background.cpu().double(), rule)[3]
     close("gradient", sums, weights.sum((2, 3)))
     close("gradient", maxima, weights.amax((2, 3)))
 
 
 def everything(gaussians, cam, tile_size=16):
-    """All pictures and gradients of one rendering, for bitwise comparison."""
+    """Return all images and gradients of one render, for bitwise comparison."""
     gaussians = leaves(gaussians)
     background = torch.full((len(cam.viewmat), 3), 0.3, device=gaussians.means.device)
     rgb, alpha, depth, _, _ = drawn(gaussians, cam, background, RULES["exact"], tile_size)
@@ -187,7 +188,7 @@ def everything(gaussians, cam, tile_size=16):
 
 
 def test_repeats_and_threads_give_the_same_bits(device):
-    """Pictures and gradients are the same on every run, and for one thread and two."""
+    """Images and gradients are the same on every run, and for one thread and two."""
     gaussians, cam = cloud(2000, device=device), camera(80, 60, cameras=2, dtype=torch.float32, device=device)
     torch.set_num_threads(1)
     first = everything(gaussians, cam)
@@ -197,16 +198,16 @@ def test_repeats_and_threads_give_the_same_bits(device):
 
 
 def test_tile_size_permutation_and_batch_give_the_same_picture(device):
-    """The bits of the picture depend neither on the tile size, nor on the order of Gaussians, nor on the batch."""
+    """The bits of the image depend neither on the tile size, nor on the order of Gaussians, nor on the batch."""
     gaussians, cam = cloud(500, device=device), camera(80, 60, cameras=3, dtype=torch.float32, device=device)
-    pictures = everything(gaussians, cam)[:3]
-    assert all(torch.equal(a, b) for a, b in zip(pictures, everything(gaussians, cam, tile_size=8)))
+    images = everything(gaussians, cam)[:3]
+    assert all(torch.equal(a, b) for a, b in zip(images, everything(gaussians, cam, tile_size=8)))
     order = torch.randperm(500, generator=torch.Generator().manual_seed(0)).to(device)
     shuffled = type(gaussians)(**{n: t[order] for n, t in gaussians.tensors().items()})
-    assert all(torch.equal(a, b) for a, b in zip(pictures, everything(shuffled, cam)))
+    assert all(torch.equal(a, b) for a, b in zip(images, everything(shuffled, cam)))
     for c in range(3):
         single = dataclasses.replace(cam, viewmat=cam.viewmat[c : c + 1], K=cam.K[c : c + 1])
-        assert all(torch.equal(a[c], b[0]) for a, b in zip(pictures, everything(gaussians, single)))
+        assert all(torch.equal(a[c], b[0]) for a, b in zip(images, everything(gaussians, single)))
 
 
 def test_no_gaussians_show_the_background(device, dtype):
@@ -222,16 +223,16 @@ def test_no_gaussians_show_the_background(device, dtype):
 def test_bad_input_names_the_argument():
     """Tiles of another image and a background of another shape are refused."""
     gaussians, cam = cloud(5), camera(40, 30, cameras=1, dtype=torch.float32)
-    *_, splats, tiles = drawn(gaussians, cam, torch.zeros(1, 3), RULES["exact"])
+    *_, projected, tiles = drawn(gaussians, cam, torch.zeros(1, 3), RULES["exact"])
     with pytest.raises(ValueError, match="tiles were made for another image"):
-        blend(splats, tiles, torch.zeros(1, 3), width=80, height=30, rule=RULES["exact"])
+        blend(projected, tiles, torch.zeros(1, 3), width=80, height=30, rule=RULES["exact"])
     with pytest.raises(ValueError, match="backgrounds"):
-        blend(splats, tiles, torch.zeros(2, 3), width=40, height=30, rule=RULES["exact"])
+        blend(projected, tiles, torch.zeros(2, 3), width=40, height=30, rule=RULES["exact"])
 
 
 @pytest.mark.cuda
 def test_cpu_equals_cuda():
-    """The CUDA kernels draw what the CPU draws, gradients included, where no threshold is near."""
+    """The CUDA kernels give the images and gradients of the CPU where no threshold is near."""
     found = {}
     for device in ("cpu", "cuda:0"):
         gaussians, cam = hand_placed(torch.float32, device), camera(33, 21, cameras=2, dtype=torch.float32, device=device)
@@ -251,21 +252,21 @@ def test_both_passes_see_the_same_alpha(device):
     def rand(*shape):
         return torch.rand(*shape, generator=generator)
 
-    splats = torch.ones(count, 1, 12)
-    splats[..., 0:2] = rand(count, 1, 2) * side
-    splats[..., 2:5] = rand(count, 1, 3) * 0.6 + 0.2
-    splats[..., 10:] = 100
-    mx, my, u11, u12, u22 = splats[:, 0, :5].double().unbind(-1)
+    projected = torch.ones(count, 1, 12)
+    projected[..., 0:2] = rand(count, 1, 2) * side
+    projected[..., 2:5] = rand(count, 1, 3) * 0.6 + 0.2
+    projected[..., 10:] = 100
+    mx, my, u11, u12, u22 = projected[:, 0, :5].double().unbind(-1)
     dx = torch.floor(mx) + 0.5 - mx + 1
     dy = torch.floor(my) + 0.5 - my + 1
     q = 0.5 * ((u11 * dx + u12 * dy) ** 2 + (u22 * dy) ** 2)
-    splats[:, 0, 5] = (rule.alpha_cut * torch.exp(q) * (1 + 6e-7 * (rand(count).double() - 0.5))).float()
-    splats = splats.to(device).requires_grad_()
+    projected[:, 0, 5] = (rule.alpha_cut * torch.exp(q) * (1 + 6e-7 * (rand(count).double() - 0.5))).float()
+    projected = projected.to(device).requires_grad_()
     numbers = torch.arange(count, dtype=torch.int32, device=device)
     ranges, one = torch.stack([numbers, numbers + 1], 1), torch.ones_like(numbers)
     tiles = Tiles(side, ranges, numbers, numbers, numbers, one, numbers, torch.tensor([count], device=device))
-    rgb = blend(splats, tiles, torch.zeros(count, 3, device=device), width=side, height=side, rule=rule)[0]
+    rgb = blend(projected, tiles, torch.zeros(count, 3, device=device), width=side, height=side, rule=rule)[0]
     rgb.sum().backward()
-    forward, backward = rgb[..., 0].detach().double().sum((1, 2)), splats.grad[:, 0, 6].double()
+    forward, backward = rgb[..., 0].detach().double().sum((1, 2)), projected.grad[:, 0, 6].double()
     assert bool((forward > 0).sum() > count / 2)
     assert float((forward - backward).abs().max()) < 0.5 * rule.alpha_cut

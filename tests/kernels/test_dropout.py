@@ -38,7 +38,7 @@ def test_same_seed_and_step_same_factors(device):
 
 
 def test_neighbours_are_independent(device):
-    """Whether one Gaussian is hidden says nothing of the next one."""
+    """Neighbouring Gaussians are hidden independently of each other."""
     hidden = (factors(device, 0.5) == 0).double()
     assert abs(float(torch.corrcoef(torch.stack([hidden[1:], hidden[:-1]]))[0, 1])) < 0.03
 

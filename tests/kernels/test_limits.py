@@ -1,4 +1,4 @@
-"""Adam, neighbours and SSIM at their limits: the last element, the smallest gradient, the narrowest picture."""
+"""Adam, neighbours and SSIM at their limits: the last element, the smallest gradient, the narrowest image."""
 
 import math
 
@@ -83,7 +83,7 @@ def test_groups_of_boxes_are_exact(device):
 
 @pytest.mark.parametrize("width", [1, 5, 6, 7])
 def test_narrow_pictures_equal_the_same_beside_black(device, width):
-    """Columns of zeros beside a picture are what the window finds there anyway; those of the padding do not come back."""
+    """Columns of zeros beside an image change nothing, since the window finds zeros there; padding is not returned."""
     generator = torch.Generator().manual_seed(width)
     a, b = torch.rand(2, 9, width, 3, generator=generator, dtype=torch.float64).to(device).unbind()
     wide = [torch.nn.functional.pad(t, (0, 0, 0, 20 - width)) for t in (a, b)]
@@ -114,7 +114,7 @@ def test_sums_take_one_pass_where_a_row_fills_a_step(monkeypatch, width, ways):
 
 
 def test_a_pixel_reaches_five_pixels(device):
-    """A change of one changes the map around it alone, and so does an upstream gradient: each pixel of a picture in turn."""
+    """A change of one changes the map around it alone, and so does an upstream gradient: each pixel of an image in turn."""
     side = 38  # three blocks each way
     a, b = torch.rand(2, side, side, 3, generator=torch.Generator().manual_seed(0)).to(device).unbind()
     rows, columns = (t.flatten() for t in torch.meshgrid(*[torch.arange(side)] * 2, indexing="ij"))
@@ -136,14 +136,14 @@ def test_pictures_that_fill_the_blocks(device, dtype, height, width):
     generator = torch.Generator().manual_seed(height)
     a, b = torch.rand(2, 2, height, width, 3, generator=generator, dtype=torch.float64).unbind()
     weights = torch.rand(a.shape, generator=generator, dtype=torch.float64)
-    twin, leaf = a.clone().requires_grad_(), a.to(device, dtype).requires_grad_()
-    wanted = torch.stack([ssim_reference(x, y) for x, y in zip(twin, b)])
+    reference_result, leaf = a.clone().requires_grad_(), a.to(device, dtype).requires_grad_()
+    wanted = torch.stack([ssim_reference(x, y) for x, y in zip(reference_result, b)])
     found = ssim(leaf, b.to(leaf))
     close("ssim", found, wanted)
     sums = differences(leaf, b.to(leaf))
-    both = torch.stack([(1 - wanted).sum(), (twin - b).abs().sum()])
+    both = torch.stack([(1 - wanted).sum(), (reference_result - b).abs().sum()])
     close("ssim", sums, both)
     maps = (found * weights.to(leaf)).sum(), (wanted * weights).sum()
     for ours, theirs in (maps, (0.3 * sums[0] + 2 * sums[1], 0.3 * both[0] + 2 * both[1])):
-        (mine,), (other,) = torch.autograd.grad(ours, leaf), torch.autograd.grad(theirs, twin, retain_graph=True)
+        (mine,), (other,) = torch.autograd.grad(ours, leaf), torch.autograd.grad(theirs, reference_result, retain_graph=True)
         close("gradient", mine, other)

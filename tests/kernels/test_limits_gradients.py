@@ -6,10 +6,10 @@ import math
 import pytest
 import torch
 
+from tests.gaussians import SMOOTH, camera, cloud, leaves
 from tests.kernels.test_limits_blend import plain
 from tests.kernels.test_limits_project import facing, run
 from tests.numerics.test_extreme_compositing import Filled
-from tests.splats import SMOOTH, camera, cloud, leaves
 from tests.tolerances import close
 from warpgs.constants import RULES
 from warpgs.kernels import blend, tiles
@@ -30,20 +30,20 @@ def test_coefficients_that_are_stored_and_not_used(device, degree, stored):
         g = leaves(dataclasses.replace(g, sh=g.sh[:, :stored].contiguous()))
         cam = camera(40, 30, cameras=2, dtype=kind, device=where)
         with Filled(math.nan, 1):
-            splats, counts = run(g, cam, degree=degree)
-            upstream = torch.linspace(-1, 1, splats.numel(), dtype=kind, device=where).view(splats.shape)
-            found = torch.autograd.grad((splats[..., 6:9] * upstream[..., 6:9]).sum(), [g.sh, g.means])
+            projected, counts = run(g, cam, degree=degree)
+            upstream = torch.linspace(-1, 1, projected.numel(), dtype=kind, device=where).view(projected.shape)
+            found = torch.autograd.grad((projected[..., 6:9] * upstream[..., 6:9]).sum(), [g.sh, g.means])
         used = (degree + 1) ** 2
         assert not bool(found[0][:, used:].any()) and not bool(found[0][(counts == 0).all(0)].any())
-        results.append((splats[..., 6:9], *found))
+        results.append((projected[..., 6:9], *found))
     for single, double in zip(*results, strict=True):
         close("gradient", single, double)
 
 
-def of_records(splats, made, rule, only_rgb, deterministic=True, **size):
-    """Gradient of the records, in fresh memory full of NaN."""
-    record = splats.detach().requires_grad_()
-    black = torch.zeros(len(splats), 3, dtype=splats.dtype, device=splats.device)
+def of_records(projected, made, rule, only_rgb, deterministic=True, **size):
+    """Return the gradient of the projected Gaussians, in fresh memory full of NaN."""
+    record = projected.detach().requires_grad_()
+    black = torch.zeros(len(projected), 3, dtype=projected.dtype, device=projected.device)
     with Filled(math.nan, 0):
         rgb, alpha, depth = blend.blend(record, made, black, rule=rule, deterministic=deterministic, **size)
         loss = rgb.sum() if only_rgb else rgb.sum() + (alpha * depth).sum()
@@ -62,10 +62,10 @@ def test_every_row_of_the_gradient_is_written(device, only_rgb, deterministic):
     for kind in (torch.float32, torch.float64):
         g = Gaussians(**{n: t.to(kind) for n, t in gaussians.tensors().items()})
         view = dataclasses.replace(cam, viewmat=cam.viewmat.to(kind), K=cam.K.to(kind))
-        splats, counts = run(g, view, SMOOTH if only_rgb else EXACT, tile_size=8)
-        made = tiles.bin_tiles(splats, counts, rule=SMOOTH if only_rgb else EXACT, tile_size=8, **size)
+        projected, counts = run(g, view, SMOOTH if only_rgb else EXACT, tile_size=8)
+        made = tiles.bin_tiles(projected, counts, rule=SMOOTH if only_rgb else EXACT, tile_size=8, **size)
         assert int(counts.max()) > 100 and int(counts.min()) == 0
-        found = of_records(splats, made, SMOOTH if only_rgb else EXACT, only_rgb, deterministic, **size)
+        found = of_records(projected, made, SMOOTH if only_rgb else EXACT, only_rgb, deterministic, **size)
         assert bool(torch.isfinite(found).all()) and not bool(found[counts == 0].any())
         assert not bool(found[..., (9 if only_rgb else 10) :].any())
         results.append(found)
@@ -76,13 +76,15 @@ def test_every_row_of_the_gradient_is_written(device, only_rgb, deterministic):
 
 @pytest.mark.parametrize("extra", [1, 3, 40])
 def test_slots_of_no_tile_add_nothing(device, dtype, extra):
-    """Room that was counted and not needed: the same gradients."""
+    """Capacity that was counted and not needed does not change the gradients."""
     size = {"width": 96, "height": 80}
     gaussians, cam = cloud(61, dtype, device), camera(**size, cameras=1, dtype=dtype, device=device)
-    splats, counts = run(gaussians, cam)
+    projected, counts = run(gaussians, cam)
     more = torch.where((counts > 0) & (torch.arange(61, device=device) % 6 == 0), counts + extra, counts)
     assert int((more - counts).sum()) % 2 == 1 or extra == 40
-    found = [of_records(splats, tiles.bin_tiles(splats, c, rule=EXACT, **size), EXACT, False, **size) for c in (counts, more)]
+    found = [
+        of_records(projected, tiles.bin_tiles(projected, c, rule=EXACT, **size), EXACT, False, **size) for c in (counts, more)
+    ]
     off = float((found[0] - found[1]).norm()) / float(found[0].norm())
     assert torch.equal(*found) if extra < 40 else off <= 1e-6  # a longer list is summed by a warp, in another order
 
@@ -90,24 +92,24 @@ def test_slots_of_no_tile_add_nothing(device, dtype, extra):
 def test_layers_that_draw_nothing_have_no_gradient(device, dtype):
     """Every other one is below the cut, among them the first of each batch of 32."""
     with Filled(math.nan, 0):
-        splats, (rgb, _, _), (sums, maxima) = plain([0.001, 0.02] * 50, device, dtype, EXACT)
-        (gradient,) = torch.autograd.grad(rgb.sum(), splats)
+        projected, (rgb, _, _), (sums, maxima) = plain([0.001, 0.02] * 50, device, dtype, EXACT)
+        (gradient,) = torch.autograd.grad(rgb.sum(), projected)
     assert not bool(gradient[0, ::2].any()) and not bool(sums[0, ::2].any()) and not bool(maxima[0, ::2].any())
     assert bool((gradient[0, 1::2, 5:9] > 0).all()) and bool((sums[0, 1::2] > 0).all())
 
 
 def test_contributions_count_the_pixels_of_the_picture(device, dtype):
-    """Of a tile that is larger than it, the first instance too."""
+    """In a tile with more instances than a chunk, the first instance has its gradient, too."""
     _, _, (sums, _) = plain([0.25, 0.5, 0.5], device, dtype, EXACT, side=3)
     assert sums.tolist() == [[9 * 0.25, 9 * 0.375, 9 * 0.1875]]
 
 
 def test_a_first_layer_behind_the_stop(device, dtype):
-    """Where one layer is already too much, nothing is drawn, and nothing has a gradient."""
+    """Where one layer already crosses the stop, nothing is blended, and nothing has a gradient."""
     rule = dataclasses.replace(EXACT, transmittance_stop=0.6, inclusive_stop=False)
-    splats, (rgb, alpha, depth), (sums, _) = plain([0.5, 0.1], device, dtype, rule)
+    projected, (rgb, alpha, depth), (sums, _) = plain([0.5, 0.1], device, dtype, rule)
     assert not bool(alpha.any()) and not bool(sums.any())
-    (gradient,) = torch.autograd.grad(rgb.sum() + alpha.sum() + depth.sum(), splats)
+    (gradient,) = torch.autograd.grad(rgb.sum() + alpha.sum() + depth.sum(), projected)
     assert not bool(gradient.any())
 
 
@@ -115,9 +117,9 @@ def test_depth_where_every_weight_is_zero(device, dtype):
     """Without a cut a Gaussian is listed everywhere, and far away its weight is 0: depth 0, and gradients are numbers."""
     size = {"width": 64, "height": 64}
     gaussians, cam = facing(2, dtype, device, size=64)
-    splats, counts = run(gaussians, cam, SMOOTH)
-    made = tiles.bin_tiles(splats, counts, rule=SMOOTH, **size)
-    record = splats.detach().requires_grad_()
+    projected, counts = run(gaussians, cam, SMOOTH)
+    made = tiles.bin_tiles(projected, counts, rule=SMOOTH, **size)
+    record = projected.detach().requires_grad_()
     black = torch.zeros(1, 3, dtype=dtype, device=device)
     depth = blend.blend(record, made, black, rule=SMOOTH, **size)[2]
     empty = depth == 0
@@ -128,14 +130,14 @@ def test_depth_where_every_weight_is_zero(device, dtype):
 
 @pytest.mark.parametrize("count", [255, 256, 257])
 def test_as_many_gaussians_as_a_block_has_threads(device, count):
-    """And one more or fewer: each is listed and has its gradient."""
+    """With one more or fewer, too, each is listed and has its gradient."""
     gaussians, cam = facing(count, device=device)
     gaussians.logit_opacities[:] = -4.0
-    splats, counts = run(gaussians, cam)
+    projected, counts = run(gaussians, cam)
     size = {"width": 16, "height": 16}
-    made = tiles.bin_tiles(splats, counts, rule=EXACT, **size)
-    assert made.splat_ids.tolist() == list(range(count)) and made.ranges.tolist() == [[0, count]]
-    assert bool((of_records(splats, made, EXACT, True, **size)[0, :, 6] > 0).all())
+    made = tiles.bin_tiles(projected, counts, rule=EXACT, **size)
+    assert made.gaussian_ids.tolist() == list(range(count)) and made.ranges.tolist() == [[0, count]]
+    assert bool((of_records(projected, made, EXACT, True, **size)[0, :, 6] > 0).all())
 
 
 def test_long_lists_are_written_by_a_warp(device, dtype):
@@ -143,14 +145,14 @@ def test_long_lists_are_written_by_a_warp(device, dtype):
     gaussians, cam = facing(2, dtype, device, size=160)
     gaussians.log_scales[0] += 6.0
     gaussians.means[1, 2] = 1.01
-    splats, counts = run(gaussians, cam)
+    projected, counts = run(gaussians, cam)
     assert counts.tolist() == [[100, 1]]
     size = {"width": 160, "height": 160, "rule": EXACT}
-    alone = tiles.bin_tiles(splats[:, :1], counts[:, :1], **size)
+    alone = tiles.bin_tiles(projected[:, :1], counts[:, :1], **size)
     assert alone.ranges.tolist() == [[i, i + 1] for i in range(100)]
-    short = tiles.bin_tiles(splats, counts - torch.tensor([[1, 0]], dtype=torch.int32, device=device), **size)
-    assert sorted(short.splat_ids.tolist()) == [0] * 99 + [1] and short.tile_ids.tolist() == [0, *range(99)]
+    short = tiles.bin_tiles(projected, counts - torch.tensor([[1, 0]], dtype=torch.int32, device=device), **size)
+    assert sorted(short.gaussian_ids.tolist()) == [0] * 99 + [1] and short.tile_ids.tolist() == [0, *range(99)]
     tall = dataclasses.replace(cam, width=16, height=640)
-    splats, counts = run(Gaussians(**{n: t[:1] for n, t in gaussians.tensors().items()}), tall)
-    made = tiles.bin_tiles(splats, counts, width=16, height=640, rule=EXACT)
+    projected, counts = run(Gaussians(**{n: t[:1] for n, t in gaussians.tensors().items()}), tall)
+    made = tiles.bin_tiles(projected, counts, width=16, height=640, rule=EXACT)
     assert counts.tolist() == [[40]] and made.ranges.tolist() == [[i, i + 1] for i in range(40)]

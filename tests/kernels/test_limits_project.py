@@ -6,8 +6,8 @@ import math
 import pytest
 import torch
 
+from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.reference.project import project_reference
-from tests.splats import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.tolerances import close
 from warpgs.constants import FAR, FARTHEST_PIXEL, LARGEST_COEFFICIENT, RULES, SHORTEST_QUAT
 from warpgs.kernels.project import project
@@ -48,15 +48,15 @@ def test_quaternions_along_an_axis_turn_as_the_reference(device, dtype):
     quats = torch.cat([axes, axes * 1e-14, axes * 1e14, axes + 1e-25]).to(dtype)
     gaussians, cam = cloud(len(quats), dtype, device), camera(cameras=1, dtype=dtype, device=device)
     gaussians.quats[:] = quats.to(device)
-    splats, counts = run(gaussians, cam, SMOOTH)
+    projected, counts = run(gaussians, cam, SMOOTH)
     plain = [t.cpu().double() for t in gaussians.tensors().values()]
     _, covs, *_ = project_reference(
         *plain, cam.viewmat.cpu().double(), cam.K.cpu().double(), width=18, height=17, degree=1, low_pass=SMOOTH.low_pass
     )
     inverse = torch.linalg.inv(covs)
     assert bool((counts > 0).all())
-    close("projection", splats[..., 2], inverse[..., 0, 0].sqrt())
-    close("projection", splats[..., 3], inverse[..., 0, 1] / inverse[..., 0, 0].sqrt())
+    close("projection", projected[..., 2], inverse[..., 0, 0].sqrt())
+    close("projection", projected[..., 3], inverse[..., 0, 1] / inverse[..., 0, 0].sqrt())
 
 
 @pytest.mark.parametrize("slot", [0, 1])
@@ -64,17 +64,17 @@ def test_a_mean_whose_pixel_overflows_is_culled(device, slot):
     """Its depth is fine and so is the other coordinate."""
     gaussians, cam = facing(2, device=device)
     gaussians.means[1, slot], gaussians.means[1, 2] = 3e38, 0.02
-    splats, counts = run(gaussians, cam)
-    assert counts.tolist() == [[1, 0]] and not bool(splats[0, 1].any())
+    projected, counts = run(gaussians, cam)
+    assert counts.tolist() == [[1, 0]] and not bool(projected[0, 1].any())
 
 
 @pytest.mark.parametrize(("axis", "log_scale"), [(0, 88.0), (1, 88.0), (2, 89.0), (0, 100.0)])
 def test_one_axis_that_overflows_culls(device, axis, log_scale):
-    """In the image, along one side only, or before it comes there."""
+    """The mean lies in the image, beside it along one side, or beyond a corner."""
     gaussians, cam = facing(2, device=device)
     gaussians.log_scales[1, axis] = log_scale
-    splats, counts = run(gaussians, cam)
-    assert counts.tolist() == [[1, 0]] and not bool(splats[0, 1].any())
+    projected, counts = run(gaussians, cam)
+    assert counts.tolist() == [[1, 0]] and not bool(projected[0, 1].any())
 
 
 def test_without_a_filter_a_flat_gaussian_is_culled_and_no_other(device):
@@ -85,12 +85,12 @@ def test_without_a_filter_a_flat_gaussian_is_culled_and_no_other(device):
     gaussians.log_scales[1] = -200.0  # a point
     gaussians.log_scales[2, ::2] = -200.0  # a line
     gaussians.log_scales[3] -= 1.0  # 0.37 px
-    splats, counts = run(gaussians, cam, bare)
-    assert counts.tolist() == [[1, 0, 0, 1, 0]] and bool(torch.isfinite(splats).all())
+    projected, counts = run(gaussians, cam, bare)
+    assert counts.tolist() == [[1, 0, 0, 1, 0]] and bool(torch.isfinite(projected).all())
 
 
 def test_quaternions_up_to_the_shortest_and_longest(device, dtype):
-    """At the shortest length itself a rotation can be read, not below; as long, the other way."""
+    """The shortest length itself gives a rotation, a shorter one does not; likewise for the longest."""
     gaussians, cam = facing(5, dtype, device)
     shortest = torch.tensor(SHORTEST_QUAT, dtype=dtype)
     gaussians.quats[:, 0] = torch.stack(
@@ -131,7 +131,7 @@ def test_an_opacity_equal_to_the_cut_is_drawn_and_none_is_not(device, dtype):
 
 @pytest.mark.parametrize("logit", [-700.0, -40.0, -3.0, 0.0, 0.7, 3.0, 40.0, 700.0, 1000.0])
 def test_opacities_equal_the_sigmoid(device, logit):
-    """On both sides and far out, in float64, whose exponential overflows beyond 709."""
+    """Both signs are tested far out, in float64, whose exponential overflows beyond 709."""
     gaussians, cam = facing(1, torch.float64, device)
     gaussians.logit_opacities[:] = logit
     found = run(gaussians, cam, dataclasses.replace(SMOOTH, near=0.01))[0][0, 0, 5].cpu()
@@ -146,15 +146,15 @@ def test_factors_of_the_largest_shrink_as_the_scale_grows(device, log_scale):
     gaussians.quats[:] = torch.tensor([0.8, 0.3, -0.4, 0.2])
     gaussians.log_scales[:] = torch.tensor([0.0, -0.3, 0.4]) + log_scale
     moving = leaves(gaussians)
-    splats, _ = run(moving, cam, dataclasses.replace(SMOOTH, low_pass=1e-9, near=0.01))
+    projected, _ = run(moving, cam, dataclasses.replace(SMOOTH, low_pass=1e-9, near=0.01))
     for k in (2, 3, 4):
-        (gradient,) = torch.autograd.grad(splats[0, 0, k], moving.log_scales, retain_graph=True)
-        value = float(splats[0, 0, k].detach())
+        (gradient,) = torch.autograd.grad(projected[0, 0, k], moving.log_scales, retain_graph=True)
+        value = float(projected[0, 0, k].detach())
         assert value != 0 and abs(float(gradient.sum()) + value) <= 1e-9 * abs(value), k
 
 
 def test_tiles_have_16_px_unless_it_is_said(device):
-    """A picture of 17 px has two columns and two rows of them."""
+    """An image of 17 px has two columns and two rows of them."""
     gaussians, cam = facing(1, device=device, size=17)
     gaussians.log_scales.add_(6.0)
     assert run(gaussians, cam)[1].tolist() == [[4]]
@@ -169,23 +169,23 @@ def test_a_colour_of_exactly_zero_has_no_gradient():
     gaussians.sh[:, 1:] = 0
     gaussians.sh[0, 0], gaussians.sh[1, 0] = -0.5 / C0, (1e-9 - 0.5) / C0
     moving = leaves(gaussians)
-    splats, _ = run(moving, cam)
-    splats[..., 6:9].sum().backward()
-    assert not bool(splats[0, 0, 6:9].any()) and bool((splats[0, 1, 6:9] > 0).all())
+    projected, _ = run(moving, cam)
+    projected[..., 6:9].sum().backward()
+    assert not bool(projected[0, 0, 6:9].any()) and bool((projected[0, 1, 6:9] > 0).all())
     assert not bool(moving.sh.grad[0].any()) and bool((moving.sh.grad[1, 0] != 0).all())
 
 
 def boxes(rule, device):
     """Half sides of the box in float64, and the covariances, of a cloud seen by two cameras."""
     gaussians, cam = cloud(200, torch.float64, device), camera(400, 300, cameras=2, device=device)
-    splats, counts = run(gaussians, cam, rule)
+    projected, counts = run(gaussians, cam, rule)
     plain = [t.cpu() for t in gaussians.tensors().values()]
-    *_, opacities = twin = project_reference(
+    *_, opacities = reference_result = project_reference(
         *plain, cam.viewmat.cpu(), cam.K.cpu(), width=400, height=300, degree=1, low_pass=rule.low_pass
     )
     seen = counts.cpu() > 0
     assert int(seen.sum()) > 100
-    return splats.cpu()[seen][:, 10:], twin[1][seen], opacities.expand(2, -1)[seen]
+    return projected.cpu()[seen][:, 10:], reference_result[1][seen], opacities.expand(2, -1)[seen]
 
 
 def test_boxes_reach_to_the_cut(device):
@@ -208,17 +208,17 @@ def test_squares_grow_with_the_longest_axis(device, dtype):
     gaussians, cam = facing(3, dtype=dtype, device=device)
     sizes = torch.tensor([1e4, 1e6, 1e8], dtype=dtype, device=device)
     gaussians.log_scales[:] += sizes.log()[:, None]
-    splats, counts = run(gaussians, cam, RULES["inria"])
-    share = splats[0, :, 10:] / sizes[:, None]
-    assert counts.tolist() == [[1, 1, 1]] and bool((share > 3).all())
-    assert torch.allclose(share, share[:1].expand_as(share), rtol=1e-4)
+    projected, counts = run(gaussians, cam, RULES["inria"])
+    fraction = projected[0, :, 10:] / sizes[:, None]
+    assert counts.tolist() == [[1, 1, 1]] and bool((fraction > 3).all())
+    assert torch.allclose(fraction, fraction[:1].expand_as(fraction), rtol=1e-4)
 
 
 def test_no_cut_asks_for_every_tile_however_far(device):
-    """Half sides without a cut cover any picture."""
+    """Half sides without a cut cover any image."""
     gaussians, cam = facing(1, device=device)
-    splats, counts = run(gaussians, cam, SMOOTH, window=(0, 0, 16, 16))
-    assert bool((splats[0, :, 10:] >= 1e30).all()) and counts.tolist() == [[1]]
+    projected, counts = run(gaussians, cam, SMOOTH, window=(0, 0, 16, 16))
+    assert bool((projected[0, :, 10:] >= 1e30).all()) and counts.tolist() == [[1]]
 
 
 def test_image_and_coefficients_may_be_the_smallest():
@@ -233,13 +233,13 @@ def test_image_and_coefficients_may_be_the_smallest():
 
 @pytest.mark.parametrize("wanted", ["viewmats", "Ks"])
 def test_one_gradient_of_the_camera_may_be_asked_for_alone(device, wanted):
-    """And nothing of it costs nothing: the gradients are None."""
+    """Camera gradients that are not needed are None."""
     gaussians, cam = hand_placed(device=device), camera(cameras=2, device=device)
     views = cam.viewmat.clone().requires_grad_(wanted == "viewmats")
     Ks = cam.K.clone().requires_grad_(wanted == "Ks")
     size = {"width": cam.width, "height": cam.height}
-    splats, _ = project(*leaves(gaussians).tensors().values(), views, Ks, **size, degree=3, rule=SMOOTH)
-    (splats[..., :10] ** 2).sum().backward()
+    projected, _ = project(*leaves(gaussians).tensors().values(), views, Ks, **size, degree=3, rule=SMOOTH)
+    (projected[..., :10] ** 2).sum().backward()
     assert bool((views if wanted == "viewmats" else Ks).grad.any())
 
 
@@ -260,19 +260,19 @@ def test_colours_and_gradients_of_near_gaussians(device):
     gaussians.means[:] = torch.tensor([[0, 0, 0.5], [0.02, 0, 0.1], [0, -0.03, 0.2], [0.01, 0.02, 0.05]], dtype=torch.float64)
     gaussians.log_scales[:] = -5.0
     moving, other = leaves(gaussians), leaves(Gaussians(**{n: t.cpu() for n, t in gaussians.tensors().items()}))
-    splats, counts = run(moving, cam, SMOOTH, degree=3)
+    projected, counts = run(moving, cam, SMOOTH, degree=3)
     assert bool((counts > 0).all())
     _, _, colors, _, _ = project_reference(
         *other.tensors().values(), cam.viewmat.cpu(), cam.K.cpu(), width=18, height=17, degree=3, low_pass=SMOOTH.low_pass
     )
-    close("projection", splats[..., 6:9], colors)
-    splats[..., 6:9].square().sum().backward()
+    close("projection", projected[..., 6:9], colors)
+    projected[..., 6:9].square().sum().backward()
     colors.square().sum().backward()
     close("gradient", moving.means.grad, other.means.grad)
 
 
 def test_one_gaussian_takes_its_factor(device):
-    """Also where there is only one; half of the opacity, or none."""
+    """It holds for a single Gaussian, too, with half of its opacity, or none."""
     gaussians, cam = facing(1, device=device)
     full = run(gaussians, cam, SMOOTH)[0][0, 0, 5]
     for factor in (0.5, 1.0):
@@ -283,7 +283,7 @@ def test_one_gaussian_takes_its_factor(device):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_unseen_gaussians_have_zero_gradients(device, degree):
-    """In memory full of NaN: rows of every length, seen and unseen among each other, by one camera, both or none."""
+    """Memory full of NaN is overwritten for rows of every length, of Gaussians seen by one camera, both or none."""
     gaussians, cam = cloud(300, torch.float32, device, degree=degree), camera(cameras=2, dtype=torch.float32, device=device)
     gaussians.means[::3, 2] = -4.0
     gaussians.means[130:260, 0] += 2.2
@@ -294,9 +294,9 @@ def test_unseen_gaussians_have_zero_gradients(device, degree):
         wide = dataclasses.replace(cam, viewmat=cam.viewmat.cpu().double(), K=cam.K.cpu().double())
         for g, view in ((gaussians, cam), (exact, wide)):
             moving = leaves(g)
-            splats, counts = run(moving, view, degree=degree)
-            weights = torch.linspace(0.5, 1.5, 9).to(splats)
-            (splats[..., :9].square() * weights).sum().backward()
+            projected, counts = run(moving, view, degree=degree)
+            weights = torch.linspace(0.5, 1.5, 9).to(projected)
+            (projected[..., :9].square() * weights).sum().backward()
             results.append((counts.cpu(), [t.grad.cpu() for t in moving.tensors().values()]))
     finally:
         torch.use_deterministic_algorithms(False)
@@ -315,9 +315,9 @@ def test_colour_gradients_of_every_degree(device, degree):
         found = {}
         for kind, where in ((torch.float32, device), (torch.float64, torch.device("cpu"))):
             g, cam = leaves(cloud(60, kind, where, degree=degree)), camera(40, 30, cameras=cameras, dtype=kind, device=where)
-            splats, _ = project(*g.tensors().values(), cam.viewmat, cam.K, width=40, height=30, degree=degree, rule=EXACT)
-            upstream = torch.linspace(-1, 1, splats.numel(), dtype=kind, device=where).view(splats.shape)
+            projected, _ = project(*g.tensors().values(), cam.viewmat, cam.K, width=40, height=30, degree=degree, rule=EXACT)
+            upstream = torch.linspace(-1, 1, projected.numel(), dtype=kind, device=where).view(projected.shape)
             upstream[..., 9:] = 0
-            found[kind] = torch.autograd.grad((splats * upstream).sum(), [g.sh, g.means])
+            found[kind] = torch.autograd.grad((projected * upstream).sum(), [g.sh, g.means])
         for single, double in zip(found[torch.float32], found[torch.float64], strict=True):
             close("gradient", single, double)

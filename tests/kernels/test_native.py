@@ -1,4 +1,4 @@
-"""What the CUDA bodies promise each other: items dealt, tiles ordered, blocks left out, chunks of one size for both passes."""
+"""Contracts between the CUDA bodies: items dealt, tiles ordered, blocks left out, chunks of one size for both passes."""
 
 import functools
 import math
@@ -9,15 +9,15 @@ import torch
 import warp as wp
 
 from warpgs.constants import ALPHA_CUT
-from warpgs.kernels import blend_cuda, bridge, native
-from warpgs.kernels.tiles import available_bytes
+from warpgs.kernels import blend_cuda, native
+from warpgs.runtime import interop
 
 pytestmark = pytest.mark.cuda
 CUDA = torch.device("cuda", 0)
 
 
-def ints(tensor: torch.Tensor) -> bridge.View:
-    return bridge.view(tensor.view(-1), wp.int32)
+def ints(tensor: torch.Tensor) -> interop.View:
+    return interop.view(tensor.view(-1), wp.int32)
 
 
 @pytest.mark.parametrize("count", [1, 31, 1000, 1025, 8192, 8193, 20_000])
@@ -30,7 +30,7 @@ def test_long_lists_come_first(count):
     ranges = torch.stack([begins, begins + lengths], 1).to(CUDA)
     order = torch.full((count + 16 * 1024,), -1, dtype=torch.int32, device=CUDA)
     inputs = [ints(ranges), count, ints(order)]
-    bridge.launch(blend_cuda.make_kernels(16).order_tiles, blend_cuda.THREADS, inputs, CUDA, block_dim=blend_cuda.THREADS)
+    interop.launch(blend_cuda.make_kernels(16).order_tiles, blend_cuda.THREADS, inputs, CUDA, block_dim=blend_cuda.THREADS)
     found = order.cpu()
     assert bool((found[count:] == -1).all())
     assert torch.equal(found[:count].sort().values, torch.arange(count, dtype=torch.int32))
@@ -48,19 +48,19 @@ def small_kernels() -> SimpleNamespace:
         native.source("blend_common.cu", **numbers)
         + """
         Splat s;
-        s.load(splats.data, i);
+        s.load(projected.data, i);
         s.rescale();
         return s.touches(corners.data[2 * i], corners.data[2 * i + 1], limit_of(s.b.y, cut));
         """
     )
-    def touches(splats: wp.array(dtype=float), corners: wp.array(dtype=float), cut: float, i: int) -> int: ...
+    def touches(projected: wp.array(dtype=float), corners: wp.array(dtype=float), cut: float, i: int) -> int: ...
 
     @wp.kernel(enable_backward=False, module="unique")
     def block(
-        begin: int, splats: wp.array(dtype=float), corners: wp.array(dtype=float), cut: float, found: wp.array(dtype=int)
+        begin: int, projected: wp.array(dtype=float), corners: wp.array(dtype=float), cut: float, found: wp.array(dtype=int)
     ):
         i = begin + wp.tid()
-        found[i] = touches(splats, corners, cut, i)
+        found[i] = touches(projected, corners, cut, i)
 
     @wp.kernel(enable_backward=False, module="unique")
     def deal(begin: int, wanted: wp.array(dtype=int), found: wp.array(dtype=int)):
@@ -70,14 +70,14 @@ def small_kernels() -> SimpleNamespace:
     return SimpleNamespace(block=block, deal=deal)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.97, 1.0])
-def test_wanted_items_go_to_the_first_threads(share):
-    """In order within their block, whatever number says that they are wanted; -1 for the threads that are left over."""
+@pytest.mark.parametrize("fraction", [0.0, 0.3, 0.97, 1.0])
+def test_wanted_items_go_to_the_first_threads(fraction):
+    """Wanted items come in order within their block, for any nonzero flag; left-over threads get -1."""
     blocks = 50
     draw = torch.rand(blocks * native.BLOCK, generator=torch.Generator().manual_seed(0))
-    wanted = torch.where(draw < share, (draw * 1000).int() % 3 + 1, 0).int()
+    wanted = torch.where(draw < fraction, (draw * 1000).int() % 3 + 1, 0).int()
     found = torch.full_like(wanted, -7).to(CUDA)
-    bridge.launch(small_kernels().deal, len(wanted), [ints(wanted.to(CUDA)), ints(found)], CUDA, block_dim=native.BLOCK)
+    interop.launch(small_kernels().deal, len(wanted), [ints(wanted.to(CUDA)), ints(found)], CUDA, block_dim=native.BLOCK)
     for i, dealt in enumerate(found.cpu().view(blocks, -1).tolist()):
         items = range(i * native.BLOCK, (i + 1) * native.BLOCK)
         mine = [item for item in items if wanted[item] > 0]
@@ -85,7 +85,7 @@ def test_wanted_items_go_to_the_first_threads(share):
 
 
 def at_their_edge(count: int, longest: float, corner: bool):
-    """Records, and for each a block of which one pixel lies at the edge of what it draws; ``longest``: log of the axis [px]."""
+    """Return projected Gaussians, and for each a block with one pixel at its edge; ``longest`` is the log of the axis [px]."""
     generator = torch.Generator().manual_seed(int(longest) + corner)
 
     def rand(*shape):
@@ -112,7 +112,7 @@ def at_their_edge(count: int, longest: float, corner: bool):
 @pytest.mark.parametrize("corner", [False, True], ids=["any pixel", "corners"])
 @pytest.mark.parametrize("longest", [5.0, 11.5, 15.5])
 def test_no_block_that_draws_is_left_out(longest, corner):
-    """Of Gaussians as round as a pixel and as long as 3 million, at the very edge of what they draw, in float64."""
+    """No block is left out of Gaussians as round as a pixel or as long as 3 million, at their very edge in float64."""
     records, corners = at_their_edge(200_000, longest, corner)
     mx, my, u11, u12, u22, opacity = (t[:, None, None] for t in records.double().unbind(1)[:6])
     dx = corners[:, 0, None, None].double() + torch.arange(8) + 0.5 - mx
@@ -120,32 +120,24 @@ def test_no_block_that_draws_is_left_out(longest, corner):
     alpha = opacity * torch.exp(-0.5 * ((u11 * dx + u12 * dy) ** 2 + (u22 * dy) ** 2))
     drawn = (alpha.amax((1, 2)) >= ALPHA_CUT).to(CUDA)
     found = torch.empty(len(records), dtype=torch.int32, device=CUDA)
-    floats = [bridge.view(t.to(CUDA).view(-1), wp.float32) for t in (records, corners)]
-    bridge.launch(small_kernels().block, len(records), [*floats, ALPHA_CUT, ints(found)], CUDA)
+    floats = [interop.view(t.to(CUDA).view(-1), wp.float32) for t in (records, corners)]
+    interop.launch(small_kernels().block, len(records), [*floats, ALPHA_CUT, ints(found)], CUDA)
     assert int(drawn.sum()) > 180_000 and int((drawn & (found == 0)).sum()) == 0
 
 
 def test_chunks_are_the_larger_ones_in_large_pictures_and_without_an_order():
-    """Both passes ask the same function."""
+    """Both passes take the chunk from the same function."""
     few, many = (SimpleNamespace(ranges=torch.zeros(count, 2)) for count in (4096, 4097))
     assert [blend_cuda.chunk_of(tiles, order) for tiles in (few, many) for order in (True, False)] == [64, 128, 128, 128]
-
-
-def test_memory_that_torch_holds_unused_is_available(monkeypatch):
-    """What is free, and what is reserved and not given out."""
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (1000, 5000))
-    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda _: 300)
-    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda _: 20)
-    assert available_bytes(CUDA) == 1280
 
 
 def test_devices_and_streams_without_a_number():
     """The current device is meant; Warp's own work runs on torch's stream, and on no other afterwards."""
     unnumbered = torch.device("cuda")
-    assert bridge.warp_device(unnumbered) is bridge.warp_device(CUDA) and bridge.warp_device(torch.device("cpu")).is_cpu
-    where = bridge.warp_device(CUDA)
+    assert interop.warp_device(unnumbered) is interop.warp_device(CUDA) and interop.warp_device(torch.device("cpu")).is_cpu
+    where = interop.warp_device(CUDA)
     before = where.stream.cuda_stream
-    with torch.cuda.stream(torch.cuda.Stream(CUDA)), bridge.stream_of(CUDA):
+    with torch.cuda.stream(torch.cuda.Stream(CUDA)), interop.stream_of(CUDA):
         wanted = torch.cuda.current_stream(CUDA).cuda_stream
-        assert where.stream.cuda_stream == wanted == bridge.warp_stream(unnumbered).cuda_stream
+        assert where.stream.cuda_stream == wanted == interop.warp_stream(unnumbered).cuda_stream
     assert where.stream.cuda_stream == before != wanted

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
+from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.reference.project import project_reference
-from tests.splats import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.tolerances import close
 from warpgs.constants import FAR, RULES
 from warpgs.kernels.project import project
@@ -21,7 +21,7 @@ def run(gaussians, cam, rule=EXACT, degree=3):
     )
 
 
-def twin(gaussians, cam, degree=3):
+def reference_result(gaussians, cam, degree=3):
     tensors = [t.cpu().double() for t in gaussians.tensors().values()]
     low_pass = EXACT.low_pass
     return project_reference(
@@ -37,27 +37,27 @@ def inverse_of(factor):
     return U.transpose(-1, -2) @ U
 
 
-def test_record_equals_reference(device, dtype):
+def test_values_equal_reference(device, dtype):
     """Mean, factor, opacity, colour and depth of every Gaussian, also of those outside the image."""
     gaussians, cam = hand_placed(dtype, device), camera(cameras=3, dtype=dtype, device=device)
-    splats, counts = run(gaussians, cam, SMOOTH)
-    means, covs, colors, depths, opacities = twin(gaussians, cam)
+    projected, counts = run(gaussians, cam, SMOOTH)
+    means, covs, colors, depths, opacities = reference_result(gaussians, cam)
     assert bool((counts > 0).all())
-    close("projection", splats[..., 0:2], means)
-    close("projection", torch.linalg.inv(inverse_of(splats[..., 2:5].cpu().double())).to(dtype), covs)
-    close("projection", splats[..., 5], opacities.expand(3, -1))
-    close("projection", splats[..., 6:9], colors)
-    close("projection", splats[..., 9], depths)
+    close("projection", projected[..., 0:2], means)
+    close("projection", torch.linalg.inv(inverse_of(projected[..., 2:5].cpu().double())).to(dtype), covs)
+    close("projection", projected[..., 5], opacities.expand(3, -1))
+    close("projection", projected[..., 6:9], colors)
+    close("projection", projected[..., 9], depths)
 
 
 def test_gradients_equal_reference(device, dtype):
-    """Gradients of a random projection of the record, for Gaussians, poses and intrinsics."""
+    """Gradients of a random weighting of the results, for Gaussians, poses and intrinsics."""
     gaussians, cam = leaves(hand_placed(dtype, device)), camera(cameras=2, dtype=dtype, device=device)
     views, Ks = cam.viewmat.clone().requires_grad_(), cam.K.clone().requires_grad_()
-    splats, _ = project(*gaussians.tensors().values(), views, Ks, width=cam.width, height=cam.height, degree=3, rule=SMOOTH)
-    upstream = torch.randn(splats.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    projected, _ = project(*gaussians.tensors().values(), views, Ks, width=cam.width, height=cam.height, degree=3, rule=SMOOTH)
+    upstream = torch.randn(projected.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     upstream[..., 10:] = 0
-    (splats * upstream.to(splats)).sum().backward()
+    (projected * upstream.to(projected)).sum().backward()
 
     other = [t.detach().cpu().double().requires_grad_() for t in (*gaussians.tensors().values(), cam.viewmat, cam.K)]
     means, covs, colors, depths, opacities = project_reference(
@@ -85,8 +85,8 @@ def test_gradcheck(device):
     inputs = [*gaussians.tensors().values(), cam.viewmat.requires_grad_(), cam.K.clone().requires_grad_()]
 
     def record(*tensors):
-        splats, _ = project(*tensors, width=cam.width, height=cam.height, degree=3, rule=SMOOTH)
-        return splats[..., :10]
+        projected, _ = project(*tensors, width=cam.width, height=cam.height, degree=3, rule=SMOOTH)
+        return projected[..., :10]
 
     clamped = record(*inputs)[..., :2].detach().cpu()
     size = torch.tensor([cam.width, cam.height])
@@ -97,46 +97,46 @@ def test_gradcheck(device):
 def test_rotation_has_no_radial_gradient(device):
     """Stretching a quaternion changes nothing: bitwise for powers of two, and no gradient along it."""
     gaussians, cam = leaves(hand_placed(torch.float32, device)), camera(dtype=torch.float32, device=device, cameras=1)
-    splats, _ = run(gaussians, cam, SMOOTH)
-    (splats[..., 2:5].sum()).backward()
+    projected, _ = run(gaussians, cam, SMOOTH)
+    (projected[..., 2:5].sum()).backward()
     radial = (gaussians.quats.grad * gaussians.quats.detach()).sum(1).abs()
     assert bool((radial <= 1e-5 * gaussians.quats.grad.norm(dim=1) * gaussians.quats.detach().norm(dim=1)).all())
     for factor in (2.0**40, 2.0**-40, -1.0):
         stretched = Gaussians(**{**gaussians.tensors(), "quats": gaussians.quats.detach() * factor})
-        assert torch.equal(run(stretched, cam, SMOOTH)[0], splats)
+        assert torch.equal(run(stretched, cam, SMOOTH)[0], projected)
 
 
 @pytest.mark.parametrize("slot", ["means", "quats", "log_scales", "logit_opacities", "sh"])
 @pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf])
 def test_poisoned_gaussian_is_no_op(device, slot, poison):
-    """A Gaussian with one non-finite number is culled: zero record, zero gradient, its neighbours untouched bit for bit."""
+    """A Gaussian with one non-finite number is culled: zero results, zero gradient, its neighbours untouched bit for bit."""
     clean, cam = cloud(8, device=device), camera(cameras=1, dtype=torch.float32, device=device)
     cut = Gaussians(**{n: torch.cat([t[:3], t[4:]]) for n, t in clean.tensors().items()})
     for column in range(clean.tensors()[slot][0].numel()):
         bad = {n: t.clone() for n, t in clean.tensors().items()}
         bad[slot].view(8, -1)[3, column] = poison
         bad = leaves(Gaussians(**bad))
-        splats, counts = run(bad, cam, degree=1)
-        assert int(counts[0, 3]) == 0 and not bool(splats[0, 3].any())
-        splats.sum().backward()
+        projected, counts = run(bad, cam, degree=1)
+        assert int(counts[0, 3]) == 0 and not bool(projected[0, 3].any())
+        projected.sum().backward()
         for name, t in bad.tensors().items():
             assert bool(torch.isfinite(t.grad).all()), name
             assert not bool(t.grad[3].any()), name
         reference, _ = run(cut, cam, degree=1)
-        assert torch.equal(torch.cat([splats[:, :3], splats[:, 4:]], 1).detach(), reference)
+        assert torch.equal(torch.cat([projected[:, :3], projected[:, 4:]], 1).detach(), reference)
 
 
 def test_zero_quaternion_is_culled(device, dtype):
     """No rotation can be read from it."""
     gaussians, cam = cloud(3, dtype, device), camera(cameras=1, dtype=dtype, device=device)
     gaussians.quats[1] = 0
-    splats, counts = run(gaussians, cam, degree=1)
-    assert int(counts[0, 1]) == 0 and not bool(splats[0, 1].any())
+    projected, counts = run(gaussians, cam, degree=1)
+    assert int(counts[0, 1]) == 0 and not bool(projected[0, 1].any())
 
 
 @pytest.mark.parametrize("z", [-1.0, 0.0, -0.0, 1e-30, 0.01, 1e10, 1e30])
 def test_near_plane(device, z):
-    """Drawn from the near plane on up to FAR, culled before it, one float apart; gradients finite everywhere."""
+    """Rendered from the near plane on up to FAR, culled before it, one float apart; gradients finite everywhere."""
     gaussians, cam = cloud(3, device=device), camera(cameras=1, dtype=torch.float32, device=device)
     near = torch.tensor(EXACT.near, dtype=torch.float32)
     gaussians.log_scales[:] = math.log(min(max(abs(z), 1e-3), FAR))
@@ -144,25 +144,25 @@ def test_near_plane(device, z):
     for depth in {z, float(below), float(near), float(above)}:
         gaussians.means[1] = torch.tensor([0.0, 0.0, depth])
         moving = leaves(gaussians)
-        splats, counts = run(moving, cam, degree=1)
+        projected, counts = run(moving, cam, degree=1)
         assert (int(counts[0, 1]) > 0) == (float(near) <= depth <= FAR), depth
-        splats[..., :10].sum().backward()
+        projected[..., :10].sum().backward()
         assert all(bool(torch.isfinite(t.grad).all()) for t in moving.tensors().values())
 
 
 @pytest.mark.parametrize("log_scale", [-200.0, -50.0, -44.0, -10.0, 0.0, 10.0, 40.0, 44.4, 88.0, 88.8, 200.0])
 def test_extreme_scales_stay_finite(device, dtype, log_scale):
-    """Any finite scale is drawn or culled; up to e^40 it is drawn; record and gradients are finite."""
+    """Any finite scale is rendered or culled; up to e^40 it is rendered; results and gradients are finite."""
     gaussians, cam = cloud(3, dtype, device), camera(cameras=1, dtype=dtype, device=device)
     for axis in range(3):
         gaussians.log_scales[1] = -2.0
         gaussians.log_scales[1, axis] = log_scale
         moving = leaves(gaussians)
-        splats, counts = run(moving, cam, degree=1)
-        assert bool(torch.isfinite(splats).all())
+        projected, counts = run(moving, cam, degree=1)
+        assert bool(torch.isfinite(projected).all())
         if log_scale <= 40:
             assert int(counts[0, 1]) > 0
-        splats[..., :10].sum().backward()
+        projected[..., :10].sum().backward()
         assert all(bool(torch.isfinite(t.grad).all()) for t in moving.tensors().values())
 
 
@@ -210,8 +210,8 @@ def test_empty_and_bad_input():
     """No Gaussians are fine; wrong shapes, types and sizes name the argument."""
     gaussians, cam = cloud(4), camera(cameras=1, dtype=torch.float32)
     empty = Gaussians(**{n: t[:0] for n, t in gaussians.tensors().items()})
-    splats, counts = run(empty, cam, degree=1)
-    assert splats.shape == (1, 0, 12) and counts.shape == (1, 0)
+    projected, counts = run(empty, cam, degree=1)
+    assert projected.shape == (1, 0, 12) and counts.shape == (1, 0)
     for name, t in gaussians.tensors().items():
         broken = Gaussians(**{**gaussians.tensors(), name: t[:3]})
         with pytest.raises(ValueError, match=name if name != "means" else "quats"):

@@ -23,7 +23,7 @@ def computed(device, costs, down, across, small) -> np.ndarray:
 
 @pytest.mark.parametrize("shape", [(4, 5, 6), (1, 7, 3), (7, 1, 3), (3, 4, 1), (3, 4, 2), (40, 33, 17), (1, 1, 4)])
 def test_equal_to_the_definition(device, shape):
-    """To the last unit, also for one row, one column and one plane."""
+    """The sums agree to the last unit, also for one row, one column and one plane."""
     costs, down, across = problem(shape)
     assert np.array_equal(computed(device, costs, down, across, 123), defined(costs, down, across, 123))
 

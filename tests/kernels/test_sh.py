@@ -1,69 +1,109 @@
-"""Spherical harmonics against scipy, their gradients, and bad input."""
+"""Spherical harmonics against scipy, by way of the projection that uses them: values, gradients, unused coefficients."""
 
+import numpy as np
 import pytest
 import torch
 
 from tests.reference.sh import basis_reference
 from tests.reference.sh_polynomials import colors_reference
 from tests.tolerances import close
-from warpgs.kernels.sh import evaluate_sh
+from warpgs.constants import RULES
+from warpgs.geometry import look_at
+from warpgs.kernels import sh
+from warpgs.kernels.project import project
+
+COUNT = 24
 
 
-def inputs(dtype, device, count=50):
+def inputs(dtype, device, count=COUNT):
+    """Return coefficients, unit directions, and for each direction a camera at the origin that looks along it."""
     generator = torch.Generator().manual_seed(1)
-    sh = torch.randn(count, 16, 3, generator=generator, dtype=torch.float64)
+    coefficients = torch.randn(count, 16, 3, generator=generator, dtype=torch.float64)
+    coefficients[:, 0] += 8 / sh.C0  # no colour is clamped at zero
     dirs = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=1)
-    return sh.to(device, dtype), dirs.to(device, dtype)
+    up = np.array([0.3, 0.5, 0.8])
+    viewmats = torch.stack([torch.from_numpy(look_at(np.zeros(3), d.numpy(), up)) for d in dirs])
+    return coefficients.to(device, dtype), dirs.to(device, dtype), viewmats.to(device, dtype)
+
+
+def colors(coefficients, means, viewmats, degree):
+    """Return the colour [N, 3] of each Gaussian in its own camera."""
+    count, K = len(means), torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]).to(means)
+    quats, log_scales = means.new_zeros(count, 4), means.new_full((count, 3), -3.0)
+    quats[:, 0] = 1
+    projected, _ = project(
+        means, quats, log_scales, means.new_zeros(count), coefficients, viewmats, K.expand(count, 3, 3).contiguous(),
+        width=16, height=16, degree=degree, rule=RULES["exact"],
+    )  # fmt: skip
+    rows = torch.arange(count, device=means.device)
+    return projected[rows, rows, 6:9]
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_values_equal_scipy(device, dtype, degree):
     """Every basis function has scipy's value, up to the sign convention."""
-    sh, dirs = inputs(dtype, device)
+    coefficients, dirs, viewmats = inputs(dtype, device)
     count = (degree + 1) ** 2
-    wanted = torch.einsum("nk,nkc->nc", basis_reference(dirs)[:, :count], sh.cpu().double()[:, :count])
-    close("sh", evaluate_sh(sh, dirs, degree), wanted)
+    basis = basis_reference(dirs)[:, :count]
+    wanted = 0.5 + torch.einsum("nk,nkc->nc", basis, coefficients.cpu().double()[:, :count])
+    close("sh", colors(coefficients, 2 * dirs, viewmats, degree), wanted)
 
 
-def test_the_polynomial_reference_equals_scipy():
-    """The twin that other references use is itself right."""
-    sh, dirs = inputs(torch.float64, "cpu")
-    wanted = torch.einsum("nk,nkc->nc", basis_reference(dirs), sh)
-    assert torch.allclose(colors_reference(sh, dirs, 3), wanted, atol=1e-12)
+def test_each_basis_function_equals_scipy(device):
+    """One coefficient at a time gives its basis function, so that none hides behind another."""
+    coefficients, dirs, viewmats = inputs(torch.float64, device)
+    basis = basis_reference(dirs)
+    for k in range(16):
+        alone = torch.zeros_like(coefficients)
+        alone[:, 0] = 2 / sh.C0
+        alone[:, k] += 1
+        wanted = (2.5 + basis[:, k])[:, None].expand(-1, 3)
+        close("sh", colors(alone, 3 * dirs, viewmats, 3), wanted)
+
+
+def test_the_torch_references_equal_scipy():
+    """The two that other tests and measurements use are themselves right."""
+    coefficients, dirs, _ = inputs(torch.float64, "cpu")
+    wanted = torch.einsum("nk,nkc->nc", basis_reference(dirs), coefficients)
+    assert torch.allclose(colors_reference(coefficients, dirs, 3), wanted, atol=1e-12)
+    assert torch.allclose(sh.basis(dirs), basis_reference(dirs), atol=1e-14)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_gradcheck(device, degree):
-    """Finite differences agree with the backward kernel for coefficients and free directions."""
-    sh, dirs = (t[:4].requires_grad_() for t in inputs(torch.float64, device))
-    assert torch.autograd.gradcheck(lambda s, d: evaluate_sh(s, d, degree), (sh, dirs), eps=1e-6, atol=1e-8, rtol=1e-6)
+    """Finite differences agree with the backward kernel for coefficients, and for means by way of their directions."""
+    coefficients, dirs, viewmats = inputs(torch.float64, device, 4)
+    leaves = [(0.3 * coefficients).requires_grad_(), (1.5 * dirs).requires_grad_()]
+    assert torch.autograd.gradcheck(
+        lambda c, m: colors(c, m, viewmats, degree), leaves, eps=1e-6, atol=1e-8, rtol=1e-6, nondet_tol=0.0
+    )
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_gradient_of_each_basis_function(device, degree):
+    """The gradient of the direction, one coefficient at a time, equals autograd's on the polynomials."""
+    coefficients, dirs, viewmats = inputs(torch.float64, device)
+    for k in range(1, (degree + 1) ** 2):
+        alone = torch.zeros_like(coefficients)
+        alone[:, 0] = 2 / sh.C0
+        alone[:, k, 1] = 1
+        means, other = (2 * dirs).requires_grad_(), (2 * dirs).cpu().requires_grad_()
+        colors(alone, means, viewmats, degree).sum().backward()
+        colors_reference(alone.cpu(), torch.nn.functional.normalize(other, dim=1), degree).sum().backward()
+        assert bool((other.grad != 0).any())
+        close("gradient", means.grad, other.grad)
 
 
 def test_unused_coefficients_get_no_gradient(device):
     """Coefficients above the degree in use have a gradient of exactly zero."""
-    sh, dirs = inputs(torch.float64, device)
-    sh.requires_grad_()
-    evaluate_sh(sh, dirs, 1).sum().backward()
-    assert bool((sh.grad[:, 4:] == 0).all()) and bool((sh.grad[:, :4] != 0).any(-1).all())
+    coefficients, dirs, viewmats = inputs(torch.float64, device)
+    coefficients.requires_grad_()
+    colors(coefficients, dirs, viewmats, 1).sum().backward()
+    assert bool((coefficients.grad[:, 4:] == 0).all()) and bool((coefficients.grad[:, :4] != 0).any(-1).all())
 
 
-def test_no_gaussians(device, dtype):
-    """Nothing in, nothing out."""
-    assert evaluate_sh(
-        torch.zeros(0, 4, 3, dtype=dtype, device=device), torch.zeros(0, 3, dtype=dtype, device=device), 1
-    ).shape == (0, 3)
-
-
-def test_bad_input_names_the_argument():
-    """A wrong shape, type or degree is refused with the argument's name."""
-    sh, dirs = inputs(torch.float32, "cpu")
-    with pytest.raises(ValueError, match="dirs"):
-        evaluate_sh(sh, dirs[:, :2], 1)
-    with pytest.raises(TypeError, match=r"dirs is torch\.float64"):
-        evaluate_sh(sh, dirs.double(), 1)
-    with pytest.raises(ValueError, match="sh holds 4 coefficients"):
-        evaluate_sh(sh[:, :4], dirs, 2)
-    with pytest.raises(ValueError, match="degree must be 0 to 3"):
-        evaluate_sh(sh, dirs, 4)
-    with pytest.raises(TypeError, match="float16"):
-        evaluate_sh(sh.half(), dirs.half(), 1)
+def test_a_degree_out_of_range_is_refused():
+    """The error names the range."""
+    for degree in (-1, 4):
+        with pytest.raises(ValueError, match="degree must be 0 to 3"):
+            sh.coefficient_count(degree)

@@ -1,4 +1,4 @@
-"""Which rows, columns and strips a Gaussian's box and ellipse touch: the shared functions themselves, against a fine search."""
+"""The functions for rows, columns and strips that a Gaussian touches, against a fine search."""
 
 import functools
 import math
@@ -7,7 +7,8 @@ import pytest
 import torch
 import warp as wp
 
-from warpgs.kernels import bridge, falloff, functions
+from warpgs.kernels import falloff, functions
+from warpgs.runtime import interop
 
 COUNT = 4000
 
@@ -46,8 +47,8 @@ def make_probe():
 
 def probe(cases: torch.Tensor, device, whole_tiles=0, origin=16, size=53, tile_size=16) -> torch.Tensor:
     spans = torch.zeros(len(cases), 5, dtype=torch.int32, device=device)
-    inputs = [bridge.view(cases.to(device), wp.float64), whole_tiles, origin, size, tile_size, bridge.view(spans, wp.int32)]
-    bridge.launch(make_probe(), len(cases), inputs, device)
+    inputs = [interop.view(cases.to(device), wp.float64), whole_tiles, origin, size, tile_size, interop.view(spans, wp.int32)]
+    interop.launch(make_probe(), len(cases), inputs, device)
     return spans.cpu()
 
 
@@ -73,7 +74,7 @@ def ellipses(origin=16, size=53, tile_size=16, far=1.0) -> torch.Tensor:
 
 
 def margin_of(center, half):
-    """What the functions promise to allow for rounding [px]."""
+    """Return the margin that the functions promise for rounding [px]."""
     return 0.01 + 2e-6 * (center.abs() + half)
 
 
@@ -88,7 +89,7 @@ def tiles_of(low, high, origin, size, tile_size):
 @pytest.mark.parametrize("far", [1.0, 1e5])
 @pytest.mark.parametrize("tile_size", [1, 16])
 def test_rows_of_tiles_are_those_of_the_box(device, tile_size, far):
-    """All that the box and its margin touch within the window, and no other."""
+    """The rows are those that the box and its margin touch within the window, and no others."""
     cases = ellipses(far=far)
     found = probe(cases, device, tile_size=tile_size)[:, :2]
     low, high = cases[:, 1] - cases[:, 7], cases[:, 1] + cases[:, 7]
@@ -103,10 +104,10 @@ def test_strips_are_those_of_the_ellipse(device, far):
     cases = ellipses(far=far)
     mx, my, u11, u12, u22, _, half_width, half_height, _ = (t[:, None] for t in cases.unbind(-1))
     if far > 1:  # beside the ellipse, at a height of it
-        share = torch.linspace(-1, 1, COUNT, dtype=torch.float64)[:, None]
-        my[:] = 16.5 - share * half_height
-        mx[:] = 20.0 + u12 / u11 * share * half_height
-        mx[::2] += (u22 * half_height / u11 * (1 - share**2).sqrt())[::2] + 8 * share[::2].flip(0)
+        fraction = torch.linspace(-1, 1, COUNT, dtype=torch.float64)[:, None]
+        my[:] = 16.5 - fraction * half_height
+        mx[:] = 20.0 + u12 / u11 * fraction * half_height
+        mx[::2] += (u22 * half_height / u11 * (1 - fraction**2).sqrt())[::2] + 8 * fraction[::2].flip(0)
     radius, dy = u22 * (half_height + margin_of(my, half_height)), 16.5 - my
     side = 3.5 + margin_of(mx, half_width)
     dx = 20.0 - mx + side * torch.linspace(-1, 1, 4001, dtype=torch.float64)
@@ -123,7 +124,7 @@ def test_strips_are_those_of_the_ellipse(device, far):
 @pytest.mark.parametrize("far", [1.0, 1e4])
 @pytest.mark.parametrize("tile_size", [1, 16])
 def test_columns_of_tiles_are_those_of_the_ellipse(device, tile_size, far):
-    """In a row of tiles, widened by its margin: all that the ellipse touches, and no other."""
+    """The columns of a row of tiles, widened by its margin, are those that the ellipse touches, and no others."""
     cases = ellipses(far=far, tile_size=tile_size)
     mx, my, u11, u12, u22, reach, half_width, half_height, row = (t[:, None] for t in cases.unbind(-1))
     slack = margin_of(my, half_height)
@@ -181,14 +182,14 @@ def make_reach():
 
 def reaches(opacities, cut, square_sigma, xs):
     found, falls = torch.zeros_like(opacities), torch.zeros_like(xs)
-    inputs = [bridge.view(opacities, wp.float64), cut, square_sigma, bridge.view(xs, wp.float32)]
-    outputs = [bridge.view(found, wp.float64), bridge.view(falls, wp.float32)]
-    bridge.launch(make_reach(), len(opacities), [*inputs, *outputs], torch.device("cpu"))
+    inputs = [interop.view(opacities, wp.float64), cut, square_sigma, interop.view(xs, wp.float32)]
+    outputs = [interop.view(found, wp.float64), interop.view(falls, wp.float32)]
+    interop.launch(make_reach(), len(opacities), [*inputs, *outputs], torch.device("cpu"))
     return found, falls
 
 
 def test_reach_is_where_alpha_is_the_cut():
-    """At the reach alpha lies a little below the cut; the box is asked for by 0."""
+    """At the reach alpha is a little below the cut; 0 stands for the whole box."""
     opacities, cut = torch.linspace(0.004, 1.0, 500, dtype=torch.float64), 1 / 255
     found, _ = reaches(opacities, cut, 0.0, torch.zeros(500))
     alpha = opacities * torch.exp(-0.5 * found**2)
@@ -201,7 +202,7 @@ def test_reach_is_where_alpha_is_the_cut():
 
 
 def test_falloff_is_the_exponential():
-    """To the polynomial's 3e-7 where x is small, then to what the rounding of x leaves, down to the bound."""
+    """The error is the polynomial's 3e-7 where x is small, then that of rounding x, down to the bound."""
     x = torch.cat([torch.linspace(0, 152, 400_001), torch.tensor([153.0, 200.0, 1e4, 1e30])])
     _, found = reaches(torch.ones(len(x), dtype=torch.float64), 0.5, 0.0, x)
     error = (found.double() / torch.exp(-0.5 * x.double()).clamp_min(2.0**-110) - 1).abs()

@@ -1,11 +1,11 @@
-"""Binning: every tile that a Gaussian draws in is listed, in depth order, within the budget."""
+"""Binning: every tile that a Gaussian contributes to is listed, in depth order, within the budget."""
 
 import pytest
 import torch
 
+from tests.gaussians import SMOOTH, camera, cloud
 from tests.reference.project import project_reference
 from tests.reference.tiles import touched_reference
-from tests.splats import SMOOTH, camera, cloud
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
 from warpgs.kernels.project import project
@@ -17,17 +17,17 @@ SIZES = [(1, 1), (1, 17), (17, 1), (15, 15), (16, 16), (17, 17), (33, 47), (97, 
 
 def binned(gaussians, cam, rule=EXACT, tile_size=16, degree=1, **options):
     size = {"width": cam.width, "height": cam.height}
-    splats, counts = project(
+    projected, counts = project(
         *gaussians.tensors().values(), cam.viewmat, cam.K, **size, degree=degree, rule=rule, tile_size=tile_size
     )
-    return splats, counts, bin_tiles(splats, counts, **size, tile_size=tile_size, rule=rule, **options)
+    return projected, counts, bin_tiles(projected, counts, **size, tile_size=tile_size, rule=rule, **options)
 
 
 def listed(tiles, camera_count, per_camera):
     """For each flat Gaussian the set of tile numbers it is listed in."""
     result = [set() for _ in range(camera_count * per_camera)]
     for tile, (begin, end) in enumerate(tiles.ranges.tolist()):
-        for i in tiles.splat_ids[begin:end].tolist():
+        for i in tiles.gaussian_ids[begin:end].tolist():
             result[i].add(tile)
     return result
 
@@ -52,7 +52,7 @@ def test_every_drawn_tile_is_listed(device, width, height, tile_size):
                 wanted = {c * columns * rows + row * columns + column for row, column in needed}
                 assert wanted <= found[c * 150 + i]
                 needed_total += len(wanted)
-    assert sum(map(len, found)) == int(counts.sum()) == len(tiles.splat_ids)
+    assert sum(map(len, found)) == int(counts.sum()) == len(tiles.gaussian_ids)
     assert sum(map(len, found)) <= 1.1 * needed_total + 30
 
 
@@ -60,10 +60,10 @@ def test_order_is_by_depth_then_number(device):
     """Within a tile instances come front to back; equal depths keep the Gaussians' order."""
     gaussians, cam = cloud(300, torch.float32, device), camera(64, 48, cameras=1, dtype=torch.float32, device=device)
     gaussians.means[100:200, 2] = 4.0
-    splats, _, tiles = binned(gaussians, cam)
-    depths = splats[0, :, 9].cpu()
+    projected, _, tiles = binned(gaussians, cam)
+    depths = projected[0, :, 9].cpu()
     for begin, end in tiles.ranges.tolist():
-        ids = tiles.splat_ids[begin:end].cpu().long()
+        ids = tiles.gaussian_ids[begin:end].cpu().long()
         keys = list(zip(depths[ids].tolist(), ids.tolist()))
         assert keys == sorted(keys)
 
@@ -74,7 +74,7 @@ def test_slots_are_a_permutation_with_neighbours_per_gaussian(device):
     _, counts, tiles = binned(gaussians, cam)
     assert torch.equal(tiles.slots.sort().values.cpu(), torch.arange(len(tiles.slots), dtype=torch.int32))
     owner = torch.full((len(tiles.slots),), -1, dtype=torch.int32)
-    owner[tiles.slots.cpu().long()] = tiles.splat_ids.cpu()
+    owner[tiles.slots.cpu().long()] = tiles.gaussian_ids.cpu()
     for i, (start, count) in enumerate(zip(tiles.starts.tolist(), counts.view(-1).tolist())):
         assert bool((owner[start : start + count] == i).all())
 
@@ -88,16 +88,16 @@ def test_without_a_cut_every_tile_is_listed(device):
 
 @pytest.mark.parametrize("extra", [1, 3, 40])
 def test_tiles_that_are_counted_and_not_found_are_no_tiles(device, extra):
-    """Room for more than a Gaussian touches, as rounding may count: every slot of it says so, and the lists are the same."""
+    """A count above what a Gaussian touches, as rounding may give, leaves marked slots and the same lists."""
     gaussians, cam = cloud(60, device=device), camera(96, 80, 1, torch.float32, device)
     size = {"width": 96, "height": 80, "rule": EXACT}
-    splats, counts = project(*gaussians.tensors().values(), cam.viewmat, cam.K, degree=1, **size)
-    wanted = bin_tiles(splats, counts, **size)
+    projected, counts = project(*gaussians.tensors().values(), cam.viewmat, cam.K, degree=1, **size)
+    wanted = bin_tiles(projected, counts, **size)
     more = torch.where((counts > 0) & (torch.arange(60, device=device) % 3 == 0), counts + extra, counts)
-    tiles = bin_tiles(splats, more, **size)
+    tiles = bin_tiles(projected, more, **size)
     length, added = int(wanted.total), int((more - counts).sum())
     assert added > 0 and int(tiles.total) == length + added
-    assert torch.equal(tiles.ranges, wanted.ranges) and torch.equal(tiles.splat_ids[:length], wanted.splat_ids)
+    assert torch.equal(tiles.ranges, wanted.ranges) and torch.equal(tiles.gaussian_ids[:length], wanted.gaussian_ids)
     assert bool((tiles.tile_ids[length:] == len(tiles.ranges)).all())
     assert torch.equal(tiles.slots.sort().values, torch.arange(length + added, dtype=torch.int32, device=device))
 
@@ -108,15 +108,15 @@ def test_nothing_visible(device):
     for gaussians in (cloud(0, device=device), cloud(3, device=device)):
         gaussians.means[:, 2] = -4.0
         _, _, tiles = binned(gaussians, cam)
-        assert len(tiles.splat_ids) == 0 and not bool(tiles.ranges.any())
+        assert len(tiles.gaussian_ids) == 0 and not bool(tiles.ranges.any())
 
 
 def test_budget_is_checked_in_64_bits_before_allocation(device):
     """Three Gaussians of 1e9 tiles each are refused by number, a small budget by bytes; the message helps."""
     gaussians, cam = cloud(3, torch.float32, device), camera(40, 30, cameras=1, dtype=torch.float32, device=device)
-    splats, counts, _ = binned(gaussians, cam)
+    projected, counts, _ = binned(gaussians, cam)
     with pytest.raises(ResourceError, match=r"3,000,000,000 \(Gaussian, tile\) instances.*far too large"):
-        bin_tiles(splats, torch.full_like(counts, 1_000_000_000), width=40, height=30, rule=EXACT)
+        bin_tiles(projected, torch.full_like(counts, 1_000_000_000), width=40, height=30, rule=EXACT)
     with pytest.raises(ResourceError, match=r"the limit is 0\.00 GiB"):
         binned(gaussians, cam, budget_bytes=10)
 
@@ -124,10 +124,10 @@ def test_budget_is_checked_in_64_bits_before_allocation(device):
 def test_bad_input_names_the_argument():
     """Counts of another shape or type are refused."""
     gaussians, cam = cloud(3), camera(40, 30, cameras=1, dtype=torch.float32)
-    splats, counts, _ = binned(gaussians, cam)
+    projected, counts, _ = binned(gaussians, cam)
     with pytest.raises(ValueError, match="tile_counts"):
-        bin_tiles(splats, counts[:, :2], width=40, height=30, rule=EXACT)
+        bin_tiles(projected, counts[:, :2], width=40, height=30, rule=EXACT)
     with pytest.raises(ValueError, match="tile_counts"):
-        bin_tiles(splats, counts.long(), width=40, height=30, rule=EXACT)
-    with pytest.raises(ValueError, match="splats"):
-        bin_tiles(splats[..., :9], counts, width=40, height=30, rule=EXACT)
+        bin_tiles(projected, counts.long(), width=40, height=30, rule=EXACT)
+    with pytest.raises(ValueError, match="projected"):
+        bin_tiles(projected[..., :9], counts, width=40, height=30, rule=EXACT)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 from tests.numerics.scenes import SCENES, Scene
-from tests.numerics.split import GRADIENTS, PICTURES, Split, gradient_errors, picture_errors
+from tests.numerics.split import GRADIENTS, IMAGES, Split, gradient_errors, image_errors
 from tests.numerics.thresholds import EPS, ulp
-from tests.tolerances import GRADIENT_ULPS, LAYER_ULPS, ORDINARY, PICTURE_ULPS, RATIO, STRESS, Limits
+from tests.tolerances import GRADIENT_ULPS, IMAGE_ULPS, LAYER_ULPS, ORDINARY, RATIO, STRESS, ParameterBounds
 from warpgs.constants import Rule
 
 SLOPE = {"rgb": 0.5**0.5 * math.exp(-0.5), "alpha": 0.5**0.5 * math.exp(-0.5), "depth": 0.5 * 0.5**0.5 * 3.33}
@@ -23,7 +23,7 @@ def tile_size_of(rule: str) -> int:
     return 8 if rule == "inria" else 16
 
 
-def limits_of(scene: Scene) -> Limits:
+def limits_of(scene: Scene) -> ParameterBounds:
     """The row of the table for a scene."""
     return STRESS if scene.stress else ORDINARY
 
@@ -32,26 +32,26 @@ def largest_allowed(scene: Scene, rule: Rule, s: Split, name: str) -> float:
     """Largest E of one pixel of a picture."""
     limits = limits_of(scene)
     if scene.stress:
-        return limits.picture_max
+        return limits.image_max
     colors = s.band.largest_color if name == "rgb" else 1.0
     stored = SLOPE[name] * colors * ulp(max(scene.camera.width, scene.camera.height)) / rule.low_pass**0.5
-    return limits.picture_max + stored
+    return limits.image_max + stored
 
 
 def measure(scene: Scene, rule: Rule, s: Split) -> dict:
     """All figures of a split, as JSON can hold them."""
-    pictures = {n: picture_errors(s, n) | {"allowed": largest_allowed(scene, rule, s, n)} for n in PICTURES}
+    images = {n: image_errors(s, n) | {"allowed": largest_allowed(scene, rule, s, n)} for n in IMAGES}
     gradients = {n: gradient_errors(s, n) for n in GRADIENTS}
     inside = s.band.mask
-    error = (s.kernel.pictures["rgb"] - s.truth.pictures["rgb"]).abs().amax(-1)
-    flipped = error[inside] > pictures["rgb"]["allowed"]
-    excess = error[inside] - s.band.jump[inside] - pictures["rgb"]["allowed"]
+    error = (s.kernel.images["rgb"] - s.truth.images["rgb"]).abs().amax(-1)
+    flipped = error[inside] > images["rgb"]["allowed"]
+    excess = error[inside] - s.band.jump[inside] - images["rgb"]["allowed"]
     return {
         "scene": scene.name, "rule": rule.name, "device": s.device, "stress": scene.stress, "gaussians": len(scene.gaussians),
         "pixels": inside.numel(), "layers": s.band.layers,
         "band": {name: int(where.sum()) for name, where in s.band.reasons.items()}, "in band": int(inside.sum()),
         "flips": int(flipped.sum()), "beyond jump": int((excess > 0).sum()),
-        "pictures": pictures, "gradients": gradients,
+        "pictures": images, "gradients": gradients,
     }  # fmt: skip
 
 
@@ -64,10 +64,10 @@ def broken(scene: Scene, found: dict) -> list[str]:
             lines.append(f"{found['scene']}, {found['rule']}: {what} is {value:.2e}, allowed {allowed:.2e}")
 
     for name, e in found["pictures"].items():
-        line(f"mean E of {name}", e["E mean"], limits.picture_mean)
+        line(f"mean E of {name}", e["E mean"], limits.image_mean)
         line(f"max E of {name}", e["E max"], e["allowed"])
         for kind in ("mean", "max"):
-            floor = PICTURE_ULPS * EPS * e[f"scale {kind}"]
+            floor = IMAGE_ULPS * EPS * e[f"scale {kind}"]
             line(f"{kind} E of {name} beside P32", e[f"E {kind}"], RATIO * e[f"P32 {kind}"] + floor)
     ulps = GRADIENT_ULPS + LAYER_ULPS[found["device"]] * found["layers"] ** 0.5
     for name, e in found["gradients"].items():

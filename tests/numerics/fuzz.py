@@ -12,10 +12,10 @@ import json
 import time
 from pathlib import Path
 
-from tests.numerics.poison import RATES, VALUES, Case, failures, make_case, non_finite, twin_error
+from tests.numerics.poison import LRS, VALUES, Case, failures, make_case, non_finite, reference_error
 from warpgs.scene import Camera, Gaussians
 
-TWIN_LIMIT = 1e-4
+REFERENCE_LIMIT = 1e-4
 """Most that a picture of finite extremes may differ from float64; measured 1.1e-6 (tests/numerics/poison.py: ASPECT)."""
 
 
@@ -51,10 +51,10 @@ def fuzz(device: str, gaussians: int, seed: int, largest: int, folder: Path) -> 
         except Exception as e:  # a crash is what is looked for; the scene is kept and the fuzz goes on
             wrong, seen = [f"{type(e).__name__}: {e}"], 0
         if scenes % 4 == 0:
-            error, some, visible = twin_error(seed, scenes, device)
+            error, some, visible = reference_error(seed, scenes, device)
             worst, compared, shown = max(worst, error), compared + some, shown + visible
-            if not error <= TWIN_LIMIT:
-                wrong.append(f"twin_error({seed}, {scenes}, {device!r}) is {error:.2e}, above {TWIN_LIMIT:.0e}")
+            if not error <= REFERENCE_LIMIT:
+                wrong.append(f"twin_error({seed}, {scenes}, {device!r}) is {error:.2e}, above {REFERENCE_LIMIT:.0e}")
         if wrong:
             failed += 1
             path = folder / f"fuzz-{seed}-{scenes}.safetensors"
@@ -66,7 +66,7 @@ def fuzz(device: str, gaussians: int, seed: int, largest: int, folder: Path) -> 
             seconds = time.perf_counter() - begin
             print(f"{scenes} scenes, {tried:,} poisoned Gaussians, {failed} failures, {seconds:.0f} s", flush=True)
     print(
-        f"{scenes} scenes on {device}, {len(VALUES)} values in 14 slots of up to {max(RATES):.0%} of the Gaussians: {tried:,} "
+        f"{scenes} scenes on {device}, {len(VALUES)} values in 14 slots of up to {max(LRS):.0%} of the Gaussians: {tried:,} "
         f"poisoned, {broken:,} of them with a non-finite parameter, {drawn:,} drawn, poisoned or not; float64 compared with "
         f"{compared:,}, {shown:,} of them drawn, largest difference {worst:.1e}"
     )

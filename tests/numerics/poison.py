@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import torch
 
+from tests.gaussians import SMOOTH, camera, cloud
 from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference, rotations
-from tests.splats import SMOOTH, camera, cloud
 from warpgs.constants import FAR, FARTHEST_PIXEL, LARGEST_AXIS, LARGEST_COEFFICIENT, RULES, SHORTEST_QUAT
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
 
 SLOTS = (
@@ -25,7 +25,7 @@ VALUES = (
     1e-12, 0.01, 1 / 255, 1.0, 16.0, -16.0, 40.0, -44.4,  # near plane, cut, tile side, largest useful log scale, underflow
 )  # fmt: skip
 
-RATES = (0.05, 0.25, 0.5, 0.75, 0.95)
+LRS = (0.05, 0.25, 0.5, 0.75, 0.95)
 SIZES = ((1, 1), (33, 17), (48, 32), (70, 50))
 ASPECT = 300.0
 """Longest over shortest axis of an ellipse up to which float32 input alone keeps weights within 1e-4 (docs/extremes.md)."""
@@ -42,16 +42,16 @@ class Case:
     rule: str
 
 
-def poison(gaussians: Gaussians, rate: float, generator: torch.Generator, values=VALUES) -> tuple[Gaussians, torch.Tensor]:
+def poison(gaussians: Gaussians, lr: float, generator: torch.Generator, values=VALUES) -> tuple[Gaussians, torch.Tensor]:
     """Overwrite slots of a share ``rate`` of the Gaussians: of half of these one slot, of the others up to all 14."""
     count = len(gaussians)
 
     def rand(*shape):
         return torch.rand(*shape, generator=generator)
 
-    hit = rand(count) < rate
-    share = torch.where(rand(count) < 0.5, 0.0, rand(count))
-    mask = (rand(count, len(SLOTS)) < share[:, None]) | torch.nn.functional.one_hot(
+    hit = rand(count) < lr
+    fraction = torch.where(rand(count) < 0.5, 0.0, rand(count))
+    mask = (rand(count, len(SLOTS)) < fraction[:, None]) | torch.nn.functional.one_hot(
         torch.randint(len(SLOTS), (count,), generator=generator), len(SLOTS)
     ).bool()
     mask &= hit[:, None]
@@ -75,8 +75,8 @@ def make_case(seed: int, number: int, largest: int = 8000) -> Case:
         return items[int(torch.randint(len(items), (1,), generator=generator))]
 
     count = max(1, int(largest * 2.0 ** (-4 * float(torch.rand(1, generator=generator)))))
-    size, rate, rule, cameras = pick(SIZES), pick(RATES), pick(sorted(RULES)), pick((1, 2))
-    gaussians, hit = poison(cloud(count, seed=number), rate, generator)
+    size, lr, rule, cameras = pick(SIZES), pick(LRS), pick(sorted(RULES)), pick((1, 2))
+    gaussians, hit = poison(cloud(count, seed=number), lr, generator)
     return Case(gaussians, hit, camera(*size, cameras=cameras, dtype=torch.float32), rule)
 
 
@@ -86,15 +86,15 @@ def non_finite(gaussians: Gaussians) -> torch.Tensor:
     return ~torch.isfinite(rows).all(1)
 
 
-def _pictures(case: Case, keep: torch.Tensor, device) -> tuple[dict, torch.Tensor]:
+def _images(case: Case, keep: torch.Tensor, device) -> tuple[dict, torch.Tensor]:
     """Pictures and gradients of the Gaussians kept, by name, and which were drawn in some view."""
     tensors = {n: t[keep].to(device).requires_grad_() for n, t in case.gaussians.tensors().items()}
     views = Camera(case.camera.viewmat.to(device), case.camera.K.to(device), case.camera.width, case.camera.height)
     render = rasterize(Gaussians(**tensors), views, RasterizeOptions(rule=case.rule, background=(0.2, 0.5, 0.8)))
     generator = torch.Generator().manual_seed(1)
     loss = 0.0
-    for picture in (render.rgb, render.alpha, render.depth):
-        loss = loss + (picture * torch.randn(picture.shape, generator=generator).to(device)).sum()
+    for image in (render.rgb, render.alpha, render.depth):
+        loss = loss + (image * torch.randn(image.shape, generator=generator).to(device)).sum()
     gradients = torch.autograd.grad(loss, list(tensors.values()))
     found = {"rgb": render.rgb, "alpha": render.alpha, "depth": render.depth}
     found |= {f"v_{n}": v for n, v in zip(tensors, gradients)}
@@ -109,13 +109,13 @@ def failures(case: Case, device) -> tuple[list[str], int]:
     """
     wrong = []
     bad = non_finite(case.gaussians)
-    found, drawn = _pictures(case, torch.ones_like(bad), device)
+    found, drawn = _images(case, torch.ones_like(bad), device)
     for name, t in found.items():
         if not bool(torch.isfinite(t).all()):
             wrong.append(f"{name} is not finite in {int((~torch.isfinite(t)).sum())} of {t.numel()} numbers")
     if bool((drawn & bad).any()):
         wrong.append(f"{int((drawn & bad).sum())} Gaussians with a non-finite parameter were drawn")
-    clean, _ = _pictures(case, ~bad, device)
+    clean, _ = _images(case, ~bad, device)
     for name, t in found.items():
         if name.startswith("v_"):
             if bool(t[bad.to(device)].any()):
@@ -156,7 +156,7 @@ def documented(gaussians: Gaussians, cam: Camera, near: float) -> tuple[torch.Te
     return inside, clear & round_enough
 
 
-def twin_error(seed: int, number: int, device, count: int = 24) -> tuple[float, int, int]:
+def reference_error(seed: int, number: int, device, count: int = 24) -> tuple[float, int, int]:
     """Largest difference from the float64 reference of a small scene of finite extremes, without cut-offs: colour per unit of
     the largest coefficient, alpha, and depth times alpha per unit of the largest depth; how many were compared and drawn.
     """

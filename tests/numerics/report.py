@@ -11,12 +11,11 @@ from pathlib import Path
 
 import torch
 
-from bench.machine import describe
+from bench import result_file
 from tests.numerics.budget import CASES, broken, measure, tile_size_of
 from tests.numerics.scenes import SCENES
 from tests.numerics.split import split
 from warpgs.constants import RULES
-from warpgs.files import write_json
 
 
 def main() -> int:
@@ -35,8 +34,8 @@ def main() -> int:
         rgb, worst = row["pictures"]["rgb"], max(e["rel L2"] for e in row["gradients"].values())
         print(f"{rule:7} {scene.name:18} rgb E mean {rgb['E mean']:.1e} max {rgb['E max']:.1e}, worst gradient {worst:.1e}")
     print(*(lines or ["every line is kept"]), sep="\n")
-    if a.out:
-        write_json(a.out, {"machine": describe(device), "broken": lines, "rows": rows})
+    what = "the error budget of docs/accuracy.md, line by line, on its scenes"
+    result_file.write(a.out, result_file.result(what, device, rows, broken=lines))
     return int(bool(lines))
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import torch
 
-from tests.reference.twins import Frame, Inputs
-from tests.splats import camera, cloud
+from tests.gaussians import camera, cloud
+from tests.reference.low_precision import Frame, Inputs
 from warpgs.scene import Camera, Gaussians
 
 

@@ -12,20 +12,20 @@ import torch
 
 from tests.numerics.scenes import Scene
 from tests.numerics.thresholds import Band, band
-from tests.reference.twins import Inputs, Pictures, p32, r64, r64c
+from tests.reference.low_precision import Images, Inputs, p32, r64, r64c
 from warpgs.constants import Rule
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
 
-PICTURES = Pictures._fields
+IMAGES = Images._fields
 GRADIENTS = Inputs._fields
 
 
 @dataclass(frozen=True)
-class Drawn:
+class SampledView:
     """Pictures and gradients of one program by name, float64 on the CPU; depth over the scene's largest."""
 
-    pictures: dict[str, torch.Tensor]
+    images: dict[str, torch.Tensor]
     gradients: dict[str, torch.Tensor]
 
 
@@ -33,39 +33,41 @@ class Drawn:
 class Split:
     """What the kernels drew, the twins beside it, and where decisions are open."""
 
-    kernel: Drawn
-    truth: Drawn
+    kernel: SampledView
+    truth: SampledView
     """R64c."""
-    plain: Drawn
+    plain: SampledView
     """P32."""
-    model: Drawn | None
+    model: SampledView | None
     """R64, where asked for."""
     band: Band
     device: str
     """Where the kernels ran: cpu or cuda."""
 
 
-def _kernel(inputs: Inputs, scene: Scene, rule: Rule, tile_size: int) -> Pictures:
+def _kernel(inputs: Inputs, scene: Scene, rule: Rule, tile_size: int) -> Images:
     options = RasterizeOptions(rule=rule, background=inputs.background, tile_size=tile_size, window=scene.window)
     camera = Camera(inputs.viewmat, inputs.K, scene.camera.width, scene.camera.height)
     r = rasterize(Gaussians(*inputs[:5]), camera, options)
-    return Pictures(r.rgb, r.alpha, r.depth)
+    return Images(r.rgb, r.alpha, r.depth)
 
 
-def _drawn(inputs: Inputs, pictures: Pictures, upstream: Pictures, largest_depth: float) -> Drawn:
-    loss = sum((p * u.to(p)).sum() for p, u in zip(pictures, upstream))
+def _drawn(inputs: Inputs, images: Images, upstream: Images, largest_depth: float) -> SampledView:
+    loss = sum((p * u.to(p)).sum() for p, u in zip(images, upstream))
     gradients = torch.autograd.grad(loss, list(inputs), allow_unused=True)
     plain = [torch.zeros_like(t) if g is None else g for g, t in zip(gradients, inputs)]
-    named = {n: p.detach().cpu().double() for n, p in zip(PICTURES, pictures)}
-    return Drawn(named | {"depth": named["depth"] / largest_depth}, {n: g.cpu().double() for n, g in zip(GRADIENTS, plain)})
+    named = {n: p.detach().cpu().double() for n, p in zip(IMAGES, images)}
+    return SampledView(
+        named | {"depth": named["depth"] / largest_depth}, {n: g.cpu().double() for n, g in zip(GRADIENTS, plain)}
+    )
 
 
-def upstream_of(truth: Pictures, near: torch.Tensor) -> Pictures:
+def upstream_of(truth: Images, near: torch.Tensor) -> Images:
     """Random gradients of the pictures, 0 in the band; those of depth smaller, as depths are larger than colours."""
     generator = torch.Generator().manual_seed(11)
     weights = [torch.randn(p.shape, generator=generator, dtype=torch.float64) for p in truth]
     open_to_view = (~near).double()
-    return Pictures(weights[0] * open_to_view[..., None], weights[1] * open_to_view, 0.2 * weights[2] * open_to_view)
+    return Images(weights[0] * open_to_view[..., None], weights[1] * open_to_view, 0.2 * weights[2] * open_to_view)
 
 
 def split(
@@ -88,16 +90,16 @@ def split(
     )
 
 
-def picture_errors(s: Split, name: str) -> dict[str, float]:
+def image_errors(s: Split, name: str) -> dict[str, float]:
     """Largest and mean E of the kernels and of P32 outside the bands, their floor, and A everywhere."""
     outside = ~s.band.mask
-    truth = s.truth.pictures[name]
+    truth = s.truth.images[name]
     found = {"scale max": float(truth.abs().max()), "scale mean": float(truth.abs().mean())}
     for label, drawn in (("E", s.kernel), ("P32", s.plain)):
-        error = (drawn.pictures[name] - truth).abs()[outside]
+        error = (drawn.images[name] - truth).abs()[outside]
         found |= {f"{label} max": float(error.max()), f"{label} mean": float(error.mean())}
     if s.model:
-        a = (truth - s.model.pictures[name]).abs()
+        a = (truth - s.model.images[name]).abs()
         found |= {"A max": float(a.max()), "A mean": float(a.mean())}
     return found
 

@@ -20,10 +20,10 @@ def test_budget(device, rule, name):
 def test_fog_under_the_cut_is_approximation_not_error(device):
     """A thousand layers below the cut hide most of what is behind: all of it A, none of it E."""
     s = split(SCENES["faint_fog"](), RULES["exact"], device, with_model=True)
-    hidden = s.model.pictures["alpha"]
+    hidden = s.model.images["alpha"]
     assert float(hidden.mean()) > 0.8
-    assert not bool(s.kernel.pictures["alpha"].any()) and not bool(s.truth.pictures["alpha"].any())
-    assert torch.equal(s.kernel.pictures["rgb"].float(), s.truth.pictures["rgb"].float())
+    assert not bool(s.kernel.images["alpha"].any()) and not bool(s.truth.images["alpha"].any())
+    assert torch.equal(s.kernel.images["rgb"].float(), s.truth.images["rgb"].float())
     # nothing is drawn, so this is a plain sum: as a product of matrices it erred 1.1e-6
     assert gradient_errors(s, "background")["E max"] < 4e-7
 
@@ -33,8 +33,8 @@ def test_a_picture_moved_by_half_a_pixel_breaks_the_budget(device):
     scene = SCENES["random_cloud"]()
     s = split(scene, RULES["exact"], device)
     clean = measure(scene, RULES["exact"], s)
-    s.kernel.pictures["rgb"][1:, 1:] = 0.25 * sum(
-        s.truth.pictures["rgb"][1 - dy : 48 - dy, 1 - dx : 64 - dx] for dy in (0, 1) for dx in (0, 1)
+    s.kernel.images["rgb"][1:, 1:] = 0.25 * sum(
+        s.truth.images["rgb"][1 - dy : 48 - dy, 1 - dx : 64 - dx] for dy in (0, 1) for dx in (0, 1)
     )
     s.kernel.gradients["quats"][0] *= -1
     lines = broken(scene, measure(scene, RULES["exact"], s))

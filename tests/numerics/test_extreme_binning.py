@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from tests.splats import SMOOTH, camera, cloud, leaves
+from tests.gaussians import SMOOTH, camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
-from warpgs.kernels import bridge
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.runtime import interop
 from warpgs.scene import Camera, Gaussians
 
 EXACT = RULES["exact"]
@@ -46,8 +46,8 @@ def plain(width: int, height: int, device) -> Camera:
 def binned(gaussians: Gaussians, cam: Camera, rule=EXACT, tile_size: int = 16, **options):
     """Records, counts and tiles of one camera."""
     size = {"width": cam.width, "height": cam.height, "tile_size": tile_size, "rule": rule}
-    splats, counts = project(*gaussians.tensors().values(), cam.viewmat[None], cam.K[None], degree=0, **size)
-    return splats, counts, bin_tiles(splats, counts, **size, **options)
+    projected, counts = project(*gaussians.tensors().values(), cam.viewmat[None], cam.K[None], degree=0, **size)
+    return projected, counts, bin_tiles(projected, counts, **size, **options)
 
 
 # B1: counts of more than 32 bits
@@ -58,10 +58,10 @@ def test_counts_beyond_the_packed_sum_are_told_exactly(device):
 
     In one running sum the two numbers would run into each other; the error has both right, and nothing is allocated.
     """
-    splats = torch.zeros(1, 140_000, 12, device=device)
+    projected = torch.zeros(1, 140_000, 12, device=device)
     counts = torch.full((1, 140_000), 518_400, dtype=torch.int32, device=device)
     with pytest.raises(ResourceError, match=r"140,000 visible .* 72,576,000,000 .* 518400 of 518400 tiles"):
-        bin_tiles(splats, counts, width=7680, height=4320, tile_size=8, rule=EXACT)
+        bin_tiles(projected, counts, width=7680, height=4320, tile_size=8, rule=EXACT)
 
 
 def test_full_screen_gaussians_at_4k_are_counted(device):
@@ -79,7 +79,7 @@ def test_full_screen_gaussians_at_4k_are_listed(device):
     assert int(counts.sum()) == len(tiles.slots) == 97_200_000
     lengths = tiles.ranges[:, 1] - tiles.ranges[:, 0]
     assert bool((lengths == 3000).all())
-    ids = tiles.splat_ids.view(-1, 3000)
+    ids = tiles.gaussian_ids.view(-1, 3000)
     assert bool((ids == torch.arange(3000, dtype=torch.int32, device=device)).all())
 
 
@@ -87,24 +87,24 @@ def test_sizes_beyond_32_bits_are_refused(device):
     """An axis, a launch and a number of tiles that would wrap around are errors that say what to do."""
     huge = torch.zeros(1, device=device).expand(2**31)
     with pytest.raises(ResourceError, match=r"2,147,483,648 entries .* fewer Gaussians"):
-        bridge.view(huge, torch.float32).array()
+        interop.view(huge, torch.float32).array()
     with pytest.raises(ResourceError, match=r"2,147,483,648 entries"):
-        bridge.launch(None, 2**31, [], device)
-    splats, counts = torch.zeros(1, 0, 12, device=device), torch.zeros(1, 0, dtype=torch.int32, device=device)
+        interop.launch(None, 2**31, [], device)
+    projected, counts = torch.zeros(1, 0, 12, device=device), torch.zeros(1, 0, dtype=torch.int32, device=device)
     with pytest.raises(ResourceError, match=r"2,147,483,648 tiles of 8 px.* fewer cameras"):
-        bin_tiles(splats, counts, width=8 * 2**16, height=8 * 2**15, tile_size=8, rule=EXACT)
+        bin_tiles(projected, counts, width=8 * 2**16, height=8 * 2**15, tile_size=8, rule=EXACT)
 
 
 def test_a_refused_size_leaves_a_recorded_launch_as_it_was():
     """A recorded launch that was refused an argument takes the next one whole, at the same address and of the same size too."""
-    recorded, packed = bridge._Recorded.__new__(bridge._Recorded), SimpleNamespace(ndim=1, data=0, shape=[0])
+    recorded, packed = interop._Recorded.__new__(interop._Recorded), SimpleNamespace(ndim=1, data=0, shape=[0])
     recorded.command = SimpleNamespace(bounds=SimpleNamespace(size=1), params=[None, None, packed], set_dim=lambda _: None)
     recorded.known = [None]
     small, other = torch.zeros(5), torch.zeros(6)
-    recorded._patch(1, [bridge.view(small, None)])
+    recorded._patch(1, [interop.view(small, None)])
     with pytest.raises(ResourceError, match="2,147,483,648 entries"):
-        recorded._patch(1, [bridge.view(other[:1].expand(2**31), None)])
-    recorded._patch(1, [bridge.view(small, None)])
+        recorded._patch(1, [interop.view(other[:1].expand(2**31), None)])
+    recorded._patch(1, [interop.view(small, None)])
     assert packed.data == small.data_ptr() and packed.shape == [5]
 
 
@@ -117,7 +117,7 @@ def test_tile_numbers_of_every_bit_length(device, tiles):
     gaussians = spots([(8.0 + 16 * i, 8.0) for i in range(tiles)], 1.0, device)
     _, counts, lists = binned(gaussians, plain(16 * tiles, 16, device))
     assert bool((counts == 1).all())
-    assert torch.equal(lists.splat_ids.cpu(), torch.arange(tiles, dtype=torch.int32))
+    assert torch.equal(lists.gaussian_ids.cpu(), torch.arange(tiles, dtype=torch.int32))
     assert lists.ranges.tolist() == [[i, i + 1] for i in range(tiles)]
 
 
@@ -128,9 +128,9 @@ def test_cameras_times_tiles_of_every_bit_length(device, cameras):
     cam = plain(80, 16, device)
     size = {"width": 80, "height": 16, "rule": EXACT}
     many = cam.viewmat.expand(cameras, 4, 4), cam.K.expand(cameras, 3, 3)
-    splats, counts = project(*gaussians.tensors().values(), *many, degree=0, **size)
-    lists = bin_tiles(splats, counts, **size)
-    assert torch.equal(lists.splat_ids.cpu(), torch.arange(5 * cameras, dtype=torch.int32))
+    projected, counts = project(*gaussians.tensors().values(), *many, degree=0, **size)
+    lists = bin_tiles(projected, counts, **size)
+    assert torch.equal(lists.gaussian_ids.cpu(), torch.arange(5 * cameras, dtype=torch.int32))
 
 
 # B3 and B4: order
@@ -149,7 +149,7 @@ def test_depths_are_sorted_as_numpy_sorts_them(device, dtype):
     cam = plain(16, 16, device)
     cam = dataclasses.replace(cam, viewmat=cam.viewmat.to(dtype), K=cam.K.to(dtype))
     _, _, lists = binned(Gaussians(**tensors), cam)
-    assert np.array_equal(lists.splat_ids.cpu().numpy(), np.argsort(depths.cpu().numpy(), kind="stable"))
+    assert np.array_equal(lists.gaussian_ids.cpu().numpy(), np.argsort(depths.cpu().numpy(), kind="stable"))
 
 
 def test_coplanar_gaussians_keep_their_order_100_times(device):
@@ -158,7 +158,7 @@ def test_coplanar_gaussians_keep_their_order_100_times(device):
     gaussians.means[:, 2] = 4.0
     _, _, lists = binned(dataclasses.replace(gaussians, sh=gaussians.sh[:, :1]), cam)
     for begin, end in lists.ranges.tolist():
-        assert bool((lists.splat_ids[begin:end].diff() > 0).all())
+        assert bool((lists.gaussian_ids[begin:end].diff() > 0).all())
     first = rasterize(gaussians, cam)
     for _ in range(99):
         again = rasterize(gaussians, cam)
@@ -203,7 +203,7 @@ def test_emitted_equals_counted(device):
         # what was counted and not found again carries the number past the last tile; on one device both are one function
         unfound = int((lists.tile_ids == tiles).sum())
         assert int(lengths.sum()) + unfound == len(lists.slots) and unfound <= len(lists.slots) // 10**5
-        seen = torch.bincount(lists.splat_ids[: int(lengths.sum())].long(), minlength=count)
+        seen = torch.bincount(lists.gaussian_ids[: int(lengths.sum())].long(), minlength=count)
         assert int((seen - counts[0]).abs().sum()) == unfound
         total += int(counts.sum())
     assert total > 200_000
@@ -219,10 +219,10 @@ def test_a_single_intersection_is_drawn(device):
         _, counts, lists = binned(gaussians, plain(80, 48, device))
         tile = int(at[1] // 16) * 5 + int(at[0] // 16)
         assert int(counts.sum()) == 1 and lists.ranges[tile].tolist() == [0, 1]
-        picture = rasterize(leaves(gaussians), plain(80, 48, device))
-        rows, columns = torch.nonzero(picture.alpha.detach() > 0, as_tuple=True)
+        image = rasterize(leaves(gaussians), plain(80, 48, device))
+        rows, columns = torch.nonzero(image.alpha.detach() > 0, as_tuple=True)
         assert bool((rows // 16 == at[1] // 16).all()) and bool((columns // 16 == at[0] // 16).all())
-        picture.rgb.sum().backward()
+        image.rgb.sum().backward()
 
 
 def test_three_gaussians_on_512_pixels(device):
@@ -233,9 +233,9 @@ def test_three_gaussians_on_512_pixels(device):
     lengths = (lists.ranges[:, 1] - lists.ranges[:, 0]).tolist()
     assert lengths[0] == 2 and lengths[-1] == 1 and sum(lengths) == 3
     moving = leaves(gaussians)
-    picture = rasterize(moving, plain(512, 512, device))
-    picture.rgb.sum().backward()
-    assert bool(torch.isfinite(picture.rgb).all()) and all(bool(t.grad.any()) for t in (moving.sh, moving.logit_opacities))
+    image = rasterize(moving, plain(512, 512, device))
+    image.rgb.sum().backward()
+    assert bool(torch.isfinite(image.rgb).all()) and all(bool(t.grad.any()) for t in (moving.sh, moving.logit_opacities))
 
 
 # B7: very many cameras
@@ -285,7 +285,7 @@ def test_a_long_thin_picture_in_every_part(device):
     gaussians = spots([(0.5, 4.0), (0.5, 8190.0)], 2.0, device)
     for rule in (EXACT, dataclasses.replace(SMOOTH, low_pass=0.3)):
         moving = leaves(gaussians)
-        picture = rasterize(moving, plain(1, 8192, device), RasterizeOptions(rule=rule))
-        assert float(picture.alpha.detach()[3:5].min()) > 0.5 and float(picture.alpha.detach()[8189:8191].min()) > 0.5
-        picture.rgb.sum().backward()
+        image = rasterize(moving, plain(1, 8192, device), RasterizeOptions(rule=rule))
+        assert float(image.alpha.detach()[3:5].min()) > 0.5 and float(image.alpha.detach()[8189:8191].min()) > 0.5
+        image.rgb.sum().backward()
         assert bool((moving.logit_opacities.grad != 0).all())

@@ -9,14 +9,15 @@ import torch
 import warp as wp
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from tests.gaussians import camera, cloud, leaves
 from tests.kernels.test_blend import drawn, stack_of
 from tests.reference.blend import blend_reference
-from tests.splats import camera, cloud, leaves
 from warpgs.constants import ALPHA_CUT, RULES
-from warpgs.kernels import blend_cuda, bridge
+from warpgs.kernels import blend_cuda
 from warpgs.kernels.falloff import make_falloff
 from warpgs.kernels.native import source
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.runtime import interop
 from warpgs.scene import Gaussians
 
 EXACT = RULES["exact"]
@@ -30,7 +31,7 @@ def layers(opacities, side=4, dtype=torch.float32, device="cpu", logits=None):
     return leaves(stack), camera(side, side, cameras=1, dtype=dtype, device=device)
 
 
-def pictures(gaussians, cam, rule=EXACT, background=0.0):
+def images(gaussians, cam, rule=EXACT, background=0.0):
     behind = torch.full((1, 3), background, dtype=gaussians.means.dtype, device=gaussians.means.device)
     return drawn(gaussians, cam, behind, rule, degree=0)[:3]
 
@@ -53,7 +54,7 @@ def test_stacks(device, count, opacity):
     """
     logits = torch.full((count,), min(40.0, math.log(opacity / max(1 - opacity, 1e-18))))
     gaussians, cam = layers([opacity] * count, 2, device=device, logits=logits)
-    rgb, alpha, depth = pictures(gaussians, cam, background=1.0)
+    rgb, alpha, depth = images(gaussians, cam, background=1.0)
     found = gradients(rgb.sum(), gaussians)
     assert finite(rgb, alpha, depth, *found.values())
     each = min(float(torch.sigmoid(gaussians.logit_opacities[0].detach().double())), EXACT.alpha_max)
@@ -72,22 +73,24 @@ def test_gradients_of_deep_stacks_equal_autograd(device):
     opacities = torch.linspace(0.0041, 0.03, 600).tolist()
     opacities[300], opacities[450] = 0.5, 1 - 1e-7
     gaussians, cam = layers(opacities, 2, device=device)
-    rgb, alpha, depth = pictures(gaussians, cam, background=0.5)
+    rgb, alpha, depth = images(gaussians, cam, background=0.5)
     found = gradients((rgb.sum(-1) + alpha + 0.1 * depth).sum(), gaussians)
     logits = gaussians.logit_opacities.detach().cpu().double().requires_grad_()
     flat = torch.eye(2, dtype=torch.float64).expand(600, 2, 2) * 1e12
     colors = torch.full((600, 3), 0.5 + 2 * 0.28209479177387814, dtype=torch.float64)
     depths = gaussians.means.detach()[:, 2].cpu().double()
     behind = torch.full((3,), 0.5, dtype=torch.float64)
-    twin = blend_reference(
+    reference_result = blend_reference(
         torch.ones(600, 2, dtype=torch.float64), flat, torch.sigmoid(logits), colors, depths, behind, 2, 2, EXACT
     )
-    (wanted,) = torch.autograd.grad((twin[0].sum(-1) + twin[1] + 0.1 * twin[2]).sum(), logits)
-    assert float((alpha.detach().cpu() - twin[1].detach()).abs().max()) <= 1e-5
+    (wanted,) = torch.autograd.grad(
+        (reference_result[0].sum(-1) + reference_result[1] + 0.1 * reference_result[2]).sum(), logits
+    )
+    assert float((alpha.detach().cpu() - reference_result[1].detach()).abs().max()) <= 1e-5
     error = float((found["logit_opacities"].cpu() - wanted).norm() / wanted.norm())
     # on CUDA what lies behind a layer is the pixel's colour less what lies before, which cancels: measured 1.0e-6 and 1.7e-5
     assert error <= (5e-5 if device.type == "cuda" else 1e-5), error
-    front = float(gradients(pictures(gaussians, cam)[0].sum(), gaussians)["sh"][0, 0, 0]) / (4 * 0.28209479177387814)
+    front = float(gradients(images(gaussians, cam)[0].sum(), gaussians)["sh"][0, 0, 0]) / (4 * 0.28209479177387814)
     assert abs(front / float(torch.sigmoid(logits[0].detach())) - 1) <= 1e-5  # measured 6e-7 on a CPU
 
 
@@ -95,12 +98,12 @@ def test_gradients_of_deep_stacks_equal_autograd(device):
 def test_gradient_on_either_side_of_the_clamp(device, opacity, passes):
     """C2: below the largest alpha the gradient is that of finite differences, above it is zero, and so is the difference."""
     gaussians, cam = layers([opacity, 0.5], 2, torch.float64, device)
-    found = gradients(pictures(gaussians, cam, background=1.0)[1].sum(), gaussians)["logit_opacities"][0]
+    found = gradients(images(gaussians, cam, background=1.0)[1].sum(), gaussians)["logit_opacities"][0]
 
     def alpha_at(step):
         moved = gaussians.logit_opacities.detach().clone()
         moved[0] += step
-        return float(pictures(Gaussians(**(gaussians.tensors() | {"logit_opacities": moved})), cam)[1].detach().sum())
+        return float(images(Gaussians(**(gaussians.tensors() | {"logit_opacities": moved})), cam)[1].detach().sum())
 
     numeric = (alpha_at(1e-5) - alpha_at(-1e-5)) / 2e-5
     assert abs(float(found) - numeric) <= 1e-6 * abs(numeric)
@@ -117,7 +120,7 @@ def test_gradient_on_the_clamp(device):
         [(0.5 - float(cam.K[0, 0, 2])) / float(cam.K[0, 0, 0]), (0.5 - float(cam.K[0, 1, 2])) / float(cam.K[0, 1, 1]), 1.0]
     )
     gaussians = leaves(Gaussians(**(gaussians.tensors() | {"means": moved})))
-    alpha = pictures(gaussians, cam, rule)[1]
+    alpha = images(gaussians, cam, rule)[1]
     assert float(alpha.detach()) == 0.5
     assert float(gradients(alpha.sum(), gaussians)["logit_opacities"]) == pytest.approx(0.25, rel=1e-6)
 
@@ -126,14 +129,14 @@ def test_gradient_on_the_clamp(device):
 def test_opacity_logits(device, dtype, logit):
     """C3: any finite one is opaque or not there, gradients finite; an infinite one is not there."""
     gaussians, cam = layers([0.5, 0.5], 4, dtype, device, logits=torch.tensor([logit, 0.3]))
-    found = pictures(gaussians, cam, background=1.0)
+    found = images(gaussians, cam, background=1.0)
     v = gradients(sum(t.sum() for t in found), gaussians)
     assert finite(*found, *v.values())
     if logit > 0 and math.isfinite(logit):
         assert float(found[1].detach().min()) >= 0.99
     else:
         alone = Gaussians(**{n: t.detach()[1:] for n, t in gaussians.tensors().items()})
-        assert all(torch.equal(a, b) for a, b in zip(found, pictures(alone, cam, background=1.0)))
+        assert all(torch.equal(a, b) for a, b in zip(found, images(alone, cam, background=1.0)))
         assert not any(bool(t[0].any()) for t in v.values())
 
 
@@ -141,10 +144,10 @@ def test_fog_below_the_cut(device):
     """C4: 1000 layers of alpha 0.0039, below 1/255. They hide 98 % in truth, and nothing under every rule with the cut."""
     gaussians, cam = layers([0.0039] * 1000, device=device)
     for rule in RULES.values():
-        rgb, alpha, depth = pictures(gaussians, cam, rule, background=0.7)
+        rgb, alpha, depth = images(gaussians, cam, rule, background=0.7)
         assert not bool(alpha.any()) and not bool(depth.any()) and bool((rgb == torch.tensor(0.7)).all())
         assert not any(bool(v.any()) for v in gradients(rgb.sum(), gaussians).values())
-    alpha = pictures(gaussians, cam, dataclasses.replace(EXACT, alpha_cut=0.0))[1].detach()
+    alpha = images(gaussians, cam, dataclasses.replace(EXACT, alpha_cut=0.0))[1].detach()
     assert float((alpha - (1 - (1 - 0.0039) ** 1000)).abs().max()) <= 1e-5
 
 
@@ -170,7 +173,7 @@ def test_what_leaks_through_two_layers(device):
     ):
         gaussians, cam = layers([opacity, opacity], device=device)
         gaussians = dataclasses.replace(gaussians, sh=torch.full_like(gaussians.sh, -2.0))
-        rgb, alpha, _ = pictures(gaussians, cam, RULES[rule], background=1.0)
+        rgb, alpha, _ = images(gaussians, cam, RULES[rule], background=1.0)
         assert low <= float(rgb.min()) and float(rgb.max()) <= high, (rule, float(rgb.max()))
         assert float((rgb - (1 - alpha)[..., None]).abs().max()) <= 1e-7
 
@@ -198,7 +201,7 @@ def everything(gaussians, cam, options, filled):
         r = rasterize(moving, dataclasses.replace(cam, viewmat=viewmat, K=K), options)
         loss = r.rgb.sum() + (r.alpha * r.depth).sum()
         v = torch.autograd.grad(loss, [*moving.tensors().values(), viewmat, K])
-    outputs = [r.rgb, r.alpha, r.depth, r.splats, r.tile_counts, r.weight_sums, r.weight_maxima, *v]
+    outputs = [r.rgb, r.alpha, r.depth, r.projected, r.tile_counts, r.weight_sums, r.weight_maxima, *v]
     return [t.detach() for t in outputs if t is not None]
 
 
@@ -253,7 +256,7 @@ def test_colour_is_clamped_at_zero(device, dtype, color, shown):
     sh = gaussians.sh.detach().clone()
     sh[0, 0, 1] = (color - 0.5) / 0.28209479177387814
     gaussians = leaves(Gaussians(**(gaussians.tensors() | {"sh": sh})))
-    rgb, alpha, _ = pictures(gaussians, cam)
+    rgb, alpha, _ = images(gaussians, cam)
     v = gradients(rgb.sum(), gaussians)
     assert finite(rgb, *v.values())
     if shown is None:
@@ -305,18 +308,18 @@ def test_exponential_in_ulps(device):
     turn = 2 * math.pi * torch.rand(len(radii), generator=generator)
     e = torch.stack([radii * torch.cos(turn), radii * torch.sin(turn)], 1)
     found = torch.empty(len(e), device=device)
-    inputs = [bridge.view(e.to(device), wp.float32), bridge.view(found, wp.float32)]
-    with bridge.stream_of(device):
-        bridge.launch(exponential(device.type == "cuda"), len(e), inputs, device)
+    inputs = [interop.view(e.to(device), wp.float32), interop.view(found, wp.float32)]
+    with interop.stream_of(device):
+        interop.launch(exponential(device.type == "cuda"), len(e), inputs, device)
     found = found.cpu().double()
     exact = torch.exp(-0.5 * e.double().square().sum(1))
     assert finite(found) and bool((found >= 0).all()) and bool((found <= 1).all())
     inside = radii <= math.sqrt(2 * math.log(255))
     ulps = ((found - exact).abs() / exact / 2.0**-24)[inside]
-    shares = [float((ulps > limit).double().mean()) for limit in (1, 2, 4, 8, 16)]
+    fractions = [float((ulps > limit).double().mean()) for limit in (1, 2, 4, 8, 16)]
     # measured 13.3 on a CPU, mean 1.7. CUDA scales the factor once more and has an exponential of 2 units itself
     most, average = (32, 6) if device.type == "cuda" else (16, 3)
-    assert float(ulps.max()) <= most and float(ulps.mean()) <= average, (float(ulps.max()), float(ulps.mean()), shares)
+    assert float(ulps.max()) <= most and float(ulps.mean()) <= average, (float(ulps.max()), float(ulps.mean()), fractions)
     # beyond, only what is too small for anything to be seen may differ; measured 2.7e-9
     assert float((found - exact)[~inside].abs().max()) <= 1e-8
     assert bool((found[-2:] <= 1e-33).all())

@@ -9,22 +9,22 @@ import pytest
 import torch
 import warp as wp
 
+from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.io.scenes import transforms_json, write_transforms
 from tests.numerics.poison import documented
 from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference
 from tests.scenes import three_gaussians
-from tests.splats import SMOOTH, camera, cloud, hand_placed, leaves
 from warpgs.constants import FAR, FARTHEST_PIXEL, LARGEST_AXIS, LARGEST_COEFFICIENT, RULES, SHORTEST_QUAT
 from warpgs.export.ply import read_ply, write_ply
 from warpgs.io.load import load_scene
-from warpgs.kernels import bridge
 from warpgs.kernels.functions import make_spans
 from warpgs.kernels.project import project
-from warpgs.pipeline.config import FitConfig
-from warpgs.pipeline.fit import Fit
-from warpgs.pipeline.init import InitConfig
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.trainer import Trainer
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.runtime import interop
 from warpgs.scene import Camera, Gaussians
 
 EXACT = RULES["exact"]
@@ -221,10 +221,10 @@ def test_view_directions_of_any_length(device, distance):
         g = one((0.0, 0.0, 1.0), [math.log(max(distance, 1e-9)) - 2] * 3, dtype=dtype, device=device, degree=3)
         g.means[0] = (along * distance).to(dtype)
         g = leaves(g)
-        splats, counts = run(g, cam, 3)
+        projected, counts = run(g, cam, 3)
         assert (int(counts) > 0) == (distance > 0.01)
-        splats[..., 6:9].sum().backward()
-        results.append((splats[..., 6:9].detach(), g.means.grad, g.sh.grad))
+        projected[..., 6:9].sum().backward()
+        results.append((projected[..., 6:9].detach(), g.means.grad, g.sh.grad))
     assert finite(t for r in results for t in r)
     for a, b in zip(*results):
         assert float((a.double() - b).norm()) <= 1e-5 * float(b.norm())
@@ -244,19 +244,19 @@ def loaded(folder, shift):
 
 def test_far_from_the_origin(tmp_path):
     """P10: a scene 0 to 5e6 units away has the same cameras, pictures and fit once it is loaded; PLY files go back there."""
-    gaussians, pictures, scores = three_gaussians(), [], []
+    gaussians, images, scores = three_gaussians(), [], []
     config = FitConfig(steps=30, init=InitConfig(source="random", random_count=300))
     for shift in SHIFTS:
         scene = loaded(tmp_path, shift)
         assert np.allclose(scene.normalization.offset - shift, loaded(tmp_path, 0.0).normalization.offset, atol=1e-8)
-        pictures.append(torch.stack([rasterize(gaussians, v.camera).rgb for v in scene.views]))
-        fit = Fit(list(scene.views), scene.points, config, torch.device("cpu"), (0.0, 0.0, 0.0))
+        images.append(torch.stack([rasterize(gaussians, v.camera).rgb for v in scene.views]))
+        fit = Trainer(list(scene.views), scene.points, config, torch.device("cpu"), (0.0, 0.0, 0.0))
         scores.append([fit.advance().loss for _ in range(30)][-1])
         write_ply(tmp_path / "model.ply", gaussians, scene.normalization)
         back = read_ply(tmp_path / "model.ply").means.double().numpy()
         wanted = gaussians.means.double().numpy() / scene.normalization.scale + scene.normalization.offset
         assert np.abs(back - wanted).max() <= np.spacing(np.float32(np.abs(wanted).max()))
-    assert all(float((p - pictures[0]).abs().max()) <= 1e-6 for p in pictures)
+    assert all(float((p - images[0]).abs().max()) <= 1e-6 for p in images)
     assert max(scores) - min(scores) <= 1e-3 * scores[0]  # measured 0, 0, 0, 7e-6 of it
 
 
@@ -268,7 +268,7 @@ def test_far_from_the_origin_without_recentring_jitters():
         view = cam.viewmat.clone()
         view[:3, 3] = -view[:3, :3] @ torch.full((3,), shift, dtype=torch.float64)
         moved = Gaussians(**(gaussians.tensors() | {"means": (gaussians.means.double() + shift).float()}))
-        found[shift] = rasterize(moved, Camera(view, cam.K, 64, 48)).splats[0, :, :2]
+        found[shift] = rasterize(moved, Camera(view, cam.K, 64, 48)).projected[0, :, :2]
     assert float((found[1e5] - found[0.0]).abs().max()) > 0.02
 
 
@@ -315,9 +315,9 @@ def test_tiles_of_impossible_boxes(device):
     found = {}
     for where in {"cpu", str(device)}:
         result = torch.empty(len(table), 4, dtype=torch.int32, device=where)
-        inputs = [bridge.view(boxes.to(where), wp.float32), bridge.view(result, wp.int32)]
-        with bridge.stream_of(torch.device(where)):
-            bridge.launch(spans_kernel(), len(table), inputs, torch.device(where))
+        inputs = [interop.view(boxes.to(where), wp.float32), interop.view(result, wp.int32)]
+        with interop.stream_of(torch.device(where)):
+            interop.launch(spans_kernel(), len(table), inputs, torch.device(where))
         found[where] = result.cpu()
     rows = found[str(device)]
     assert torch.equal(rows, found["cpu"])
@@ -335,10 +335,10 @@ def test_coefficients_above_the_degree_are_not_read(device, degree):
         g = hand_placed(torch.float32, device)
         g.sh[:, (degree + 1) ** 2 :] = rest
         g = leaves(g)
-        splats, counts = run(g, cam, degree)
+        projected, counts = run(g, cam, degree)
         assert int((counts > 0).sum()) == 5
-        (splats[..., 6:9] * torch.tensor([1.0, -2.0, 0.5], device=device)).sum().backward()
-        results.append([splats.detach(), *(t.grad for t in g.tensors().values())])
+        (projected[..., 6:9] * torch.tensor([1.0, -2.0, 0.5], device=device)).sum().backward()
+        results.append([projected.detach(), *(t.grad for t in g.tensors().values())])
     assert all(torch.equal(a, b) for r in results[1:] for a, b in zip(results[0], r))
     assert bool(results[0][1].any()) == (degree > 0)
 

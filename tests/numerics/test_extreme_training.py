@@ -9,30 +9,30 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.gaussians import cloud
+from tests.pipeline import tables
 from tests.reference.knn import mean_square_distances_reference
-from tests.scenes import photographs, priors, ring, seeds
-from tests.splats import cloud
+from tests.scenes import photos, priors, ring, seeds
 from warpgs.errors import DataError, NotFiniteError, UsageError
 from warpgs.export.ply import write_ply
 from warpgs.io.normalize import normalization_of, normalize_points, normalize_view
 from warpgs.kernels.adam import adam_step
 from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.ssim import differences, ssim
-from warpgs.pipeline.checkpoint import TENSORS, load_checkpoint, save_checkpoint
-from warpgs.pipeline.config import FitConfig
-from warpgs.pipeline.density import DensityConfig, DensityStats, Refinement, refine
-from warpgs.pipeline.fit import Fit, run
-from warpgs.pipeline.importance import ImportanceConfig, normalized
-from warpgs.pipeline.init import InitConfig, initial_gaussians, initial_points
-from warpgs.pipeline.judge import JudgeConfig
-from warpgs.pipeline.layers import ProtectConfig
-from warpgs.pipeline.loss import LossConfig, photometric_loss
-from warpgs.pipeline.method import MethodConfig
-from warpgs.pipeline.optimizer import Optimizer, OptimizerConfig
-from warpgs.pipeline.quantiles import quantiles
-from warpgs.pipeline.sampler import SamplerConfig, geometry_gate, sample_pixels
-from warpgs.pipeline.schedule import PhaseConfig
-from warpgs.rasterizer import rasterize
+from warpgs.pipeline.metrics.quantiles import quantiles
+from warpgs.pipeline.model.init import InitConfig, initial_gaussians, initial_points
+from warpgs.pipeline.model.table import Column, DensityUpdate, Table
+from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loss import LossConfig, photometric_loss
+from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig, refine
+from warpgs.pipeline.train.strategies.holdout_blocks import HoldoutConfig
+from warpgs.pipeline.train.strategies.importance import ImportanceConfig, normalized
+from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig, ProtectConfig
+from warpgs.pipeline.train.strategies.sampler import SamplerConfig, geometry_gate, sample_pixels
+from warpgs.pipeline.train.trainer import Trainer, run
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Normalization, PointCloud, View
 
 POINTS = InitConfig(source="points", max_sh_degree=0)
@@ -47,11 +47,11 @@ def gray(points) -> PointCloud:
     return PointCloud(points, np.full((len(points), 3), 0.5, np.float32))
 
 
-def taken(views, cloud_, device, steps: int = 3, **more) -> Fit:
+def taken(views, cloud_, device, steps: int = 3, **more) -> Trainer:
     """A fit after some steps, all of whose numbers are finite."""
-    fit = Fit(views, cloud_, FitConfig(steps=steps, init=POINTS, **more), device)
+    fit = Trainer(views, cloud_, FitConfig(steps=steps, init=POINTS, **more), device)
     for _ in range(steps):
-        assert math.isfinite(fit.advance().loss)
+        assert math.isfinite(fit.advance()[0].loss)
     assert all(bool(torch.isfinite(t).all()) for t in fit.state()[0].values() if t.is_floating_point())
     return fit
 
@@ -89,7 +89,7 @@ def test_clusters_closer_than_squares_can_tell(device, dtype):
 
 def test_a_fit_from_coincident_points(device):
     """All points in one place: steps are taken, nothing becomes infinite."""
-    taken(photographs(2), gray(np.zeros((6, 3))), device)
+    taken(photos(2), gray(np.zeros((6, 3))), device)
 
 
 # T2 and T3: nothing to start from, no extent
@@ -97,7 +97,7 @@ def test_a_fit_from_coincident_points(device):
 
 def test_an_empty_cloud_is_an_error_or_a_random_start():
     """Zero rows: an error that names the way out, or by itself a random start that says why."""
-    views = photographs(3)
+    views = photos(3)
     with pytest.raises(DataError, match=r"no 3D points .* --init.source random"):
         initial_points(views, gray([]), POINTS, np.random.default_rng(0))
     start = initial_points(views, gray([]), InitConfig(random_count=50), np.random.default_rng(0))
@@ -106,7 +106,7 @@ def test_an_empty_cloud_is_an_error_or_a_random_start():
 
 def standing(kind: str) -> list[View]:
     """One camera, two in one place, or three on a line."""
-    views = photographs(3)
+    views = photos(3)
     if kind == "one":
         return views[:1]
     if kind == "twins":
@@ -129,15 +129,15 @@ def test_cameras_without_extent(device, kind, source):
     points = normalize_points(seeds(), n)
     assert 0 < n.scale < math.inf
     views = [normalize_view(v, n) for v in views]
-    density = DensityConfig(start=1, every=1, stop_share=1.0)
+    density = DensityConfig(start=1, every=1, stop_fraction=1.0)
     init = InitConfig(source=source, random_count=60, max_sh_degree=0)
-    fit = Fit(views, points, FitConfig(steps=4, init=init, density=density), device)
-    assert 0 < fit.extent < math.inf and fit.optimizer.rates(0.0)["means"] > 0
+    fit = Trainer(views, points, FitConfig(steps=4, init=init, density=density), device)
+    assert 0 < fit.extent < math.inf and fit.lrs(1)["means"] > 0
     # what stands before the near plane would never be drawn, and never be moved
     assert int(rasterize(fit.gaussians, fit.views[0].camera).visible.sum()) >= 20
-    fit.reset_done = True  # size pruning is on
+    fit.strategy.was_reset = True  # size pruning is on
     for _ in range(4):
-        assert math.isfinite(fit.advance().loss)
+        assert math.isfinite(fit.advance()[0].loss)
     assert len(fit.gaussians) >= 30
 
 
@@ -146,63 +146,67 @@ def test_cameras_without_extent(device, kind, source):
 
 def test_pruning_everything_leaves_one_and_the_fit_goes_on(device):
     """A threshold that no opacity reaches: one Gaussian stays at each event, and later steps still work."""
-    density = DensityConfig(start=1, every=2, stop_share=1.0, prune_opacity=1.0, gradient=math.inf)
-    fit = taken(photographs(2), seeds(), device, steps=8, density=density)
+    density = DensityConfig(start=1, every=2, stop_fraction=1.0, prune_opacity=1.0, gradient=math.inf)
+    fit = taken(photos(2), seeds(), device, steps=8, density=density)
     assert len(fit.gaussians) == 1
 
 
 def test_a_set_of_none_is_legal(device):
-    """No rows: optimizer, refinement and statistics work on nothing."""
+    """No rows: a step, refinement, a change of the set and columns work on nothing."""
     g = cloud(0, device=device)
-    optimizer = Optimizer(g, OptimizerConfig(), 1.0)
-    for t in optimizer.params.values():
-        t.grad = torch.zeros_like(t)
-    optimizer.step(0.0)
-    optimizer.apply(
-        Refinement(torch.zeros(0, dtype=torch.int64, device=device), g.tensors(), torch.zeros(0, dtype=torch.int64))
-    )
-    assert all(t.shape[0] == 0 for t in optimizer.state().values())
+    table = Table.of_gaussians(g, {"seen": Column(0.0)})
+    tables.adam_step(table, {n: torch.zeros_like(t) for n, t in table.params.items()})
+    none = torch.zeros(0, dtype=torch.int64, device=device)
+    table.apply(DensityUpdate(none, g.tensors(), none))
+    change = refine(
+        g, torch.zeros(0, device=device), DensityConfig(prune_opacity=0.0), extent=1.0, capacity=9, after_reset=False,
+        generator=torch.Generator(),
+    )  # fmt: skip
+    assert len(change.keep) == len(change.parents) == len(table) == 0
+    assert all(t.shape[0] == 0 for t in table.state().values())
 
 
 def test_rows_follow_any_chain_of_changes(device):
     """Ten random refinements, the first before any step, some of them empty: every row keeps its moments and its tag."""
     count, generator = 40, torch.Generator().manual_seed(0)
-    optimizer, stats = Optimizer(cloud(count, device=device), OptimizerConfig(), 1.0), DensityStats(count, device)
+    table = Table.of_gaussians(cloud(count, device=device), {"seen": Column(0.0, inherited=False)})
     for event in range(10):
-        rows = len(optimizer.gaussians)
+        rows = len(table)
         tags = torch.arange(rows, dtype=torch.float32, device=device)
-        for group in (optimizer.params, optimizer.means, optimizer.squares):
+        for group in (table.params, table.exp_avg, table.exp_avg_sq):
             for t in group.values():
                 t.detach().copy_((tags + 1000 * event).view(-1, *[1] * (t.ndim - 1)).expand_as(t))
-        stats.seen.copy_(tags)
+        table.columns["seen"].copy_(tags)
         kept = torch.nonzero(torch.rand(rows, generator=generator) < (1.0 if event == 4 else 0.7)).squeeze(1).to(device)
         fresh = cloud(0 if event == 4 else event, device=device, seed=event)
-        change = Refinement(kept, fresh.tensors(), torch.full((len(fresh),), -1, device=device))
-        before = {k: v.clone() for k, v in optimizer.state().items()}
-        optimizer.apply(change)
-        stats.apply(change)
-        for name, t in optimizer.state().items():
-            assert len(t) == len(kept) + len(fresh) == len(stats.seen)
+        change = DensityUpdate(kept, fresh.tensors(), torch.full((len(fresh),), -1, device=device))
+        before = {k: v.clone() for k, v in table.state().items()}
+        table.apply(change)
+        for name, t in table.state().items():
+            assert len(t) == len(kept) + len(fresh) == len(table)
             assert torch.equal(t[: len(kept)], before[name][kept])
-            if not name.startswith("param"):
+            if not name.startswith("params"):
                 assert not bool(t[len(kept) :].any())
-        assert torch.equal(stats.seen[: len(kept)], tags[kept])
+        assert torch.equal(table.columns["seen"][: len(kept)], tags[kept])
 
 
 def test_refinement_that_changes_nothing_changes_no_bit(device):
     """Nothing pulled at and nothing faint: all rows stay, with their moments."""
     g = cloud(30, device=device)
     g.logit_opacities[:] = 1.0
-    change = refine(g, DensityStats(30, device), DensityConfig(), extent=1.0, after_reset=False, generator=torch.Generator())
+    change = refine(
+        g, torch.zeros(30, device=device), DensityConfig(), extent=1.0, capacity=100, after_reset=False,
+        generator=torch.Generator(),
+    )  # fmt: skip
     assert torch.equal(change.keep.cpu(), torch.arange(30)) and len(change.parents) == 0
 
 
 # T7: numbers that are none
 
 
-def bad_photographs(value: float) -> list[View]:
+def bad_photos(value: float) -> list[View]:
     """Two photographs, one pixel of the first of which has one channel of that value."""
-    views = photographs(2)
+    views = photos(2)
     image = views[0].image.copy()
     image[3, 4, 1] = value
     return [View(views[0].name, views[0].camera, image), views[1]]
@@ -211,14 +215,14 @@ def bad_photographs(value: float) -> list[View]:
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_one_bad_pixel_stops_the_fit_before_it_harms(device, value):
     """The step that looks at it is not taken, and the Gaussians are finite."""
-    fit = Fit(bad_photographs(value), seeds(), FitConfig(steps=4, init=POINTS, cuda_graph=False), device)
+    fit = Trainer(bad_photos(value), seeds(), FitConfig(steps=4, init=POINTS, cuda_graph=False), device)
     with pytest.raises(NotFiniteError, match=r"loss became (nan|inf)"):
         for _ in range(4):
             fit.advance()
     assert all(bool(torch.isfinite(t).all()) for t in fit.gaussians.tensors().values())
 
 
-def poison(fit: Fit, name: str, where: str, value: float) -> None:
+def poison(fit: Trainer, name: str, where: str, value: float) -> None:
     """Put a value into the gradient of a tensor's first row from the next step on, or into the tensor itself."""
     if where == "gradient":
 
@@ -227,9 +231,9 @@ def poison(fit: Fit, name: str, where: str, value: float) -> None:
             gradient[0] = value
             return gradient
 
-        fit.optimizer.params[name].register_hook(spoil)
+        fit.table.params[name].register_hook(spoil)
     else:
-        fit.optimizer.params[name].detach()[0] = value
+        fit.table.params[name].detach()[0] = value
 
 
 @pytest.mark.parametrize(
@@ -244,24 +248,26 @@ def test_what_is_no_number_is_never_saved(device, tmp_path, name, where, value):
     config = FitConfig(
         steps=6, init=POINTS, density=DensityConfig(start=100), checkpoint_every=2, checkpoint_seconds=0, cuda_graph=False
     )
-    fit, saved = Fit(photographs(2), seeds(), config, device), []
+    fit, saved = Trainer(photos(2), seeds(), config, device), []
 
-    def save(current: Fit) -> None:
+    def save(current: Trainer) -> None:
         save_checkpoint(tmp_path, *current.state())
         saved.append(current.step)
 
     def on_step(report) -> None:
         assert math.isfinite(report.loss)
 
-    original = fit.burst
+    original = fit.advance
 
-    def burst(limit: int):
+    def advance(limit: int):
         if fit.step == 3:
             poison(fit, name, where, value)
         return original(limit)
 
-    fit.burst = burst
-    with pytest.raises(NotFiniteError, match=rf"(param|mean|square)\.{name} holds numbers that are not finite.*--resume"):
+    fit.advance = advance
+    with pytest.raises(
+        NotFiniteError, match=rf"(params|exp_avg|exp_avg_sq)\.{name} holds numbers that are not finite.*--resume"
+    ):
         run(fit, on_step, save, lambda: False)
     tensors, state = load_checkpoint(tmp_path)
     assert saved == [2] and state["step"] == 2
@@ -317,10 +323,10 @@ def test_more_pixels_than_2_to_the_24(device):
 
 @few
 @given(st.lists(st.floats(-1e6, 1e6, width=32), min_size=1, max_size=60), st.floats(0, 1))
-def test_quantiles_are_those_of_numpy(values, share):
+def test_quantiles_are_those_of_numpy(values, fraction):
     """Linear between neighbours."""
-    found = quantiles(torch.tensor(values, dtype=torch.float64), share)[0]
-    assert math.isclose(float(found), float(np.quantile(np.array(values), share)), rel_tol=1e-12, abs_tol=1e-9)
+    found = quantiles(torch.tensor(values, dtype=torch.float64), fraction)[0]
+    assert math.isclose(float(found), float(np.quantile(np.array(values), fraction)), rel_tol=1e-12, abs_tol=1e-9)
 
 
 # T10: similarity of constant and tiny images
@@ -346,11 +352,12 @@ def test_constant_images_of_any_size(device, dtype, value, height, width):
 NUMBERS = [math.nan, math.inf, -1, 0, 1e-300, 1, 3, 1e300]
 KINDS = [
     DensityConfig, OptimizerConfig, LossConfig, ImportanceConfig, SamplerConfig, ProtectConfig, PhaseConfig, MethodConfig,
-    InitConfig, JudgeConfig, FitConfig,
+    InitConfig, HoldoutConfig, FitConfig,
 ]  # fmt: skip
 SHORT = FitConfig(
     steps=4, init=InitConfig(source="points", max_sh_degree=1), sh_every=2, phases=PhaseConfig(coarse=1, every=1),
-    density=DensityConfig(start=1, every=2, stop_share=1.0, gradient=1e-6, max_gaussians=200),
+    density=DensityConfig(start=1, every=2, stop_fraction=1.0, gradient=1e-6),
+    max_gaussians=200, strategy="importance_sampling",
     method=MethodConfig(events=True, hier=True, pm=False, sampler=SamplerConfig(min_alpha=0.01)),
 )  # fmt: skip
 
@@ -381,7 +388,7 @@ def test_the_list_of_settings_is_complete():
 @pytest.mark.parametrize("kind", KINDS, ids=lambda k: k.__name__)
 def test_a_setting_is_refused_or_works(kind):
     """Any number in any field, zero intervals too: a UsageError at once, or steps, events and resets that stay finite."""
-    views, points = photographs(1, 12, 10), seeds(12)
+    views, points = photos(1, 12, 10), seeds(12)
     known, refused = priors(views), 0
     torch.set_num_threads(1)  # everything is tiny
     for field in dataclasses.fields(kind):
@@ -396,13 +403,13 @@ def test_a_setting_is_refused_or_works(kind):
             except UsageError:
                 refused += 1
                 continue
-            fit = Fit(views, points, config, torch.device("cpu"), priors=known)
+            fit = Trainer(views, points, config, torch.device("cpu"), priors=known)
             for _ in range(2):
-                assert math.isfinite(fit.advance().loss), (field.name, value)
-            fit.optimizer.cap_opacity(config.density.reset_opacity)
-            fit.reset_done = True
-            assert math.isfinite(fit.advance().loss), (field.name, value)
-            for name, t in fit.optimizer.state().items():
+                assert math.isfinite(fit.advance()[0].loss), (field.name, value)
+            fit.table.reset_opacities(config.density.reset_opacity)
+            fit.strategy.was_reset = True
+            assert math.isfinite(fit.advance()[0].loss), (field.name, value)
+            for name, t in fit.table.state().items():
                 assert bool(torch.isfinite(t).all()), (field.name, value, name)
     assert refused > 0
 
@@ -412,19 +419,19 @@ def test_a_setting_is_refused_or_works(kind):
 
 def test_views_of_which_nothing_counts(device):
     """All pixels masked in one view, or in all: no division by zero, and nothing moves for a view that says nothing."""
-    views = photographs(2)
+    views = photos(2)
     hidden = [dataclasses.replace(v, mask=np.zeros(v.image.shape[:2], bool)) for v in views]
     fit = taken(hidden, seeds(), device, steps=2)
     first = initial_gaussians(seeds(), POINTS, fit.extent, device)
     assert all(torch.equal(a, b) for a, b in zip(fit.gaussians.tensors().values(), first.tensors().values()))
     taken([hidden[0], views[1]], seeds(), device, steps=4)
     with pytest.raises(DataError, match="every pixel of the training views is masked out"):
-        Fit(hidden, None, FitConfig(init=InitConfig(source="random")), device)
+        Trainer(hidden, None, FitConfig(init=InitConfig(source="random")), device)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("fraction", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize("masked", ["all", "all but one"])
-def test_masks_that_leave_nothing_or_one_pixel(device, share, masked):
+def test_masks_that_leave_nothing_or_one_pixel(device, fraction, masked):
     """The mean is over what counts, and over nothing it is 0; gradients stay at what counts, or near it for similarity."""
     mask = torch.zeros(12, 13, device=device)
     if masked == "all but one":
@@ -432,7 +439,7 @@ def test_masks_that_leave_nothing_or_one_pixel(device, share, masked):
     generator = torch.Generator().manual_seed(0)
     image, target = torch.rand(2, 12, 13, 3, generator=generator).to(device)
     leaf = image.requires_grad_()
-    loss = photometric_loss(leaf, target, mask, LossConfig(ssim_weight=share))
+    loss = photometric_loss(leaf, target, mask, fraction)
     loss.backward()
     assert math.isfinite(float(loss.detach())) and bool(torch.isfinite(leaf.grad).all())
     moved = torch.nonzero(leaf.grad.abs().sum(-1)).tolist()

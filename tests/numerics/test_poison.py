@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from tests.numerics.fuzz import TWIN_LIMIT, fuzz, load, save
-from tests.numerics.poison import SLOTS, VALUES, Case, failures, make_case, non_finite, twin_error
-from tests.splats import camera, cloud
+from tests.gaussians import camera, cloud
+from tests.numerics.fuzz import REFERENCE_LIMIT, fuzz, load, save
+from tests.numerics.poison import SLOTS, VALUES, Case, failures, make_case, non_finite, reference_error
 from warpgs.scene import Gaussians
 
 
@@ -43,8 +43,8 @@ def test_finite_extremes_equal_float64(device):
     """What is drawn of finite extremes is what float64 draws; the same Gaussians are culled."""
     drawn = 0
     for number in range(20):
-        error, _, visible = twin_error(2, number, device)
-        assert error <= TWIN_LIMIT, number
+        error, _, visible = reference_error(2, number, device)
+        assert error <= REFERENCE_LIMIT, number
         drawn += visible
     assert drawn > 100
 

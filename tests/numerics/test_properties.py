@@ -13,15 +13,15 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.splats import SMOOTH, camera, cloud, leaves
+from tests.gaussians import SMOOTH, camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.export.ply import read_ply, write_ply
 from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
 from warpgs.kernels.sh import C0
 from warpgs.kernels.tiles import bin_tiles
-from warpgs.pipeline.checkpoint import load_checkpoint, save_checkpoint
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians, Normalization, Render
 
 few = settings(
@@ -292,11 +292,11 @@ def painted(gaussians: Gaussians, cam: Camera, rule: str):
     """A function from colours [N, 3] and a background [3] to the picture, of projections made once."""
     size = {"width": cam.width, "height": cam.height, "rule": RULES[rule]}
     with torch.no_grad():
-        splats, counts = project(*gaussians.tensors().values(), cam.viewmat, cam.K, degree=1, **size)
-    tiles = bin_tiles(splats, counts, **size)
+        projected, counts = project(*gaussians.tensors().values(), cam.viewmat, cam.K, degree=1, **size)
+    tiles = bin_tiles(projected, counts, **size)
 
     def paint(colors: torch.Tensor, behind: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        records = torch.cat([splats[..., :6], colors[None], splats[..., 9:]], -1)
+        records = torch.cat([projected[..., :6], colors[None], projected[..., 9:]], -1)
         return blend(records, tiles, behind[None], **size)[:2]
 
     return paint
@@ -327,12 +327,12 @@ def test_the_picture_is_affine_in_the_background(device, scene, rule):
     colors = torch.rand(len(gaussians), 3, generator=generator).to(device)
     behind = torch.rand(3, generator=generator).to(device).requires_grad_()
     on_black, alpha = paint(colors, torch.zeros(3, device=device))
-    picture = paint(colors, behind)[0]
+    image = paint(colors, behind)[0]
     slope = 1 - alpha[..., None]
-    gap = (picture - (on_black + slope * behind)).detach()
+    gap = (image - (on_black + slope * behind)).detach()
     assert float(gap.abs().max()) <= 4 * torch.finfo(F32).eps  # measured 0.5
-    weights = torch.rand(picture.shape, generator=generator).to(device)
-    v = torch.autograd.grad((picture * weights).sum(), behind)[0]
+    weights = torch.rand(image.shape, generator=generator).to(device)
+    v = torch.autograd.grad((image * weights).sum(), behind)[0]
     assert torch.allclose(v, (slope * weights).sum((0, 1, 2)), rtol=1e-5, atol=1e-5)
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from bench.determinism import atomic_spread, gradients_of, scene
-from tests.splats import camera, cloud
+from tests.gaussians import camera, cloud
 from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.ssim import differences
 
@@ -88,13 +88,13 @@ def test_a_side_stream_gives_the_same_bits():
 
 PROCESS = """
 import hashlib, torch
-from tests.scenes import photographs
-from warpgs.pipeline.config import FitConfig
-from warpgs.pipeline.fit import Fit
-from warpgs.pipeline.init import InitConfig
+from tests.scenes import photos
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.trainer import Trainer
 torch.set_num_threads({threads})
 config = FitConfig(steps=12, seed=5, dropout=0.1, init=InitConfig(source="random", random_count=300))
-fit = Fit(photographs(3), None, config, torch.device("cpu"))
+fit = Trainer(photos(3), None, config, torch.device("cpu"))
 for _ in range(12):
     fit.advance()
 digest = hashlib.sha256()

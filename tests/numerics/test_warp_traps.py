@@ -73,7 +73,7 @@ def test_no_constant_is_hidden_float32():
 DEBUG = """
 import sys, torch, warp as wp
 wp.config.mode = "debug"
-from tests.splats import camera, cloud, leaves
+from tests.gaussians import camera, cloud, leaves
 from warpgs.kernels.adam import adam_step
 from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.ssim import differences

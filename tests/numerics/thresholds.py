@@ -9,7 +9,7 @@ import dataclasses
 
 import torch
 
-from tests.reference.twins import Frame, Inputs, Splats, layers, parts, splats_of
+from tests.reference.low_precision import Frame, Inputs, ProjectedGaussians, layers, parts, projected_of
 from warpgs.constants import Rule
 
 EPS = 2.0**-23
@@ -43,32 +43,32 @@ def ulp(value: float) -> float:
     return float(torch.nextafter(x, torch.tensor(float("inf"))) - x)
 
 
-def uncertainties(inputs: Inputs, splats: Splats, frame: Frame) -> tuple[torch.Tensor, torch.Tensor]:
+def uncertainties(inputs: Inputs, projected: ProjectedGaussians, frame: Frame) -> tuple[torch.Tensor, torch.Tensor]:
     """How far rounding may move each projected mean [px] and each depth [u]: two tensors [N]."""
-    reach = inputs.means[splats.ids].norm(dim=1) + inputs.viewmat[:3, 3].norm()
+    reach = inputs.means[projected.ids].norm(dim=1) + inputs.viewmat[:3, 3].norm()
     depth = 2 * EPS * reach
     focal = torch.maximum(inputs.K[0, 0], inputs.K[1, 1])
     size = max(frame.width, frame.height)
-    pixel = 2**0.5 * (1.5 * ulp(size) + depth * (focal + size) / splats.depths)
+    pixel = 2**0.5 * (1.5 * ulp(size) + depth * (focal + size) / projected.depths)
     return pixel, depth
 
 
 @torch.no_grad()
 def band(inputs: Inputs, frame: Frame, rule: Rule, tile_size: int = 16) -> Band:
     """Bands of the float64 picture of a rule."""
-    splats = splats_of(inputs, frame, rule)
+    projected = projected_of(inputs, frame, rule)
     width, height = frame.window[2:]
-    count = len(splats.ids)
+    count = len(projected.ids)
     names = ("cut", "stop", "clamp", "near", "order", "square")
     if count == 0:
         nothing = torch.zeros(height, width)
         return Band({n: nothing.bool() for n in names}, nothing.double(), 0, 1.0, 1.0)
-    pixel, depth = uncertainties(inputs, splats, frame)
+    pixel, depth = uncertainties(inputs, projected, frame)
     # an axis of s1 px turned by a rounded rotation moves its end across the other axis
-    short, long = splats.sigmas.clamp_min(rule.low_pass**0.5).unbind(1)
-    largest = float(torch.cat([splats.colors.flatten(), inputs.background, torch.ones(1).double()]).max())
+    short, long = projected.sigmas.clamp_min(rule.low_pass**0.5).unbind(1)
+    largest = float(torch.cat([projected.colors.flatten(), inputs.background, torch.ones(1).double()]).max())
     lags = 1
-    while lags < count and bool((splats.depths[lags:] - splats.depths[:-lags] <= 2 * depth[lags:]).any()):
+    while lags < count and bool((projected.depths[lags:] - projected.depths[:-lags] <= 2 * depth[lags:]).any()):
         lags += 1
     at_near = bool(
         ((inputs.means @ inputs.viewmat[2, :3] + inputs.viewmat[2, 3] - rule.near).abs() <= float(depth.max())).any()
@@ -77,9 +77,9 @@ def band(inputs: Inputs, frame: Frame, rule: Rule, tile_size: int = 16) -> Band:
     flags, jumps, most = {n: [] for n in names}, [], 0
     wider = dataclasses.replace(rule, square_sigma=rule.square_sigma * (1 + 64 * EPS))
     narrower = dataclasses.replace(rule, square_sigma=rule.square_sigma * (1 - 64 * EPS))
-    spans = zip(*(parts(splats, frame, r, tile_size) for r in (rule, wider, narrower)))
+    spans = zip(*(parts(projected, frame, r, tile_size) for r in (rule, wider, narrower)))
     for (pixels, reach), (_, wide), (_, narrow) in spans:
-        f = layers(pixels, reach, splats, rule)
+        f = layers(pixels, reach, projected, rule)
         most = max(most, int(f.blended.sum(0).max()))
         r = f.power.clamp_min(0).sqrt()
         u = 64 * EPS + r * (pixel[:, None] + 8 * EPS * r * long[:, None]) / short[:, None]
@@ -100,7 +100,7 @@ def band(inputs: Inputs, frame: Frame, rule: Rule, tile_size: int = 16) -> Band:
         stop = f.drawn & ((tested - rule.transmittance_stop).abs() <= drift * rule.transmittance_stop)
         order, swapped = torch.zeros_like(cut), torch.zeros_like(r)
         for lag in range(1, lags):
-            close = (splats.depths[lag:] - splats.depths[:-lag] <= 2 * depth[lag:])[:, None]
+            close = (projected.depths[lag:] - projected.depths[:-lag] <= 2 * depth[lag:])[:, None]
             both = close & running[:-lag] & f.drawn[:-lag] & f.drawn[lag:]
             order[:-lag] |= both
             swapped[:-lag] += torch.where(both, f.before[:-lag] * alpha[:-lag] * alpha[lag:], 0)
@@ -114,4 +114,4 @@ def band(inputs: Inputs, frame: Frame, rule: Rule, tile_size: int = 16) -> Band:
         jumps.append(largest * (jump.sum(0) + float(at_near)))
     shape = (height, width)
     reasons = {n: torch.cat(v).view(shape) for n, v in flags.items()}
-    return Band(reasons, torch.cat(jumps).view(shape), most, largest, float(splats.depths.max()))
+    return Band(reasons, torch.cat(jumps).view(shape), most, largest, float(projected.depths.max()))

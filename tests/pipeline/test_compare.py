@@ -5,27 +5,29 @@ import dataclasses
 import io
 import json
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from tests.report.test_table import cells
-from warpgs.cli import main
-from warpgs.demo import split_spec, write_demo
+from tests.pipeline.test_table_files import cells
+from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
-from warpgs.pipeline import config
-from warpgs.pipeline.checkpoint import TENSORS
-from warpgs.pipeline.compare import ABLATION_ROWS, ablation_variants, preset_variants, run_study
-from warpgs.pipeline.config import FitConfig
-from warpgs.pipeline.init import InitConfig
-from warpgs.pipeline.lpips_weights import NETS, convert_lpips
-from warpgs.pipeline.method import MethodConfig
-from warpgs.pipeline.repeat import ensure_run
-from warpgs.pipeline.run import FitRequest, SceneRequest, fit_scene, read_scene
-from warpgs.pipeline.study import FILES, SWITCHES, StudyRequest, run_folder
-from warpgs.report.statistics import paired_difference
+from warpgs.pipeline.metrics.lpips_weights import NETS, convert_lpips
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.runs.checkpoint import TENSORS
+from warpgs.pipeline.runs.fit import fit_request
+from warpgs.pipeline.runs.request import FitRequest, SceneRequest, read_scene
+from warpgs.pipeline.study.compare import ABLATION_ROWS, ablation_variants, preset_variants, run_study
+from warpgs.pipeline.study.ensure_run import ensure_run
+from warpgs.pipeline.study.statistics import paired_difference
+from warpgs.pipeline.study.study import FILES, SWITCHES, StudyRequest, run_folder
+from warpgs.pipeline.train import config
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
+from warpgs.synthetic.demo import split_spec, write_demo
 
 A = FitConfig(steps=8, init=InitConfig(source="random", random_count=200))
 B = dataclasses.replace(A, preset="b", steps=16)
@@ -149,7 +151,9 @@ def test_runs_of_another_kind_are_moved_aside_and_said(finished, tmp_path):
 )  # fmt: skip
 def test_what_makes_a_run_another_run(finished, tmp_path, monkeypatch, key, value, word):
     """Each of these alone forbids to keep it."""
-    monkeypatch.setattr("warpgs.pipeline.repeat.fit_scene", lambda request: {"fitted": request.resume})
+    monkeypatch.setattr(
+        "warpgs.pipeline.study.ensure_run.fit_request", lambda request: SimpleNamespace(metrics={"fitted": request.resume})
+    )
     request = copy_of(finished, tmp_path)
     folder = run_folder(request, "still", "a", 0)
     record = json.loads((folder / "config.json").read_text()) | {key: value}
@@ -168,7 +172,7 @@ def test_a_failed_run_is_left_out_of_its_pairs_and_named(finished, tmp_path, mon
     def fail(*_):
         raise DataError("no luck")
 
-    monkeypatch.setattr("warpgs.pipeline.repeat.fit_scene", fail)
+    monkeypatch.setattr("warpgs.pipeline.study.ensure_run.fit_request", fail)
     run_study(request)
     text = (request.out / "table.md").read_text()
     assert states(request) == ["kept", "kept", "kept", "failed"]
@@ -247,15 +251,15 @@ def test_ablation_rows_switch_off_one_part_each():
 def test_command_ablates(scene, tmp_path, capsys, monkeypatch):
     """`warpgs ablate` from flags to a table with check marks; two of the nine rows, for time."""
     monkeypatch.setitem(config.PRESETS, "whole", FULL)
-    monkeypatch.setattr("warpgs.pipeline.compare.ABLATION_ROWS", {n: ABLATION_ROWS[n] for n in ("full", "no pm")})
+    monkeypatch.setattr("warpgs.pipeline.study.compare.ABLATION_ROWS", {n: ABLATION_ROWS[n] for n in ("full", "no pm")})
     monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "cache"))
     asked = []
 
     def noted(request):
         asked.append((request.config.seed, request.config.method))
-        return fit_scene(request)
+        return fit_request(request)
 
-    monkeypatch.setattr("warpgs.pipeline.repeat.fit_scene", noted)
+    monkeypatch.setattr("warpgs.pipeline.study.ensure_run.fit_request", noted)
     flags = ["--preset", "whole", "--seeds", "1", "--steps", "2", "--device", "cpu", "--out", str(tmp_path / "out")]
     assert main(["ablate", scene.path, "--split", scene.split, *flags]) == 0
     assert "[2/2] still, no pm, seed 0" in capsys.readouterr().out

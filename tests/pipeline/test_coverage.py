@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from tests.scenes import ring, three_gaussians
-from warpgs.pipeline.coverage import CONE, SEEN, Coverage, coverage, fisher
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.pipeline.model.coverage import CONE, SEEN, Coverage, coverage, fisher
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
 
 
@@ -74,3 +74,5 @@ def test_fisher_is_the_trace_of_the_jacobian():
     error = estimates.std(0) / 7
     assert bool((exact > 1e-2).all()) and bool(((estimates.mean(0) - exact).abs() < 4 * error).all())
     assert bool((error < 0.25 * exact).all())
+    with torch.no_grad():
+        assert torch.equal(fisher(g, small, RasterizeOptions(), 0), estimates[0])

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from tests.scenes import photographs, ring
+from tests.scenes import photos, ring
 from warpgs.errors import UsageError
 from warpgs.geometry import back_project, camera_extent, focus_point, in_image, project_points
-from warpgs.pipeline.evaluate import guesses, psnr, score, summarize, to_8_bit, variants
-from warpgs.pipeline.paths import camera_path
-from warpgs.pipeline.region import counted_region
+from warpgs.pipeline.metrics.evaluate import baselines, score, summarize, to_8_bit, variants
+from warpgs.pipeline.metrics.psnr import psnr
+from warpgs.pipeline.metrics.region import counted_region
+from warpgs.pipeline.runs.camera_paths import camera_path
 from warpgs.scene import View
 
 
@@ -28,7 +29,7 @@ def test_psnr_of_known_errors():
 
 def test_scores_are_of_the_saved_picture():
     """Clamping and rounding to 8 bits happen before scoring."""
-    view = photographs(1)[0]
+    view = photos(1)[0]
     m = score(view, view.image + 1e-4)
     assert m.psnr > 50 and m.ssim > 0.999 and m.ssim_skimage > 0.999
     assert np.array_equal(to_8_bit(np.array([-1.0, 0.5, 2.0])), np.float32([0, 128 / 255, 1]))
@@ -36,7 +37,7 @@ def test_scores_are_of_the_saved_picture():
 
 def test_counted_region():
     """A mask counts first; an object on black counts by its bright pixels; an ordinary photo counts whole."""
-    view = photographs(1)[0]
+    view = photos(1)[0]
     bright = View("a", view.camera, np.full_like(view.image, 0.5))
     assert counted_region(bright) == (None, "all")
     dark = np.zeros_like(view.image)
@@ -59,7 +60,7 @@ class Witness:
 @pytest.mark.parametrize("kind", ["mask", "score_mask"])
 def test_masked_view_is_scored_by_the_dtu_recipe(kind):
     """PSNR over the mask alone; SSIM and LPIPS on both images with white outside, so what stands there cannot matter."""
-    view = photographs(1)[0]
+    view = photos(1)[0]
     mask = np.zeros(view.image.shape[:2], bool)
     mask[8:24, 10:30] = True
     rng = np.random.default_rng(0)
@@ -84,7 +85,7 @@ def test_masked_view_is_scored_by_the_dtu_recipe(kind):
 
 def test_score_mask_wins_over_the_mask_of_the_fit():
     """The protocol's mask decides the score, whatever the fit was allowed to see."""
-    view = photographs(1)[0]
+    view = photos(1)[0]
     left, right = np.zeros((2, *view.image.shape[:2]), bool)
     left[:, :20], right[:, 20:] = True, True
     image = view.image.copy()
@@ -94,7 +95,7 @@ def test_score_mask_wins_over_the_mask_of_the_fit():
 
 def test_lpips_joins_the_figures():
     """Measured: in the row and the means, by variant; not measured: no figure, and the words say so."""
-    view = photographs(1)[0]
+    view = photos(1)[0]
     m = score(view, view.image, Witness())
     assert m.row()["lpips_vgg_legacy"] == 0.25 and "lpips" not in m.row()
     assert summarize([m, m])["lpips_vgg_legacy"] == 0.25
@@ -104,12 +105,12 @@ def test_lpips_joins_the_figures():
 
 def test_guesses():
     """The mean photo and the nearest photo are scored as predictions; other sizes are left out."""
-    views = photographs(3)
-    g = guesses([views[0], views[2]], [views[1]])
+    views = photos(3)
+    g = baselines([views[0], views[2]], [views[1]])
     mean = to_8_bit((views[0].image + views[2].image) / 2)
     region, _ = counted_region(views[1])
     assert g["mean_photo"] == pytest.approx(psnr(mean, views[1].image, region))
-    assert guesses(photographs(2, 20, 16), [views[1]]) == {}
+    assert baselines(photos(2, 20, 16), [views[1]]) == {}
     assert summarize([]) == {}
 
 

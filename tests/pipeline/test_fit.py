@@ -1,313 +1,117 @@
-"""The loop: repeatable, resumable, and honest when something is wrong."""
+"""`warpgs.fit` from Python: the same fit as the command, with or without a run folder, in either units."""
 
 import dataclasses
 import json
-import math
-import os
-import signal
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from tests.scenes import photographs, seeds
-from warpgs.demo import split_spec, write_demo
+import warpgs
+from warpgs.app.cli import main
+from warpgs.coordinates import convert_camera
 from warpgs.errors import DataError, UsageError
-from warpgs.geometry import look_at
-from warpgs.kernels.knn import morton_codes
-from warpgs.pipeline.checkpoint import TENSORS, load_checkpoint, save_checkpoint
-from warpgs.pipeline.config import PRESETS, FitConfig
-from warpgs.pipeline.density import DensityConfig
-from warpgs.pipeline.fit import Fit, NotFiniteError
-from warpgs.pipeline.init import InitConfig, empty_votes, initial_gaussians, initial_points, nearest, random_points
-from warpgs.pipeline.loss import LossConfig, photometric_loss
-from warpgs.pipeline.region import counted_region
-from warpgs.pipeline.schedule import log_linear, sh_degree
-from warpgs.scene import Camera, PointCloud, View
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.synthetic.demo import split_spec, write_demo
 
-CPU = torch.device("cpu")
-BUSY = FitConfig(
-    steps=60, sh_every=15, init=InitConfig(source="points"), density=DensityConfig(start=10, every=10, reset_every=20)
-)
+STEPS, SPLIT = 12, split_spec(8)
+CONFIG = warpgs.FitConfig(steps=STEPS, init=InitConfig(source="random", random_count=80))
+FLAGS = ["--preset", "3dgs", "--steps", str(STEPS), "--init.source", "random", "--init.random-count", "80", "--split", SPLIT]
 
 
-def fitted(config: FitConfig, steps: int, background=(0.0, 0.0, 0.0)) -> Fit:
-    fit = Fit(photographs(4), seeds(), config, CPU, background)
-    for _ in range(steps):
-        fit.advance()
-    return fit
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A scene, and a run of the command on it."""
+    folder = tmp_path_factory.mktemp("fit")
+    write_demo(folder / "scene", views=8, width=40, height=32)
+    assert main(["fit", str(folder / "scene"), "--out", str(folder / "run"), "--device", "cpu", *FLAGS]) == 0
+    return folder
 
 
-def test_random_points_stand_on_an_object_on_black():
-    """A bright ball's silhouette in four views: points start inside its visual hull, not in the black before it."""
-    views = []
-    for angle in np.linspace(0, 2 * np.pi, 5)[:4]:
-        center = 4 * np.array([np.sin(angle), 0, -np.cos(angle)])
-        camera = Camera(
-            look_at(center, np.zeros(3), np.array([0, -1.0, 0])), np.array([[60.0, 0, 20], [0, 60, 20], [0, 0, 1]]), 40, 40
-        )
-        y, x = np.mgrid[:40, :40] + 0.5
-        ball = (x - 20) ** 2 + (y - 20) ** 2 < 6**2
-        views.append(View(f"{angle:.1f}", camera, np.where(ball[..., None], 0.8, 0).astype(np.float32).repeat(3, 2)))
-    regions = [counted_region(v) for v in views]
-    assert empty_votes(views, regions, np.array([[0.0, 0, 0], [1.2, 0, 0], [0, 1.2, 0]])).tolist() == [0, 2, 4]
-    cloud, how = random_points(views, 400, np.random.default_rng(0))
-    assert "object that 4 views show on black" in how
-    assert len(cloud) == 400 and (cloud.colors == np.float32(0.8)).all()
-    # without votes, one point in six stands before some view's black
-    assert (empty_votes(views, regions, cloud.points) == 0).all()
+@pytest.fixture(scope="module")
+def fitted(folder):
+    """The same fit from Python on a scene in memory; the result and the reports of its steps."""
+    steps = []
+    scene = warpgs.load_scene(folder / "scene")
+    result = warpgs.fit(scene, CONFIG, split=SPLIT, device="cpu", on_step=steps.append, verbose=False)
+    return result, steps
 
 
-def test_nearest_points():
-    """Against a search tree, over more pairs than are held at a time, the nearest first."""
-    from scipy.spatial import cKDTree
-
-    generator = np.random.default_rng(0)
-    points, queries = generator.uniform(0, 500, (700, 2)), generator.uniform(0, 500, (3000, 2))
-    assert np.array_equal(nearest(points, queries, 5), cKDTree(points).query(queries, k=5)[1])
-
-
-def test_same_seed_same_bits_and_threads_do_not_matter():
-    """Two fits with one seed agree bit for bit, also for another number of threads; another seed does not."""
-    torch.set_num_threads(1)
-    first = fitted(BUSY, 40).state()[0]
-    torch.set_num_threads(2)
-    again = fitted(BUSY, 40).state()[0]
-    other = fitted(FitConfig(**{**vars(BUSY), "seed": 1}), 40).state()[0]
-    assert first.keys() == again.keys() and all(torch.equal(first[k], again[k]) for k in first)
-    assert not torch.equal(first["param.means"][:10], other["param.means"][:10])
+def test_command_and_function_are_one_fit(folder, fitted):
+    """Same Gaussians to the bit, same scores; the step reports are those of the log."""
+    result, steps = fitted
+    run = warpgs.open_run(folder / "run", "cpu")
+    for name, t in run.gaussians().tensors().items():
+        assert torch.equal(getattr(result.gaussians(), name), t), name
+    stored = json.loads((folder / "run" / "metrics.json").read_text())
+    assert {k: result.metrics[k] for k in ("test", "train", "views")} == {k: stored[k] for k in ("test", "train", "views")}
+    log = [json.loads(line) for line in (folder / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert [(r.step, r.loss, r.count) for r in steps] == [(r["step"], r["loss"], r["count"]) for r in log]
+    assert (result.config, result.step, result.folder) == (CONFIG, STEPS, None)
+    assert (result.train, result.test) == (run.train, run.test) and len(result.test) > 0
+    views = [warpgs.load_scene(folder / "scene").view(n) for n in result.test]
+    assert warpgs.evaluate(result.gaussians(), views, result.options())[0].psnr == stored["views"][0]["psnr"]
 
 
-def test_continued_fit_equals_uninterrupted_one(tmp_path):
-    """Saved in the middle of densification, loaded elsewhere, continued: the same bits at the end."""
-    straight = fitted(BUSY, 60)
-    broken = fitted(BUSY, 27)
-    save_checkpoint(tmp_path, *broken.state())
-    resumed = Fit(photographs(4), seeds(), BUSY, CPU)
-    resumed.load(*load_checkpoint(tmp_path))
-    for _ in range(33):
-        resumed.advance()
-    a, b = straight.state()[0], resumed.state()[0]
-    assert len(straight.gaussians) != len(seeds())
-    assert all(torch.equal(a[k], b[k]) for k in a)
+def test_nothing_is_written_or_printed_unless_asked_for(folder, tmp_path, monkeypatch, capsys):
+    """Without a folder the current one stays empty; verbose prints what the command prints, else there is silence."""
+    monkeypatch.chdir(tmp_path)
+    few = dataclasses.replace(CONFIG, steps=2)
+    loud = warpgs.fit(folder / "scene", few, device="cpu")
+    printed = capsys.readouterr().out
+    assert "views to fit" in printed and "no folder was asked for" in printed and all(n in printed for n in loud.notes)
+    assert warpgs.fit(folder / "scene", few, device="cpu", verbose=False).notes == loud.notes
+    assert capsys.readouterr().out == "" and not list(tmp_path.iterdir())
+    with pytest.raises(UsageError, match="preset 'best' is not one of"):
+        warpgs.fit(folder / "scene", "best", device="cpu", out=tmp_path / "x")
+    with pytest.raises(UsageError, match="give out"):
+        warpgs.fit(folder / "scene", CONFIG, resume=True)
+    assert not list(tmp_path.iterdir())
 
 
-def test_order_of_the_gaussians_changes_nothing_but_their_order():
-    """Sorted along the curve at each event or not: the same rows with their moments, bit for bit, as long as none splits."""
-    results = []
-    for morton in (True, False):
-        density = DensityConfig(start=5, every=10, gradient=1e-5, clone_size=1e9, morton_order=morton)
-        fit = fitted(FitConfig(steps=60, sh_every=15, init=InitConfig(source="points"), density=density), 30)
-        assert bool((morton_codes(fit.gaussians.means).diff() >= 0).all()) == morton
-        tensors = [t.flatten(1) if t.ndim > 1 else t[:, None] for t in fit.optimizer.state().values()]
-        results.append(sorted(map(tuple, torch.cat(tensors, 1).tolist())))
-    assert len(results[0]) > 2 * len(seeds()) and results[0] == results[1]
+def test_units_lead_from_the_fit_to_its_files_and_back(folder, fitted):
+    """In file units the Gaussians are those of the PLY, the cameras those of the reconstruction."""
+    result, _ = fitted
+    ply = warpgs.read_ply(folder / "run" / "point_cloud.ply")
+    torch.testing.assert_close(result.gaussians("file").means, ply.means, rtol=0, atol=0)
+    again = warpgs.read_ply(folder / "run" / "point_cloud.ply", result.normalization, units="scene")
+    torch.testing.assert_close(again.means, result.gaussians().means, rtol=1e-5, atol=1e-5)
+    name, camera = next(iter(result.cameras("file").items()))
+    scene = warpgs.load_scene(folder / "scene")
+    wanted = (scene.view(name).camera.center / scene.normalization.scale) + scene.normalization.offset
+    np.testing.assert_allclose(camera.center, wanted, atol=1e-9)
 
 
-def test_all_that_goes_by_row_is_sorted_together():
-    """Parameters, moments and layers of a Gaussian stay together."""
-    fit = fitted(FitConfig(steps=9, init=InitConfig(source="points")), 3)
-    fit.layers.birth = torch.arange(len(fit.gaussians), dtype=torch.int32)
-    before = {name: t.clone() for name, t in fit.optimizer.state().items()}
-    fit.layers.reorder(fit.optimizer.sort_along_curve())
-    rows = fit.layers.birth.long()
-    assert not bool((rows.diff() > 0).all()) and bool((rows.sort().values.diff() == 1).all())
-    assert all(torch.equal(t, before[name][rows]) for name, t in fit.optimizer.state().items())
-    assert all(t.requires_grad for t in fit.optimizer.params.values())
+def test_render_path_takes_own_cameras_in_either_units(folder, fitted, tmp_path):
+    """The same camera in scene and in file units gives the same PNG, which is the view's render; a film comes with them."""
+    result, _ = fitted
+    camera = result.cameras()[result.test[0]]
+    in_file = convert_camera(camera, result.normalization, "scene", "file")
+    *scene_files, film = warpgs.render_path(result, [camera, camera], out=tmp_path / "a")
+    file_files = warpgs.render_path(result, [in_file], out=tmp_path / "b", units="file")
+    assert film.name == "film.mp4" and len(scene_files) == 2 and len(file_files) == 2
+    image, other = (np.asarray(Image.open(f), float) for f in (scene_files[0], file_files[0]))
+    assert np.abs(image - other).max() <= 1
+    with torch.no_grad():
+        rgb = warpgs.rasterize(result.gaussians(), camera, result.options()).rgb.numpy()
+    assert np.abs(image / 255 - rgb.clip(0, 1)).max() < 0.51 / 255
+    with pytest.raises(UsageError, match="no camera to render"):
+        warpgs.render_path(result, [], out=tmp_path / "c")
 
 
-def test_masked_pixels_do_not_count():
-    """What a mask hides may hold anything, even NaN-free nonsense, without changing the fit."""
-    views = photographs(2)
-    mask = np.ones(views[0].image.shape[:2], bool)
-    mask[:, :8] = False
-    results = []
-    for filling in (0.0, 1.0):
-        changed = []
-        for v in views:
-            image = v.image.copy()
-            image[~mask] = filling
-            changed.append(View(v.name, v.camera, image, mask))
-        fit = Fit(changed, seeds(), FitConfig(steps=5, init=InitConfig(source="points")), CPU)
-        reports = [fit.advance() for _ in range(5)]
-        results.append((fit.gaussians.means, [r.psnr for r in reports]))
-    assert torch.equal(results[0][0], results[1][0]) and results[0][1] == results[1][1]
-
-
-def test_fully_masked_view_has_loss_zero():
-    """No pixel counts: loss 0, gradient 0, no division by zero."""
-    image = torch.rand(9, 8, 3, requires_grad=True)
-    loss = photometric_loss(image, torch.rand(9, 8, 3), torch.zeros(9, 8), LossConfig())
-    loss.backward()
-    assert float(loss.detach()) == 0 and not bool(image.grad.any())
-
-
-def test_loss_of_known_images():
-    """L1 alone is the mean difference; equal images have loss 0."""
-    a, b = torch.full((12, 12, 3), 0.75), torch.full((12, 12, 3), 0.5)
-    assert abs(float(photometric_loss(a, b, None, LossConfig(ssim_weight=0))) - 0.25) < 1e-7
-    assert abs(float(photometric_loss(a, a, None, LossConfig()))) < 1e-7
-
-
-def test_loss_that_is_no_number_stops_the_fit():
-    """A NaN in a photograph is named, not trained on."""
-    views = photographs(2)
-    bad = [View(v.name, v.camera, np.full_like(v.image, np.nan)) for v in views]
-    fit = Fit(bad, seeds(), FitConfig(steps=3, init=InitConfig(source="points")), CPU)
-    before = fit.gaussians.means.clone()
-    with pytest.raises(NotFiniteError, match="loss became nan at step 1"):
-        fit.advance()
-    assert torch.equal(fit.gaussians.means, before)
-
-
-def test_every_view_comes_once_before_any_comes_again():
-    """Views are drawn like cards."""
-    fit = fitted(FitConfig(steps=9, init=InitConfig(source="points")), 0)
-    drawn = [fit.next_view() for _ in range(12)]
-    assert all(sorted(drawn[i : i + 4]) == [0, 1, 2, 3] for i in (0, 4, 8))
-
-
-def test_schedules():
-    """Ends and middle of the log-linear decay; degrees rise one at a time."""
-    assert log_linear(1e-2, 1e-4, 0) == pytest.approx(1e-2) and log_linear(1e-2, 1e-4, 1) == pytest.approx(1e-4)
-    assert log_linear(1e-2, 1e-4, 0.5) == pytest.approx(1e-3)
-    assert [sh_degree(s, 10, 2) for s in (1, 10, 11, 21, 500)] == [0, 0, 1, 2, 2]
-
-
-def test_first_gaussians():
-    """Width from the three nearest, colour from the point, coincident points with a floor, a lone one with a ceiling."""
-    points = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 2], [50, 50, 50]], float)
-    cloud = PointCloud(points, np.full((5, 3), 0.8, np.float32))
-    g = initial_gaussians(cloud, InitConfig(opacity=0.1), extent=100.0, device=CPU)
-    assert float(g.log_scales[0, 0].exp()) == pytest.approx(math.sqrt((1 + 4 + 4) / 3), rel=1e-5)
-    assert float(g.log_scales[4].exp().max()) == pytest.approx(10.0)
-    assert torch.allclose(g.sh[:, 0] * 0.28209479177387814 + 0.5, torch.tensor(0.8)) and not bool(g.sh[:, 1:].any())
-    assert torch.allclose(g.logit_opacities.sigmoid(), torch.tensor(0.1))
-    same = initial_gaussians(PointCloud(np.zeros((4, 3)), np.zeros((4, 3), np.float32)), InitConfig(), 1.0, CPU)
-    assert torch.allclose(same.log_scales.exp(), torch.tensor(1e-6))
-
-
-def test_start_falls_back_to_random_and_says_so():
-    """Too few points: a random start inside what the cameras see, named; asked for points: an error with a way out."""
-    views = photographs(4)
-    few = PointCloud(np.zeros((3, 3)), np.zeros((3, 3), np.float32))
-    cloud, how, _ = initial_points(views, few, InitConfig(random_count=500), np.random.default_rng(0))
-    assert len(cloud) == 500 and "500 random points" in how and "only 3 points" in how
-    again, *_ = initial_points(views, few, InitConfig(random_count=500), np.random.default_rng(0))
-    assert np.array_equal(cloud.points, again.points)
-    with pytest.raises(DataError, match=r"--init.source random"):
-        initial_points(views, None, InitConfig(source="points"), np.random.default_rng(0))
-
-
-def test_a_start_of_more_points_than_allowed_is_drawn_from():
-    """Some of the points, each once and the same every time, said so; wider, for they lie farther apart; and no more later."""
-    most = len(seeds()) // 4
-    config = dataclasses.replace(BUSY, density=dataclasses.replace(BUSY.density, gradient=1e-6, max_gaussians=most))
-    whole, fit = fitted(BUSY, 0), fitted(config, 0)
-    kept = (whole.gaussians.means[None] == fit.gaussians.means[:, None]).all(2)
-    assert len(fit.gaussians) == most and bool((kept.sum(1) == 1).all()) and bool((kept.sum(0) <= 1).all())
-    assert torch.equal(fitted(config, 0).gaussians.means, fit.gaussians.means)
-    assert float(fit.gaussians.log_scales.mean()) > float(whole.gaussians.log_scales.mean()) + 0.1
-    assert any(f"{most} of these {len(seeds())} points" in n and "--max-gaussians" in n for n in fit.notes)
-    assert not any("max-gaussians" in n for n in whole.notes)
-    assert len(fitted(config, 25).gaussians) <= most
-
-
-def test_points_of_other_views_are_not_used():
-    """A track that only a held-out view belongs to must not seed the fit."""
-    cloud = PointCloud(np.zeros((2, 3)), np.zeros((2, 3), np.float32), (frozenset({"00.png"}), frozenset({"09.png"})))
-    assert len(cloud.seen_by({"00.png", "01.png"})) == 1
-
-
-def test_no_training_view_is_an_error():
-    """An empty list of views stops at once."""
-    with pytest.raises(DataError, match="no training view"):
-        Fit([], seeds(), FitConfig(), CPU)
-
-
-def test_config_survives_json():
-    """What a run folder stores gives the same configuration back; a foreign field is refused."""
-    stored = json.loads(json.dumps(BUSY.to_json()))
-    assert FitConfig.from_json(stored) == BUSY and FitConfig.from_json(stored).fingerprint() == BUSY.fingerprint()
-    with pytest.raises(UsageError, match="another version"):
-        FitConfig.from_json({**stored, "bogus": 1})
-    assert all(isinstance(p, FitConfig) for p in PRESETS.values())
-
-
-@pytest.mark.parametrize("bad", [{"steps": 0}, {"sh_every": 0}, {"rule": "best"}])
-def test_bad_configuration_is_refused(bad):
-    """A setting that cannot work is an error at once."""
-    with pytest.raises(UsageError):
-        FitConfig(**bad)
-
-
-def test_checkpoint_that_is_not_whole_is_refused(tmp_path):
-    """Truncated or altered anywhere, the file is named and nothing is loaded; a missing one says what to do."""
-    with pytest.raises(DataError, match="warpgs fit"):
-        load_checkpoint(tmp_path)
-    path = save_checkpoint(tmp_path, {"a": torch.arange(50.0)}, {"step": 3})
-    tensors, state = load_checkpoint(tmp_path)
-    assert torch.equal(tensors["a"], torch.arange(50.0)) and state == {"step": 3}
-    save_checkpoint(tmp_path, {"b": torch.zeros(0, 3), "c": torch.tensor(7), "d": torch.arange(3, dtype=torch.uint8)}, {})
-    odd = load_checkpoint(tmp_path)[0]
-    assert (
-        odd["b"].shape == (0, 3) and odd["c"].item() == 7 and odd["c"].dtype == torch.int64 and odd["d"].tolist() == [0, 1, 2]
-    )
-    path = save_checkpoint(tmp_path, {"a": torch.arange(50.0)}, {"step": 3})
-    whole = path.read_bytes()
-    for broken in (whole[:-1], whole[:40], b"", whole[:100] + bytes([whole[100] ^ 1]) + whole[101:]):
-        path.write_bytes(broken)
-        with pytest.raises(DataError, match="checksum"):
-            load_checkpoint(tmp_path)
-    assert path.name == TENSORS
-
-
-def test_interrupted_fit_saves_the_step_in_progress(tmp_path):
-    """Ctrl-C ends with exit code 130 and a checkpoint of the last whole step, from which --resume goes on."""
-    write_demo(tmp_path / "scene", views=8, width=48, height=36)
-    command = [
-        sys.executable, "-m", "warpgs", "fit", str(tmp_path / "scene"), "--split", split_spec(8), "--steps", "100000",
-        "--device", "cpu", "--out", str(tmp_path / "run"),
-    ]  # fmt: skip
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    for line in process.stdout:
-        if line.startswith("step"):
-            break
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130 and "--resume" in errors and "Traceback" not in errors
-    _, state = load_checkpoint(tmp_path / "run")
-    steps = [json.loads(x)["step"] for x in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
-    assert state["step"] == steps[-1] >= 1
-
-
-def test_resume_after_kill_gives_the_same_ply(tmp_path):
-    """SIGKILL in the middle, --resume, and the PLY equals that of a run left alone, byte for byte."""
-    write_demo(tmp_path / "scene", views=8, width=64, height=48)
-    flags = [
-        str(tmp_path / "scene"), "--split", split_spec(8), "--steps", "60", "--device", "cpu",
-        "--checkpoint-every", "10", "--checkpoint-seconds", "0",
-        "--density.start", "10", "--density.every", "10",
-    ]  # fmt: skip
-
-    def command(out: str, *more: str) -> list[str]:
-        return [sys.executable, "-m", "warpgs", "fit", *flags, "--out", str(tmp_path / out), *more]
-
-    subprocess.run(command("whole"), check=True, capture_output=True)
-    process = subprocess.Popen(command("killed"), stdout=subprocess.DEVNULL, start_new_session=True)
-    deadline = time.monotonic() + 120
-    while not (tmp_path / "killed" / TENSORS).is_file() and time.monotonic() < deadline:
-        time.sleep(0.01)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-    assert not (tmp_path / "killed" / "point_cloud.ply").exists(), "the run ended before it could be killed"
-    subprocess.run(command("killed", "--resume"), check=True, capture_output=True)
-    plys = [(tmp_path / run / "point_cloud.ply").read_bytes() for run in ("whole", "killed")]
-    assert plys[0] == plys[1]
-    logs = [
-        [json.loads(x)["step"] for x in (tmp_path / r / "metrics.jsonl").read_text().splitlines()] for r in ("whole", "killed")
-    ]
-    assert logs[0] == logs[1] == list(range(1, 61))
+def test_a_run_of_a_scene_from_python_is_complete_but_for_the_scene(folder, tmp_path, capsys):
+    """Its folder exports and renders; scoring it again needs the scene, which is said; it is continued with the scene."""
+    scene = warpgs.load_scene(folder / "scene")
+    few = dataclasses.replace(CONFIG, steps=3)
+    result = warpgs.fit(scene, few, out=tmp_path / "run", device="cpu", verbose=False)
+    assert result.folder == tmp_path / "run" and (tmp_path / "run" / "report.html").is_file()
+    assert main(["export", str(tmp_path / "run"), "--to", str(tmp_path / "a.ply")]) == 0
+    assert main(["eval", str(tmp_path / "run"), "--device", "cpu"]) == 3
+    assert "passed from Python" in capsys.readouterr().err
+    with pytest.raises(DataError, match="no record of a fit"):
+        (tmp_path / "x").mkdir()
+        (tmp_path / "x" / "config.json").write_text("{}")
+        warpgs.fit(scene, few, out=tmp_path / "x", resume=True)
+    again = warpgs.fit(scene, few, out=tmp_path / "run", device="cpu", resume=True, verbose=False)
+    assert torch.equal(again.gaussians().means, result.gaussians().means)

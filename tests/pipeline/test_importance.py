@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from warpgs.errors import UsageError
-from warpgs.pipeline.importance import (
+from warpgs.pipeline.train.strategies.importance import (
     ImportanceConfig,
     blur,
     geometry_score,
@@ -70,10 +70,10 @@ def test_semantic_score_is_the_papers_product():
 
 def test_render_score_is_the_length_of_the_colour_difference():
     """Largest where the pictures differ most, by the norm over channels."""
-    photo, rendered = torch.zeros(30, 30, 3), torch.zeros(30, 30, 3)
+    image, rendered = torch.zeros(30, 30, 3), torch.zeros(30, 30, 3)
     rendered[4:14, 4:14] = torch.tensor([0.3, 0.0, 0.4])  # length 0.5
     rendered[18:28, 18:28, 0] = 0.45
-    score = render_score(rendered, photo)
+    score = render_score(rendered, image)
     assert score[9, 9] == 1 and abs(float(score[23, 23]) - 0.9) < 5e-3 and score[0, 29] == 0
 
 

@@ -7,17 +7,28 @@ import numpy as np
 import pytest
 import torch
 
-from tests.scenes import photographs, priors, seeds
+from tests.scenes import photos, priors, seeds
 from warpgs.errors import UsageError
-from warpgs.pipeline.config import PRESETS, FitConfig
-from warpgs.pipeline.density import DensityConfig
-from warpgs.pipeline.fit import Fit
-from warpgs.pipeline.init import InitConfig
-from warpgs.pipeline.loss import FLAT, MIN_ALPHA, LossConfig, depth_disagreement, training_loss
-from warpgs.pipeline.method import TrainingView
-from warpgs.pipeline.resolution import halved
-from warpgs.rasterizer import rasterize
-from warpgs.scene import Prior
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.train.config import PRESETS, FitConfig
+from warpgs.pipeline.train.loss import (
+    FLAT,
+    MIN_ALPHA,
+    DepthCorrelation,
+    LossConfig,
+    Photometric,
+    Target,
+    built_in_terms,
+    depth_disagreement,
+    photometric_loss,
+)
+from warpgs.pipeline.train.step import total_loss
+from warpgs.pipeline.train.strategies.base import Strategy
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.train.views import TrainingView, half_size
+from warpgs.render.rasterize import rasterize
+from warpgs.scene import Prior, Render
 
 CPU = torch.device("cpu")
 GUIDED = FitConfig(
@@ -113,8 +124,10 @@ def test_depth_term_hides_no_nan():
 
 def test_depth_term_reaches_the_gaussians():
     """The whole way from means to the term, in float64, against central differences along a random direction."""
-    view, prior = photographs(1)[0], priors(photographs(1))[0]
-    fit = Fit([view], seeds(), dataclasses.replace(GUIDED, init=InitConfig(source="points", opacity=0.9)), CPU, priors=[prior])
+    view, prior = photos(1)[0], priors(photos(1))[0]
+    fit = Trainer(
+        [view], seeds(), dataclasses.replace(GUIDED, init=InitConfig(source="points", opacity=0.9)), CPU, priors=[prior]
+    )
     tensors = {n: t.double() for n, t in fit.gaussians.tensors().items()}
     disparity = torch.as_tensor(prior.disparity, dtype=torch.float64)
 
@@ -130,25 +143,31 @@ def test_depth_term_reaches_the_gaussians():
     assert abs(slope) > 0.1 and float((gradient * towards).sum()) == pytest.approx(slope, rel=1e-4)
 
 
-def test_training_loss_adds_the_weighted_term():
-    """Photometric alone where no disparity is given."""
+def test_total_loss_is_the_sum_of_terms_and_of_what_the_strategy_adds():
+    """The photometric loss alone without a depth weight, to the bit; then the weighted depth term; then a regularisation."""
     depth, alpha, disparity, mask = maps(torch.float32)
-    rgb, target = torch.rand(2, 9, 11, 3)
-    config = LossConfig(depth_weight=0.25)
-    plain = training_loss((rgb, alpha, depth), target, mask, None, config)
-    both = training_loss((rgb, alpha, depth), target, mask, disparity, config)
+    rgb, image = torch.rand(2, 9, 11, 3)
+    render, target = Render(rgb, alpha, depth, rgb, rgb), Target(image, mask, {"disparity": disparity}, {})
+    strategy = Strategy.__new__(Strategy)
+    plain = total_loss(built_in_terms(LossConfig()), render, target, None, strategy)
+    terms = built_in_terms(LossConfig(depth_weight=0.25, depth_until=0.5))
+    both = total_loss(terms, render, target, None, strategy)
+    assert terms == (Photometric(0.2), DepthCorrelation(0.25, 0.5)) and built_in_terms(LossConfig()) == (Photometric(),)
+    assert torch.equal(plain, photometric_loss(rgb, image, mask))
     assert float(both - plain) == pytest.approx(0.25 * float(depth_disagreement(depth, alpha, disparity, mask)), abs=1e-6)
+    strategy.regularisation = lambda gaussians: torch.tensor(2.0)
+    assert torch.equal(total_loss(terms, render, target, None, strategy), both + 2)
 
 
-def fitted(config: FitConfig, found: list[Prior] | None = None) -> Fit:
-    views = photographs(3)
-    fit = Fit(views, seeds(), config, CPU, priors=priors(views) if found is None else found)
+def fitted(config: FitConfig, found: list[Prior] | None = None) -> Trainer:
+    views = photos(3)
+    fit = Trainer(views, seeds(), config, CPU, priors=priors(views) if found is None else found)
     for _ in range(config.steps):
         fit.advance()
     return fit
 
 
-def agreement(fit: Fit, wanted: list[Prior]) -> float:
+def agreement(fit: Trainer, wanted: list[Prior]) -> float:
     """Mean correlation of a fit's depths with given disparities."""
     renders = [rasterize(fit.gaussians, v.camera) for v in fit.views]
     return float(np.mean([correlation(r.depth, r.alpha, torch.as_tensor(p.disparity), None) for r, p in zip(renders, wanted)]))
@@ -156,7 +175,7 @@ def agreement(fit: Fit, wanted: list[Prior]) -> float:
 
 def test_fit_follows_its_priors_without_sampling_events():
     """Whichever way round the prior is: depth comes nearer to it than it began, and than under the other."""
-    straight = priors(photographs(3))
+    straight = priors(photos(3))
     turned = [dataclasses.replace(p, disparity=1 - p.disparity) for p in straight]
     start = fitted(dataclasses.replace(GUIDED, steps=1), straight)
     fits = [fitted(GUIDED, given) for given in (straight, turned)]
@@ -170,27 +189,30 @@ def test_term_ends_when_it_should():
     for until, same in ((0.0, True), (0.5, False)):
         fit = fitted(dataclasses.replace(GUIDED, loss=LossConfig(depth_weight=0.5, depth_until=until)))
         assert torch.equal(fit.gaussians.means, plain.gaussians.means) == same
-    assert [fit._phase(s).guided for s in (1, 20, 21, 40)] == [True, True, False, False]
+    assert [len(fit.plan_of(s).terms) for s in (1, 20, 21, 40)] == [2, 2, 1, 1]
 
 
 def test_fit_says_in_which_views_it_has_the_term():
     """Without a prior that knows anything it is 0, which the user is told with a way out; its sources are told too."""
-    nothing = [dataclasses.replace(p, disparity=np.zeros_like(p.disparity)) for p in priors(photographs(3))]
-    two = [*priors(photographs(3))[:2], nothing[2]]
+    nothing = [dataclasses.replace(p, disparity=np.zeros_like(p.disparity)) for p in priors(photos(3))]
+    two = [*priors(photos(3))[:2], nothing[2]]
     short = dataclasses.replace(GUIDED, steps=1)
     assert any("depth term" in n and "2 of 3 views" in n for n in fitted(short, two).notes)
-    told = Fit(photographs(3), seeds(), short, CPU).notes
+    told = Trainer(photos(3), seeds(), short, CPU).notes
     assert any("depth: none" in n for n in told) and any("0 of 3 views" in n and "--depth-model" in n for n in told)
     assert not any("depth" in n for n in fitted(dataclasses.replace(short, loss=LossConfig())).notes)
 
 
 def test_half_size_views_keep_their_disparity():
-    """Each pixel has the mean of what it covers."""
-    view = photographs(1)[0]
-    guided = TrainingView.of(view, CPU).guided(priors([view])[0])
-    half = halved(guided)
-    assert torch.allclose(half.disparity, guided.disparity.reshape(16, 2, 20, 2).mean((1, 3)), atol=1e-6)
-    assert halved(TrainingView.of(view, CPU)).disparity is None
+    """Each pixel has the mean of what it covers, whatever channels a map has."""
+    view = photos(1)[0]
+    whole = TrainingView.of(view, CPU)
+    (disparity,) = DepthCorrelation().needs(whole, priors([view])[0]).values()
+    whole = dataclasses.replace(whole, maps={"disparity": disparity, "two": torch.stack([disparity, 1 - disparity], 2)})
+    half = half_size(whole).maps
+    assert torch.allclose(half["disparity"], disparity.reshape(16, 2, 20, 2).mean((1, 3)), atol=1e-6)
+    assert torch.allclose(half["two"][..., 1], 1 - half["disparity"], atol=1e-6) and half["two"].shape == (16, 20, 2)
+    assert half_size(TrainingView.of(view, CPU)).maps == {}
 
 
 @pytest.mark.parametrize(
@@ -208,5 +230,5 @@ def test_only_the_preset_after_fsgs_has_the_term():
     c = PRESETS["fsgs"]
     assert (c.preset, c.steps, c.sh_every, c.dropout, c.loss) == ("fsgs", 10_000, 500, 0, LossConfig(depth_weight=0.05))
     d = c.density
-    assert (d.gradient, d.stop_share, d.reset_every, d.reset_opacity, d.prune_size) == (5e-4, 1, 3000, 0.05, 0)
+    assert (d.gradient, d.stop_fraction, d.reset_every, d.reset_opacity, d.prune_size) == (5e-4, 1, 3000, 0.05, 0)
     assert c.optimizer.scales_lr == 0.005 and c.init.sweep_up_to >= 3 and c.init.max_sh_degree == 3 and not c.method.events

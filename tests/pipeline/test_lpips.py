@@ -9,10 +9,10 @@ import torch
 from safetensors import safe_open
 from torch import nn
 
-from warpgs.cli import main
+from warpgs.app.cli import main
 from warpgs.errors import DataError
-from warpgs.pipeline.lpips import MODES, load_lpips
-from warpgs.pipeline.lpips_weights import NETS, convert_lpips
+from warpgs.pipeline.metrics.lpips import MODES, load_lpips
+from warpgs.pipeline.metrics.lpips_weights import NETS, convert_lpips
 
 CHANNELS = {"vgg": (64, 128, 256, 512, 512), "alex": (64, 192, 384, 256, 256)}
 TAPS = {"vgg": (3, 8, 15, 22, 29), "alex": (1, 4, 7, 9, 11)}

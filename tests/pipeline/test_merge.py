@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
-from tests.splats import cloud
-from warpgs.pipeline.merge import OPAQUE, covariances, merges, quaternions, rotation_matrices
+from tests.gaussians import cloud
+from warpgs.geometry import quaternions, rotation_matrices
+from warpgs.pipeline.model.merge import OPAQUE, covariances, merges
 from warpgs.scene import Gaussians
 
 
@@ -31,14 +32,14 @@ def test_moments_of_a_pair():
     assert sorted([*pairs.first.tolist(), *pairs.second.tolist()]) == [0, 1]
     areas = g.log_scales.double().exp().sort(1).values[:, 1:].prod(1)
     mass = g.logit_opacities.double().sigmoid() * areas
-    share = (mass / mass.sum())[:, None]
-    mean = (share * g.means.double()).sum(0)
+    fraction = (mass / mass.sum())[:, None]
+    mean = (fraction * g.means.double()).sum(0)
     apart = g.means.double() - mean
     cov = covariances(g.quats.double(), g.log_scales.double()) + apart[:, :, None] * apart[:, None, :]
     merged = {n: t.double() for n, t in pairs.merged.items()}
     assert torch.allclose(merged["means"][0], mean, atol=1e-6)
-    assert torch.allclose(covariances(merged["quats"], merged["log_scales"])[0], (share[:, None] * cov).sum(0), atol=1e-6)
-    assert torch.allclose(merged["sh"][0], (share[:, None] * g.sh.double()).sum(0), atol=1e-6)
+    assert torch.allclose(covariances(merged["quats"], merged["log_scales"])[0], (fraction[:, None] * cov).sum(0), atol=1e-6)
+    assert torch.allclose(merged["sh"][0], (fraction[:, None] * g.sh.double()).sum(0), atol=1e-6)
     new = merged["logit_opacities"].sigmoid() * merged["log_scales"].exp().sort(1).values[:, 1:].prod(1)
     assert 0.5 * float(mass.sum()) < float(new) < float(mass.sum()) * (1 + 1e-6)
 

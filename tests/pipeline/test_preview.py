@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from tests.priors import networks as nw
-from warpgs.cli import main
-from warpgs.demo import split_spec, write_demo
+from warpgs.app.cli import main
+from warpgs.synthetic.demo import split_spec, write_demo
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_without_networks_the_notes_say_what_stands_in(scene, tmp_path, capsys, 
     assert main(show(scene, "--out", tmp_path / "a", "--source", source)) == 0
     text = capsys.readouterr().out
     assert "semantics: no network, so saliency stands for foreground" in text
-    assert "depth: from the other views, " in text and "no depth is confirmed" not in text
+    assert "depth: from the other views, " in text and "no depth is consistent" not in text
     assert not (tmp_path / "cache").exists()
 
 

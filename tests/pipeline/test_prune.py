@@ -6,19 +6,26 @@ import math
 import pytest
 import torch
 
+from tests.gaussians import camera, cloud
 from tests.scenes import ring
-from tests.splats import camera, cloud
-from warpgs.cli import main
-from warpgs.demo import split_spec, write_demo
+from warpgs.app.cli import main
 from warpgs.errors import UsageError
 from warpgs.export.ply import read_ply
-from warpgs.pipeline.checkpoint import load_checkpoint
-from warpgs.pipeline.optimizer import Optimizer, OptimizerConfig
-from warpgs.pipeline.prune import prune
-from warpgs.pipeline.run import open_run
-from warpgs.pipeline.shrink import Looks, keep_last, largest_share, needed_degrees, prune_order, rows_of, stored_degrees
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.pipeline.model.compress import (
+    ViewSet,
+    keep_last,
+    largest_fraction,
+    needed_degrees,
+    prune_order,
+    rows_of,
+    stored_degrees,
+)
+from warpgs.pipeline.runs.checkpoint import load_checkpoint
+from warpgs.pipeline.runs.folder import open_run
+from warpgs.pipeline.runs.prune import prune
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera
+from warpgs.synthetic.demo import split_spec, write_demo
 
 CPU = torch.device("cpu")
 
@@ -26,11 +33,11 @@ CPU = torch.device("cpu")
 def test_largest_share():
     """Within the last interval of what is accepted, never above it; all and nothing are found; what comes back was accepted."""
     for limit in (0.3, 0.77, 0.0001):
-        share = largest_share(limit.__ge__, rounds=10)
-        assert limit - 2**-10 <= share <= limit
-    assert largest_share(lambda s: True) == 1 and largest_share(lambda s: False) == 0
+        fraction = largest_fraction(limit.__ge__, rounds=10)
+        assert limit - 2**-10 <= fraction <= limit
+    assert largest_fraction(lambda s: True) == 1 and largest_fraction(lambda s: False) == 0
     asked = []
-    odd = largest_share(lambda s: asked.append(s) or int(s * 32) % 3 == 0)
+    odd = largest_fraction(lambda s: asked.append(s) or int(s * 32) % 3 == 0)
     assert odd == 0 or (odd in asked and int(odd * 32) % 3 == 0)
 
 
@@ -49,11 +56,11 @@ def test_what_contributes_nothing_goes_first():
     """Without the transparent and the hidden tenth the picture is the same to the bit."""
     g = cloud(100)
     g.logit_opacities[:10] = -9
-    looks = RasterizeOptions(contributions=True)
+    view_set = RasterizeOptions(contributions=True)
     c = camera(dtype=torch.float32)
-    order = prune_order(rasterize(g, c, looks).weight_maxima[0], torch.zeros(100))
-    assert float(rasterize(g, c, looks).weight_maxima[0][:10].max()) == 0
-    thin = rows_of(g, keep_last(prune_order(rasterize(g, c, looks).weight_maxima[0], torch.arange(100.0)), 0.1))
+    order = prune_order(rasterize(g, c, view_set).weight_maxima[0], torch.zeros(100))
+    assert float(rasterize(g, c, view_set).weight_maxima[0][:10].max()) == 0
+    thin = rows_of(g, keep_last(prune_order(rasterize(g, c, view_set).weight_maxima[0], torch.arange(100.0)), 0.1))
     assert len(order) == 100 and torch.equal(rasterize(g, c).rgb, rasterize(thin, c).rgb)
 
 
@@ -75,7 +82,7 @@ def test_prune_keeps_its_promise(run, tmp_path, capsys):
     assert "Gaussians, mean SH degree" in words and "times smaller" in words and "held-out PSNR" in words
     assert before == {p: p.read_bytes() for p in run.rglob("*") if p.is_file()}
     record = json.loads((tmp_path / "small" / "config.json").read_text())["pruned"]
-    whole, small = (open_run(f, CPU).gaussians for f in (run, tmp_path / "small"))
+    whole, small = (open_run(f, CPU).gaussians() for f in (run, tmp_path / "small"))
     assert record["count"] == [len(whole), len(small)] and record["bytes"][1] < 0.6 * record["bytes"][0]
     assert record["train_psnr"][1] >= record["train_psnr"][0] - 0.2
     assert json.loads((run / "metrics.json").read_text())["train"]["psnr"] == pytest.approx(record["train_psnr"][0])
@@ -83,7 +90,7 @@ def test_prune_keeps_its_promise(run, tmp_path, capsys):
     degrees = stored_degrees(small.sh)
     assert bool((degrees.diff() >= 0).all()), "not sorted by degree"
     tensors, _ = load_checkpoint(tmp_path / "small")
-    stored = sum(t.numel() * t.element_size() for n, t in tensors.items() if n.startswith("param."))
+    stored = sum(t.numel() * t.element_size() for n, t in tensors.items() if n.startswith("params."))
     assert stored == record["bytes"][1]
     ply = read_ply(tmp_path / "small" / "point_cloud.ply")
     assert len(ply) == len(small) and torch.equal(ply.sh, small.sh)
@@ -150,27 +157,10 @@ def test_only_the_mirror_keeps_its_harmonics():
         Camera(torch.from_numpy(c.viewmat).float(), torch.from_numpy(c.K).float(), c.width, c.height) for c in ring(6, 80, 60)
     ]
     photos = [rasterize(g, c).rgb for c in cameras]
-    looks = Looks(cameras, RasterizeOptions(), 0)
+    view_set = ViewSet(cameras, RasterizeOptions(), 0)
 
     def accepted(model) -> bool:
         return all(float((rasterize(model, c).rgb - p).square().mean()) < 1e-6 for c, p in zip(cameras, photos))
 
-    degrees = needed_degrees(g, looks.coverage(g).supported_degree(), looks, accepted)
+    degrees = needed_degrees(g, view_set.coverage(g).supported_degree(), view_set, accepted)
     assert bool((degrees[~right] == 0).all()) and float(degrees[right].float().mean()) > 0.8
-
-
-def test_moments_go_where_their_gaussians_go():
-    """First ones in their sum, second ones as the square of the sum of roots; those of what was removed are gone."""
-    g = cloud(4)
-    optimizer = Optimizer(g, OptimizerConfig(), 1.0)
-    for name in optimizer.params:
-        values = torch.arange(1.0, 5).reshape(4, *[1] * (g.tensors()[name].dim() - 1)).expand_as(g.tensors()[name])
-        optimizer.means[name], optimizer.squares[name] = values.clone(), values.square()
-    new = rows_of(g, torch.tensor([2, 0]))
-    optimizer.regroup(new, torch.tensor([1, -1, 0, 1]))
-    for name, t in new.tensors().items():
-        assert torch.equal(optimizer.params[name], t) and optimizer.params[name].requires_grad
-        for moments, wanted in ((optimizer.means, [3.0, 5.0]), (optimizer.squares, [9.0, 25.0])):
-            assert torch.allclose(
-                moments[name].flatten(1) if t.dim() > 1 else moments[name][:, None], torch.tensor(wanted)[:, None]
-            )

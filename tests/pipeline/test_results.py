@@ -2,12 +2,12 @@
 
 import pytest
 
-from tests.scenes import photographs, seeds
+from tests.scenes import photos, seeds
 from warpgs.errors import ResourceError
-from warpgs.pipeline import results
-from warpgs.pipeline.evaluate import render_view, score
-from warpgs.pipeline.init import InitConfig, initial_gaussians
-from warpgs.pipeline.results import evaluate_run, options_for
+from warpgs.pipeline.metrics.evaluate import options_for, render_view, score
+from warpgs.pipeline.model.init import InitConfig, initial_gaussians
+from warpgs.pipeline.runs import results
+from warpgs.pipeline.runs.results import evaluate_run
 
 BLACK = (0.0, 0.0, 0.0)
 
@@ -17,7 +17,7 @@ def scene():
     """Gaussians, and more views than there are threads and pictures at a time."""
     import torch
 
-    return initial_gaussians(seeds(), InitConfig(), 1.0, torch.device("cpu")), photographs(12)
+    return initial_gaussians(seeds(), InitConfig(), 1.0, torch.device("cpu")), photos(12)
 
 
 def test_scores_are_those_of_their_views(scene, tmp_path):
@@ -38,7 +38,7 @@ def test_without_held_out_views_training_views_are_pictured(scene, tmp_path):
     """And no score is called held-out."""
     gaussians, views = scene
     found = evaluate_run(tmp_path, gaussians, views[:2], [], "exact", BLACK)
-    assert found["test"] == {} and found["views"] == [] and found["guesses"] == {} and found["train"]["psnr"] > 5
+    assert found["test"] == {} and found["views"] == [] and found["baselines"] == {} and found["train"]["psnr"] > 5
     assert len(list((tmp_path / "renders").iterdir())) == 2
 
 

@@ -9,7 +9,7 @@ from tests.scenes import ring
 from warpgs import geometry
 from warpgs.errors import UsageError
 from warpgs.kernels.sh import C0
-from warpgs.pipeline.sampler import (
+from warpgs.pipeline.train.strategies.sampler import (
     SUPPORT,
     SamplerConfig,
     back_project,
@@ -106,19 +106,19 @@ def test_fine_gaussians_stand_behind_their_pixels():
     tensors = Camera(
         *(torch.as_tensor(t, dtype=torch.float32) for t in (camera.viewmat, camera.K)), camera.width, camera.height
     )
-    photo = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(0))
+    image = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(0))
     depth = torch.full((camera.height, camera.width), 2.5)
     at = torch.tensor([[3, 7], [20, 30]])
-    rows = fine_gaussians(tensors, photo, depth, at, SamplerConfig(), 4)
+    rows = fine_gaussians(tensors, image, depth, at, SamplerConfig(), 4)
     pixels, z = geometry.project_points(camera, rows["means"].double().numpy())
     assert np.allclose(pixels, [[7.5, 3.5], [30.5, 20.5]], atol=1e-5) and np.allclose(z, 2.5)
-    assert torch.allclose(rows["sh"][:, 0] * C0 + 0.5, photo[at[:, 0], at[:, 1]]) and not bool(rows["sh"][:, 1:].any())
+    assert torch.allclose(rows["sh"][:, 0] * C0 + 0.5, image[at[:, 0], at[:, 1]]) and not bool(rows["sh"][:, 1:].any())
     assert torch.allclose(rows["logit_opacities"].sigmoid(), torch.tensor(0.1))
     assert torch.allclose(rows["log_scales"].exp(), torch.tensor(2.5 / camera.K[0, 0], dtype=torch.float32))
 
 
 def test_bad_settings_are_named():
     """Out of range: said before anything starts."""
-    for bad in ({"share": 0}, {"gate_quantile": 1}, {"opacity": 1}, {"footprint": 0}, {"border": -1}):
+    for bad in ({"fraction": 0}, {"gate_quantile": 1}, {"opacity": 1}, {"footprint": 0}, {"border": -1}):
         with pytest.raises(UsageError, match="sampler"):
             SamplerConfig(**bad)

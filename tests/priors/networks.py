@@ -16,7 +16,7 @@ def varint(n: int) -> bytes:
 
 
 def field(number: int, value: int | str | bytes) -> bytes:
-    """One protobuf field: a whole number, or bytes with their length."""
+    """Return one protobuf field: a whole number, or bytes with their length."""
     if isinstance(value, int):
         return varint(number << 3) + varint(value)
     data = value.encode() if isinstance(value, str) else value
@@ -73,7 +73,7 @@ def linear(
     outputs: int = 1,
     kind: int = 1,
 ) -> bytes:
-    """A network whose C outputs at a pixel are ``weights [C, 3] @ x + bias [C]``, then one more operator."""
+    """Return a network whose C outputs at a pixel are ``weights [C, 3] @ x + bias [C]``, then one more operator."""
     count = len(weights)
     if layout == "nchw":
         shapes, first = ((1, 3, *size), (1, count, *size)), node("Conv", ["x", "W", "b"], ["y"])
@@ -102,12 +102,12 @@ DEPTH_WEIGHTS, DEPTH_BIAS = np.array([[0.7, 0.2, 0.4]]), np.array([3.0])
 
 
 def depth_network(path: Path, **options) -> str:
-    """Writes a network that gives 0.7 r + 0.2 g + 0.4 b + 3 of its input."""
+    """Write a network that gives 0.7 r + 0.2 g + 0.4 b + 3 of its input."""
     return write(path, linear(DEPTH_WEIGHTS, DEPTH_BIAS, **options))
 
 
 def segmentation_weights() -> tuple[np.ndarray, np.ndarray]:
-    """Background for dark, class 3 for red, class 15 for blue; all else unlikely."""
+    """Return weights for background on dark, class 3 on red, class 15 on blue; other classes are unlikely."""
     weights, bias = np.zeros((CLASSES, 3)), np.full(CLASSES, -6.0)
     bias[[0, 3, 15]] = 2.0, 0.0, 0.0
     weights[3, 0] = weights[15, 2] = 5.0
@@ -115,5 +115,5 @@ def segmentation_weights() -> tuple[np.ndarray, np.ndarray]:
 
 
 def segmentation_network(path: Path, **options) -> str:
-    """Writes a network with those logits."""
+    """Write a network with those logits."""
     return write(path, linear(*segmentation_weights(), **options))

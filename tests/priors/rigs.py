@@ -4,16 +4,16 @@ import functools
 
 import numpy as np
 
-from warpgs import demo, raycast
 from warpgs.geometry import look_at
 from warpgs.priors.epipolar import pixel_grid
 from warpgs.scene import Camera, View
+from warpgs.synthetic import demo, raycast
 
 SIZE = (160, 120)
 
 
 def exact_depth(shapes: list, camera: Camera) -> np.ndarray:
-    """z-depth behind every pixel centre [u], shape [H, W]."""
+    """Return the z-depth behind every pixel centre [u], shape [H, W]."""
     rays = raycast.pixel_rays(camera.K, camera.viewmat, pixel_grid(camera))
     t, _ = raycast.cast(shapes, camera.center, rays)
     return (t * (rays @ camera.viewmat[2, :3])).reshape(camera.height, camera.width)
@@ -21,7 +21,7 @@ def exact_depth(shapes: list, camera: Camera) -> np.ndarray:
 
 @functools.cache
 def still_life(count: int = 3) -> tuple[list[View], list[np.ndarray]]:
-    """Every fourth view from the middle of the demo's path, and their depths."""
+    """Return every fourth view from the middle of the demo's path, and their depths."""
     shapes, light = demo.still_life(0), raycast.Light()
     views, depths = [], []
     for i, camera in enumerate(demo.camera_path(24, *SIZE)[6::4][:count]):
@@ -32,7 +32,7 @@ def still_life(count: int = 3) -> tuple[list[View], list[np.ndarray]]:
 
 
 def rig(count: int = 3) -> list[Camera]:
-    """Cameras with unequal intrinsics and poses that look at the origin from about 4 u."""
+    """Return cameras with unequal intrinsics and poses that look at the origin from about 4 u."""
     generator = np.random.default_rng(3)
     cameras = []
     for i in range(count):

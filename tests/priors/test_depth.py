@@ -1,4 +1,4 @@
-"""Disparity from networks with known answers, and from depth that other views confirm at some pixels."""
+"""Disparity from networks with known answers, and from depth that is consistent between views at some pixels."""
 
 import json
 import re
@@ -9,7 +9,7 @@ import pytest
 
 from tests.priors import networks as nw
 from warpgs.errors import DataError, UsageError
-from warpgs.priors.depth import USUAL, complete_disparity, network_disparity, unit_range
+from warpgs.priors.depth import DEFAULTS, complete_disparity, network_disparity, unit_range
 from warpgs.priors.preprocess import HALF, IMAGENET, Preprocessing, describe, resize
 from warpgs.priors.session import open_network
 
@@ -17,7 +17,7 @@ MEAN, STD = (0.4, 0.5, 0.6), (0.2, 0.25, 0.5)
 
 
 def scaled(values):
-    """[0, 1] by minimum and maximum, in float64."""
+    """Scale to [0, 1] by minimum and maximum, in float64."""
     return (values - values.min()) / (values.max() - values.min())
 
 
@@ -26,14 +26,14 @@ def photo(height, width, seed=0):
 
 
 def response(image, mean=MEAN, std=STD):
-    """What the depth network answers to colours, in float64."""
+    """Return the depth network's answer to colours, in float64."""
     return ((image.astype(float) - mean) / std) @ nw.DEPTH_WEIGHTS[0] + nw.DEPTH_BIAS[0]
 
 
 @pytest.mark.parametrize("layout", ["nchw", "nhwc"])
 @pytest.mark.parametrize(("output", "sign"), [("disparity", 1), ("depth", -1)])
 def test_normalisation_and_sign(tmp_path, layout, output, sign):
-    """At the network's own size the map is the formula: colours normalised, depth inverted, minimum and maximum at 0 and 1."""
+    """At the network's own size the map is the formula: colours normalised, depth inverted, scaled to [0, 1]."""
     image = photo(32, 64)
     how = Preprocessing(32, 32, MEAN, STD, output)
     if output == "depth":
@@ -44,7 +44,7 @@ def test_normalisation_and_sign(tmp_path, layout, output, sign):
 
 
 def test_resizing_keeps_pixel_centres(tmp_path):
-    """A ramp through a network of a quarter of the size stays the ramp, flat only beyond the outermost coarse centres."""
+    """A ramp stays a ramp through a network of a quarter of the size, flat only beyond its outermost centres."""
     x, y = np.meshgrid(np.arange(96) + 0.5, np.arange(64) + 0.5)
     image = np.repeat((x / 200 + y / 150)[..., None], 3, 2).astype(np.float32)
     network = open_network(nw.depth_network(tmp_path / "d.onnx", size=(16, 24)))
@@ -80,17 +80,17 @@ def test_depth_that_is_not_positive_is_refused(tmp_path):
 def test_an_output_that_is_no_map_is_refused(tmp_path):
     network = open_network(nw.segmentation_network(tmp_path / "s.onnx"))
     with pytest.raises(DataError, match=r"shape \(1, 21, 384, 384\), not that of one depth map"):
-        network_disparity(network, USUAL, photo(32, 32))
+        network_disparity(network, DEFAULTS, photo(32, 32))
 
 
 def described(path, **flags):
-    return describe(open_network(path), flags, USUAL, "depth")
+    return describe(open_network(path), flags, DEFAULTS, "depth")
 
 
 def test_flags_come_before_the_side_file_and_that_before_what_is_usual(tmp_path):
     path = nw.depth_network(tmp_path / "d.onnx")
     how, notes = described(path)
-    assert how == USUAL
+    assert how == DEFAULTS
     assert notes == [
         "d.onnx: assumed size 384, multiple 32, mean 0.5 0.5 0.5, std 0.5 0.5 0.5, output disparity; "
         "flags --depth-... or d.onnx.json say otherwise"
@@ -132,7 +132,7 @@ def test_a_size_against_the_graph_is_refused(tmp_path):
     path = nw.depth_network(tmp_path / "d.onnx", size=(32, 48))
     with pytest.raises(UsageError, match=r"--depth-size 64: .* takes 48 x 32 px only"):
         described(path, size=64)
-    assert described(path, size=32)[0].mean == USUAL.mean
+    assert described(path, size=32)[0].mean == DEFAULTS.mean
 
 
 def test_unit_range_of_a_wall_is_zero():
@@ -144,7 +144,7 @@ def test_unit_range_of_a_wall_is_zero():
 
 
 def two_planes(height=60, width=80, seed=0):
-    """A near plane that leans, red, before a far one, blue: colours, true inverse depth."""
+    """Return a slanted near plane, red, before a far one, blue: colours and true inverse depth."""
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     near = (x > 25) & (x < 60) & (y > 15)
     image = np.where(near[..., None], [0.8, 0.2, 0.1], [0.1, 0.2, 0.7])
@@ -153,7 +153,7 @@ def two_planes(height=60, width=80, seed=0):
 
 
 def test_gaps_are_filled_up_to_the_colour_edge_and_not_across():
-    """Four of a hundred pixels suffice, and the edge of the object stays where the colours have it."""
+    """Four valid pixels of a hundred suffice; the object's edge stays where the colours have it."""
     image, inverse, near = two_planes()
     valid = np.random.default_rng(1).random(near.shape) < 0.04
     depth = np.where(valid, 1 / inverse, 0).astype(np.float32)
@@ -174,7 +174,7 @@ def test_completion_knows_no_unit_of_length():
 
 
 def test_badly_conditioned_depths_yield():
-    """Every tenth depth is wrong by half: where its sensitivity says so, the map hardly changes."""
+    """Every tenth depth is wrong by half; where its sensitivity is large too, the map hardly changes."""
     image, inverse, near = two_planes()
     rng = np.random.default_rng(2)
     valid, wrong = rng.random(near.shape) < 0.3, rng.random(near.shape) < 0.1
@@ -188,7 +188,7 @@ def test_badly_conditioned_depths_yield():
 
 
 def test_weights_are_those_of_inverse_depth():
-    """Depths 1 and 2 whose inverses are equally uncertain count alike where both are found on one surface."""
+    """Depths 1 and 2 with equally uncertain inverses get the same weight on one surface."""
     columns = np.arange(90) // 30 + np.zeros((40, 1), int)
     image = np.repeat((0.1 + 0.4 * columns)[..., None], 3, 2).astype(np.float32)
     board = np.indices((40, 90)).sum(0) % 2 == 0

@@ -1,5 +1,7 @@
 """Depth from matches: exact where geometry is, rejected where it is not, blended as said."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -16,11 +18,12 @@ from warpgs.priors.epipolar import (
     pixel_grid,
     round_trip,
 )
+from warpgs.priors.sweep_planes import plane_homography, project_inverse
 from warpgs.scene import Camera, View
 
 
 def matches_of(first: Camera, second: Camera, depths: np.ndarray) -> np.ndarray:
-    """Where the pixels of the first camera lie in the second, exactly."""
+    """Return the exact positions in the second image of pixels of the first."""
     return project_points(second, back_project(first, pixel_grid(first), depths))[0]
 
 
@@ -29,7 +32,7 @@ def true_depths(count: int) -> np.ndarray:
 
 
 def exact_flow(views: list[View], depths: list[np.ndarray]):
-    """Flow between views whose depth is known; NaN-free, so occlusions give wrong matches, as real flow does."""
+    """Return flow between views of known depth; occluded pixels get wrong matches, as in real flow."""
 
     def flow(i: int, j: int) -> np.ndarray:
         at = matches_of(views[i].camera, views[j].camera, depths[i].ravel()) - pixel_grid(views[i].camera)
@@ -38,14 +41,24 @@ def exact_flow(views: list[View], depths: list[np.ndarray]):
     return flow
 
 
+def test_only_pinholes_have_epipolar_lines():
+    """Another camera model is refused on either side, instead of a depth by the wrong geometry."""
+    a, b, _ = rig()
+    fisheye = dataclasses.replace(b, model="fisheye")
+    for pair in ((a, fisheye), (fisheye, a)):
+        for op, more in ((fundamental, ()), (plane_homography, (0.3,)), (project_inverse, (np.zeros((1, 2)), np.ones(1)))):
+            with pytest.raises(UsageError, match="pinhole cameras only, and this one is 'fisheye'"):
+                op(*pair, *more)
+
+
 def test_pixel_centres_are_at_one_half():
-    """Row by row, the first at (0.5, 0.5)."""
+    """Pixels go row by row, the first at (0.5, 0.5)."""
     pixels = pixel_grid(rig()[0])
     assert pixels.shape == (64 * 48, 2) and pixels[[0, 1, 64]].tolist() == [[0.5, 0.5], [1.5, 0.5], [0.5, 1.5]]
 
 
 def test_depth_is_exact_on_a_synthetic_rig():
-    """Depths drawn at random come back to a relative 1e-9, with no residual; some points leave the image and are not valid."""
+    """Random depths come back to a relative 1e-9 with no residual; points outside the image are not valid."""
     a, b, _ = rig()
     depths = true_depths(64 * 48)
     matches = matches_of(a, b, depths)
@@ -57,7 +70,7 @@ def test_depth_is_exact_on_a_synthetic_rig():
 
 
 def test_a_match_beside_its_line_is_judged_by_its_foot():
-    """Pushed off the line at a right angle, a match keeps its depth and shows how far it was pushed."""
+    """A match moved at a right angle to its line keeps its depth; the residual is the distance moved."""
     a, b, _ = rig()
     depths, pixels = true_depths(64 * 48), pixel_grid(a)
     lines = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ fundamental(a, b)[0].T
@@ -69,7 +82,7 @@ def test_a_match_beside_its_line_is_judged_by_its_foot():
 
 
 def test_rays_that_meet_behind_a_camera_are_rejected():
-    """A match on the line, on the far side of the vanishing point, has a negative depth: norms alone would call it positive."""
+    """A match beyond the vanishing point has a negative depth, which norms alone would call positive."""
     a, b, _ = rig()
     pixels = pixel_grid(a)
     behind = matches_of(a, b, -true_depths(len(pixels)))
@@ -78,7 +91,7 @@ def test_rays_that_meet_behind_a_camera_are_rejected():
 
 
 def test_parallax_below_the_floor_is_rejected():
-    """Far points fail the floor of the angle, and only they; without a baseline, or at the epipole, nothing is valid."""
+    """Only far points fail the smallest angle; without a baseline, or at the epipole, nothing is valid."""
     a, b, _ = rig()
     pixels = pixel_grid(a)
     depths = np.geomspace(3, 3000, len(pixels))
@@ -105,7 +118,7 @@ def test_what_is_no_number_is_rejected():
 
 
 def test_sensitivity_is_the_derivative_along_the_line():
-    """Against the depth itself, recomputed with the match moved by 1e-4 px along the line."""
+    """It equals the change of the depth with the match moved by 1e-4 px along the line."""
     a, b, _ = rig()
     pixels, depths = pixel_grid(a), true_depths(64 * 48)
     matches = matches_of(a, b, depths)
@@ -122,7 +135,7 @@ def test_sensitivity_is_the_derivative_along_the_line():
 
 
 def test_blending_modes():
-    """Which candidate wins, and what a pixel without one holds."""
+    """Each mode takes its candidate; a pixel without one gets 0 and infinity."""
     depths = np.array([[1.0, 2, 3, 4, 9], [5, 6, 7, 8, 9]])
     sensitivities = np.array([[0.2, 0.1, 0.3, np.inf, 0.1], [0.1, 0.3, 0.1, 0.5, 0.1]])
     valid = np.array([[True, True, True, True, False], [True, True, False, False, False]])
@@ -137,7 +150,7 @@ def test_blending_modes():
 
 
 def test_nearest_views_come_first():
-    """By distance of the centres, ties by order, the view itself left out."""
+    """Views are sorted by distance of the centres, ties by order, without the view itself."""
     views = []
     for x in (0.0, 3.0, 1.0, -1.0):
         viewmat = np.eye(4)
@@ -147,7 +160,7 @@ def test_nearest_views_come_first():
 
 
 def test_round_trip_measures_the_way_back():
-    """A constant flow and its opposite return to the start; half a pixel off shows; what leaves the image never returns."""
+    """A constant flow and its opposite return to the start; half a pixel off shows; a match outside never returns."""
     pixels = np.array([[2.5, 3.5], [7.5, 3.5], [9.5, 3.5]])
     back = np.full((8, 10, 2), [-2.0, 0.5], np.float32)
     distance = round_trip(pixels + np.array([2, -0.5]), pixels, back)
@@ -160,7 +173,7 @@ def test_round_trip_measures_the_way_back():
 
 
 def test_depth_of_a_view_from_exact_flow():
-    """Exact flow of a ray-cast scene: what the checks pass is right, and most passes; blending took the less sensitive view."""
+    """Exact flow of a ray-cast scene passes the checks mostly, and is right where it passes."""
     views, depths = still_life()
     flow = exact_flow(views, depths)
     found = flow_depth(views, 1, flow, EpipolarConfig())
@@ -174,7 +187,7 @@ def test_depth_of_a_view_from_exact_flow():
 
 
 def test_missing_flow_is_a_note_not_a_failure():
-    """No flow at all: nothing valid, a note per pair; no flow back: depth all the same, and a note."""
+    """Without flow nothing is valid and each pair has a note; without flow back the depth stays, with a note."""
     views, depths = still_life()
     nothing = flow_depth(views, 0, lambda i, j: None, EpipolarConfig())
     assert nothing.coverage == 0 and nothing.notes == ("no flow to 001.png", "no flow to 002.png")
@@ -187,6 +200,6 @@ def test_missing_flow_is_a_note_not_a_failure():
 
 @pytest.mark.parametrize("bad", [{"blend": "best"}, {"max_residual": np.nan}, {"min_parallax": 0}, {"near_count": 0}])
 def test_bad_settings_are_refused(bad):
-    """At once, with the name of the setting."""
+    """A UsageError names the setting."""
     with pytest.raises(UsageError):
         EpipolarConfig(**bad)

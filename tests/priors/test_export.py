@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from warpgs.cli import main
+from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.priors.export import ExportRequest, build, export_network
 from warpgs.priors.session import open_network
@@ -50,14 +50,14 @@ def test_a_missing_package_is_named_with_its_remedy(name, tmp_path, monkeypatch,
 @needs_extra
 @pytest.mark.parametrize(("name", "shape"), [("dpt", (64, 64)), ("fcn-resnet18", (21, 64, 64))])
 def test_the_architecture_gives_in_onnxruntime_what_it_gives_in_torch(name, shape, tmp_path):
-    """Small random weights of the real classes; differences in standard deviations of the output."""
+    """The real classes with small random weights; differences in standard deviations of the output."""
     request, path = ExportRequest(name, random_weights=True, size=64), tmp_path / "n.onnx"
     lines = export_network(request, path)
     assert "small and untrained" in lines[0] and "warpgs priors show" in lines[1]
-    picture = np.random.default_rng(3).normal(size=(64, 64, 3)).astype(np.float32)
-    found = open_network(path).run(picture)[0]
+    image = np.random.default_rng(3).normal(size=(64, 64, 3)).astype(np.float32)
+    found = open_network(path).run(image)[0]
     with torch.no_grad():
-        wanted = build(request)(torch.from_numpy(picture).permute(2, 0, 1)[None])[0].numpy()
+        wanted = build(request)(torch.from_numpy(image).permute(2, 0, 1)[None])[0].numpy()
     assert found.shape == wanted.shape == shape and wanted.std() > 1e-3
     assert np.abs(found - wanted).max() < 1e-4 * wanted.std()
     assert json.loads((tmp_path / "n.onnx.json").read_text())["output"] == ("disparity" if name == "dpt" else "classes")

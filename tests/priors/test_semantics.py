@@ -20,7 +20,7 @@ PLAIN = Preprocessing(32, 32, (0.0,) * 3, (1.0,) * 3, "classes")
 
 
 def shapes(height=32, width=64):
-    """Black with a red and a blue rectangle; the labels that the network gives them."""
+    """Return a black image with a red and a blue rectangle, and the labels that the network gives them."""
     image, labels = np.zeros((height, width, 3), np.float32), np.zeros((height, width), int)
     image[8:20, 6:24, 0], labels[8:20, 6:24] = 0.9, 3
     image[12:30, 40:58, 2], labels[12:30, 40:58] = 0.7, 15
@@ -28,7 +28,7 @@ def shapes(height=32, width=64):
 
 
 def brute_boundary(labels):
-    """exp(-d^2 / 2 s^2) from all distances to all pixels at a label change."""
+    """Return exp(-d^2 / 2 s^2) by the distances of every pixel to all pixels at a label change."""
     height, width = labels.shape
     edges = []
     for i in range(height):
@@ -45,7 +45,7 @@ def brute_boundary(labels):
     "options", [{}, {"layout": "nhwc"}, {"size": (32, 64)}, {"then": "Softmax"}, {"layout": "nhwc", "then": "Softmax"}]
 )
 def test_maps_equal_the_formula(tmp_path, options):
-    """Softmax, largest probability, 1 - background and the falloff, for logits and for probabilities, in both layouts."""
+    """Softmax, largest probability, 1 - background and falloff, for logits and probabilities, in both layouts."""
     image, labels = shapes()
     maps = network_semantics(open_network(nw.segmentation_network(tmp_path / "s.onnx", **options)), PLAIN, image)
     weights, bias = nw.segmentation_weights()
@@ -62,7 +62,7 @@ def test_maps_equal_the_formula(tmp_path, options):
 
 
 def test_a_coarse_network_puts_labels_where_they_are(tmp_path):
-    """Through a quarter of the size each label covers its object; half a pixel of shift would show at every edge."""
+    """At a quarter of the size each label covers its object; a shift of half a pixel would show."""
     image, labels = np.zeros((128, 256, 3), np.float32), np.zeros((128, 256), int)
     image[32:80, 64:160, 0], labels[32:80, 64:160] = 0.9, 3
     network = open_network(nw.segmentation_network(tmp_path / "s.onnx", size=(32, 64)))
@@ -101,7 +101,7 @@ def test_when_foreground_is_known():
 
 
 def test_classical_maps_show_an_object_and_its_outline():
-    """A bright disc with texture on a dark ground: salient, with a boundary along its outline and none far away."""
+    """A bright textured disc on dark ground is salient, with a boundary along its outline and none far away."""
     y, x = np.mgrid[:96, :128] + 0.5
     radius = np.hypot(x - 70, y - 45)
     disc = radius < 22

@@ -26,17 +26,17 @@ def test_a_network_knows_its_file_layout_and_size(tmp_path):
 
 
 @pytest.mark.parametrize("layout", ["nchw", "nhwc"])
-def test_a_picture_goes_in_with_its_axes_in_order(tmp_path, layout):
+def test_an_image_goes_in_with_its_axes_in_order(tmp_path, layout):
     path = nw.write(tmp_path / "a.onnx", nw.linear(EYE, ZERO, layout=layout))
-    picture = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float32)
-    output = open_network(path).run(picture)[0]
-    np.testing.assert_allclose(output if layout == "nhwc" else output.transpose(1, 2, 0), picture, rtol=1e-6)
+    image = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float32)
+    output = open_network(path).run(image)[0]
+    np.testing.assert_allclose(output if layout == "nhwc" else output.transpose(1, 2, 0), image, rtol=1e-6)
 
 
 GOOD = nw.linear(EYE, ZERO)
 REFUSED = {
     "empty": (b"", "no ONNX model"),
-    "text": (b"a photograph, not a network", "no ONNX model"),
+    "text": (b"an image, not a network", "no ONNX model"),
     "png": (b"\x89PNG\r\n\x1a\n" + bytes(64), "no ONNX model"),
     "cut off": (GOOD[: len(GOOD) // 2], "no ONNX model"),
     "no graph": (nw.field(1, 8) + nw.field(8, nw.field(2, 17)), "it has no graph"),
@@ -48,11 +48,11 @@ REFUSED = {
     ),
     "a batch": (
         nw.model(nw.graph([nw.node("Relu", ["x"], ["y"])], [], [nw.value("x", (2, 3, 8, 8))], [nw.value("y", (2, 3, 8, 8))])),
-        "one picture",
+        "one image",
     ),
     "three axes": (
         nw.model(nw.graph([nw.node("Relu", ["x"], ["y"])], [], [nw.value("x", (3, 8, 8))], [nw.value("y", (3, 8, 8))])),
-        "one picture",
+        "one image",
     ),
     "one free side": (nw.linear(EYE, ZERO, size=(8, "w")), "fixes only one side"),
     "whole numbers": (
@@ -85,7 +85,7 @@ def test_files_that_are_refused(tmp_path, name):
 
 
 def external(where: str) -> bytes:
-    """A model with a constant in a side file: as initializer, in a node's attribute, or in a branch of an If."""
+    """Return a model with a constant in a side file: as initializer, in a node's attribute, or in a branch of an If."""
     x, y = nw.value("x", (1, 3, "h", "w")), nw.value("y", (1, 3, "h", "w"))
     outside = nw.external_tensor("k", (1,), "weights.bin")
     add = nw.node("Add", ["x", "k"], ["y"])
@@ -118,8 +118,8 @@ def test_functions_that_travel_in_the_file_are_welcome(tmp_path):
     x, y = nw.value("x", (1, 3, "h", "w")), nw.value("y", (1, 3, "h", "w"))
     more = nw.field(25, twice) + nw.field(8, nw.field(1, "own") + nw.field(2, 1))
     path = nw.write(tmp_path / "m.onnx", nw.model(nw.graph([nw.node("Twice", ["x"], ["y"], "own")], [], [x], [y]), more))
-    picture = np.random.default_rng(0).normal(size=(4, 4, 3)).astype(np.float32)
-    np.testing.assert_allclose(open_network(path).run(picture)[0], 2 * picture.transpose(2, 0, 1))
+    image = np.random.default_rng(0).normal(size=(4, 4, 3)).astype(np.float32)
+    np.testing.assert_allclose(open_network(path).run(image)[0], 2 * image.transpose(2, 0, 1))
 
 
 def test_nested_graphs_end(tmp_path):
@@ -131,7 +131,7 @@ def test_nested_graphs_end(tmp_path):
 
 
 def test_no_bytes_crash_the_reader(tmp_path):
-    """Damaged files give a message or still work; nothing else, and at once."""
+    """Damaged files raise a DataError or still work."""
     rng, began = np.random.default_rng(5), time.perf_counter()
     for i in range(150):
         data = bytearray(GOOD)

@@ -9,19 +9,9 @@ from warpgs.errors import UsageError
 from warpgs.geometry import back_project, project_points
 from warpgs.priors.completion import complete
 from warpgs.priors.epipolar import pixel_grid
-from warpgs.priors.sweep import (
-    LARGEST_STEP,
-    UNIT,
-    SweepConfig,
-    best_inverse,
-    confirm,
-    matching_costs,
-    path_costs,
-    plane_homography,
-    plane_inverses,
-    project_inverse,
-    sweep_depths,
-)
+from warpgs.priors.sweep import consistent_depth, sweep_depths
+from warpgs.priors.sweep_cpu import best_inverse, matching_costs, path_costs
+from warpgs.priors.sweep_planes import MAX_LARGE_STEP, UNIT, SweepConfig, plane_homography, plane_inverses, project_inverse
 from warpgs.scene import Camera, View
 
 
@@ -51,7 +41,7 @@ def test_planes_are_half_a_pixel_apart():
 
 
 def test_cost_is_least_at_the_true_plane():
-    """A wall parallel to the image: zero cost at its plane, more at others, no opinion where the other view does not reach."""
+    """A wall parallel to the image costs nothing at its plane, more at others, 0.5 where the other view does not reach."""
     generator = np.random.default_rng(0)
     K = np.array([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]])
     texture = generator.uniform(0.1, 0.9, (30, 60, 3)).astype(np.float32)
@@ -69,7 +59,7 @@ def test_cost_is_least_at_the_true_plane():
 
 
 def test_paths_are_those_of_the_definition():
-    """Against the recursion written out pixel by pixel, to the last unit; an edge of the picture lets depth jump."""
+    """Paths equal the recursion written pixel by pixel, to the last unit; an edge of the image lets depth jump."""
     generator = np.random.default_rng(1)
     costs = generator.integers(0, UNIT + 1, (4, 5, 6)).astype(np.int16)
     image = generator.uniform(0.4, 0.55, (4, 5, 3)).astype(np.float32)
@@ -84,15 +74,15 @@ def test_paths_are_those_of_the_definition():
     assert np.array_equal(found, scanline_costs(costs, down, across, round(p1 * UNIT))) and np.ptp(down) > 500
 
 
-def test_paths_of_the_dearest_costs_fit_in_16_bits():
-    """Where the best plane changes from pixel to pixel and every other costs 1, nothing wraps around at the largest steps."""
+def test_paths_of_the_largest_costs_fit_in_16_bits():
+    """With the best plane changing at every pixel and all others at cost 1, nothing overflows."""
     costs = np.full((6, 6, 8), UNIT, np.int16)
     y, x = np.indices((6, 6))
     costs[y, x, (3 * y + 5 * x) % 8] = 0
-    parts = [path_costs(costs, np.zeros((6, 6, 3), np.float32), 0.03, LARGEST_STEP, down=down) for down in (True, False)]
+    parts = [path_costs(costs, np.zeros((6, 6, 3), np.float32), 0.03, MAX_LARGE_STEP, down=down) for down in (True, False)]
     wide = sum(p.astype(int) for p in parts)
     assert np.array_equal((parts[0] + parts[1]).astype(int), wide) and wide.max() > 3 * UNIT and wide.min() >= 0
-    assert 4 * (1 + LARGEST_STEP) * UNIT + 4 < 2**15
+    assert 4 * (1 + MAX_LARGE_STEP) * UNIT + 4 < 2**15
 
 
 def test_parabola_between_planes():
@@ -104,26 +94,26 @@ def test_parabola_between_planes():
     assert np.allclose(best_inverse(np.zeros((1, 1, 9)), inverses), inverses[1])
 
 
-def test_only_what_another_view_confirms_counts():
+def test_only_consistent_depth_counts():
     """True depths pass where a second view sees them, a wrong patch does not, nor does anything without parallax."""
     views, depths = still_life()
     inverses = [1 / d for d in depths]
     config = SweepConfig()
-    right = confirm(views, inverses, 1, config)
+    right = consistent_depth(views, inverses, 1, config)
     assert right.coverage > 0.85 and np.allclose(right.depth[right.valid], depths[1][right.valid], rtol=1e-5)
     wrong = [i.copy() for i in inverses]
     wrong[1][40:60, 60:90] *= 1.2
-    patch = confirm(views, wrong, 1, config)
+    patch = consistent_depth(views, wrong, 1, config)
     assert not patch.valid[42:58, 62:88].any() and np.array_equal(patch.valid[:38], right.valid[:38])
     assert np.isinf(patch.sensitivity[~patch.valid]).all() and (patch.depth[~patch.valid] == 0).all()
-    still = confirm([views[0], views[0]], [inverses[0]] * 2, 0, config)
+    still = consistent_depth([views[0], views[0]], [inverses[0]] * 2, 0, config)
     assert still.coverage == 0 and "agrees" in still.notes[0]
 
 
 def test_sensitivity_is_depth_per_pixel():
-    """Moving the depth by the sensitivity moves the match by a pixel, in the view where it moves most."""
+    """A change of depth by the sensitivity moves the match by a pixel, in the view where it moves most."""
     views, depths = still_life()
-    found = confirm(views, [1 / d for d in depths], 1, SweepConfig())
+    found = consistent_depth(views, [1 / d for d in depths], 1, SweepConfig())
     pixels, z = pixel_grid(views[1].camera), depths[1].ravel()
     moved = []
     for j in (0, 2):
@@ -131,12 +121,12 @@ def test_sensitivity_is_depth_per_pixel():
         moved.append(np.linalg.norm(ends[0] - ends[1], axis=1) / 2e-4)
     product = found.sensitivity.ravel() * np.maximum(*moved)
     valid = found.valid.ravel()
-    # where only the other view confirms, that one decides
+    # where only the other view is consistent, that one decides
     assert np.median(np.abs(product[valid] - 1)) < 1e-3 and product[valid].min() > 0.999
 
 
 def test_depth_of_a_known_scene():
-    """Ray-cast views: at least three quarters confirmed in each, half of that within 0.8 %, nine tenths within 5 %."""
+    """Of every ray-cast view three quarters are consistent; half of these err by at most 0.8 %, nine tenths by 5 %."""
     views, depths = still_life()
     for found, true in zip(sweep_depths(views, [(2, 12)] * 3, SweepConfig()), depths):
         error = np.abs(found.depth / true - 1)[found.valid]
@@ -144,7 +134,7 @@ def test_depth_of_a_known_scene():
 
 
 def test_large_images_are_swept_small_and_masks_hold():
-    """Above the limit of pixels the size is reduced and said; what a mask hides is not valid."""
+    """Above the limit of pixels the size is reduced, with a note; masked pixels are not valid."""
     views, depths = still_life()
     mask = np.ones(depths[0].shape, bool)
     mask[:, :50] = False
@@ -161,13 +151,13 @@ def test_large_images_are_swept_small_and_masks_hold():
     {"small_step": 0.7},
 ])  # fmt: skip
 def test_bad_settings_are_refused(bad):
-    """At once."""
+    """A UsageError is raised when the settings are made."""
     with pytest.raises(UsageError):
         SweepConfig(**bad)
 
 
-def test_completion_follows_the_picture():
-    """Two flat regions, a few confirmed pixels in each: each takes its own depth up to the edge between them."""
+def test_completion_follows_the_image():
+    """Each of two flat regions takes the depth of its few valid pixels, up to the edge between them."""
     image = np.zeros((40, 60, 3), np.float32)
     image[:, 30:] = 0.8
     true = np.where(np.arange(60) < 30, 2.0, 5.0)[None].repeat(40, 0).astype(np.float32)
@@ -178,7 +168,7 @@ def test_completion_follows_the_picture():
 
 
 def test_completion_keeps_planes_and_bounds():
-    """A slanted plane with a hole is linear in inverse depth; nothing valid gives nothing; all valid changes nothing."""
+    """A slanted plane with a hole stays linear in inverse depth; all valid changes nothing."""
     x = np.arange(64)[None].repeat(48, 0)
     true = (1 / (0.1 + 0.004 * x)).astype(np.float32)
     valid = np.ones((48, 64), bool)

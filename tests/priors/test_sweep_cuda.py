@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from tests.priors.rigs import still_life
-from warpgs.priors import sweep, sweep_cuda
-from warpgs.priors.sweep import UNIT, SweepConfig, sweep_depths
+from warpgs.priors import sweep, sweep_cpu, sweep_cuda
+from warpgs.priors.sweep import sweep_depths
+from warpgs.priors.sweep_planes import NEUTRAL_COST, UNIT, SweepConfig, plane_inverses
 from warpgs.scene import Camera, View
 
 CPU = torch.device("cpu")
@@ -17,29 +18,29 @@ PLANES = np.linspace(1 / 12, 1 / 2, 40)
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 def device(request):
-    """Where torch works."""
+    """Return the device of torch."""
     return torch.device(request.param)
 
 
 def computed(view: View, others: list[View], inverses: np.ndarray, window: int, device: torch.device) -> np.ndarray:
-    """Costs as `sweep` gives them, [D, H, W]."""
+    """Return costs in the layout of `sweep_cpu`, [D, H, W]."""
     found = sweep_cuda.matching_costs(view, others, inverses, window, device)
     return found.cpu().numpy().transpose(2, 0, 1) / UNIT
 
 
 def test_costs_agree(device):
-    """To half a unit, and the rounding of correlations where there is little pattern; no opinion is none in both."""
+    """Costs agree to half a unit and the rounding of correlations; neutral costs are neutral in both."""
     views, _ = still_life()
-    wanted = sweep.matching_costs(views[1], [views[0], views[2]], PLANES, 7)
+    wanted = sweep_cpu.matching_costs(views[1], [views[0], views[2]], PLANES, 7)
     found = computed(views[1], [views[0], views[2]], PLANES, 7, device)
     off = np.abs(found - wanted)
     assert off.max() < 2e-3 and np.quantile(off, 0.999) < 2e-4 + 0.5 / UNIT and off.mean() < 5e-6 + 0.25 / UNIT
-    silent = wanted == sweep.NO_OPINION
-    assert 0.001 < silent.mean() < 0.5 and (found[silent] == sweep.NO_OPINION).mean() > 0.999
+    silent = wanted == NEUTRAL_COST
+    assert 0.001 < silent.mean() < 0.5 and (found[silent] == NEUTRAL_COST).mean() > 0.999
 
 
 def test_costs_of_another_size_agree(device):
-    """The other view has other sides, and planes behind its camera have no opinion in either."""
+    """The other view has another size, and planes behind its camera are neutral in both."""
     generator = np.random.default_rng(0)
     texture = generator.uniform(0.1, 0.9, (30, 60, 3)).astype(np.float32)
     K = np.array([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]])
@@ -47,35 +48,35 @@ def test_costs_of_another_size_agree(device):
     behind[:3, 3] = [-0.5, 0.1, -3.0]
     views = [View("a", Camera(np.eye(4), K, 40, 30), texture[:, :40]), View("b", Camera(behind, K, 60, 30), texture)]
     inverses = np.array([0.15, 0.25, 0.5, 1.0])
-    wanted = sweep.matching_costs(views[0], views[1:], inverses, 5)
+    wanted = sweep_cpu.matching_costs(views[0], views[1:], inverses, 5)
     found = computed(views[0], views[1:], inverses, 5, device)
-    assert np.abs(found - wanted).max() < 1e-4 + 0.5 / UNIT and (wanted != sweep.NO_OPINION).mean() > 0.3
+    assert np.abs(found - wanted).max() < 1e-4 + 0.5 / UNIT and (wanted != NEUTRAL_COST).mean() > 0.3
 
 
 def test_paths_agree(device):
-    """To the last unit, in a picture with edges."""
+    """Paths agree to the last unit, in an image with edges."""
     generator = np.random.default_rng(1)
     costs = generator.integers(0, UNIT + 1, (9, 7, 12)).astype(np.int16)
     image = generator.uniform(0.4, 0.55, (9, 7, 3)).astype(np.float32)
-    wanted = sum(sweep.path_costs(costs, image, 0.05, 0.6, down=down) for down in (True, False))
+    wanted = sum(sweep_cpu.path_costs(costs, image, 0.05, 0.6, down=down) for down in (True, False))
     found = sweep_cuda.path_costs(torch.from_numpy(costs).to(device), image, 0.05, 0.6)
     assert np.array_equal(found.cpu().numpy(), wanted)
 
 
 def test_parabola_agrees(device):
-    """Between planes, at the first and last plane, and where costs are flat."""
+    """Inverse depths agree between planes, at the first and last plane, and where costs are flat."""
     generator = np.random.default_rng(2)
     costs = generator.integers(0, 1000, (6, 5, 40)).astype(np.float32)
     costs[0], costs[1, :, 0], costs[2, :, -1] = 7.0, -1.0, -1.0
-    wanted = sweep.best_inverse(costs, PLANES)
+    wanted = sweep_cpu.best_inverse(costs, PLANES)
     assert np.allclose(sweep_cuda.best_inverse(torch.from_numpy(costs).to(device), PLANES), wanted, rtol=1e-12)
 
 
 def test_depths_agree(device):
-    """Of a view of the still life: nearly all the same, and as near to the truth."""
+    """Depths of a view of the still life are nearly all the same, with the same error."""
     views, depths = still_life()
     config, others = SweepConfig(), [views[0], views[2]]
-    planes = sweep.plane_inverses(views[1].camera, [o.camera for o in others], (2, 12), config.spacing, config.max_planes)
+    planes = plane_inverses(views[1].camera, [o.camera for o in others], (2, 12), config.spacing, config.max_planes)
     with ThreadPoolExecutor(2) as pool:
         wanted, _ = sweep._inverses(views, [(2, 12)] * 3, config, CPU, pool)
     found = sweep_cuda.inverse_depths(views[1], others, planes, config, device)
@@ -85,7 +86,7 @@ def test_depths_agree(device):
 
 
 def test_a_small_gpu_leaves_it_to_the_cpu(monkeypatch):
-    """The same depths as on the CPU, and one note that says so and how much there should be."""
+    """Depths are those of the CPU, and one note names the memory that a GPU should have."""
     views, _ = still_life()
     monkeypatch.setattr(sweep, "installed_bytes", lambda _: 2**20)
     found = sweep_depths(views, [(2, 12)] * 3, SweepConfig(), torch.device("cuda"))
@@ -95,8 +96,8 @@ def test_a_small_gpu_leaves_it_to_the_cpu(monkeypatch):
 
 
 @pytest.mark.parametrize("size", [(40, 3), (3, 40), (3, 3), (40, 1), (1, 1)])
-def test_tiny_pictures_are_left_to_the_cpu(size, monkeypatch):
-    """Narrower than half a window: torch mirrors no border there."""
+def test_tiny_images_are_left_to_the_cpu(size, monkeypatch):
+    """Images narrower than half a window are swept on the CPU: torch mirrors no border there."""
     width, height = size
     K = np.array([[40.0, 0, width / 2], [0, 40, height / 2], [0, 0, 1]])
     aside = np.eye(4)
@@ -121,8 +122,8 @@ def test_the_gpu_takes_no_more_than_it_says():
 
 
 @pytest.mark.cuda
-def test_a_gpu_confirms_as_much():
-    """Of the still life, within half a per cent of the pixels."""
+def test_a_gpu_finds_as_much_consistent_depth():
+    """Coverage of the still life agrees within half a per cent of the pixels."""
     views, _ = still_life()
     for a, b in zip(*(sweep_depths(views, [(2, 12)] * 3, SweepConfig(), d) for d in (CPU, torch.device("cuda")))):
         assert abs(a.coverage - b.coverage) < 0.005

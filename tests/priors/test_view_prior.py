@@ -18,7 +18,7 @@ PLAIN = {"segmentation_size": 32, "segmentation_mean": (0.0, 0.0, 0.0), "segment
 
 @dataclass(frozen=True)
 class Depth:
-    """What other views confirm."""
+    """A stand-in for `warpgs.scene.ViewDepth`."""
 
     depth: np.ndarray
     valid: np.ndarray
@@ -31,7 +31,7 @@ def view(image, name="a.png", mask=None):
 
 
 def dark(name="dark.png"):
-    """A photograph in which the network finds background alone."""
+    """Return an image in which the network finds background alone."""
     return view(0.02 * np.random.default_rng(1).random((32, 64, 3), np.float32), name)
 
 
@@ -45,7 +45,7 @@ def networks(tmp_path, **more):
 
 
 def check(prior, shape):
-    """Every map is float32, finite, in [0, 1] and of the view's size."""
+    """Assert that every map is float32, finite, in [0, 1] and of the view's size."""
     for m in (prior.disparity, prior.confidence, prior.boundary, prior.foreground):
         assert m.dtype == np.float32 and m.shape == shape and m.min() >= 0 and m.max() <= 1
     assert prior.depth_source and prior.semantics_source
@@ -128,16 +128,16 @@ def test_a_region_beats_saliency():
 def test_classical_sources_say_so():
     image, inverse, near = two_planes()
     valid = np.random.default_rng(1).random(near.shape) < 0.1
-    confirmed = Depth(np.where(valid, 1 / inverse, 0), valid, np.where(valid, 0.01, np.inf))
+    consistent = Depth(np.where(valid, 1 / inverse, 0), valid, np.where(valid, 0.01, np.inf))
     nothing = Depth(np.zeros(near.shape), np.zeros(near.shape, bool), np.full(near.shape, np.inf))
     views = [view(image, "a.png"), view(image, "b.png")]
-    (a, b), notes = view_priors(views, PriorConfig(), depths=lambda: [confirmed, nothing])
+    (a, b), notes = view_priors(views, PriorConfig(), depths=lambda: [consistent, nothing])
     for p in (a, b):
         check(p, near.shape)
     assert a.disparity[near].min() > a.disparity[~near].max() and f"{valid.mean():.1%}" in a.depth_source
     assert not b.disparity.any() and b.depth_source == "none"
     text = "\n".join(notes)
-    assert f"0.0% to {valid.mean():.1%} of a view's pixels" in text and "no depth is confirmed in b.png" in text
+    assert f"0.0% to {valid.mean():.1%} of a view's pixels" in text and "no depth is consistent in b.png" in text
     assert "saliency stands for foreground" in text and "--segmentation-model" in text
 
 

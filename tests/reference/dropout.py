@@ -1,4 +1,4 @@
-"""What opacity dropout means, in numpy: which factors there are, and how often."""
+"""Opacity dropout in numpy: the factors there are, and how often each occurs."""
 
 import numpy as np
 

@@ -1,8 +1,19 @@
-"""Projection of 3D Gaussians written from the paper (Kerbl et al. 2023, section 4), dense, float64, by matrices."""
+"""Projection of 3D Gaussians written from the paper (Kerbl et al. 2023, section 4), dense, in any float type, by matrices."""
 
 import torch
 
 from tests.reference.sh_polynomials import colors_reference
+
+
+def product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Return the matrix product of ``a`` [..., I, J] and ``b`` [..., J, K], each sum from the first term to the last.
+
+    A library picks order and fused multiply-adds by the processor; in float32 its choice would be part of what P32 errs.
+    """
+    total = a[..., :, 0, None] * b[..., None, 0, :]
+    for j in range(1, a.shape[-1]):
+        total = total + a[..., :, j, None] * b[..., None, j, :]
+    return total
 
 
 def rotations(quats: torch.Tensor) -> torch.Tensor:
@@ -12,18 +23,18 @@ def rotations(quats: torch.Tensor) -> torch.Tensor:
     zero = torch.zeros_like(w)
     skew = torch.stack([zero, -v[:, 2], v[:, 1], v[:, 2], zero, -v[:, 0], -v[:, 1], v[:, 0], zero], -1).view(-1, 3, 3)
     # Rodrigues: R = I + 2 w [v] + 2 [v]^2
-    return torch.eye(3, dtype=q.dtype) + 2 * w[:, None, None] * skew + 2 * skew @ skew
+    return torch.eye(3, dtype=q.dtype) + 2 * w[:, None, None] * skew + 2 * product(skew, skew)
 
 
 def project_reference(means, quats, log_scales, logit_opacities, sh, viewmats, Ks, *, width, height, degree, low_pass):
     """Means [C, N, 2], covariances [C, N, 2, 2], colours [C, N, 3], depths [C, N] and opacities [N], none culled."""
     S = torch.diag_embed(torch.exp(log_scales))
-    M = rotations(quats) @ S
-    sigma = M @ M.transpose(1, 2)
+    M = product(rotations(quats), S)
+    sigma = product(M, M.transpose(1, 2))
     all_means, all_covs, all_colors, all_depths = [], [], [], []
     for view, K in zip(viewmats, Ks):
         W, t = view[:3, :3], view[:3, 3]
-        p = means @ W.T + t
+        p = product(means, W.T) + t
         z = p[:, 2]
         pixels = torch.stack([K[0, 0] * p[:, 0] / z + K[0, 2], K[1, 1] * p[:, 1] / z + K[1, 2]], -1)
         size = torch.tensor([width, height], dtype=means.dtype)
@@ -33,8 +44,9 @@ def project_reference(means, quats, log_scales, logit_opacities, sh, viewmats, K
         J = torch.stack(
             [K[0, 0] / z, zero, -K[0, 0] * xy[:, 0] / z, zero, K[1, 1] / z, -K[1, 1] * xy[:, 1] / z], -1
         ).view(-1, 2, 3)  # fmt: skip
-        cov = J @ W @ sigma @ W.T @ J.transpose(1, 2) + low_pass * torch.eye(2, dtype=means.dtype)
-        center = -W.T @ t
+        T = product(J, W)
+        cov = product(product(T, sigma), T.transpose(1, 2)) + low_pass * torch.eye(2, dtype=means.dtype)
+        center = -product(W.T, t[:, None])[:, 0]
         away = means - center
         dirs = away / away.norm(dim=-1, keepdim=True)
         all_means.append(pixels)

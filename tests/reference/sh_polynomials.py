@@ -25,5 +25,6 @@ def colors_reference(sh: torch.Tensor, dirs: torch.Tensor, degree: int) -> torch
             (-sqrt(35 / (32 * pi)), x * (x**2 - 3 * y**2)),
         ],
     ]  # fmt: skip
-    basis = torch.stack([c * p for row in rows[: degree + 1] for c, p in row], -1)
-    return torch.einsum("nk,nkc->nc", basis, sh[:, : basis.shape[1]])
+    values = [c * p for row in rows[: degree + 1] for c, p in row]
+    # a plain sum, not einsum, whose order and roundings a library chooses by the processor
+    return sum(value[:, None] * sh[:, k] for k, value in enumerate(values))

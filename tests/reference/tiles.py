@@ -1,4 +1,4 @@
-"""Which tiles hold a pixel that a Gaussian draws: by looking at every pixel."""
+"""The tiles that hold a pixel to which a Gaussian contributes, found by a look at every pixel."""
 
 import torch
 

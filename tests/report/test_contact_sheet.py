@@ -1,40 +1,40 @@
-"""Sheets of labelled pictures: every tile in its place, unharmed, with its label, range and text."""
+"""Sheets of labelled images: every tile in its place, unharmed, with its label, range and text."""
 
 import numpy as np
 
 from warpgs.report.contact_sheet import GAP, HEAD, MARGIN, PAPER, TITLE_SIZE, Tile, contact_sheet
-from warpgs.report.pictures import colored
+from warpgs.report.images import colored
 
 TOP = MARGIN + TITLE_SIZE + 18
 
 
 def corner(index, width, height, columns):
-    """Where the picture of a tile begins: x, y."""
+    """Return the left upper corner x, y of a tile's image [px]."""
     return MARGIN + index % columns * (width + GAP), TOP + HEAD + index // columns * (HEAD + height + GAP)
 
 
 def test_tiles_keep_their_pixels_and_order():
-    """At their own size the pictures on the sheet are those that were given, maps by their colours."""
+    """At their own size images on the sheet are unchanged, and maps have the colours of their map."""
     rng = np.random.default_rng(0)
-    photo = np.round(rng.random((150, 200, 3)) * 255).astype(np.float32) / 255
+    image = np.round(rng.random((150, 200, 3)) * 255).astype(np.float32) / 255
     maps = [rng.random((150, 200), np.float32) for _ in range(3)]
-    tiles = [Tile("photo", photo), *(Tile(f"map {i}", m, "VIRIDIS") for i, m in enumerate(maps))]
+    tiles = [Tile("photo", image), *(Tile(f"map {i}", m, "VIRIDIS") for i, m in enumerate(maps))]
     sheet = contact_sheet("a view", ["one sentence"], tiles, columns=3, tile_width=200)
     assert (
         sheet.shape == (TOP + 2 * (HEAD + 150) + GAP + MARGIN, 2 * MARGIN + 3 * 200 + 2 * GAP, 3) and sheet.dtype == np.float32
     )
-    for i, wanted in enumerate([photo, *(colored(m, "VIRIDIS") for m in maps)]):
+    for i, wanted in enumerate([image, *(colored(m, "VIRIDIS") for m in maps)]):
         x, y = corner(i, 200, 150, 3)
         np.testing.assert_allclose(sheet[y : y + 150, x : x + 200], wanted, atol=0.51 / 255)
 
 
 def test_labels_ranges_and_text_are_drawn_on_paper():
-    """Ink where a label, a colour bar and the text belong; paper around them; longer text takes more of it."""
+    """Labels, colour bars and text have ink in their places and paper around them; longer text has more."""
 
     def ink(part):
         return int((np.abs(part - np.float32(PAPER) / 255).max(-1) > 0.1).sum())
 
-    tiles = [Tile("photograph", np.zeros((60, 300, 3))), Tile("map", np.zeros((60, 300)), largest=2.5)]
+    tiles = [Tile("image", np.zeros((60, 300, 3))), Tile("map", np.zeros((60, 300)), largest=2.5)]
     short = contact_sheet("title", ["Depth: none."], tiles, columns=2, tile_width=300)
     long = contact_sheet("title", ["Depth: none.", "Semantics: saliency and edges."], tiles, columns=2, tile_width=300)
     (ax, ay), (bx, by), (cx, cy) = (corner(i, 300, 60, 2) for i in range(3))

@@ -12,7 +12,7 @@ K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
 
 
 def camera(angle):
-    """A camera 4 u from the origin that looks at it."""
+    """Return a camera 4 u from the origin that looks at it."""
     center = np.array([4 * np.sin(angle), 0, -4 * np.cos(angle)])
     forward, down = -center / 4, np.array([0.0, 1, 0])
     R = np.stack([np.cross(down, forward), down, forward])
@@ -26,8 +26,8 @@ def cloud():
     return points, np.full((500, 3), 0.2)
 
 
-def test_overview_is_a_picture_or_a_reason_with_a_remedy():
-    """Either branch is right; which one depends on the graphics libraries of the machine."""
+def test_overview_is_an_image_or_a_reason_with_a_remedy():
+    """Either result is right; the graphics libraries of the machine decide."""
     data, why = render_overview([camera(a) for a in (-0.4, 0.0, 0.4)], [camera(0.2)], *cloud())
     if data is None:
         assert "libegl1" in why
@@ -81,7 +81,7 @@ def test_nothing_to_draw_is_a_note():
 
 
 @pytest.mark.parametrize("direction", [[0.3, -1, 2], [0, 5, 0], [0, 0, -1e-15], [1, 1, 1]])
-def test_everything_shown_is_in_the_picture_and_fills_it(direction):
+def test_everything_shown_is_in_the_image_and_fills_it(direction):
     shown = np.random.default_rng(1).normal(size=(300, 3)) * [5, 1, 2] + [10, -20, 3]
     eye, focus, up = module._framing(shown, np.array(direction, float), np.array([0.0, 1, 0]))
     forward = (focus - eye) / np.linalg.norm(focus - eye)

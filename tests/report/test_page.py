@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from warpgs.report.curve import curve
-from warpgs.report.page import SamplingStory, ViewPictures, write_page
-from warpgs.report.pictures import png
+from warpgs.report.images import png
+from warpgs.report.page import SamplingReport, ViewImages, write_page
 
 VOID = {"meta", "img", "input", "br", "hr", "link"}
 
@@ -45,13 +45,13 @@ class Page(HTMLParser):
         return [t for tag, t in self.texts if tag in tags]
 
 
-def picture(value):
+def image(value):
     return png(np.full((6, 8, 3), value, np.float32))
 
 
 def write(path, **changes):
     views = [
-        ViewPictures(f"images/{i}.png", f"PSNR {20 + i}.25 dB, SSIM 0.{80 + i}", *(picture(0.1 * i + j / 5) for j in range(4)))
+        ViewImages(f"images/{i}.png", f"PSNR {20 + i}.25 dB, SSIM 0.{80 + i}", *(image(0.1 * i + j / 5) for j in range(4)))
         for i in range(2)
     ]
     values = {
@@ -60,8 +60,8 @@ def write(path, **changes):
         "notes": ["every 8th view held out", "downscaled by 2"],
         "table": [["view", "PSNR [dB]"], ["images/0.png", "20.25"], ["images/1.png", "21.25"]],
         "views": views, "curves": [curve("Training loss", [1, 2, 3], [0.3, 0.2, 0.1])],
-        "sampling": SamplingStory("Two sentences.", [("first", picture(0.31)), ("later", picture(0.32))], [["added"], ["12"]]),
-        "overview": picture(0.7), "protocol": {"ground truth": "images_8 as stored", "LPIPS": "not measured"},
+        "sampling": SamplingReport("Two sentences.", [("first", image(0.31)), ("later", image(0.32))], [["added"], ["12"]]),
+        "overview": image(0.7), "protocol": {"ground truth": "images_8 as stored", "LPIPS": "not measured"},
         "details": {"config": {"steps": 2000}, "versions": {"torch": "2"}},
     }  # fmt: skip
     values |= changes
@@ -79,11 +79,11 @@ def test_nothing_is_loaded_from_anywhere(tmp_path):
         assert attrs.get("src", "data:").startswith("data:image/png;base64,") or "src" not in attrs
 
 
-def test_all_pictures_are_embedded_byte_for_byte(tmp_path):
+def test_all_images_are_embedded_byte_for_byte(tmp_path):
     values, _, page = write(tmp_path / "report.html")
     embedded = [base64.b64decode(a["src"].split(",", 1)[1], validate=True) for a in page.all("img")]
-    given = [b for v in values["views"] for b in (v.truth, v.render, v.error, v.depth)]
-    given += [values["overview"], *(data for _, data in values["sampling"].pictures)]
+    given = [b for v in values["views"] for b in (v.reference, v.render, v.error, v.depth)]
+    given += [values["overview"], *(data for _, data in values["sampling"].images)]
     assert sorted(embedded) == sorted(given)
     for data in embedded:
         assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).shape == (6, 8, 3)
@@ -114,11 +114,11 @@ def test_every_view_has_a_slider_a_keyboard_reaches(tmp_path):
 
 def test_names_from_files_cannot_become_markup(tmp_path):
     evil = '<script>alert("x")</script>&amp;\'"'
-    view = ViewPictures(evil, evil, *(picture(0.5) for _ in range(4)))
+    view = ViewImages(evil, evil, *(image(0.5) for _ in range(4)))
     _, _, page = write(
         tmp_path / "report.html", title=evil, subtitle=evil, figures=[(evil, evil)], notes=[evil],
         table=[["view"], [evil]], views=[view], details={evil: evil},
-        sampling=SamplingStory(evil, [(evil, picture(0.5))], [[evil]]),
+        sampling=SamplingReport(evil, [(evil, image(0.5))], [[evil]]),
     )  # fmt: skip
     assert len(page.all("script")) == 1
     assert page.text("h1", "p", "li", "td") == [evil] * 5
@@ -132,8 +132,8 @@ def test_parts_that_are_not_there_leave_no_empty_heading(tmp_path):
     assert page.text("h2") == ["Settings"] and not page.all("img")
 
 
-def test_sampling_shows_the_first_picture_and_the_others_on_request(tmp_path):
-    """The first event stands open under its words, later ones in a fold with their caption."""
+def test_sampling_shows_the_first_image_and_the_others_on_request(tmp_path):
+    """The first event is open under its text, later ones in a fold with their caption."""
     _, text, page = write(tmp_path / "report.html")
     assert "Why Gaussians were placed" in page.text("h2") and "Two sentences." in page.text("p")
     section = text[text.index("Why Gaussians") : text.index("Cameras and Gaussians")]

@@ -6,7 +6,7 @@ from warpgs.report.progress import Progress, duration
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A clock to set by hand: clock[0] is now [s]."""
+    """Return a clock to set by hand: clock[0] is the time [s]."""
     now = [1000.0]
     monkeypatch.setattr(module.time, "perf_counter", lambda: now[0])
     return now

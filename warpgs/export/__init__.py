@@ -1,1 +1,1 @@
-"""Model files for other programs; coordinates go back to those of the input files."""
+"""Export of Gaussians to files of other programs, in the coordinates of the input files."""

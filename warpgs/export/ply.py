@@ -6,7 +6,6 @@ first, the rest channel-major), opacity as a logit, log scales, rotation wxyz as
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import secrets
@@ -18,15 +17,16 @@ from typing import BinaryIO
 
 import numpy as np
 
+from warpgs.coordinates import checked_normalization, convert_gaussians
 from warpgs.errors import DataError, ResourceError
 from warpgs.scene import Gaussians, Normalization
 
-HEADER_LIMIT = 65536
-"""A header longer than this [bytes] is refused: a real one has some two thousand."""
+MAX_HEADER_BYTES = 65536
+"""Largest accepted header [bytes]: a real one has some two thousand."""
 CHUNK_ROWS = 65536
-"""Gaussians written at a time, so that the interleaved copy of a large model never exists as a whole."""
+"""Number of Gaussians written at a time, so that the interleaved copy of a large model never exists as a whole."""
 
-MEND = "Export the model again with warpgs, or with any tool that writes the binary layout of the INRIA 3DGS code."
+REMEDY = "Export the model again with warpgs, or with any tool that writes the binary layout of the INRIA 3DGS code."
 
 _TYPES = {
     "char": "i1",
@@ -60,36 +60,40 @@ class _Element:
     name: str
     count: int
     properties: list[tuple[str, str]] = field(default_factory=list)
-    """(name, numpy type) in file order."""
+    """Pairs (name, numpy type) in file order."""
     has_list: bool = False
     """True where a property is a list, so that rows differ in length."""
 
 
-def write_ply(path: str | os.PathLike, gaussians: Gaussians, normalization: Normalization) -> None:
-    """Write Gaussians in the coordinates of the scene's files.
+def write_ply(
+    path: str | os.PathLike[str], gaussians: Gaussians, normalization: Normalization | None = None, *, units: str = "scene"
+) -> None:
+    """Write Gaussians to a PLY file, which is in the units of the scene's files.
 
-    The file appears whole or not at all: it is written beside ``path`` and moved there once it is on the disk.
+    Means become ``mean / scale + offset`` [file units] and log scales ``log_scale - log(scale)``, computed in float64 and
+    stored as float32; rotations, logit opacities and spherical harmonics are stored as they are. The file appears whole
+    or not at all: it is written beside ``path`` and moved there once it is on the disk.
 
     Args:
-        path: Where to write; an existing file is replaced.
-        gaussians: N Gaussians in scene coordinates [u], on any device.
-        normalization: How scene coordinates came from file coordinates.
+        path: The file; an existing one is replaced.
+        gaussians: N Gaussians, on any device: means [N, 3], quats wxyz of any length [N, 4], log scales [N, 3], logit opacities
+            [N], spherical harmonics [N, K, 3] with K in {1, 4, 9, 16}.
+        normalization: Similarity from file to scene units, ``x_scene = scale * (x_file - offset)``: that of the scene that was
+            fitted; needed where ``units`` is scene.
+        units: Units of ``gaussians``: scene, or file for those that are to be written as they are.
 
     Raises:
-        DataError: A tensor holds a NaN or an infinity, or would after the change of coordinates.
-        ResourceError: The folder or the disk does not take the file.
+        warpgs.errors.DataError: A tensor holds a NaN or an infinity, or would after the change of coordinates; or the
+            normalization is no similarity. Nothing is written.
+        warpgs.errors.ResourceError: The folder or the disk does not take the file.
+        warpgs.errors.UsageError: The units are unknown, or scene units come without a normalization.
     """
     path = Path(path)
-    arrays = {name: t.detach().cpu().numpy() for name, t in gaussians.tensors().items()}
-    _refuse_non_finite(path, arrays)
-    if not (math.isfinite(normalization.scale) and normalization.scale > 0 and np.isfinite(normalization.offset).all()):
-        raise DataError(f"{path}: not written, the scene's normalization is not a similarity: {normalization}. Read it again.")
-    # float64 throughout: georeferenced offsets (10^6 m) would eat the millimetres of a float32 sum.
-    with np.errstate(over="ignore"):
-        means = arrays["means"].astype(np.float64) / normalization.scale + np.asarray(normalization.offset, np.float64)
-        log_scales = arrays["log_scales"].astype(np.float64) - math.log(normalization.scale)
-        arrays |= {"means": means.astype(np.float32), "log_scales": log_scales.astype(np.float32)}
-    _refuse_non_finite(path, arrays)
+    normalization = checked_normalization(normalization, units, f"{path}: not written")
+    in_file = convert_gaussians(gaussians, normalization, units, "file")
+    for g in (gaussians, in_file):  # finite numbers may leave float32 on the way
+        arrays = {name: t.detach().cpu().numpy() for name, t in g.tensors().items()}
+        _refuse_non_finite(path, arrays)
 
     n, k = arrays["sh"].shape[:2]
     try:
@@ -103,26 +107,32 @@ def write_ply(path: str | os.PathLike, gaussians: Gaussians, normalization: Norm
         ) from e
 
 
-def read_ply(path: str | os.PathLike) -> Gaussians:
-    """Read Gaussians from a PLY file in the INRIA 3DGS layout.
+def read_ply(path: str | os.PathLike[str], normalization: Normalization | None = None, *, units: str = "file") -> Gaussians:
+    """Read Gaussians from a PLY file in the INRIA 3DGS layout, binary little endian.
 
-    Properties and elements that are not part of the layout are ignored. Nothing is allocated from the header's word
-    alone: the number of rows is checked against the size of the file first.
+    Properties and elements that are not part of the layout are ignored. The number of rows is checked against the size of
+    the file before memory is allocated.
 
     Args:
-        path: The file.
+        path: The file, written by `write_ply` or by another program of that layout.
+        normalization: Similarity from file to scene units; needed where ``units`` is scene.
+        units: Units of the result: file as stored, or scene to go with a scene's cameras.
 
     Returns:
-        N Gaussians in the coordinates of the file, torch float32 tensors on the CPU.
+        N Gaussians, torch float32 tensors on the CPU: means [N, 3], quats wxyz as stored [N, 4], log scales [N, 3], logit
+        opacities [N], spherical harmonics [N, K, 3] with K in {1, 4, 9, 16}.
 
     Raises:
-        DataError: The file is missing, malformed, cut short or holds NaNs, infinities or a rotation of zero length.
+        warpgs.errors.DataError: The file is missing, malformed, cut short, or holds a NaN, an infinity or a rotation of zero
+            length; the message names the place.
+        warpgs.errors.UsageError: The units are unknown, or scene units are asked for without a normalization.
     """
     path = Path(path)
+    normalization = checked_normalization(normalization, units, str(path))
     try:
         with open(path, "rb") as file:
             size = os.fstat(file.fileno()).st_size
-            elements, start = _parse_header(path, file.read(HEADER_LIMIT))
+            elements, start = _parse_header(path, file.read(MAX_HEADER_BYTES))
             vertex, start = _locate_vertices(path, elements, start)
             rest = _check_properties(path, vertex)
             dtype = np.dtype(vertex.properties)
@@ -138,12 +148,12 @@ def read_ply(path: str | os.PathLike) -> Gaussians:
         raise DataError(f"{path}: cannot be read ({e.strerror or e}). Check the path and its permissions.") from e
     if len(rows) != vertex.count:
         raise _error(path, f"cut short: {vertex.count} Gaussians announced, {len(rows)} read")
-    return _assemble(path, rows, rest)
+    return convert_gaussians(_assemble(path, rows, rest), normalization, "file", units)
 
 
 @contextmanager
 def _replacing(path: Path) -> Iterator[BinaryIO]:
-    """A file to write that takes the place of ``path`` when the block ends well and vanishes when it does not."""
+    """Open a file that replaces ``path`` when the block ends without an error and is removed otherwise."""
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         with open(temporary, "xb") as file:
@@ -168,12 +178,12 @@ def _refuse_non_finite(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def _names(rest: int) -> list[str]:
-    """Property names of the layout with ``rest`` coefficients above degree 0, in file order."""
+    """Return the property names of the layout with ``rest`` coefficients above degree 0, in file order."""
     return [*_POSITION, "nx", "ny", "nz", *_DC, *(f"f_rest_{i}" for i in range(rest)), "opacity", *_SCALE, *_ROTATION]
 
 
 def _header(n: int, rest: int) -> bytes:
-    """The header of a file with ``n`` Gaussians."""
+    """Return the header of a file with ``n`` Gaussians and ``rest`` coefficients above degree 0."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
     lines += [f"property float {name}" for name in _names(rest)]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
@@ -191,17 +201,17 @@ def _rows(arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _error(path: Path, what: str) -> DataError:
-    """A DataError about a malformed file, with the way to mend it."""
-    return DataError(f"{path}: not a usable Gaussian PLY file: {what}. {MEND}")
+    """Return a DataError about a malformed file, with the remedy."""
+    return DataError(f"{path}: not a usable Gaussian PLY file: {what}. {REMEDY}")
 
 
 def _parse_header(path: Path, head: bytes) -> tuple[list[_Element], int]:
-    """Elements of the header in the first bytes of a file, and the offset [bytes] of the data behind it."""
+    """Return the elements of the header in the first bytes of a file, and the offset [bytes] of the data behind it."""
     if not re.match(rb"ply\r?\n", head):
         raise _error(path, "it does not start with 'ply'")
     end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
     if end is None:
-        raise _error(path, f"no 'end_header' line within the first {HEADER_LIMIT} bytes")
+        raise _error(path, f"no 'end_header' line within the first {MAX_HEADER_BYTES} bytes")
     try:
         lines = head[: end.start()].decode("ascii").splitlines()[1:]
     except UnicodeDecodeError as e:
@@ -229,7 +239,7 @@ def _parse_header(path: Path, head: bytes) -> tuple[list[_Element], int]:
 
 
 def _locate_vertices(path: Path, elements: list[_Element], start: int) -> tuple[_Element, int]:
-    """The vertex element and the offset [bytes] of its rows, behind the rows of any elements before it."""
+    """Return the vertex element and the offset [bytes] of its rows, behind the rows of any elements before it."""
     if [e.name for e in elements].count("vertex") != 1:
         raise _error(path, "the header must have one 'element vertex'")
     for element in elements:
@@ -242,7 +252,7 @@ def _locate_vertices(path: Path, elements: list[_Element], start: int) -> tuple[
 
 
 def _check_properties(path: Path, vertex: _Element) -> int:
-    """Number of coefficients above degree 0; raises where the layout is incomplete."""
+    """Return the number of coefficients above degree 0; DataError where the layout is incomplete."""
     names = [name for name, _ in vertex.properties]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
@@ -258,7 +268,7 @@ def _check_properties(path: Path, vertex: _Element) -> int:
 
 
 def _assemble(path: Path, rows: np.ndarray, rest: int) -> Gaussians:
-    """Gaussians from structured rows, shape [N]; raises where a value cannot be used."""
+    """Return the Gaussians of structured rows, shape [N]; DataError where a value cannot be used."""
     import torch
 
     def columns(names: list[str] | tuple[str, ...]) -> np.ndarray:

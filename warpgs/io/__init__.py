@@ -1,1 +1,1 @@
-"""Dataset doors: one file per format, each giving a `warpgs.scene.Scene` in the house conventions."""
+"""Readers of scene folders: one file per format; `load_scene` turns each into a `warpgs.scene.Scene`."""

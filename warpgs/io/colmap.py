@@ -1,6 +1,6 @@
 """COLMAP reconstructions, binary and text: cameras, images, points (colmap.github.io, "Output Format").
 
-Other files of a reconstruction (rigs, frames, project.ini) say nothing that a pinhole scene needs and are not read.
+Other files of a reconstruction (rigs, frames, project.ini) hold nothing that a pinhole scene needs and are not read.
 """
 
 from __future__ import annotations
@@ -14,13 +14,14 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.io.folders import ViewList, child, find_mask, image_folder, view_name
-from warpgs.io.images import Lens, list_images, load_photo
+from warpgs.io.folders import ViewList, child, find_mask, has_folder, image_folder, pixel_source, view_name
+from warpgs.io.images import Lens, list_images, load_image
 from warpgs.io.poses import quat_rotation, rigid
-from warpgs.scene import PointCloud, View
+from warpgs.io.readers import Probe, Reader, ReadOptions, register
+from warpgs.scene import PointCloud, Scene, View
 
 MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}
-"""Model number to name and number of parameters."""
+"""Name and number of parameters by model number."""
 OTHER_MODELS = {
     5: "OPENCV_FISHEYE", 6: "FULL_OPENCV", 7: "FOV", 8: "SIMPLE_RADIAL_FISHEYE", 9: "RADIAL_FISHEYE",
     10: "THIN_PRISM_FISHEYE",
@@ -42,15 +43,15 @@ class Pose:
     """Translation of camera_from_world [file units]."""
 
 
-class _Reader:
-    """A binary file read front to back, each read checked against what is left."""
+class _BinaryFile:
+    """A binary file that is read front to back; every read is checked against the bytes that are left."""
 
     def __init__(self, path: Path):
         self.path, self.at = path, 0
         try:
             self.data = path.read_bytes()
         except OSError as e:
-            raise DataError(f"{path}: cannot be read ({e.strerror}); mend its permissions or copy it again") from e
+            raise DataError(f"{path}: cannot be read ({e.strerror}); fix its permissions or copy it again") from e
 
     def _need(self, size: int) -> None:
         if size > len(self.data) - self.at:
@@ -60,31 +61,31 @@ class _Reader:
             )
 
     def take(self, layout: str) -> tuple:
-        """The next values, little endian."""
+        """Return the next values, little endian."""
         size = struct.calcsize("<" + layout)
         self._need(size)
         self.at += size
         return struct.unpack_from("<" + layout, self.data, self.at - size)
 
-    def skip(self, size: int) -> bytes:
-        """The next bytes as they are."""
+    def raw(self, size: int) -> bytes:
+        """Return the next bytes as they are."""
         self._need(size)
         self.at += size
         return self.data[self.at - size : self.at]
 
     def count(self, smallest: int) -> int:
-        """A record count, held against the bytes that are left before anything is allocated."""
+        """Return a record count; DataError where the bytes that are left cannot hold so many records."""
         (count,) = self.take("Q")
-        room = (len(self.data) - self.at) // smallest
-        if count > room:
+        capacity = (len(self.data) - self.at) // smallest
+        if count > capacity:
             raise DataError(
-                f"{self.path}: announces {count:,} records but holds bytes for at most {room:,}; it is truncated or no "
+                f"{self.path}: announces {count:,} records but holds bytes for at most {capacity:,}; it is truncated or no "
                 "COLMAP file. Copy it again"
             )
         return count
 
     def text(self) -> str:
-        """A name that ends in a zero byte, UTF-8."""
+        """Return the next name, which is UTF-8 and ends in a zero byte."""
         end = self.data.find(b"\0", self.at)
         if end < 0:
             raise DataError(f"{self.path}: a name has no end, so the file is truncated; copy it again")
@@ -95,7 +96,7 @@ class _Reader:
             raise DataError(f"{self.path}: the name {raw[:80]!r} is not UTF-8; rename the image, run COLMAP again") from e
 
     def end(self) -> None:
-        """Nothing may follow the last record: leftover bytes mean a wrong count."""
+        """Raise a DataError where bytes follow the last record, which means a wrong count."""
         if self.at != len(self.data):
             raise DataError(
                 f"{self.path}: {len(self.data) - self.at} bytes follow the last record, so its count "
@@ -104,11 +105,11 @@ class _Reader:
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
-    """Numbered lines of a text file; only line feeds end a line, since names may hold other separators."""
+    """Return the numbered lines of a text file; only line feeds end a line, since names may hold other separators."""
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except OSError as e:
-        raise DataError(f"{path}: cannot be read ({e.strerror}); mend its permissions or copy it again") from e
+        raise DataError(f"{path}: cannot be read ({e.strerror}); fix its permissions or copy it again") from e
     except UnicodeDecodeError as e:
         raise DataError(f"{path}: is not UTF-8 text ({e.reason} at byte {e.start}); write it again") from e
     return list(enumerate(text.replace("\r\n", "\n").split("\n"), 1))
@@ -127,6 +128,12 @@ def _understood(path: Path, line: int):
         yield
     except (ValueError, IndexError, OverflowError) as e:
         raise DataError(f"{path}, line {line}: cannot be understood ({e}); write the file again") from e
+
+
+def _expect(condition: bool, message: str) -> None:
+    """Raise a ValueError for `_understood` where a line breaks a rule."""
+    if not condition:
+        raise ValueError(message)
 
 
 def _store(table: dict, key: int, value: object, where: str) -> None:
@@ -155,10 +162,14 @@ def _unknown_model(path: Path, model: object) -> DataError:
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:
-    """Lenses by camera number from cameras.bin or cameras.txt; DataError where the file is malformed."""
+    """Return lenses by camera number from cameras.bin or cameras.txt.
+
+    Raises:
+        DataError: The file is malformed, or a camera model is not supported.
+    """
     cameras: dict[int, Lens] = {}
     if path.suffix == ".bin":
-        r = _Reader(path)
+        r = _BinaryFile(path)
         for _ in range(r.count(24)):
             number, model, width, height = r.take("iiQQ")
             if model not in MODELS:
@@ -174,23 +185,26 @@ def read_cameras(path: Path) -> dict[int, Lens]:
             number, model, parameters = int(words[0]), words[1], tuple(float(w) for w in words[4:])
             if model not in counts:
                 raise _unknown_model(path, model)
-            if len(parameters) != counts[model]:
-                raise ValueError(f"{model} has {counts[model]} parameters, not {len(parameters)}")
+            _expect(len(parameters) == counts[model], f"{model} has {counts[model]} parameters, not {len(parameters)}")
             where = f"{path}, line {line}, camera {number}"
             _store(cameras, number, _lens(where, model, int(words[2]), int(words[3]), parameters), where)
     return cameras
 
 
 def read_poses(path: Path) -> dict[int, Pose]:
-    """Poses by image number from images.bin or images.txt; DataError where the file is malformed."""
+    """Return poses by image number from images.bin or images.txt.
+
+    Raises:
+        DataError: The file is malformed.
+    """
     poses: dict[int, Pose] = {}
     if path.suffix == ".bin":
-        r = _Reader(path)
+        r = _BinaryFile(path)
         for _ in range(r.count(73)):
             number, *values, camera = r.take("i7di")
             pose = Pose(r.text(), camera, tuple(values[:4]), tuple(values[4:]))
             (observed,) = r.take("Q")
-            r.skip(24 * observed)
+            r.raw(24 * observed)
             _store(poses, number, pose, str(path))
         r.end()
         return poses
@@ -214,11 +228,14 @@ def read_poses(path: Path) -> dict[int, Pose]:
 
 
 def read_points(path: Path, names: dict[int, str]) -> PointCloud:
-    """Points with the views that saw them from points3D.bin or points3D.txt.
+    """Return points, with the views that saw them, from points3D.bin or points3D.txt.
 
     Args:
         path: The file; an empty one gives no points.
         names: View names by image number; numbers that are not in it are left out of the tracks.
+
+    Returns:
+        N points in file coordinates with colours in [0, 1] and tracks.
 
     Raises:
         DataError: The file is malformed, or a point is not finite.
@@ -227,10 +244,10 @@ def read_points(path: Path, names: dict[int, str]) -> PointCloud:
     colors: list[tuple[int, ...]] = []
     tracks: list[frozenset[str]] = []
     if path.suffix == ".bin":
-        r = _Reader(path)
+        r = _BinaryFile(path)
         for _ in range(r.count(51)):
             _, x, y, z, red, green, blue, _, length = r.take("Q3d3BdQ")
-            track = np.frombuffer(r.skip(8 * length), "<i4")[::2]
+            track = np.frombuffer(r.raw(8 * length), "<i4")[::2]
             points.append((x, y, z))
             colors.append((red, green, blue))
             tracks.append(frozenset(names[i] for i in track.tolist() if i in names))
@@ -238,8 +255,7 @@ def read_points(path: Path, names: dict[int, str]) -> PointCloud:
     else:
         for line, words in _rows(path):
             with _understood(path, line):
-                if len(words) < 8 or len(words) % 2:
-                    raise ValueError("a point has 8 numbers, then pairs IMAGE OBSERVATION")
+                _expect(len(words) >= 8 and len(words) % 2 == 0, "a point has 8 numbers, then pairs IMAGE OBSERVATION")
                 points.append(tuple(float(w) for w in words[1:4]))
                 colors.append(tuple(min(max(int(w), 0), 255) for w in words[4:7]))
                 tracks.append(frozenset(names[i] for w in words[8::2] if (i := int(w)) in names))
@@ -251,7 +267,7 @@ def read_points(path: Path, names: dict[int, str]) -> PointCloud:
 
 
 def complete_kind(folder: Path) -> str | None:
-    """The kind of files, bin before txt, of which cameras and images are there; None where neither is complete."""
+    """Return bin or txt, the kind of which cameras and images are there (bin first); None where neither is complete."""
     for kind in ("bin", "txt"):
         if not _missing(folder, kind):
             return kind
@@ -263,14 +279,14 @@ def _missing(folder: Path, kind: str) -> list[str]:
 
 
 def missing_parts(folder: Path) -> list[str]:
-    """Names of the files that a complete reconstruction needs and this folder lacks."""
+    """Return the names of the files that a complete reconstruction needs and this folder lacks."""
     if complete_kind(folder):
         return []
     return min((_missing(folder, kind) for kind in ("bin", "txt")), key=len)
 
 
 def model_folder(root: Path) -> Path | None:
-    """The folder of the reconstruction: sparse/0, sparse, or the root; None if none holds any COLMAP file.
+    """Return the folder of the reconstruction: sparse/0, sparse, or the root; None where none holds any COLMAP file.
 
     The first complete one is taken, else the first that holds anything, for the error message.
     """
@@ -279,8 +295,8 @@ def model_folder(root: Path) -> Path | None:
     return next((f for f in partial if complete_kind(f)), partial[0] if partial else None)
 
 
-def _photo_paths(images: Path, names: list[str], where: str, allow_outside: bool) -> tuple[dict[str, Path], str]:
-    """The file of each view, and a note.
+def _image_paths(images: Path, names: list[str], where: str, allow_outside: bool) -> tuple[dict[str, Path], str]:
+    """Return the image file by view name, and a note for the user (empty where nothing was chosen).
 
     Ready-made small folders often hold other suffixes (image_8/a.png for a.JPG) or names of their own (LLFF's image000.png);
     the former are matched by stem, the latter by sorted order where the counts agree.
@@ -301,28 +317,51 @@ def _photo_paths(images: Path, names: list[str], where: str, allow_outside: bool
     return paths, ""  # the missing file is named when it is read
 
 
-def load(
-    root: Path, *, downscale: int, allow_outside: bool, invert_masks: bool, **_
-) -> tuple[list[View], PointCloud | None, list[str]]:
-    """Read a scene folder with a COLMAP reconstruction.
+@register("colmap")
+class ColmapReader(Reader):
+    """COLMAP reconstructions, binary or text, with their image folder."""
 
-    Returns:
-        Views in file coordinates, points (None where there is no points file), notes.
+    description = "sparse/0, sparse or the folder itself with cameras and images .bin/.txt (COLMAP)"
+    priority = 10
 
-    Raises:
-        DataError: A file is missing or malformed, an image lacks, or a size does not fit.
-    """
-    folder = model_folder(root)
-    kind = None if folder is None else complete_kind(folder)
-    if folder is None or kind is None:
-        lacks = "cameras and images" if folder is None else " and ".join(missing_parts(folder))
-        raise DataError(f"{folder or root}: the COLMAP reconstruction lacks {lacks}; copy the whole folder")
-    lenses = read_cameras(folder / f"cameras.{kind}")
-    file = folder / f"images.{kind}"
-    poses = read_poses(file)
-    images, factor, note = image_folder(root, downscale)
+    def probe(self, folder: Path) -> Probe | None:
+        """See `Reader.probe`."""
+        model = model_folder(folder)
+        if model is None:
+            return None
+        found = f"the COLMAP reconstruction in {model.relative_to(folder).as_posix()}"
+        if missing := missing_parts(model):
+            return Probe(found, " and ".join(missing))
+        return Probe(found, "" if has_folder(folder, "images", "images_*") else "its images, a folder images")
+
+    def read(self, folder: Path, options: ReadOptions) -> Scene:
+        """See `Reader.read`."""
+        model = model_folder(folder)
+        kind = None if model is None else complete_kind(model)
+        if model is None or kind is None:
+            lacks = "cameras and images" if model is None else " and ".join(missing_parts(model))
+            raise DataError(f"{model or folder}: the COLMAP reconstruction lacks {lacks}; copy the whole folder")
+        poses = read_poses(model / f"images.{kind}")
+        views, notes = _read_views(folder, model, kind, poses, options)
+        points_path, points = model / f"points3D.{kind}", None
+        if not points_path.is_file():
+            notes.append(f"{points_path.name} is missing, so there are no points to start from")
+        else:
+            points = read_points(points_path, {n: view_name(p.name) for n, p in poses.items()})
+            if len(points) == 0:
+                notes.append(f"{points_path.name} holds no points")
+        return self.scene(folder, views, notes, points=points, pixels=pixel_source(folder, options.downscale, by_folder=True))
+
+
+def _read_views(
+    root: Path, model: Path, kind: str, poses: dict[int, Pose], options: ReadOptions
+) -> tuple[list[View], list[str]]:
+    """Return the views of a reconstruction in file coordinates, sorted by the names in the file, and notes."""
+    lenses = read_cameras(model / f"cameras.{kind}")
+    file = model / f"images.{kind}"
+    images, factor, note = image_folder(root, options.downscale)
     notes = [note] if note else []
-    paths, note = _photo_paths(images, [p.name for p in poses.values()], str(file), allow_outside)
+    paths, note = _image_paths(images, [p.name for p in poses.values()], str(file), options.allow_outside)
     notes += [note] if note else []
     views = ViewList()
     for pose in sorted(poses.values(), key=lambda p: p.name):
@@ -333,17 +372,10 @@ def load(
         viewmat[:3, :3] = quat_rotation(pose.quat, where)
         viewmat[:3, 3] = pose.translation
         path = paths[pose.name]
-        mask = find_mask(path, images, invert_masks)
-        photo = load_photo(path, lenses[pose.camera_id], downscale=factor, mask=mask)
-        views.add(view_name(pose.name), rigid(viewmat, where), photo)
+        mask = find_mask(path, images, options.invert_masks)
+        loaded = load_image(path, lenses[pose.camera_id], downscale=factor, mask=mask)
+        views.add(view_name(pose.name), rigid(viewmat, where), loaded)
     unposed = len(set(list_images(images)) - set(paths.values()))
     if unposed:
         notes.append(f"{unposed} images of {images.name} have no pose in the reconstruction and are left out")
-    notes += views.notes()
-    points_path = folder / f"points3D.{kind}"
-    if not points_path.is_file():
-        return views.views, None, [*notes, f"{points_path.name} is missing, so there are no points to start from"]
-    points = read_points(points_path, {n: view_name(p.name) for n, p in poses.items()})
-    if len(points) == 0:
-        notes.append(f"{points_path.name} holds no points")
-    return views.views, points, notes
+    return views.views, notes + views.notes()

@@ -8,22 +8,23 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.io.folders import ViewList, read_mask
-from warpgs.io.images import Lens, list_images, load_photo
+from warpgs.io.folders import ViewList, has_folder, pixel_source, read_mask, resampling_note
+from warpgs.io.images import Lens, list_images, load_image
 from warpgs.io.poses import rigid
-from warpgs.scene import PointCloud, View
+from warpgs.io.readers import Probe, Reader, ReadOptions, register
+from warpgs.scene import Scene
 
 FILES = ("cameras.npz", "cameras_sphere.npz")
 FOLDERS = ("image", "images")
-LARGEST_MEMBER = 4096
-"""Bytes that a 4 x 4 matrix and its header stay below, unpacked."""
+MAX_MATRIX_BYTES = 4096
+"""Size of an unpacked 4 x 4 matrix with its header [bytes] above which it is refused."""
 
 
 def decompose(P: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
     """Split a projection matrix [3, 4] into intrinsics [3, 3] and camera_from_world [4, 4].
 
     Raises:
-        DataError: It is not finite or singular, or its axes are skewed by more than a thousandth.
+        DataError: The matrix is not finite or singular, or its axes are skewed by more than a thousandth.
     """
     M = P[:3, :3]
     if not (np.isfinite(P).all() and abs(np.linalg.det(M)) > 1e-12 * np.abs(M).max() ** 3):
@@ -46,13 +47,13 @@ def decompose(P: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_matrices(path: Path) -> dict[str, np.ndarray]:
-    """The world and scale matrices of the archive, float64 [4, 4] each, by name."""
+    """Return the world and scale matrices of the archive by name, float64, shape [4, 4] each."""
     matrices = {}
     try:
         with np.load(path, allow_pickle=False) as archive:
             for key in archive.files:
                 if key.startswith(("world_mat_", "scale_mat_")) and "inv" not in key:
-                    if archive.zip.getinfo(f"{key}.npy").file_size > LARGEST_MEMBER:
+                    if archive.zip.getinfo(f"{key}.npy").file_size > MAX_MATRIX_BYTES:
                         raise ValueError(f"{key} is too large for a 4 x 4 matrix")
                     matrices[key] = archive[key].astype(np.float64)
     except Exception as e:  # numpy and zipfile raise a dozen types on foreign bytes
@@ -69,7 +70,7 @@ def _number(file: Path) -> int | None:
 
 
 def _masks(root: Path, files: list[Path]) -> dict[Path, Path]:
-    """Mask of each image: by name, else by the number in it (image/000003.png, mask/003.png)."""
+    """Return the mask file of each image that has one, by name, else by the number in it (image/000003.png, mask/003.png)."""
     folder = next((root / f for f in ("mask", "masks") if (root / f).is_dir()), None)
     masks = [] if folder is None else list_images(folder)
     by_name, by_number = {m.stem: m for m in masks}, {_number(m): m for m in masks}
@@ -79,40 +80,50 @@ def _masks(root: Path, files: list[Path]) -> dict[Path, Path]:
     return {f: m for f, m in found.items() if m is not None}
 
 
-def load(root: Path, *, downscale: int, invert_masks: bool, **_) -> tuple[list[View], PointCloud | None, list[str]]:
-    """Read a DTU scene folder: `image` or `images`, `mask` (matched by name or number), and the camera archive.
+@register("dtu")
+class DTUReader(Reader):
+    """DTU scenes: `image` or `images`, `mask` or `masks` (matched by name or number), and the camera archive.
 
-    Returns:
-        Views in the archive's normalised coordinates, None for points, notes.
-
-    Raises:
-        DataError: The archive is malformed, or an image has no camera.
+    Scenes are in the archive's normalised coordinates.
     """
-    path = next((root / f for f in FILES if (root / f).is_file()), root / FILES[0])
-    matrices = _read_matrices(path)
-    images = next((root / f for f in FOLDERS if (root / f).is_dir()), root / FOLDERS[0])
-    files = list_images(images)
-    cameras = sum(key.startswith("world_mat_") for key in matrices)
-    if not files or cameras != len(files):
-        raise DataError(
-            f"{path}: has {cameras} cameras, but {images} holds {len(files)} images. They are matched in sorted order, so the "
-            "counts must agree: restore the set"
-        )
-    masks, views = _masks(root, files), ViewList()
-    for i, file in enumerate(files):
-        name = file.relative_to(images).as_posix()
-        where = f"{path}, image {name!r}"
-        world, scale = matrices.get(f"world_mat_{i}"), matrices.get(f"scale_mat_{i}", np.eye(4))
-        if world is None:
-            raise DataError(f"{where}: world_mat_{i} is missing; copy the archive again")
-        K, viewmat = decompose((world @ scale)[:3], where)
-        K[:2, 2] += 0.5  # the archives count pixels from the centre of the first one
-        photo = load_photo(
-            file,
-            lambda width, height: Lens(K, width, height).checked(where),  # noqa: B023 - called before the next round
-            downscale=downscale,
-            mask=read_mask(masks[file], invert_masks) if file in masks else None,
-        )
-        views.add(name, viewmat, photo)
-    notes = [f"images area-resampled by {downscale}"] if downscale > 1 else []
-    return views.views, None, notes + views.notes()
+
+    description = "cameras.npz or cameras_sphere.npz with image or images (DTU)"
+    priority = 40
+
+    def probe(self, folder: Path) -> Probe | None:
+        """See `Reader.probe`."""
+        found = next((f for f in FILES if (folder / f).is_file()), None)
+        if found is None:
+            return None
+        return Probe(found, "" if has_folder(folder, *FOLDERS) else f"its images, a folder {' or '.join(FOLDERS)}")
+
+    def read(self, folder: Path, options: ReadOptions) -> Scene:
+        """See `Reader.read`."""
+        path = next((folder / f for f in FILES if (folder / f).is_file()), folder / FILES[0])
+        matrices = _read_matrices(path)
+        images = next((folder / f for f in FOLDERS if (folder / f).is_dir()), folder / FOLDERS[0])
+        files = list_images(images)
+        cameras = sum(key.startswith("world_mat_") for key in matrices)
+        if not files or cameras != len(files):
+            raise DataError(
+                f"{path}: has {cameras} cameras, but {images} holds {len(files)} images. They are matched in sorted order, so "
+                "the counts must agree: restore the set"
+            )
+        masks, views = _masks(folder, files), ViewList()
+        for i, file in enumerate(files):
+            name = file.relative_to(images).as_posix()
+            where = f"{path}, image {name!r}"
+            world, scale = matrices.get(f"world_mat_{i}"), matrices.get(f"scale_mat_{i}", np.eye(4))
+            if world is None:
+                raise DataError(f"{where}: world_mat_{i} is missing; copy the archive again")
+            K, viewmat = decompose((world @ scale)[:3], where)
+            K[:2, 2] += 0.5  # the archives count pixels from the centre of the first one
+            loaded = load_image(
+                file,
+                lambda width, height: Lens(K, width, height).checked(where),  # noqa: B023 - called before the next round
+                downscale=options.downscale,
+                mask=read_mask(masks[file], options.invert_masks) if file in masks else None,
+            )
+            views.add(name, viewmat, loaded)
+        notes = resampling_note(options.downscale) + views.notes()
+        return self.scene(folder, views.views, notes, pixels=pixel_source(folder, options.downscale, by_folder=False))

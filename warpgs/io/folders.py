@@ -1,4 +1,4 @@
-"""Finding the files of a scene: names that stay inside the folder, image folders, masks; and the list of views read."""
+"""Files of a scene: names that stay inside the folder, image folders, masks; and the list of views read."""
 
 from __future__ import annotations
 
@@ -9,14 +9,19 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.io.images import Photo, decode, list_images
+from warpgs.io.images import LoadedImage, decode, list_images
 from warpgs.scene import Camera, View
 
-LONGEST_NAME = 4096
+MAX_NAME_LENGTH = 4096
+
+
+def has_folder(root: Path, *patterns: str) -> bool:
+    """Return True where a folder of one of the names or glob patterns lies in ``root``."""
+    return any(p.is_dir() for pattern in patterns for p in root.glob(pattern))
 
 
 def child(folder: Path, name: object, where: str, *, root: Path | None = None, allow_outside: bool = False) -> Path:
-    """The path that a scene file names, relative to ``folder``.
+    """Return the path of a file that a scene names.
 
     Args:
         folder: What the name is relative to.
@@ -29,9 +34,9 @@ def child(folder: Path, name: object, where: str, *, root: Path | None = None, a
         The path; the file may not exist.
 
     Raises:
-        DataError: The name is none, or leads out of the scene folder.
+        DataError: The name is empty or no file name, or leads out of the scene folder.
     """
-    usable = isinstance(name, str) and name.strip("/\\. ") and "\0" not in name and len(name) < LONGEST_NAME
+    usable = isinstance(name, str) and name.strip("/\\. ") and "\0" not in name and len(name) < MAX_NAME_LENGTH
     if usable:
         try:
             name.encode("utf-8")
@@ -48,9 +53,9 @@ def child(folder: Path, name: object, where: str, *, root: Path | None = None, a
 
 
 def view_name(name: str) -> str:
-    """Key of the view of a file name: its plainest form ("./a//b.png" is "a/b.png"); one that climbs goes below `outside`.
+    """Return the name of the view of a file name, in its plainest form: "./a//b.png" gives "a/b.png".
 
-    Renderings are stored under these names, so none may be absolute or climb.
+    Renders are stored under these names, so none is absolute or climbs: "../a.png" gives "outside/a.png".
     """
     plain = posixpath.normpath(name)
     kept = [part for part in plain.split("/") if part not in ("", "..")]
@@ -58,20 +63,20 @@ def view_name(name: str) -> str:
 
 
 def view_name_of(path: Path, root: Path) -> str:
-    """Key of the view of a file: its path below ``root``, links not followed; of a file elsewhere one below `outside`."""
+    """Return the name of the view of a file: its path below ``root``, links not followed, or one below `outside`."""
     plain, base = (posixpath.normpath(p.absolute().as_posix()) for p in (path, root))
     return view_name(plain[len(base) + 1 :] if Path(plain).is_relative_to(base) else plain)
 
 
 def read_mask(path: Path, invert: bool) -> np.ndarray:
-    """Mask file, bool [H, W]: white keeps a pixel; ``invert`` turns that round. DataError where it cannot be decoded."""
+    """Return a mask file as bool [H, W]: white keeps a pixel; ``invert`` turns that round. DataError where unreadable."""
     return (decode(path)[0][..., 0] > 0.5) != invert
 
 
 def find_mask(image: Path, images_root: Path, invert: bool, folder: Path | None = None) -> np.ndarray | None:
-    """Mask [H, W] of an image, None where it has none.
+    """Return the mask [H, W] of an image, None where it has none.
 
-    Looked for in ``folder``, by default `masks` beside the image folder: same name as .png, name plus .png, or same name.
+    It lies in ``folder``, by default `masks` beside the image folder: same name as .png, name plus .png, or same name.
     """
     folder = folder or images_root.parent / "masks"
     if not image.is_relative_to(images_root) or not folder.is_dir():
@@ -100,14 +105,14 @@ def image_folder(root: Path, downscale: int, base: str = "images") -> tuple[Path
         return full, downscale, f"images area-resampled by {downscale}" if downscale > 1 else ""
     others = {int(n): p for p in root.glob(f"{base}_*") if (n := p.name[len(base) + 1 :]).isdecimal() and list_images(p)}
     if not others:
-        raise DataError(f"{root}: there is no folder '{base}' with images; put the photographs there")
+        raise DataError(f"{root}: there is no folder '{base}' with images; put the images there")
     largest = others[min(others)]
     how = f", area-resampled by {downscale}" if downscale > 1 else ""
     return largest, downscale, f"there is no full-size folder '{base}': images taken from {largest.name}{how}"
 
 
 def pixel_source(root: Path, downscale: int, by_folder: bool) -> str:
-    """Where a scene's pixels come from, for result files: the folder, and whether they are as stored or area-resampled.
+    """Return the source of a scene's pixels, for result files: the folder, and "as stored" or the factor of resampling.
 
     Args:
         root: The scene folder.
@@ -121,19 +126,24 @@ def pixel_source(root: Path, downscale: int, by_folder: bool) -> str:
     return f"{name} area-resampled by {factor}" if factor > 1 else f"{name} as stored"
 
 
+def resampling_note(downscale: int) -> list[str]:
+    """Return the note of a format whose images are always resampled; an empty list for a factor of 1."""
+    return [f"images area-resampled by {downscale}"] if downscale > 1 else []
+
+
 class ViewList:
-    """The views of a scene as they are read, and a count of what was done to them."""
+    """Views of a scene in the order they are read, and a count of what was done to their pixels."""
 
     def __init__(self) -> None:
         self.views: list[View] = []
         self._done: Counter[str] = Counter()
 
-    def add(self, name: str, viewmat: np.ndarray, photo: Photo) -> None:
-        """Append a view: ``viewmat`` is camera_from_world [4, 4] in file units, checked to be rigid."""
-        height, width = photo.image.shape[:2]
-        self.views.append(View(name, Camera(viewmat, photo.K, width, height), photo.image, photo.mask))
-        self._done.update(photo.done)
+    def add(self, name: str, viewmat: np.ndarray, loaded: LoadedImage) -> None:
+        """Append a view of an image at its final size; ``viewmat`` is camera_from_world [4, 4] in file units, rigid."""
+        height, width = loaded.image.shape[:2]
+        self.views.append(View(name, Camera(viewmat, loaded.K, width, height), loaded.image, loaded.mask))
+        self._done.update(loaded.done)
 
     def notes(self) -> list[str]:
-        """What was done to the pixels, a sentence each."""
+        """Return what was done to the pixels, a sentence each."""
         return [f"{n} image{'s' if n != 1 else ''} {what}" for what, n in sorted(self._done.items())]

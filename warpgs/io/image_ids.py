@@ -1,4 +1,4 @@
-"""Which photograph of a numbered set is this? Ids from file names, so that nothing is matched by sorted order."""
+"""Ids of numbered images from their file names, so that nothing is matched by sorted order."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from warpgs.errors import DataError
 
 
 def _numbers(names: list[str]) -> list[int] | None:
-    """The number in each name that tells the names apart: the first place among their digits where no two agree."""
+    """Return the number in each name that tells the names apart, the first place of digits where no two agree; else None."""
     groups = [re.findall(r"[0-9]{1,12}", PurePosixPath(n).stem) for n in names]
     for place in range(min(map(len, groups), default=0)):
         values = [int(g[place]) for g in groups]
@@ -19,12 +19,12 @@ def _numbers(names: list[str]) -> list[int] | None:
 
 
 def named_by_dtu(names: list[str]) -> bool:
-    """Whether all names are DTU's own, `rect_001_3_r5000.png`, which count from 1."""
+    """Return True where all names are DTU's own, `rect_001_3_r5000.png`, which count from 1."""
     return all(re.search(r"rect_[0-9]+_", n) for n in names)
 
 
 def image_ids(names: list[str]) -> list[int] | None:
-    """Ids of image files from their names, counted from 0; None where the names hold no number that tells them apart.
+    """Return the ids of image files from their names, counted from 0; None where no number tells the names apart.
 
     DTU's own names `rect_001_3_r5000.png` count from 1 and so name id 0; all others are taken as they are.
     """
@@ -35,20 +35,20 @@ def image_ids(names: list[str]) -> list[int] | None:
 
 
 def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: str) -> dict[int, str]:
-    """Names of the photographs with the wanted ids.
+    """Return the names of the images with the wanted ids.
 
     Args:
         names: All image names of a scan, sorted.
         wanted: Ids that a protocol picks, counted from 0.
-        least: Number of photographs that the ids count in.
-        where: Names protocol and scene in errors.
+        least: Smallest number of images in which the ids mean what the protocol says.
+        where: Protocol and scene, for errors.
 
     Returns:
         Name by id. Names without numbers are counted in sorted order; numbered ones must be there without a gap, for a gap
         would shift every id after it.
 
     Raises:
-        DataError: There are too few photographs, or some are missing from the middle; the message names the ids.
+        DataError: There are too few images, or some are missing from the middle; the message names the ids.
     """
     if len(names) < least:
         raise DataError(
@@ -64,7 +64,7 @@ def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: s
     if missing:
         shown = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
         raise DataError(
-            f"{where}: photographs with the ids {shown} are missing (ids are counted from 0, names run from {names[0]} to "
+            f"{where}: images with the ids {shown} are missing (ids are counted from 0, names run from {names[0]} to "
             f"{names[-1]}); restore them, for the protocol's ids would name other views"
         )
     return {i: by_id[i] for i in wanted}

@@ -1,4 +1,4 @@
-"""Photographs and masks: decoding, orientation, undistortion, resizing, each with the camera kept in step."""
+"""Images and masks: decoding, orientation, undistortion and resizing, with intrinsics that follow."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from warpgs.errors import DataError, UsageError
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 EXIF_ORIENTATION = 0x0112
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-LARGEST_DEFLATE_RATIO = 1032
-"""No deflate stream unpacks to more than this many times its size (zlib's technical notes)."""
-SMALLEST_SIDE = 4
-"""Images whose shorter side falls below this [px] hold nothing to fit."""
-LARGEST_INTRINSIC = 1e9
-LARGEST_DISTORTION = 1e4
-"""Beyond these a number is taken for a broken file; real lenses stay orders of magnitude below."""
+MAX_DEFLATE_RATIO = 1032
+"""Largest ratio of unpacked to packed bytes of a deflate stream (zlib's technical notes)."""
+MIN_SIDE = 4
+"""Smallest shorter side of an image [px]; below it there is nothing to fit."""
+MAX_INTRINSIC = 1e9
+MAX_DISTORTION = 1e4
+"""Largest distortion coefficient; beyond it, or an intrinsic beyond `MAX_INTRINSIC` [px], a file is taken for broken."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics of a photograph as its file has them, and the distortion to undo."""
+    """Intrinsics of an image as its file has them, and the distortion to undo."""
 
     K: np.ndarray
     """Intrinsics [px] for ``width`` x ``height``, pixel centres at +0.5, shape [3, 3]."""
@@ -39,22 +39,26 @@ class Lens:
     """Name of the camera model, for notes."""
 
     def checked(self, where: str) -> Lens:
-        """This lens; DataError where a number is not finite, not positive or absurd (``where`` names file and image)."""
+        """Return this lens after a check of its numbers; ``where`` is file and image, for errors.
+
+        Raises:
+            DataError: A number is not finite, not positive or absurdly large.
+        """
         f, c = self.K[[0, 1], [0, 1]], self.K[:2, 2]
-        if not (1 <= self.width <= LARGEST_INTRINSIC and 1 <= self.height <= LARGEST_INTRINSIC):
-            raise DataError(f"{where}: the camera's image size {self.width} x {self.height} px is impossible; mend the file")
-        if not ((f > 0) & (f < LARGEST_INTRINSIC)).all():
+        if not (1 <= self.width <= MAX_INTRINSIC and 1 <= self.height <= MAX_INTRINSIC):
+            raise DataError(f"{where}: the camera's image size {self.width} x {self.height} px is impossible; fix the file")
+        if not ((f > 0) & (f < MAX_INTRINSIC)).all():
             raise DataError(f"{where}: focal lengths {f.tolist()} px must be positive and finite; calibrate again")
-        if not (np.abs(c) < LARGEST_INTRINSIC).all():
+        if not (np.abs(c) < MAX_INTRINSIC).all():
             raise DataError(f"{where}: the principal point {c.tolist()} px is not finite; calibrate again")
-        if not (np.abs(self.distortion) < LARGEST_DISTORTION).all():
+        if not (np.abs(self.distortion) < MAX_DISTORTION).all():
             raise DataError(f"{where}: distortion {self.distortion} of the {self.model} lens is impossible; calibrate again")
         return self
 
 
 @dataclass(frozen=True)
-class Photo:
-    """A decoded photograph with its intrinsics at its own size."""
+class LoadedImage:
+    """A decoded image with its intrinsics at its own size."""
 
     image: np.ndarray
     """Colours in [0, 1], float32, shape [H, W, 3]."""
@@ -63,20 +67,20 @@ class Photo:
     K: np.ndarray
     """Intrinsics [px], shape [3, 3]."""
     done: tuple[str, ...] = ()
-    """What was done to the pixels and a user should know of, in words that fit "1 image ..."."""
+    """Changes of the pixels that a user should know of, in words that continue "1 image ..."."""
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Image files below a folder, sorted by relative POSIX path."""
-    # hidden files are leavings of file managers ("._photo.jpg"), not photographs
+    """Return the image files below a folder, sorted by relative POSIX path."""
+    # hidden files are leavings of file managers ("._image.jpg"), not images
     files = [p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.name[0] != "." and p.is_file()]
     return sorted(files, key=lambda p: p.relative_to(folder).as_posix())
 
 
 def _png_is_plausible(data: np.ndarray) -> bool:
-    """Whether a PNG's header and chunk lengths fit its size; any other file is left to the decoder.
+    """Return False where the header or chunk lengths of a PNG do not fit its size; True for any other file.
 
-    OpenCV reserves what they announce, gigabytes for a few damaged bytes, before it notices.
+    OpenCV reserves the memory that they announce, gigabytes for a few damaged bytes, before it notices.
     """
     if data[:8].tobytes() != PNG_SIGNATURE:
         return True
@@ -88,13 +92,16 @@ def _png_is_plausible(data: np.ndarray) -> bool:
         return False
     width, height, depth, color = struct.unpack(">IIBB", data[16:26].tobytes())
     channels = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(color, 4)
-    return height * (width * channels * depth // 8 + 1) <= LARGEST_DEFLATE_RATIO * data.size
+    return height * (width * channels * depth // 8 + 1) <= MAX_DEFLATE_RATIO * data.size
 
 
 def decode(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Colours in [0, 1], float32 [H, W, 3], and alpha in [0, 1], float32 [H, W], or None; stored raster, not rotated.
+    """Decode an image file as stored, without rotation by its EXIF tag.
 
     Gray, palette, 8- and 16-bit images and straight alpha are understood.
+
+    Returns:
+        Colours in [0, 1], float32, shape [H, W, 3]; and alpha in [0, 1], float32, shape [H, W], or None.
 
     Raises:
         DataError: The file is missing, empty, truncated or no image.
@@ -108,7 +115,7 @@ def decode(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         # IMREAD_UNCHANGED also leaves the EXIF orientation alone: the camera, not the tag, says how the raster lies
         raw = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size and _png_is_plausible(data) else None
     except OSError as e:
-        raise DataError(f"{path}: the image cannot be read ({e.strerror}); mend its permissions or copy it again") from e
+        raise DataError(f"{path}: the image cannot be read ({e.strerror}); fix its permissions or copy it again") from e
     except cv2.error:
         raw = None
     if raw is None:
@@ -134,7 +141,7 @@ def decode(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def exif_orientation(path: Path) -> int:
-    """EXIF orientation 1 to 8; 1 where the file has none."""
+    """Return the EXIF orientation, 1 to 8; 1 where the file has none."""
     from PIL import Image, UnidentifiedImageError
 
     try:
@@ -156,7 +163,7 @@ def _turn(array: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def _fits(shape: tuple[int, ...], lens: Lens) -> bool:
-    """Whether a raster has the lens's aspect within one pixel."""
+    """Return True where a raster has the aspect of the lens within one pixel."""
     height, width = shape[:2]
     return abs(width * lens.height / lens.width - height) <= 1 or abs(height * lens.width / lens.height - width) <= 1
 
@@ -168,47 +175,49 @@ def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def _fold_radius2(distortion: tuple[float, ...]) -> float:
-    """Squared radius in the image plane beyond which the radial polynomial turns back; infinity where it never does."""
+    """Return the squared radius in the image plane beyond which the radial polynomial turns back; inf where it never does."""
     k1, k2, k3 = distortion[0], distortion[1], distortion[4] if len(distortion) > 4 else 0.0
     roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
     real = roots[np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots.real))].real
     return float(min(real[real > 0], default=np.inf))
 
 
-def _undistort(photo: Photo, lens: Lens) -> Photo:
+def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     """Resample to a pinhole of the same K; pixels that the lens never saw leave the mask."""
     import cv2
 
-    height, width = photo.image.shape[:2]
-    K = photo.K.copy()
+    height, width = loaded.image.shape[:2]
+    K = loaded.K.copy()
     K[:2, 2] -= 0.5  # OpenCV's pixel centres are at whole numbers
     map_x, map_y = cv2.initUndistortRectifyMap(K, np.array(lens.distortion), None, K, (width, height), cv2.CV_32FC1)
-    image = cv2.remap(photo.image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    image = cv2.remap(loaded.image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     inside = (map_x >= -0.5) & (map_x <= width - 0.5) & (map_y >= -0.5) & (map_y <= height - 0.5)
     # where the polynomial turns back, the map leads into the image again but to a ray that the lens sent elsewhere
     x2 = ((np.arange(width) - K[0, 2]) / K[0, 0]) ** 2
     y2 = ((np.arange(height) - K[1, 2]) / K[1, 1]) ** 2
     inside &= y2[:, None] + x2 < _fold_radius2(lens.distortion)
-    if photo.mask is not None:
-        inside &= cv2.remap(photo.mask.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR) > 0.5
-    return Photo(image, None if inside.all() else inside, photo.K, (*photo.done, f"freed of lens distortion ({lens.model})"))
+    if loaded.mask is not None:
+        inside &= cv2.remap(loaded.mask.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR) > 0.5
+    return LoadedImage(
+        image, None if inside.all() else inside, loaded.K, (*loaded.done, f"freed of lens distortion ({lens.model})")
+    )
 
 
-def _shrink(path: Path, photo: Photo, downscale: int) -> Photo:
-    height, width = photo.image.shape[:2]
+def _shrink(path: Path, loaded: LoadedImage, downscale: int) -> LoadedImage:
+    height, width = loaded.image.shape[:2]
     small_w, small_h = round(width / downscale), round(height / downscale)
-    if min(small_w, small_h) < SMALLEST_SIDE:
+    if min(small_w, small_h) < MIN_SIDE:
         raise UsageError(
             f"--downscale {downscale} leaves {small_w} x {small_h} px of {path} ({width} x {height} px); "
-            f"both sides must keep at least {SMALLEST_SIDE} px. Choose a smaller factor"
+            f"both sides must keep at least {MIN_SIDE} px. Choose a smaller factor"
         )
-    K = np.diag([small_w / width, small_h / height, 1.0]) @ photo.K
-    mask = None if photo.mask is None else _resize(photo.mask.astype(np.float32), small_w, small_h) > 0.5
-    return Photo(_resize(photo.image, small_w, small_h), mask, K, photo.done)
+    K = np.diag([small_w / width, small_h / height, 1.0]) @ loaded.K
+    mask = None if loaded.mask is None else _resize(loaded.mask.astype(np.float32), small_w, small_h) > 0.5
+    return LoadedImage(_resize(loaded.image, small_w, small_h), mask, K, loaded.done)
 
 
 def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tuple[int, int], orientation: int) -> np.ndarray:
-    """The mask at the upright size (height, width); a mask that lies like the stored raster is turned with it."""
+    """Return the mask at the upright size (height, width); a mask that lies like the stored raster is turned with it."""
     if stored != upright and mask.shape == stored:
         mask = _turn(mask, orientation)
     height, width = upright
@@ -224,7 +233,7 @@ def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tu
 
 
 def _upright(path: Path, lens: Lens, image: np.ndarray) -> int:
-    """The EXIF orientation to apply: 1 (none) where the raster fits the camera as stored, the tag's where only that fits."""
+    """Return the EXIF orientation to apply: 1 (none) where the raster fits the camera as stored, else the tag's."""
     if _fits(image.shape, lens):
         return 1
     orientation = exif_orientation(path)
@@ -236,26 +245,26 @@ def _upright(path: Path, lens: Lens, image: np.ndarray) -> int:
     return orientation
 
 
-def load_photo(
+def load_image(
     path: Path,
     lens: Lens | Callable[[int, int], Lens],
     *,
     downscale: int = 1,
     mask: np.ndarray | None = None,
     background: tuple[float, float, float] | None = None,
-) -> Photo:
-    """Decode a photograph, set it upright if its camera says so, undo distortion, and resample.
+) -> LoadedImage:
+    """Decode an image, set it upright if its camera says so, undo distortion, and resample.
 
     Args:
         path: The image file.
-        lens: Its intrinsics, at whatever size; they are scaled to the image. Or what makes them from the width and height
-            [px] of the stored raster, for formats that leave the size to the image.
+        lens: Its intrinsics, at any size; they are scaled to the image. Or a function that makes them from the width and
+            height [px] of the stored raster, for formats that leave the size to the image.
         downscale: Factor by which both sides shrink (area resampling).
         mask: True where a pixel counts, [H, W] at the size of the file or of the same aspect.
-        background: Put behind transparent pixels; None turns transparency into the mask instead.
+        background: Colour in [0, 1] behind transparent pixels; None turns transparency into the mask instead.
 
     Returns:
-        The photograph with intrinsics for its final size.
+        The image with intrinsics for its final size.
 
     Raises:
         DataError: The file cannot be decoded, its size does not fit its camera or its mask, or no pixel counts.
@@ -283,11 +292,11 @@ def load_photo(
             done.append("masked by its alpha channel")
     if mask is not None and not mask.any():
         raise DataError(f"{path}: its mask leaves no pixel; white keeps a pixel, so perhaps --invert-masks is wanted")
-    photo = Photo(image, mask, K, tuple(done))
+    loaded = LoadedImage(image, mask, K, tuple(done))
     if any(lens.distortion):
-        photo = _undistort(photo, lens)
+        loaded = _undistort(loaded, lens)
     if downscale > 1:
-        photo = _shrink(path, photo, downscale)
-    if photo.mask is not None and not photo.mask.any():
+        loaded = _shrink(path, loaded, downscale)
+    if loaded.mask is not None and not loaded.mask.any():
         raise DataError(f"{path}: no pixel is left after its mask, its lens distortion and --downscale; look at all three")
-    return Photo(np.ascontiguousarray(photo.image, np.float32), photo.mask, photo.K, photo.done)
+    return LoadedImage(np.ascontiguousarray(loaded.image, np.float32), loaded.mask, loaded.K, loaded.done)

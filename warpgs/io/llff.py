@@ -7,14 +7,21 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.io.folders import ViewList, find_mask, image_folder
-from warpgs.io.images import Lens, list_images, load_photo
+from warpgs.io.folders import ViewList, find_mask, has_folder, image_folder, pixel_source
+from warpgs.io.images import Lens, list_images, load_image
 from warpgs.io.poses import from_camera_to_world
-from warpgs.scene import PointCloud, View
+from warpgs.io.readers import Probe, Reader, ReadOptions, register
+from warpgs.scene import Scene
+
+FILE = "poses_bounds.npy"
 
 
 def read_rows(path: Path) -> np.ndarray:
-    """The array of poses_bounds.npy, float64 [n, 17]; DataError where it is anything else."""
+    """Return the array of poses_bounds.npy, float64, shape [N, 17].
+
+    Raises:
+        DataError: The file holds anything else.
+    """
     try:
         # mapped, because that holds the announced shape against the file's size before memory is taken
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -28,36 +35,43 @@ def read_rows(path: Path) -> np.ndarray:
     return rows.astype(np.float64)
 
 
-def load(root: Path, *, downscale: int, invert_masks: bool, **_) -> tuple[list[View], PointCloud | None, list[str]]:
-    """Read an LLFF scene folder.
+@register("llff")
+class LLFFReader(Reader):
+    """LLFF scenes: poses_bounds.npy and its image folder."""
 
-    Returns:
-        Views in file coordinates, None for points, notes.
+    description = "poses_bounds.npy with images or images_N (LLFF)"
+    priority = 30
 
-    Raises:
-        DataError: The array is malformed, the number of images differs from its rows, or a size does not fit.
-    """
-    path = root / "poses_bounds.npy"
-    rows = read_rows(path)
-    images, factor, note = image_folder(root, downscale)
-    files = list_images(images)
-    if len(files) != len(rows):
-        raise DataError(
-            f"{path}: has {len(rows)} poses, but {images} holds {len(files)} images. They are matched in sorted order, so one "
-            "missing or extra file would give every photo the wrong pose: restore the set, or make the array again."
-        )
-    views = ViewList()
-    for file, row in zip(files, rows):
-        name = file.relative_to(images).as_posix()
-        where = f"{path}, image {name!r}"
-        matrix = row[:15].reshape(3, 5)
-        height, width, focal = matrix[:, 4].tolist()
-        if not np.isfinite(matrix).all():
-            raise DataError(f"{where}: the pose is not finite; estimate it again, or remove row and image")
-        lens = Lens(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), int(width), int(height))
-        # columns: down, right, back, centre
-        pose = np.stack([matrix[:, 1], matrix[:, 0], -matrix[:, 2], matrix[:, 3]], axis=1)
-        mask = find_mask(file, images, invert_masks)
-        photo = load_photo(file, lens.checked(where), downscale=factor, mask=mask)
-        views.add(name, from_camera_to_world(pose, where, opengl=False), photo)
-    return views.views, None, ([note] if note else []) + views.notes()
+    def probe(self, folder: Path) -> Probe | None:
+        """See `Reader.probe`."""
+        if not (folder / FILE).is_file():
+            return None
+        return Probe(FILE, "" if has_folder(folder, "images", "images_*") else "its images, a folder images or images_N")
+
+    def read(self, folder: Path, options: ReadOptions) -> Scene:
+        """See `Reader.read`."""
+        path = folder / FILE
+        rows = read_rows(path)
+        images, factor, note = image_folder(folder, options.downscale)
+        files = list_images(images)
+        if len(files) != len(rows):
+            raise DataError(
+                f"{path}: has {len(rows)} poses, but {images} holds {len(files)} images. They are matched in sorted order, so "
+                "one missing or extra file would give every image the wrong pose: restore the set, or make the array again."
+            )
+        views = ViewList()
+        for file, row in zip(files, rows):
+            name = file.relative_to(images).as_posix()
+            where = f"{path}, image {name!r}"
+            matrix = row[:15].reshape(3, 5)
+            height, width, focal = matrix[:, 4].tolist()
+            if not np.isfinite(matrix).all():
+                raise DataError(f"{where}: the pose is not finite; estimate it again, or remove row and image")
+            lens = Lens(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), int(width), int(height))
+            # columns: down, right, back, centre
+            pose = np.stack([matrix[:, 1], matrix[:, 0], -matrix[:, 2], matrix[:, 3]], axis=1)
+            mask = find_mask(file, images, options.invert_masks)
+            loaded = load_image(file, lens.checked(where), downscale=factor, mask=mask)
+            views.add(name, from_camera_to_world(pose, where, opengl=False), loaded)
+        notes = ([note] if note else []) + views.notes()
+        return self.scene(folder, views.views, notes, pixels=pixel_source(folder, options.downscale, by_folder=True))

@@ -1,25 +1,24 @@
-"""From a folder to a `Scene`: detect, read, bring to the house coordinates, fingerprint."""
+"""Loading of a `Scene` from a folder: choose a reader, read, bring to scene coordinates, fingerprint."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
-from warpgs.errors import DataError, UsageError
-from warpgs.io import colmap, dtu, llff, middlebury, transforms
-from warpgs.io.detect import detect
-from warpgs.io.folders import pixel_source
-from warpgs.io.normalize import fingerprint, normalization_of, normalize_points, normalize_view
-from warpgs.io.score_masks import FOLDER, add_score_masks
-from warpgs.scene import Scene, View
+import numpy as np
 
-READERS = {
-    "colmap": colmap.load, "transforms": transforms.load, "llff": llff.load, "dtu": dtu.load, "middlebury": middlebury.load,
-}  # fmt: skip
+from warpgs.errors import DataError, UsageError
+from warpgs.io.normalize import fingerprint, normalization_of, normalize_points, normalize_view
+from warpgs.io.poses import rigid
+from warpgs.io.readers import Reader, ReadOptions, all_readers, find_reader
+from warpgs.io.score_masks import FOLDER, add_score_masks
+from warpgs.scene import Normalization, Scene, View
 
 
 def load_scene(
     path: str | Path,
     *,
+    reader: str | type[Reader] | Reader | None = None,
     downscale: int = 1,
     strict: bool = False,
     allow_outside: bool = False,
@@ -33,6 +32,8 @@ def load_scene(
 
     Args:
         path: The scene folder.
+        reader: Name of a format (colmap, transforms, llff, dtu, middlebury), or a `Reader` of your own: an object, a class,
+            ``module:Class`` or ``path/to/file.py:Class``. None asks every built-in reader whether the folder has its format.
         downscale: Factor by which both image sides shrink; a ready-made folder `images_N` is used where there is one.
         strict: A frame without an image file is an error instead of a note.
         allow_outside: Let the scene name image files outside its folder.
@@ -45,53 +46,104 @@ def load_scene(
 
     Raises:
         DataError: Anything in the folder is missing or malformed; the message names file, reason and remedy.
-        UsageError: ``downscale`` is below 1.
+        UsageError: ``downscale`` is below 1, or there is no such reader.
     """
-    if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
-        raise UsageError(f"--downscale must be a whole number of at least 1, not {downscale!r}")
-    options = {"downscale": downscale, "strict": strict, "allow_outside": allow_outside, "invert_masks": invert_masks}
+    options = ReadOptions(downscale, strict, allow_outside, invert_masks)
     root = Path(path)
     try:
-        return _read(root, options, score_masks)
+        _check_folder(root)
+        chosen, notes = detect(root) if reader is None else (_accepted(root, find_reader(reader)), [])
+        return _finished(root, chosen, chosen.read(root, options), notes, score_masks)
     except OSError as e:
         # folders without permission, names too long for the file system, disks that fail
-        raise DataError(f"{e.filename or root}: cannot be read ({e.strerror or e}); mend its permissions or copy it") from e
+        raise DataError(f"{e.filename or root}: cannot be read ({e.strerror or e}); fix its permissions or copy it") from e
 
 
-def _read(root: Path, options: dict, score_masks: str | Path | None) -> Scene:
-    name, notes = detect(root)
-    views, points, more = READERS[name](root, **options)
+def detect(root: Path) -> tuple[Reader, list[str]]:
+    """Return the reader of the first complete format of a scene folder, and notes on the formats passed over.
+
+    Raises:
+        DataError: The folder holds no format, or only a broken one; the message lists what was looked for.
+    """
+    readers = all_readers()
+    found = [(r, p) for r in readers if (p := r.probe(root)) is not None]
+    complete = [r for r, p in found if not p.missing]
+    broken = [f"{p.found} lacks {p.missing}" for _, p in found if p.missing]
+    if not complete and broken:
+        raise DataError(f"{root}: {broken[0]}, and there is no other format. Copy the whole reconstruction")
+    if not complete:
+        raise DataError(f"{root}: no scene format found. Looked for: {', '.join(r.description for r in readers)}")
+    taken, *others = complete
+    notes = [f"{lack}; passed over, {taken.name} is complete" for lack in broken]
+    if others:
+        notes.append(f"the folder also holds {' and '.join(r.name for r in others)}: {taken.name} is taken")
+    return taken, notes
+
+
+def _check_folder(root: Path) -> None:
+    if root.is_file():
+        raise DataError(f"{root}: is a file; give the folder that holds the images and their cameras")
+    if not root.is_dir():
+        raise DataError(f"{root}: there is no such folder; give the folder that holds the images and their cameras")
+
+
+def _accepted(root: Path, reader: Reader) -> Reader:
+    """Return a reader that the user chose; DataError where its format is not in the folder or not complete."""
+    probe = reader.probe(root)
+    if probe is None:
+        others = [p.found for r in all_readers() if (p := r.probe(root)) is not None]
+        there = f"; the folder holds {' and '.join(others)}" if others else ""
+        wanted = f" ({reader.description})" if reader.description else ""
+        raise DataError(f"{root}: the reader {reader.name} does not find its format{wanted}{there}. Choose another reader")
+    if probe.missing:
+        raise DataError(f"{root}: {probe.found} lacks {probe.missing}. Copy the whole scene")
+    return reader
+
+
+def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], score_masks: str | Path | None) -> Scene:
+    """Return a scene as read from files, checked, sorted, in scene coordinates, with score masks and fingerprint."""
+    if not isinstance(scene, Scene) or scene.normalization.scale != 1 or scene.normalization.offset.any():
+        raise UsageError(f"the reader {reader.name} must return a Scene in file coordinates, without a Normalization; fix it")
+    views, points, more = list(scene.views), scene.points, scene.notes
     if len(views) < 2:
         reasons = f" ({'; '.join(more)})" if more else ""
         raise DataError(
             f"{root}: the scene has {len(views)} usable view{'s' if len(views) != 1 else ''}{reasons}; depth needs at least 2. "
-            "Add photographs with cameras"
+            "Add images with cameras"
         )
-    _check_names(root, views)
-    n = normalization_of(views, points)
+    _check_views(root, views)
+    n: Normalization = normalization_of(views, points)
     views = [normalize_view(v, n) for v in sorted(views, key=lambda v: v.name)]
     if points is not None:
         points = normalize_points(points, n)
     if score_masks is not None or (root / FOLDER).is_dir():
         views, note = add_score_masks(views, Path(score_masks) if score_masks is not None else root / FOLDER)
-        more = [*more, note]
-    blender = name == "transforms" and transforms.is_blender(root)
-    return Scene(
+        more = (*more, note)
+    return replace(
+        scene,
         path=str(root),
-        format=name,
+        format=reader.name,
         views=tuple(views),
         points=points,
         normalization=n,
         notes=(*notes, *more),
         fingerprint=fingerprint(views),
-        background=transforms.WHITE if blender else (0.0, 0.0, 0.0),
-        pixels=pixel_source(root, options["downscale"], name in ("colmap", "llff")),
     )
 
 
-def _check_names(root: Path, views: list[View]) -> None:
+def _check_views(root: Path, views: list[View]) -> None:
+    """Refuse names that are not unique, poses that are not rigid, and images and masks of another size than the camera."""
     seen: set[str] = set()
     for v in views:
         if v.name in seen:
             raise DataError(f"{root}: the image {v.name!r} is listed twice; remove one of its cameras")
         seen.add(v.name)
+        where, size = f"{root}, image {v.name!r}", (v.camera.height, v.camera.width)
+        rigid(np.asarray(v.camera.viewmat), where)
+        wanted = [("image", v.image, (*size, 3), np.float32), ("mask", v.mask, size, bool)]
+        for noun, array, shape, dtype in wanted:
+            if array is not None and (array.shape != shape or array.dtype != dtype):
+                raise DataError(
+                    f"{where}: its {noun} is {array.dtype} {list(array.shape)}, the camera needs {np.dtype(dtype)} "
+                    f"{list(shape)}; fix the reader"
+                )

@@ -7,19 +7,24 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.io.folders import ViewList, child, find_mask, view_name
-from warpgs.io.images import Lens, load_photo
+from warpgs.io.folders import ViewList, child, find_mask, pixel_source, resampling_note, view_name
+from warpgs.io.images import Lens, load_image
 from warpgs.io.poses import rigid
-from warpgs.scene import PointCloud, View
+from warpgs.io.readers import Probe, Reader, ReadOptions, register
+from warpgs.scene import Scene
 
 
 def files_of(root: Path) -> list[Path]:
-    """The parameter files of a folder, sorted; a scene has one."""
+    """Return the parameter files of a folder, sorted; a scene has one."""
     return sorted(p for p in root.glob("*_par.txt") if p.is_file() and not p.name.startswith("."))
 
 
 def read_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
-    """Line number, image name and 21 numbers (K, R, t) of each camera; DataError where the file is malformed."""
+    """Return line number, image name and the numbers K, R, t, float64, shape [21], of each camera.
+
+    Raises:
+        DataError: The file is malformed; the message names the line.
+    """
     try:
         lines = path.read_bytes().decode("utf-8-sig").splitlines()
         words = [(number, line.split()) for number, line in enumerate(lines, 1) if line.strip()]
@@ -41,41 +46,46 @@ def read_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
     return rows
 
 
-def load(
-    root: Path, *, downscale: int, allow_outside: bool, invert_masks: bool, **_
-) -> tuple[list[View], PointCloud | None, list[str]]:
-    """Read a Middlebury scene folder.
+def _intrinsics(K: np.ndarray, where: str) -> np.ndarray:
+    """Return K [3, 3] of a file for pixel centres at +0.5; DataError where it is no matrix of intrinsics or skewed."""
+    if abs(K[0, 1]) > 1e-3 * abs(K[0, 0]):
+        raise DataError(f"{where}: the camera is skewed by {K[0, 1]:.3g} px, which is not supported; rectify the images")
+    if not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], (0, 0, 0, 1)):
+        raise DataError(f"{where}: K is no matrix of intrinsics (its lower rows are not 0 fy cy, 0 0 1); calibrate again")
+    K[0, 1] = 0.0
+    K[:2, 2] += 0.5  # the file counts pixels from the centre of the first one
+    return K
 
-    Returns:
-        Views in file coordinates, None for points, notes.
 
-    Raises:
-        DataError: The file's lines do not hold a name and 21 numbers, their number differs from the count in its first
-            line, or an image is missing.
-    """
-    path, *others = files_of(root)
-    notes = [f"cameras taken from {path.name}; {', '.join(p.name for p in others)} passed over"] if others else []
-    views = ViewList()
-    for number, name, values in read_rows(path):
-        where = f"{path}, line {number}, image {name!r}"
-        K = values[:9].reshape(3, 3).copy()
-        if abs(K[0, 1]) > 1e-3 * abs(K[0, 0]):
-            raise DataError(f"{where}: the camera is skewed by {K[0, 1]:.3g} px, which is not supported; rectify the images")
-        if not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], (0, 0, 0, 1)):
-            raise DataError(f"{where}: K is no matrix of intrinsics (its lower rows are not 0 fy cy, 0 0 1); calibrate again")
-        K[0, 1] = 0.0
-        K[:2, 2] += 0.5  # the file counts pixels from the centre of the first one
-        viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = values[9:18].reshape(3, 3), values[18:21]
-        viewmat = rigid(viewmat, where)
-        file = child(root, name, where, allow_outside=allow_outside)
-        photo = load_photo(
-            file,
-            lambda width, height: Lens(K, width, height).checked(where),  # noqa: B023 - called before the next round
-            downscale=downscale,
-            mask=find_mask(file, root, invert_masks, root / "masks"),
-        )
-        views.add(view_name(name), viewmat, photo)
-    if downscale > 1:
-        notes.append(f"images area-resampled by {downscale}")
-    return views.views, None, notes + views.notes()
+@register("middlebury")
+class MiddleburyReader(Reader):
+    """Middlebury scenes: a parameter file, and the images it names beside it."""
+
+    description = "*_par.txt (Middlebury)"
+    priority = 50
+
+    def probe(self, folder: Path) -> Probe | None:
+        """See `Reader.probe`."""
+        files = files_of(folder)
+        return Probe(files[0].name) if files else None
+
+    def read(self, folder: Path, options: ReadOptions) -> Scene:
+        """See `Reader.read`."""
+        path, *others = files_of(folder)
+        notes = [f"cameras taken from {path.name}; {', '.join(p.name for p in others)} passed over"] if others else []
+        views = ViewList()
+        for number, name, values in read_rows(path):
+            where = f"{path}, line {number}, image {name!r}"
+            K, viewmat = _intrinsics(values[:9].reshape(3, 3).copy(), where), np.eye(4)
+            viewmat[:3, :3], viewmat[:3, 3] = values[9:18].reshape(3, 3), values[18:21]
+            viewmat = rigid(viewmat, where)
+            file = child(folder, name, where, allow_outside=options.allow_outside)
+            loaded = load_image(
+                file,
+                lambda width, height: Lens(K, width, height).checked(where),  # noqa: B023 - called before the next round
+                downscale=options.downscale,
+                mask=find_mask(file, folder, options.invert_masks, folder / "masks"),
+            )
+            views.add(view_name(name), viewmat, loaded)
+        notes += resampling_note(options.downscale) + views.notes()
+        return self.scene(folder, views.views, notes, pixels=pixel_source(folder, options.downscale, by_folder=False))

@@ -1,4 +1,4 @@
-"""From file coordinates to scene coordinates, and the fingerprint of what was read."""
+"""Change from file coordinates to scene coordinates, and the fingerprint of what was read."""
 
 from __future__ import annotations
 
@@ -11,59 +11,60 @@ from warpgs.errors import DataError
 from warpgs.geometry import matmul
 from warpgs.scene import Normalization, PointCloud, View
 
-SMALLEST_EXTENT = 1e-9
-"""Camera sets smaller than this [file units] count as one place."""
-FARTHEST = 1e12
-"""Camera centres farther than this [file units] from the origin are taken for a broken file: squares would lose digits."""
+MIN_EXTENT = 1e-9
+"""Extent of a camera set [file units] below which all cameras count as one place."""
+MAX_CENTER = 1e12
+"""Largest coordinate of a camera centre [file units]; beyond it squares lose digits and the file is taken for broken."""
 
 
 def normalization_of(views: list[View], points: PointCloud | None) -> Normalization:
-    """Put the mean camera centre at the origin and make 1.1 times the largest distance from it one unit.
+    """Return the similarity that puts the mean camera centre at the origin and the farthest camera at 1 / 1.1.
 
-    Where all cameras stand in one place, the points' median distance takes that role, else 1.
+    Where all cameras stand in one place, the points' median distance becomes 1; without points the scale stays.
 
     Raises:
         DataError: A camera centre is absurdly far away; the message names the image.
     """
     centers = np.array([v.camera.center for v in views])
     far = np.abs(centers).max(axis=1)
-    if not (far < FARTHEST).all():
+    if not (far < MAX_CENTER).all():
         worst = int(np.argmax(far))
         raise DataError(
-            f"image {views[worst].name!r}: its camera centre {centers[worst].tolist()} is beyond {FARTHEST:.0e} units, so the "
-            "scene cannot be scaled; estimate its pose again, or remove the image"
+            f"image {views[worst].name!r}: its camera centre {centers[worst].tolist()} is beyond {MAX_CENTER:.0e} units, so "
+            "the scene cannot be scaled; estimate its pose again, or remove the image"
         )
     offset = centers.mean(0)
     extent = 1.1 * float(np.linalg.norm(centers - offset, axis=1).max())
-    if extent < SMALLEST_EXTENT:
+    if extent < MIN_EXTENT:
         extent = 1.0
         if points is not None and len(points):
             median = float(np.median(np.abs(points.points - offset).max(axis=1)))
-            extent = median if SMALLEST_EXTENT < median < FARTHEST else 1.0
+            extent = median if MIN_EXTENT < median < MAX_CENTER else 1.0
     return Normalization(offset, 1 / extent)
 
 
 def normalize_view(view: View, n: Normalization) -> View:
-    """The view with its camera in scene coordinates (float64); rotation and intrinsics stay as they are."""
+    """Return the view with its camera in scene coordinates (float64); rotation and intrinsics stay as they are."""
     viewmat = view.camera.viewmat.copy()
     viewmat[:3, 3] = n.scale * (matmul(viewmat[:3, :3], n.offset) + viewmat[:3, 3])
     return replace(view, camera=replace(view.camera, viewmat=viewmat))
 
 
 def normalize_points(points: PointCloud, n: Normalization) -> PointCloud:
-    """The points in scene coordinates (float64)."""
+    """Return the points in scene coordinates (float64)."""
     return replace(points, points=n.scale * (points.points - n.offset))
 
 
 def fingerprint(views: list[View]) -> str:
-    """SHA-256, hexadecimal, over names, cameras and pixels of the views in their order."""
+    """Return the SHA-256, hexadecimal, over names, cameras and pixels of the views in their order."""
     digest = hashlib.sha256()
     for v in views:
         # cameras to 1e-9: their last bits depend on the machine's linear algebra
         cameras = [np.round(m, 9) + 0.0 for m in (v.camera.viewmat, v.camera.K)]
         arrays = [*cameras, v.image] + [m for m in (v.mask, v.score_mask) if m is not None]
         # name and shapes are delimited, so that bytes moved from one field to the next cannot give the same hash
-        digest.update(repr((v.name, [(a.shape, str(a.dtype)) for a in arrays])).encode("utf-8", "surrogateescape"))
+        model = () if v.camera.model == "pinhole" else (v.camera.model,)
+        digest.update(repr((v.name, [(a.shape, str(a.dtype)) for a in arrays], *model)).encode("utf-8", "surrogateescape"))
         for array in arrays:
             digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()

@@ -1,21 +1,21 @@
-"""Poses at the door: checked to be rigid and finite, converted to camera_from_world with OpenCV axes."""
+"""Poses of files: checked to be rigid and finite, converted to camera_from_world with OpenCV axes."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.geometry import matmul, nearest_rotation
+from warpgs.geometry import matmul, nearest_rotation, rotation_matrices
 
 TOLERANCE = 1e-3
 """Largest entry of R R^T - 1 that is put down to rounding in the file."""
 
 
 def rigid(viewmat: np.ndarray, where: str) -> np.ndarray:
-    """Check a [4, 4] pose and return it with its rotation made exactly orthonormal.
+    """Return a pose [4, 4] with its rotation made exactly orthonormal.
 
     Raises:
-        DataError: It is not finite, or its upper left 3 x 3 block is no rotation; ``where`` names file and image.
+        DataError: The pose is not finite, or its upper left 3 x 3 block is no rotation; ``where`` is file and image.
     """
     if viewmat.shape != (4, 4) or not np.isfinite(viewmat).all():
         raise DataError(f"{where}: the pose is not finite; estimate it again, or remove the image")
@@ -35,27 +35,24 @@ def rigid(viewmat: np.ndarray, where: str) -> np.ndarray:
 
 
 def quat_rotation(quat: tuple[float, ...], where: str) -> np.ndarray:
-    """Rotation [3, 3] of a quaternion wxyz; DataError where it is zero or not finite."""
+    """Return the rotation [3, 3] of a quaternion wxyz of any length.
+
+    Raises:
+        DataError: The quaternion is zero or not finite.
+    """
     q = np.array(quat, np.float64)
     norm = float(np.linalg.norm(q)) if (np.abs(q) < 1e100).all() else np.inf
     if not 1e-12 < norm < np.inf:
         raise DataError(f"{where}: the rotation quaternion {tuple(quat)} is zero or not finite; estimate the pose again")
-    w, x, y, z = q / norm
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return rotation_matrices(q / norm)
 
 
 def from_camera_to_world(matrix: np.ndarray, where: str, *, opengl: bool) -> np.ndarray:
-    """camera_from_world, OpenCV axes, from a camera-to-world matrix [3 or 4, 4].
+    """Return camera_from_world [4, 4] with OpenCV axes from a camera-to-world matrix.
 
     Args:
-        matrix: Camera to world.
-        where: Names file and image in errors.
+        matrix: Camera to world, shape [3, 4] or [4, 4].
+        where: File and image, for errors.
         opengl: The camera looks along -z with +y up (OpenGL, Blender); the two axes are turned round.
 
     Raises:

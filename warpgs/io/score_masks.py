@@ -1,4 +1,4 @@
-"""Object masks that say where a rendering is scored and hide nothing from the fit, as DTU's published protocol has them."""
+"""Object masks that limit where a render is scored and hide nothing from the fit, as in DTU's published protocol."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from warpgs.io.images import list_images
 from warpgs.scene import View
 
 FOLDER = "idrmasks"
-"""Taken from a scene folder where no other is named; the name that DTU's masks are passed on under."""
+"""Subfolder of a scene that is taken where no other folder is named: the name under which DTU's masks are published."""
 ASPECT_TOLERANCE = 0.02
-"""Undistortion changes the aspect of DTU photographs by about a percent; the masks are of the originals."""
+"""Largest relative difference of aspects: undistorted DTU images differ by about a percent from the originals' masks."""
 
 
 def _by_id(files: list[Path], folder: Path) -> dict[int, Path]:
@@ -33,8 +33,8 @@ def _fit(path: Path, mask: np.ndarray, view: View) -> np.ndarray:
     ratio = (mask.shape[1] / mask.shape[0]) / (width / height)
     if not abs(ratio - 1) <= ASPECT_TOLERANCE:
         raise DataError(
-            f"{path}: the mask is {mask.shape[1]} x {mask.shape[0]} px, its photograph {view.name} {width} x {height}: the "
-            "aspects differ by more than two percent. Give the masks of these photographs"
+            f"{path}: the mask is {mask.shape[1]} x {mask.shape[0]} px, its image {view.name} {width} x {height}: the "
+            "aspects differ by more than two percent. Give the masks of these images"
         )
     if mask.shape != (height, width):
         mask = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
@@ -46,7 +46,7 @@ def _fit(path: Path, mask: np.ndarray, view: View) -> np.ndarray:
 def add_score_masks(views: list[View], folder: Path) -> tuple[list[View], str]:
     """Give every view its object mask, matched by image id and never by sorted order.
 
-    The masks lie in ``folder`` or in its subfolder `mask`, named by id counted from 0 (000.png, 001.png, ...); the photographs
+    The masks lie in ``folder`` or in its subfolder `mask`, named by id counted from 0 (000.png, 001.png, ...); the images
     are named by the same ids, or as DTU names them, `rect_001_...` being id 0.
 
     Args:
@@ -58,7 +58,7 @@ def add_score_masks(views: list[View], folder: Path) -> tuple[list[View], str]:
 
     Raises:
         DataError: There is no mask, one is missing (the message names the ids) or does not fit, or it cannot be known whether
-            the photographs count from 0 or from 1.
+            the images count from 0 or from 1.
     """
     inner = folder / "mask"
     folder = inner if inner.is_dir() else folder
@@ -68,20 +68,20 @@ def add_score_masks(views: list[View], folder: Path) -> tuple[list[View], str]:
     masks, ids = _by_id(files, folder), image_ids([v.name for v in views])
     if ids is None:
         raise DataError(
-            f"{folder}: masks are matched by image id, but the photographs ({views[0].name}, ...) have no numbers that tell "
+            f"{folder}: masks are matched by image id, but the images ({views[0].name}, ...) have no numbers that tell "
             "them apart; name them by id"
         )
     missing = sorted(set(ids) - set(masks))
     if missing:
         shown = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
         raise DataError(
-            f"{folder}: there is no mask for image id {shown} (ids are counted from 0; a photograph rect_001_... is id 0); the "
+            f"{folder}: there is no mask for image id {shown} (ids are counted from 0; an image rect_001_... is id 0); the "
             f"masks run from {files[0].name} to {files[-1].name}. Restore the missing ones"
         )
     if min(ids) == 1 and 0 in masks and not named_by_dtu([v.name for v in views]):
         raise DataError(
-            f"{folder}: the photographs start with 1 ({views[ids.index(1)].name}), the masks with 0, so it cannot be known "
-            "whether they are off by one; rename the photographs so that they count from 0, or remove mask 0"
+            f"{folder}: the images start with 1 ({views[ids.index(1)].name}), the masks with 0, so it cannot be known "
+            "whether they are off by one; rename the images so that they count from 0, or remove mask 0"
         )
     done = [replace(v, score_mask=_fit(masks[i], read_mask(masks[i], False), v)) for i, v in zip(ids, views)]
     return done, f"scores count the pixels of the masks in {folder}, matched by image id; the fit sees every pixel"

@@ -1,4 +1,4 @@
-"""Which views train and which are held out: the published protocols, and splits of one's own."""
+"""Splits of a scene into training views and held-out views: published protocols, and the user's own."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DTU_TRAIN = (25, 22, 28, 40, 44, 48, 0, 8, 13)
 """Training ids of pixelNeRF's DTU protocol; the first 3, 6 or 9 are used."""
 DTU_TEST = (1, 2, 9, 10, 11, 12, 14, 15, 23, 24, 26, 27, 29, 30, 31, 32, 33, 34, 35, 41, 42, 43, 45, 46, 47)
 DTU_VIEWS = 49
-"""The ids count the first 49 views of a scan; some scans have 64."""
+"""Number of views that the ids count in: the first 49 of a scan; some scans have 64."""
 BLENDER_TRAIN = (2, 16, 26, 55, 73, 76, 86, 93)
 """Training ids of DietNeRF's 8-view Blender protocol; tests are every 8th of the test frames."""
 
@@ -81,7 +81,7 @@ def _blender(names: list[str], count: int, spec: str) -> Split:
 
 
 def _find(names: list[str], wanted: str, spec: str) -> str:
-    """The view of a name, whole or its last parts, with suffix or without; the closest of these that fits decides."""
+    """Return the view of a name, given whole or by its last parts, with suffix or without; the strictest match decides."""
     bare = {n: str(PurePosixPath(n).with_suffix("")) for n in names}
     fits = (
         lambda n: n == wanted,
@@ -117,7 +117,7 @@ def _explicit(names: list[str], spec: str) -> Split:
 
 
 def split_views(scene: Scene, spec: str) -> Split:
-    """Apply a split to a scene.
+    """Return the split of a scene that a specification names.
 
     ``llff:K`` and ``mip360:K``: of the sorted views every 8th is held out, K of the rest are chosen evenly. ``dtu:K`` and
     ``blender:8``: the published ids. ``every:N``: every Nth is held out, the rest trains. ``all``: none is held out.
@@ -145,7 +145,7 @@ def split_views(scene: Scene, spec: str) -> Split:
 
 
 def default_split(scene: Scene) -> tuple[Split, str]:
-    """The split where the user names none, and a sentence that says so.
+    """Return the split for a user who names none, and a sentence that says so.
 
     Every 8th view is held out where there are at least 9, else the middle one; of two views none.
     """
@@ -158,10 +158,10 @@ def default_split(scene: Scene) -> tuple[Split, str]:
     return Split(tuple(n for n in names if n != middle), (middle,)), f"no --split given: {middle} is held out"
 
 
-def twins(scene: Scene, split: Split) -> list[tuple[str, str]]:
-    """Held-out views whose camera is that of a training view, each with that view: what they score, copying would score.
+def coincident_views(scene: Scene, split: Split) -> list[tuple[str, str]]:
+    """Return pairs (held-out view, training view) with the same camera: a copy of the training image would score as well.
 
-    The same means: the pose differs by less than a thousandth in every entry, lengths taken in extents of the camera set.
+    Two cameras are the same where no entry of their poses differs by a thousandth, lengths in extents of the camera set.
     """
     extent = max(camera_extent([v.camera for v in scene.views]), 1e-9)
     unit = np.array([[1, 1, 1, 1 / extent]] * 3 + [[1] * 4])

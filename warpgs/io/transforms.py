@@ -10,26 +10,27 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.io.folders import ViewList, child, find_mask, read_mask, view_name_of
-from warpgs.io.images import SUFFIXES, Lens, load_photo
+from warpgs.io.folders import ViewList, child, find_mask, pixel_source, read_mask, resampling_note, view_name_of
+from warpgs.io.images import SUFFIXES, Lens, load_image
 from warpgs.io.poses import from_camera_to_world
-from warpgs.scene import PointCloud, View
+from warpgs.io.readers import Probe, Reader, ReadOptions, register
+from warpgs.scene import Scene
 
 BLENDER_FILES = tuple(f"transforms_{split}.json" for split in ("train", "val", "test"))
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 UNSUPPORTED_TERMS = ("k4", "k5", "k6", "is_fisheye", "fisheye_crop_radius")
-"""Keys of lens models that OpenCV's five terms cannot express."""
+"""Keys of lens models that the five distortion terms of OpenCV cannot express."""
 WHITE = (1.0, 1.0, 1.0)
 
 
 def files_of(root: Path) -> list[Path]:
-    """The JSON files of the scene: transforms.json, or Blender's three."""
+    """Return the JSON files of the scene that exist: transforms.json, or Blender's three."""
     single = root / "transforms.json"
     return [single] if single.is_file() else [root / f for f in BLENDER_FILES if (root / f).is_file()]
 
 
 def is_blender(root: Path) -> bool:
-    """Whether the folder is in Blender's layout, where transparent pixels stand for a white background."""
+    """Return True where the folder has Blender's layout, in which transparent pixels stand for a white background."""
     return not (root / "transforms.json").is_file() and bool(files_of(root))
 
 
@@ -38,7 +39,11 @@ def _reject_constant(name: str):
 
 
 def read_json(path: Path) -> dict:
-    """Parsed file with a list of frames; DataError where it is malformed or holds NaN or Infinity."""
+    """Return the parsed file with its list of frames.
+
+    Raises:
+        DataError: The file is malformed, or holds NaN or Infinity.
+    """
     try:
         values = json.loads(path.read_bytes().decode("utf-8-sig"), parse_constant=_reject_constant)
     except (OSError, ValueError, RecursionError) as e:
@@ -49,7 +54,7 @@ def read_json(path: Path) -> dict:
 
 
 def _number(frame: dict, shared: dict, key: str) -> float | None:
-    """A number of the frame, else of the file; None where neither has it. ValueError where it is no finite number."""
+    """Return a number of the frame, else of the file; None where neither has it, ValueError where it is no finite number."""
     value = frame.get(key, shared.get(key))
     if value is None:
         return None
@@ -62,14 +67,14 @@ def _number(frame: dict, shared: dict, key: str) -> float | None:
 
 
 def lens_of(frame: dict, shared: dict, width: int, height: int, where: str) -> Lens:
-    """Intrinsics of a frame, its own before the shared ones.
+    """Return the intrinsics of a frame; its own values come before the shared ones.
 
     Args:
-        frame: Of the list of frames.
+        frame: An entry of the list of frames.
         shared: The whole file.
-        width: Width of the image [px], where the file does not say.
-        height: Height of the image [px], likewise.
-        where: Names file and frame in errors.
+        width: Width of the image [px], where the file has none.
+        height: Height of the image [px], where the file has none.
+        where: File and frame, for errors.
 
     Raises:
         DataError: There is no focal length, a number is not finite, or the lens model is not supported.
@@ -119,23 +124,21 @@ def _matrix(frame: dict, where: str) -> np.ndarray:
 
 @dataclass
 class _Reading:
-    """A scene as it is read, frame by frame."""
+    """State of a scene that is read frame by frame."""
 
     root: Path
-    downscale: int
-    allow_outside: bool
-    invert_masks: bool
-    blender: bool
+    options: ReadOptions
+    background: tuple[float, float, float] | None
     views: ViewList = field(default_factory=ViewList)
     missing: list[str] = field(default_factory=list)
     outside: int = 0
     total: int = 0
 
     def child(self, folder: Path, name: object, where: str) -> Path:
-        return child(folder, name, where, root=self.root, allow_outside=self.allow_outside)
+        return child(folder, name, where, root=self.root, allow_outside=self.options.allow_outside)
 
     def image_path(self, folder: Path, name: object, where: str) -> Path:
-        """The image of a frame; Blender leaves the suffix out."""
+        """Return the image file of a frame; Blender leaves the suffix out."""
         path = self.child(folder, name, where)
         if path.suffix.lower() in SUFFIXES:
             return path
@@ -144,8 +147,8 @@ class _Reading:
 
     def mask(self, file: Path, frame: dict, path: Path, where: str) -> np.ndarray | None:
         if frame.get("mask_path"):
-            return read_mask(self.child(file.parent, frame["mask_path"], f"{where}, mask"), self.invert_masks)
-        return find_mask(path, self.root / "images", self.invert_masks)
+            return read_mask(self.child(file.parent, frame["mask_path"], f"{where}, mask"), self.options.invert_masks)
+        return find_mask(path, self.root / "images", self.options.invert_masks)
 
     def frame(self, file: Path, shared: dict, number: int, frame: object) -> None:
         where = f"{file}, frame {number}"
@@ -160,46 +163,56 @@ class _Reading:
         self.outside += name.startswith("outside/")
         where = f"{where} ({name})"
         viewmat = from_camera_to_world(_matrix(frame, where), where, opengl=True)
-        photo = load_photo(
+        loaded = load_image(
             path,
             lambda width, height: lens_of(frame, shared, width, height, where),
-            downscale=self.downscale,
+            downscale=self.options.downscale,
             mask=self.mask(file, frame, path, where),
-            background=WHITE if self.blender else None,
+            background=self.background,
         )
-        self.views.add(name, viewmat, photo)
+        self.views.add(name, viewmat, loaded)
 
 
-def load(
-    root: Path, *, downscale: int, strict: bool, allow_outside: bool, invert_masks: bool
-) -> tuple[list[View], PointCloud | None, list[str]]:
-    """Read a scene folder with transforms.json, or Blender's transforms_train/val/test.json.
+@register("transforms")
+class TransformsReader(Reader):
+    """Scenes with transforms.json, or Blender's transforms_train/val/test.json.
 
-    Frames without a file are skipped and named in the notes; ``strict`` makes them an error. Transparent Blender images are
-    put over white.
-
-    Returns:
-        Views in file coordinates with OpenCV axes, None for points, notes.
-
-    Raises:
-        DataError: A file is malformed, a path leads out of the folder, or (strict) an image is missing.
+    Frames without a file are skipped and named in the notes; `ReadOptions.strict` makes them an error. Transparent Blender
+    images are put over white.
     """
-    reading = _Reading(root, downscale, allow_outside, invert_masks, is_blender(root))
-    notes = []
-    for file in files_of(root):
-        shared = read_json(file)
-        for number, frame in enumerate(shared["frames"]):
-            reading.frame(file, shared, number, frame)
-        if shared.get("ply_file_path"):
-            notes.append(f"the points of {str(shared['ply_file_path'])[:80]} are not read")
-    if missing := reading.missing:
-        some = f"{', '.join(missing[:5])}{' ...' if len(missing) > 5 else ''}"
-        text = f"{len(missing)} of {reading.total} frames have no image file: {some}"
-        if strict:
-            raise DataError(f"{files_of(root)[0]}: {text}. Restore them, or leave out --strict to go on without them")
-        notes.append(f"skipped: {text}")
-    if reading.outside:
-        notes.append(f"{reading.outside} images lie outside the scene folder; their views are named outside/...")
-    if downscale > 1:
-        notes.append(f"images area-resampled by {downscale}")
-    return reading.views.views, None, notes + reading.views.notes()
+
+    description = "transforms.json or transforms_train.json (nerfstudio, instant-ngp, Blender)"
+    priority = 20
+
+    def probe(self, folder: Path) -> Probe | None:
+        """See `Reader.probe`."""
+        files = files_of(folder)
+        return Probe(files[0].name) if files else None
+
+    def read(self, folder: Path, options: ReadOptions) -> Scene:
+        """See `Reader.read`."""
+        background = WHITE if is_blender(folder) else None
+        reading = _Reading(folder, options, background)
+        notes = []
+        for file in files_of(folder):
+            shared = read_json(file)
+            for number, frame in enumerate(shared["frames"]):
+                reading.frame(file, shared, number, frame)
+            if shared.get("ply_file_path"):
+                notes.append(f"the points of {str(shared['ply_file_path'])[:80]} are not read")
+        if missing := reading.missing:
+            some = f"{', '.join(missing[:5])}{' ...' if len(missing) > 5 else ''}"
+            text = f"{len(missing)} of {reading.total} frames have no image file: {some}"
+            if options.strict:
+                raise DataError(f"{files_of(folder)[0]}: {text}. Restore them, or leave out --strict to go on without them")
+            notes.append(f"skipped: {text}")
+        if reading.outside:
+            notes.append(f"{reading.outside} images lie outside the scene folder; their views are named outside/...")
+        notes += resampling_note(options.downscale) + reading.views.notes()
+        return self.scene(
+            folder,
+            reading.views.views,
+            notes,
+            background=background or (0.0, 0.0, 0.0),
+            pixels=pixel_source(folder, options.downscale, by_folder=False),
+        )

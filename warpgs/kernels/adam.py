@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba 2015) in place, one pass over parameter, gradient and both moments."""
+"""Adam (Kingma and Ba 2015) in place: one pass over parameter, gradient and both moments."""
 
 import functools
 from types import SimpleNamespace
@@ -6,53 +6,56 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from warpgs.kernels import bridge
 from warpgs.kernels.compiler import ROLLED
+from warpgs.runtime import interop
 
 BETAS = (0.9, 0.999)
-"""Decay of the two running means (Kingma and Ba 2015)."""
+"""Decay rates of the two moments (Kingma and Ba 2015)."""
 EPS = 1e-15
-"""Added to the root; as in Kerbl et al. 2023, whose gradients are tiny."""
+"""Number added to the root, as in Kerbl et al. 2023, since gradients are tiny."""
 LANES = 16
-"""Elements that are updated together on a CPU: a loop that vectorises."""
+"""Elements that are updated together on a CPU, in a loop that vectorises."""
 SEGMENT = 4096
 """Elements that one task updates on a CPU, a multiple of `LANES`."""
 
 
 @functools.cache
 def make_functions(real):
-    """The update of one element in three parts, for one scalar type."""
+    """Make the update of one element, in three functions."""
 
     @wp.func
     def decayed(m: real, g: real, beta1: real, rest1: real) -> real:
-        """Running mean of the gradient."""
+        """Return the running mean of the gradient."""
         return beta1 * m + rest1 * g
 
     @wp.func
     def decayed_square(s: real, g: real, beta2: real, rest2: real) -> real:
-        """Running mean of its square."""
+        """Return the running mean of the squared gradient."""
         return beta2 * s + rest2 * g * g
 
     @wp.func
-    def moved(p: real, m: real, s: real, rate: real, root_correction2: real, eps: real) -> real:
-        """The parameter after the step."""
-        return p - rate * m / (wp.sqrt(s) / root_correction2 + eps)
+    def moved(p: real, m: real, s: real, lr: real, root_correction2: real, eps: real) -> real:
+        """Return the parameter after the step."""
+        return p - lr * m / (wp.sqrt(s) / root_correction2 + eps)
 
     return SimpleNamespace(decayed=decayed, decayed_square=decayed_square, moved=moved)
 
 
 @functools.cache
 def make_kernel(real, split: bool, lanes: int):
-    """The update kernel for one scalar type; a task updates a segment of the flat parameter, some lanes at a time.
+    """Make the update kernel; a task updates a segment of the flat parameter, some lanes at a time.
 
-    ``split`` says whether the head of each row has a rate of its own, which costs some arithmetic.
+    Args:
+        real: wp.float32 or wp.float64.
+        split: True where the head of each row has a learning rate of its own, which costs some arithmetic.
+        lanes: Elements at a time.
     """
     values = wp.types.vector(lanes, real)
     f = make_functions(real)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def update(
-        begin: int, gradient: wp.array(dtype=real), length: int, row: int, head: int, head_rate: real, rate: real,
+        begin: int, gradient: wp.array(dtype=real), length: int, row: int, head: int, head_lr: real, lr: real,
         beta1: real, beta2: real, rest1: real, rest2: real, root_correction2: real, eps: real,
         # outputs
         parameter: wp.array(dtype=real), mean: wp.array(dtype=real), square: wp.array(dtype=real),
@@ -73,11 +76,11 @@ def make_kernel(real, split: bool, lanes: int):
                     g = gradient[i]
                     m[lane] = f.decayed(mean[i], g, beta1, rest1)
                     s[lane] = f.decayed_square(square[i], g, beta2, rest2)
-                    step = rate
+                    step = lr
                     if wp.static(split):
                         # place in the row, from its middle, so that no rounding moves it to another
                         place = (phase + real(lane)) / real(row)
-                        step = wp.where((place - wp.floor(place)) * real(row) < real(head), head_rate, rate)
+                        step = wp.where((place - wp.floor(place)) * real(row) < real(head), head_lr, lr)
                     p[lane] = f.moved(parameter[i], m[lane], s[lane], step, root_correction2, eps)
                 for lane in range(lanes):
                     parameter[base + lane] = p[lane]
@@ -88,16 +91,16 @@ def make_kernel(real, split: bool, lanes: int):
                     g = gradient[i]
                     mean[i] = f.decayed(mean[i], g, beta1, rest1)
                     square[i] = f.decayed_square(square[i], g, beta2, rest2)
-                    step = rate
+                    step = lr
                     if wp.static(split):
-                        step = wp.where(i % row < head, head_rate, rate)
+                        step = wp.where(i % row < head, head_lr, lr)
                     parameter[i] = f.moved(parameter[i], mean[i], square[i], step, root_correction2, eps)
 
     return update
 
 
 # The same for CUDA. Products and sums that the compiler might fuse are spelled with their rounding: it may choose otherwise
-# in another kernel, and all that update must give the same bits.
+# in another kernel, and all kernels that update must give the same bits.
 ELEMENT = """
     auto one = [&](float g, float rate, float& p, float& m, float& s) {
         m = __fmaf_rn(beta1, m, __fmul_rn(rest1, g));
@@ -110,71 +113,104 @@ _UPDATE = (
     """
     if (skip.data[0] != 0)
         return;
-    const float head_rate = rates.data[0], rate = rates.data[1], root_correction2 = rates.data[2];
+    const float head_lr = lrs.data[0], lr = lrs.data[1], root_correction2 = lrs.data[2];
     const int size = parameter.shape[0];
 """
     + ELEMENT
-    + """    auto rate_of = [&](int i) { return i % row < head ? head_rate : rate; };
+    + """    auto lr_of = [&](int i) { return i % row < head ? head_lr : lr; };
     if (4 * four + 4 <= size) {
         float4 p = reinterpret_cast<float4*>(parameter.data)[four], m = reinterpret_cast<float4*>(mean.data)[four];
         float4 s = reinterpret_cast<float4*>(square.data)[four];
         const float4 g = reinterpret_cast<const float4*>(gradient.data)[four];
-        one(g.x, rate_of(4 * four), p.x, m.x, s.x);
-        one(g.y, rate_of(4 * four + 1), p.y, m.y, s.y);
-        one(g.z, rate_of(4 * four + 2), p.z, m.z, s.z);
-        one(g.w, rate_of(4 * four + 3), p.w, m.w, s.w);
+        one(g.x, lr_of(4 * four), p.x, m.x, s.x);
+        one(g.y, lr_of(4 * four + 1), p.y, m.y, s.y);
+        one(g.z, lr_of(4 * four + 2), p.z, m.z, s.z);
+        one(g.w, lr_of(4 * four + 3), p.w, m.w, s.w);
         reinterpret_cast<float4*>(parameter.data)[four] = p;
         reinterpret_cast<float4*>(mean.data)[four] = m;
         reinterpret_cast<float4*>(square.data)[four] = s;
     } else
         for (int i = 4 * four; i < size; ++i)
-            one(gradient.data[i], rate_of(i), parameter.data[i], mean.data[i], square.data[i]);
+            one(gradient.data[i], lr_of(i), parameter.data[i], mean.data[i], square.data[i]);
 """
 )
 
 
 @functools.cache
 def make_scheduled_kernel():
-    """The update for CUDA in float32, four elements a thread, its rates in memory: it can be recorded once and replayed."""
+    """Make the update for CUDA in float32: four elements a thread, learning rates in memory, so that a graph can replay it."""
 
     @wp.func_native(_UPDATE)
     def update_body(
-        four: int, gradient: wp.array(dtype=float), row: int, head: int, rates: wp.array(dtype=float),
+        four: int, gradient: wp.array(dtype=float), row: int, head: int, lrs: wp.array(dtype=float),
         beta1: float, beta2: float, rest1: float, rest2: float, eps: float, skip: wp.array(dtype=int),
         parameter: wp.array(dtype=float), mean: wp.array(dtype=float), square: wp.array(dtype=float),
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, grid_stride=False, module="warpgs.kernels.adam.scheduled")
     def update(
-        begin: int, gradient: wp.array(dtype=float), row: int, head: int, rates: wp.array(dtype=float),
+        begin: int, gradient: wp.array(dtype=float), row: int, head: int, lrs: wp.array(dtype=float),
         beta1: float, beta2: float, rest1: float, rest2: float, eps: float, skip: wp.array(dtype=int),
         # outputs
         parameter: wp.array(dtype=float), mean: wp.array(dtype=float), square: wp.array(dtype=float),
     ):  # fmt: skip
         update_body(
-            wp.tid(), gradient, row, head, rates, beta1, beta2, rest1, rest2, eps, skip, parameter, mean, square
+            wp.tid(), gradient, row, head, lrs, beta1, beta2, rest1, rest2, eps, skip, parameter, mean, square
         )  # fmt: skip
 
     return update
 
 
-def scheduled_rates(lr: float, step: int, betas: tuple[float, float] = BETAS, head_lr: float | None = None) -> list[float]:
-    """What `adam_scheduled` reads from memory at a step: both learning rates and the root of the second correction."""
+def scheduled_lrs(lr: float, step: int, betas: tuple[float, float] = BETAS, head_lr: float | None = None) -> list[float]:
+    """Return what `adam_scheduled` reads from memory: two corrected learning rates and the root of the second correction."""
     correction1, correction2 = 1 - betas[0] ** step, 1 - betas[1] ** step
     return [(lr if head_lr is None else head_lr) / correction1, lr / correction1, correction2**0.5]
 
 
 def adam_scheduled(
-    param: torch.Tensor, grad: torch.Tensor, exp_avg: torch.Tensor, exp_avg_sq: torch.Tensor, rates: torch.Tensor,
+    param: torch.Tensor, grad: torch.Tensor, exp_avg: torch.Tensor, exp_avg_sq: torch.Tensor, lrs: torch.Tensor,
     skip: torch.Tensor, *, head: int, betas: tuple[float, float] = BETAS, eps: float = EPS,
 ) -> None:  # fmt: skip
-    """`adam_step` on CUDA in float32, with ``rates`` [3] of `scheduled_rates`; nothing changes where ``skip`` [1] is not 0."""
+    """Update as `adam_step` does, in float32, with learning rates in memory, so that a CUDA graph can replay it.
+
+    Args:
+        param: Parameter, contiguous, shape [N, ...].
+        grad: Its gradient, same shape.
+        exp_avg: Running mean of the gradient, same shape, contiguous.
+        exp_avg_sq: Running mean of its square, same shape, contiguous.
+        lrs: What `scheduled_lrs` gives, float32, shape [3].
+        skip: Nothing changes where this is not 0, int32, shape [1].
+        head: How many numbers of a row take the first learning rate; 0 for none.
+        betas: Decay of the two running means.
+        eps: Added to the root.
+    """
+    if param.numel() == 0:
+        return
+    if param.device.type == "cpu":
+        if int(skip) == 0:
+            _update(param, grad, exp_avg, exp_avg_sq, lrs.tolist(), head, betas, eps)
+        return
     inputs = [
-        bridge.view(grad.view(-1), wp.float32), param[0].numel(), head, bridge.view(rates, wp.float32),
-        *betas, 1 - betas[0], 1 - betas[1], eps, bridge.view(skip, wp.int32),
-        *(bridge.view(t.view(-1), wp.float32) for t in (param, exp_avg, exp_avg_sq)),
+        interop.view(grad.contiguous().view(-1), wp.float32), param[0].numel(), head, interop.view(lrs, wp.float32),
+        *betas, 1 - betas[0], 1 - betas[1], eps, interop.view(skip, wp.int32),
+        *(interop.view(t.view(-1), wp.float32) for t in (param, exp_avg, exp_avg_sq)),
     ]  # fmt: skip
-    bridge.launch(make_scheduled_kernel(), -(-param.numel() // 4), inputs, param.device)
+    interop.launch(make_scheduled_kernel(), -(-param.numel() // 4), inputs, param.device)
+
+
+def _update(param, grad, exp_avg, exp_avg_sq, lrs: list[float], head: int, betas: tuple[float, float], eps: float) -> None:
+    """Launch the generic kernel, which is that of a CPU and of float64."""
+    real, device = interop.real_of(param), param.device
+    length, lanes = (SEGMENT, LANES) if device.type == "cpu" else (1, 1)
+    flat = [interop.view(t.view(-1), real) for t in (param, exp_avg, exp_avg_sq)]
+    head_lr, lr, root_correction2 = lrs
+    with interop.stream_of(device):
+        inputs = [
+            interop.view(grad.contiguous().view(-1), real), length, param[0].numel(), head, head_lr, lr,
+            *betas, 1 - betas[0], 1 - betas[1], root_correction2, eps, *flat,
+        ]  # fmt: skip
+        kernel = make_kernel(real, head > 0, lanes)
+        interop.launch(kernel, -(-param.numel() // length), inputs, device, cost=max(1, length // 16))
 
 
 def adam_step(
@@ -199,41 +235,28 @@ def adam_step(
         exp_avg_sq: Running mean of its square, same shape, contiguous.
         lr: Learning rate.
         step: Number of this step, from 1.
-        betas: Decay of the two running means.
-        eps: Added to the root; 1e-15 as in Kerbl et al. 2023, whose gradients are tiny.
+        betas: Decay rates of the two moments.
+        eps: Number added to the root.
         head_lr: Learning rate of the first ``head`` numbers of each of the N rows.
-        head: How many numbers of a row take ``head_lr``; 0 for none.
+        head: Count of numbers of a row that take ``head_lr``; 0 for none.
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
         ValueError: A shape or device disagrees, a tensor to be updated is not contiguous, or ``step`` is below 1.
     """
     pattern = " ".join(str(s) for s in param.shape)
-    bridge.check(param=(param, pattern), grad=(grad, pattern), exp_avg=(exp_avg, pattern), exp_avg_sq=(exp_avg_sq, pattern))
+    interop.check(param=(param, pattern), grad=(grad, pattern), exp_avg=(exp_avg, pattern), exp_avg_sq=(exp_avg_sq, pattern))
     if not (param.is_contiguous() and exp_avg.is_contiguous() and exp_avg_sq.is_contiguous()):
         raise ValueError("param, exp_avg and exp_avg_sq are updated in place and must be contiguous")
     if step < 1:
         raise ValueError(f"step counts from 1, not {step}")
     if param.numel() == 0:
         return
-    real, device = bridge.real_of(param), param.device
-    if device.type == "cuda" and real is wp.float32:
-        # one kernel for this and for recorded steps, so that both give the same bits
-        rates = torch.tensor(scheduled_rates(lr, step, betas, head_lr), device=device)
-        skip = torch.zeros(1, dtype=torch.int32, device=device)
-        adam_scheduled(param, grad.contiguous(), exp_avg, exp_avg_sq, rates, skip, betas=betas, eps=eps, head=head)
+    lrs = scheduled_lrs(lr, step, betas, head_lr)
+    if param.is_cuda and param.dtype == torch.float32:
+        # one kernel for this and for captured steps, so that both give the same bits
+        skip = torch.zeros(1, dtype=torch.int32, device=param.device)
+        on_device = torch.tensor(lrs, device=param.device)
+        adam_scheduled(param, grad, exp_avg, exp_avg_sq, on_device, skip, betas=betas, eps=eps, head=head)
         return
-    beta1, beta2 = betas
-    correction1, correction2 = 1 - beta1**step, 1 - beta2**step
-    row = param[0].numel()
-    length, lanes = (SEGMENT, LANES) if device.type == "cpu" else (1, 1)
-    flat = [bridge.view(t.view(-1), real) for t in (param, exp_avg, exp_avg_sq)]
-    with bridge.stream_of(device):
-        inputs = [
-            bridge.view(grad.contiguous().view(-1), real), length, row, head,
-            (lr if head_lr is None else head_lr) / correction1, lr / correction1,
-            beta1, beta2, 1 - beta1, 1 - beta2, correction2**0.5, eps, *flat,
-        ]  # fmt: skip
-        bridge.launch(
-            make_kernel(real, head > 0, lanes), -(-param.numel() // length), inputs, device, cost=max(1, length // 16)
-        )
+    _update(param, grad, exp_avg, exp_avg_sq, lrs, head, betas, eps)

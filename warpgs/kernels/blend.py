@@ -1,6 +1,7 @@
-"""Composite binned Gaussians front to back: colour, alpha, expected depth, and each Gaussian's share of the picture."""
+"""Compositing of binned Gaussians front to back: colour, alpha, expected depth, and each Gaussian's blending weight."""
 
 import functools
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 import torch
@@ -8,24 +9,26 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from warpgs.constants import Rule
-from warpgs.kernels import blend_cpu, blend_cuda, bridge
-from warpgs.kernels.memory import TORCH, Memory
+from warpgs.kernels import blend_cpu, blend_cuda
+from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.tiles import Tiles, grid
+from warpgs.runtime import interop
+from warpgs.runtime.allocator import TORCH, Allocator
 
 VALUES = 10
-"""Gradient values of an instance: the record of `project` without its last two entries."""
+"""Gradient values of an instance: those of a projected Gaussian but for its last two, which are the box."""
 
 
 @functools.cache
 def make_segments(real):
-    """Kernels that gather the slots of each Gaussian, in slot order and so repeatably."""
+    """Make the kernels that sum over the slots of each Gaussian, in slot order and so repeatably."""
     vec10 = wp.types.vector(VALUES, real)
 
     @wp.kernel(enable_backward=False, module=f"warpgs.kernels.blend.{real.__name__}")
     def sum_gradients(
         begin: int, v_slots: wp.array2d(dtype=real), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
         # outputs, zero on entry
-        v_splats: wp.array2d(dtype=real),
+        v_projected: wp.array2d(dtype=real),
     ):  # fmt: skip
         i = begin + wp.tid()
         total = vec10()
@@ -33,7 +36,7 @@ def make_segments(real):
             for k in range(VALUES):
                 total[k] += v_slots[slot, k]
         for k in range(VALUES):
-            v_splats[i, k] = total[k]
+            v_projected[i, k] = total[k]
 
     @wp.kernel(enable_backward=False, module=f"warpgs.kernels.blend.{real.__name__}")
     def gather_weights(
@@ -53,87 +56,119 @@ def make_segments(real):
     return SimpleNamespace(sum_gradients=sum_gradients, gather_weights=gather_weights)
 
 
-def _native(splats: torch.Tensor) -> bool:
-    """Whether the CUDA kernels apply; else the generic ones do."""
-    return splats.is_cuda and splats.dtype == torch.float32
+def _native(projected: torch.Tensor) -> bool:
+    """Return whether the CUDA kernels apply; else the generic ones do."""
+    return projected.is_cuda and projected.dtype == torch.float32
 
 
 def _launch(kernel, tiles: int, inputs: list, device: torch.device) -> None:
-    """One task per tile of the generic kernels."""
-    bridge.launch(kernel, tiles, inputs, device, cost=10_000, block_dim=32)
+    """Launch a generic kernel, one task per tile."""
+    interop.launch(kernel, tiles, inputs, device, cost=10_000, block_dim=32)
 
 
-def _tile_inputs(splats: torch.Tensor, tiles: Tiles, real) -> list[bridge.View]:
+def _tile_inputs(projected: torch.Tensor, tiles: Tiles, real) -> list[interop.View]:
     return [
-        bridge.view(splats.view(-1, splats.shape[-1]), real),
-        bridge.view(tiles.ranges, wp.int32),
-        bridge.view(tiles.splat_ids, wp.int32),
+        interop.view(projected.view(-1, projected.shape[-1]), real),
+        interop.view(tiles.ranges, wp.int32),
+        interop.view(tiles.gaussian_ids, wp.int32),
     ]
 
 
-def _frame(origin: tuple[int, int], width: int, height: int, tile_size: int) -> list[int]:
-    columns, rows = grid(width, height, tile_size)
-    return [*origin, width, height, columns, columns * rows]
-
-
 def composite(
-    splats, tiles, backgrounds, origin, width, height, rule, keep, deterministic=True, memory: Memory = TORCH
-):  # fmt: skip
-    """Pictures, and what the backward pass needs: rgb, alpha, depth, transmittances, weights, ends, states (CUDA only)."""
-    if _native(splats):
-        return blend_cuda.forward(splats, tiles, backgrounds, origin, width, height, rule, keep, deterministic, memory)
-    real, device = bridge.real_of(splats), splats.device
-    shape = (len(backgrounds), height, width)
-    rgb, alpha, depth = (memory.own(s, splats.dtype, device) for s in ((*shape, 3), shape, shape))
-    transmittances, weights = (memory.kept(shape, splats.dtype, device) for _ in range(2))
-    ends = memory.kept(shape, torch.int32, device)
+    projected: torch.Tensor,
+    tiles: Tiles,
+    backgrounds: torch.Tensor,
+    settings: BlendSettings,
+    *,
+    save: bool,
+    allocator: Allocator = TORCH,
+) -> tuple[torch.Tensor, ...]:
+    """Return the images, and what the backward pass needs. Nothing is checked, and no gradient is recorded.
+
+    Args:
+        projected: Projected Gaussians, contiguous, shape [C, N, 12].
+        tiles: Their instances.
+        backgrounds: Colour behind everything, contiguous, shape [C, 3].
+        settings: Settings.
+        save: True where gradients will be taken.
+        allocator: Provider of the results' memory.
+
+    Returns:
+        ``rgb`` [C, H, W, 3]; ``alpha``, ``depth``, transmittances and weight sums [C, H, W]; one past the last instance that
+        was blended [C, H, W]; states of the chunks (CUDA only, else empty).
+    """
+    if _native(projected):
+        return blend_cuda.forward(projected, tiles, backgrounds, settings, save=save, allocator=allocator)
+    real, device, rule = interop.real_of(projected), projected.device, settings.rule
+    shape = (len(backgrounds), settings.height, settings.width)
+    rgb, alpha, depth = (allocator.output(s, projected.dtype, device) for s in ((*shape, 3), shape, shape))
+    transmittances, weights = (allocator.saved(shape, projected.dtype, device) for _ in range(2))
+    ends = allocator.saved(shape, torch.int32, device)
     inputs = [
-        *_tile_inputs(splats, tiles, real), bridge.view(backgrounds, real), *_frame(origin, width, height, tiles.size),
+        *_tile_inputs(projected, tiles, real), interop.view(backgrounds, real), *settings.window_inputs(tiles.size),
         rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), rule.transmittance_stop, int(rule.inclusive_stop),
-        bridge.view(rgb.view(-1, 3), real),
-        *(bridge.view(t.view(-1), real) for t in (alpha, depth, transmittances, weights)),
-        bridge.view(ends.view(-1), wp.int32),
+        interop.view(rgb.view(-1, 3), real),
+        *(interop.view(t.view(-1), real) for t in (alpha, depth, transmittances, weights)),
+        interop.view(ends.view(-1), wp.int32),
     ]  # fmt: skip
     _launch(blend_cpu.make_kernels(real, tiles.size).forward, len(tiles.ranges), inputs, device)
-    return rgb, alpha, depth, transmittances, weights, ends, memory.kept((0,), splats.dtype, device)
+    return rgb, alpha, depth, transmittances, weights, ends, allocator.saved((0,), projected.dtype, device)
 
 
-def _backward(splats, tiles, backgrounds, origin, width, height, rule, _, saved, v_rgb, v_alpha, v_depth, memory):
-    """Gradient of the records by the generic kernels; ``saved`` as in blend_cuda.backward."""
+def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_images, allocator) -> torch.Tensor:
+    """Return what `blend_cuda.backward` returns, by the generic kernels."""
     _, depth, transmittances, weights, ends, _ = saved
-    real, device = bridge.real_of(splats), splats.device
-    v_splats = memory.own(splats.shape, splats.dtype, device).zero_()
-    v_slots = memory.scratch((len(tiles.slots), VALUES), splats.dtype, device).zero_()
-    upstream = [bridge.view(v_rgb.contiguous().view(-1, 3), real)]
+    v_rgb, v_alpha, v_depth = v_images
+    real, device, rule = interop.real_of(projected), projected.device, settings.rule
+    v_projected = allocator.output(projected.shape, projected.dtype, device).zero_()
+    v_slots = allocator.workspace((len(tiles.slots), VALUES), projected.dtype, device).zero_()
+    upstream = [interop.view(v_rgb.contiguous().view(-1, 3), real)]
     for v in (v_alpha, v_depth):
-        upstream.append(bridge.view((torch.zeros_like(depth) if v is None else v.contiguous()).view(-1), real))
+        upstream.append(interop.view((torch.zeros_like(depth) if v is None else v.contiguous()).view(-1), real))
     inputs = [
-        *_tile_inputs(splats, tiles, real), bridge.view(tiles.slots, wp.int32), bridge.view(backgrounds, real),
-        *_frame(origin, width, height, tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
-        *(bridge.view(t.view(-1), real) for t in (transmittances, weights, depth)), bridge.view(ends.view(-1), wp.int32),
-        *upstream, bridge.view(v_slots, real),
+        *_tile_inputs(projected, tiles, real), interop.view(tiles.slots, wp.int32), interop.view(backgrounds, real),
+        *settings.window_inputs(tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
+        *(interop.view(t.view(-1), real) for t in (transmittances, weights, depth)), interop.view(ends.view(-1), wp.int32),
+        *upstream, interop.view(v_slots, real),
     ]  # fmt: skip
     _launch(blend_cpu.make_kernels(real, tiles.size).backward, len(tiles.ranges), inputs, device)
     inputs = [
-        bridge.view(v_slots, real), bridge.view(tiles.starts, wp.int32), bridge.view(tiles.counts, wp.int32),
-        bridge.view(v_splats.view(-1, v_splats.shape[-1]), real),
+        interop.view(v_slots, real), interop.view(tiles.starts, wp.int32), interop.view(tiles.counts, wp.int32),
+        interop.view(v_projected.view(-1, v_projected.shape[-1]), real),
     ]  # fmt: skip
-    bridge.launch(make_segments(real).sum_gradients, len(tiles.counts), inputs, device, cost=5)
-    return v_splats
+    interop.launch(make_segments(real).sum_gradients, len(tiles.counts), inputs, device, cost=5)
+    return v_projected
 
 
-def gradients(splats, tiles, backgrounds, how: tuple, saved, v_rgb, v_alpha, v_depth, memory: Memory = TORCH) -> torch.Tensor:
-    """Gradient of the records from those of the pictures, where any of them may be None.
+def composite_gradients(
+    projected: torch.Tensor,
+    tiles: Tiles,
+    backgrounds: torch.Tensor,
+    settings: BlendSettings,
+    saved: Sequence[torch.Tensor],
+    v_images: Sequence[torch.Tensor | None],
+    allocator: Allocator = TORCH,
+) -> torch.Tensor:
+    """Return the gradient of ``projected``, shape [C, N, 12]. Nothing is checked.
 
-    ``how`` is what `composite` takes after backgrounds, less ``keep``; ``saved`` what it returned, less alpha.
+    Args:
+        projected: As given to `composite`, like the next three.
+        tiles: See there.
+        backgrounds: See there.
+        settings: See there.
+        saved: The results of `composite` but for ``alpha``.
+        v_images: Gradients of ``rgb``, ``alpha`` and ``depth``, each of which may be None.
+        allocator: Provider of the gradient's memory.
     """
+    v_rgb, v_alpha, v_depth = v_images
     v_rgb = torch.zeros_like(saved[0]) if v_rgb is None else v_rgb
-    work = blend_cuda.backward if _native(splats) else _backward
-    return work(splats, tiles, backgrounds, *how, saved, v_rgb, v_alpha, v_depth, memory)
+    backward = blend_cuda.backward if _native(projected) else _backward
+    return backward(projected, tiles, backgrounds, settings, saved, (v_rgb, v_alpha, v_depth), allocator)
 
 
 def background_gradient(transmittances: torch.Tensor, v_rgb: torch.Tensor | None) -> torch.Tensor:
-    """Shape [C, 3]. A product of matrices would sum the pixels one by one, and err several times as much."""
+    """Return the gradient of the backgrounds, shape [C, 3]; ``v_rgb`` None is zero."""
+    # a product of matrices would sum the pixels one by one, and err several times as much
     if v_rgb is None:
         return transmittances.new_zeros(len(transmittances), 3)
     return torch.stack([(transmittances * v_rgb[..., k]).sum((1, 2)) for k in range(3)], 1)
@@ -141,29 +176,29 @@ def background_gradient(transmittances: torch.Tensor, v_rgb: torch.Tensor | None
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, splats, backgrounds, tiles, origin, width, height, rule, deterministic):
-        splats, backgrounds = splats.contiguous(), backgrounds.contiguous()
-        keep = any(ctx.needs_input_grad)
-        rgb, alpha, depth, *rest = composite(splats, tiles, backgrounds, origin, width, height, rule, keep, deterministic)
-        if keep:
+    def forward(ctx, projected, backgrounds, tiles, settings):
+        projected, backgrounds = projected.contiguous(), backgrounds.contiguous()
+        save = any(ctx.needs_input_grad)
+        rgb, alpha, depth, *rest = composite(projected, tiles, backgrounds, settings, save=save)
+        if save:
             # all of it as saved tensors: those are freed once the gradient is taken
-            ctx.save_for_backward(splats, backgrounds, rgb, depth, *rest, *tiles.tensors())
-            ctx.tile_size, ctx.how = tiles.size, (origin, width, height, rule, deterministic)
+            ctx.save_for_backward(projected, backgrounds, rgb, depth, *rest, *tiles.tensors())
+            ctx.tile_size, ctx.settings = tiles.size, settings
         ctx.set_materialize_grads(False)
         return rgb, alpha, depth
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, *v_pictures):
-        splats, backgrounds, *tensors = ctx.saved_tensors
+    def backward(ctx, *v_images):
+        projected, backgrounds, *tensors = ctx.saved_tensors
         saved, tiles = tensors[:6], Tiles(ctx.tile_size, *tensors[6:])
-        v_splats = gradients(splats, tiles, backgrounds, ctx.how, saved, *v_pictures)
-        v_backgrounds = background_gradient(saved[2], v_pictures[0]) if ctx.needs_input_grad[1] else None
-        return v_splats, v_backgrounds, None, None, None, None, None, None
+        v_projected = composite_gradients(projected, tiles, backgrounds, ctx.settings, saved, v_images)
+        v_backgrounds = background_gradient(saved[2], v_images[0]) if ctx.needs_input_grad[1] else None
+        return v_projected, v_backgrounds, None, None
 
 
-def _check(splats: torch.Tensor, tiles: Tiles, width: int, height: int, **backgrounds) -> None:
-    sizes = bridge.check(splats=(splats, "C N 12"), **backgrounds)
+def _check(projected: torch.Tensor, tiles: Tiles, width: int, height: int, **backgrounds) -> None:
+    sizes = interop.check(projected=(projected, "C N 12"), **backgrounds)
     columns, rows = grid(width, height, tiles.size)
     if len(tiles.ranges) != sizes["C"] * columns * rows:
         raise ValueError(
@@ -173,7 +208,7 @@ def _check(splats: torch.Tensor, tiles: Tiles, width: int, height: int, **backgr
 
 
 def blend(
-    splats: torch.Tensor,
+    projected: torch.Tensor,
     tiles: Tiles,
     backgrounds: torch.Tensor,
     *,
@@ -185,11 +220,11 @@ def blend(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Composite C images of H x W pixels (Kerbl et al. 2023, eq. 3; order and early stop as ``rule`` says).
 
-    Differentiable in the first ten values of each record and in ``backgrounds``; the gradient of a clamped alpha is zero.
+    Differentiable in the first ten values of each projected Gaussian and in ``backgrounds``; a clamped alpha has gradient zero.
     Derivation of the backward pass: docs/blend.md. Bitwise repeatable on a CPU, whatever the number of threads, and on CUDA.
 
     Args:
-        splats: Records of `project`, shape [C, N, 12].
+        projected: Projected Gaussians of `project`, shape [C, N, 12].
         tiles: Instances of `bin_tiles` for the same image size.
         backgrounds: Colour behind everything, shape [C, 3].
         width: Image width [px].
@@ -197,7 +232,7 @@ def blend(
         rule: Cut-offs.
         deterministic: Sum gradients in a fixed order. False adds them atomically on CUDA in float32, which takes less memory
             and gives other bits each time; elsewhere it changes nothing.
-        origin: Left and top [px] of the window of that size which the tiles were made for.
+        origin: Left and top [px] of the window that the tiles were made for.
 
     Returns:
         ``rgb`` [C, H, W, 3]; ``alpha`` [C, H, W], accumulated opacity; ``depth`` [C, H, W], the mean z-depth [u] under the
@@ -207,22 +242,22 @@ def blend(
         TypeError: A scalar type is neither float32 nor float64, or they differ.
         ValueError: A shape or device disagrees, or the tiles belong to another image size.
     """
-    _check(splats, tiles, width, height, backgrounds=(backgrounds, "C 3"))
-    return _Blend.apply(splats, backgrounds, tiles, origin, width, height, rule, deterministic)
+    _check(projected, tiles, width, height, backgrounds=(backgrounds, "C 3"))
+    return _Blend.apply(projected, backgrounds, tiles, BlendSettings(origin, width, height, rule, deterministic))
 
 
 def contributions(
-    splats: torch.Tensor, tiles: Tiles, *, width: int, height: int, rule: Rule, origin: tuple[int, int] = (0, 0)
+    projected: torch.Tensor, tiles: Tiles, *, width: int, height: int, rule: Rule, origin: tuple[int, int] = (0, 0)
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """How much each Gaussian shows in each image: sum and maximum over pixels of its weight alpha * T. Not differentiable.
+    """Return sum and maximum over pixels of each Gaussian's blending weight alpha * T in each image. Not differentiable.
 
     Args:
-        splats: Records of `project`, shape [C, N, 12].
+        projected: Projected Gaussians of `project`, shape [C, N, 12].
         tiles: Instances of `bin_tiles` for the same image size.
         width: Image width [px].
         height: Image height [px].
         rule: Cut-offs.
-        origin: Left and top [px] of the window of that size which the tiles were made for.
+        origin: Left and top [px] of the window that the tiles were made for.
 
     Returns:
         ``weight_sums`` [C, N] and ``weight_maxima`` [C, N].
@@ -231,24 +266,26 @@ def contributions(
         TypeError: The scalar type is neither float32 nor float64.
         ValueError: A shape disagrees, or the tiles belong to another image size.
     """
-    _check(splats, tiles, width, height)
-    splats = splats.detach().contiguous()
-    real, device = bridge.real_of(splats), splats.device
-    ends = composite(splats, tiles, splats.new_zeros(len(splats), 3), origin, width, height, rule, keep=False)[5]
-    if _native(splats):
-        weights = blend_cuda.instance_weights(splats, tiles, origin, width, height, rule, ends)
+    _check(projected, tiles, width, height)
+    projected = projected.detach().contiguous()
+    real, device = interop.real_of(projected), projected.device
+    settings = BlendSettings(origin, width, height, rule)
+    ends = composite(projected, tiles, projected.new_zeros(len(projected), 3), settings, save=False)[5]
+    if _native(projected):
+        weights = blend_cuda.instance_weights(projected, tiles, settings, ends)
     else:
-        weights = splats.new_zeros(len(tiles.slots), 2)
+        weights = projected.new_zeros(len(tiles.slots), 2)
         inputs = [
-            *_tile_inputs(splats, tiles, real), bridge.view(tiles.slots, wp.int32), *_frame(origin, width, height, tiles.size),
-            rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), bridge.view(ends.view(-1), wp.int32),
-            bridge.view(weights, real),
+            *_tile_inputs(projected, tiles, real), interop.view(tiles.slots, wp.int32),
+            *settings.window_inputs(tiles.size),
+            rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), interop.view(ends.view(-1), wp.int32),
+            interop.view(weights, real),
         ]  # fmt: skip
         _launch(blend_cpu.make_kernels(real, tiles.size).contributions, len(tiles.ranges), inputs, device)
-    sums, maxima = splats.new_empty(splats.shape[:2]), splats.new_empty(splats.shape[:2])
+    sums, maxima = projected.new_empty(projected.shape[:2]), projected.new_empty(projected.shape[:2])
     inputs = [
-        bridge.view(weights, real), bridge.view(tiles.starts, wp.int32), bridge.view(tiles.counts, wp.int32),
-        bridge.view(sums.view(-1), real), bridge.view(maxima.view(-1), real),
+        interop.view(weights, real), interop.view(tiles.starts, wp.int32), interop.view(tiles.counts, wp.int32),
+        interop.view(sums.view(-1), real), interop.view(maxima.view(-1), real),
     ]  # fmt: skip
-    bridge.launch(make_segments(real).gather_weights, len(tiles.counts), inputs, device)
+    interop.launch(make_segments(real).gather_weights, len(tiles.counts), inputs, device)
     return sums, maxima

@@ -1,4 +1,4 @@
-"""Blending kernels in plain Warp, one task per tile: the CPU's kernels, and the float64 kernels on every device.
+"""Blending kernels in plain Warp, one task per tile: those of the CPU, and of float64 on every device.
 
 A task cuts the rows of its tile into strips. The innermost loops run over the pixels of one strip without branches and are
 kept rolled, so that the compiler vectorises them (docs/blend.md, section 5).
@@ -14,12 +14,12 @@ from warpgs.kernels.compiler import ROLLED
 from warpgs.kernels.falloff import ABREAST, STRIP, make_functions
 
 BATCH = 64
-"""Gaussians that the forward pass takes at a time, strip by strip; a power of 2, as indices are bounded by its bits."""
+"""Gaussians that the forward pass takes at a time, strip by strip; a power of 2, since indices are bounded by its bits."""
 
 
 @functools.cache
 def make_kernels(real, tile_size: int):
-    """Forward, backward and contribution kernels for one scalar type and tile size."""
+    """Make the forward, backward and contribution kernels for one scalar type and tile size."""
     f = make_functions(real)
     # Vectors rather than local arrays: the compiler must see that they do not overlap. One row longer than the tile, so that
     # they do not lie 4096 bytes apart, where a load is taken to wait for a store to the other.
@@ -41,7 +41,7 @@ def make_kernels(real, tile_size: int):
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def forward(
-        begin: int, splats: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), splat_ids: wp.array(dtype=int),
+        begin: int, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), gaussian_ids: wp.array(dtype=int),
         backgrounds: wp.array2d(dtype=real), origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
         alpha_cut: real, alpha_max: real, whole_tiles: int, stop: real, inclusive: int,
         # outputs
@@ -79,7 +79,7 @@ def make_kernels(real, tile_size: int):
         strip_z = strip_reals()
         strip_total = strip_reals()
         strip_end = strip_ints()
-        # The Gaussians of a batch: values, u11 times the pixels of a strip; what they share in a row; which reach a strip.
+        # The Gaussians of a batch: values; u11 times the pixels of a strip; values shared in a row; those that reach a strip.
         mx = batch_reals()
         my = batch_reals()
         u11 = batch_reals()
@@ -107,24 +107,24 @@ def make_kernels(real, tile_size: int):
         while first < last:
             count = wp.min(batch, last - first)
             for j in range(count):
-                mx[j] = splats[splat_ids[first + j], 0]  # alone, so that many records are on their way at once
+                mx[j] = projected[gaussian_ids[first + j], 0]  # in a loop of its own, so that many loads are under way at once
             for j in range(batch):
                 limit[j] = real(-1.0)  # reaches nothing
             j = int(0)
             while j < count:
-                i = splat_ids[wp.max(first + j, 0)]
+                i = gaussian_ids[wp.max(first + j, 0)]
                 if i < 0:
-                    break  # never; but a loop that may end early is not vectorised, which here would mean slow gathers
-                my[j] = splats[i, 1]
-                u11[j] = splats[i, 2]
-                u12[j] = splats[i, 3]
-                u22[j] = splats[i, 4]
-                opacity[j] = splats[i, 5]
-                c0[j] = splats[i, 6]
-                c1[j] = splats[i, 7]
-                c2[j] = splats[i, 8]
-                distance[j] = splats[i, 9]
-                bounds = f.bounds_of(mx[j], my[j], u11[j], u22[j], splats[i, 10], splats[i, 11], whole_tiles)
+                    break  # never; but a loop that may end early is not vectorised, and here that would mean slow gathers
+                my[j] = projected[i, 1]
+                u11[j] = projected[i, 2]
+                u12[j] = projected[i, 3]
+                u22[j] = projected[i, 4]
+                opacity[j] = projected[i, 5]
+                c0[j] = projected[i, 6]
+                c1[j] = projected[i, 7]
+                c2[j] = projected[i, 8]
+                distance[j] = projected[i, 9]
+                bounds = f.bounds_of(mx[j], my[j], u11[j], u22[j], projected[i, 10], projected[i, 11], whole_tiles)
                 aside[j] = bounds[0]
                 limit[j] = bounds[1]
                 j += 1
@@ -157,7 +157,7 @@ def make_kernels(real, tile_size: int):
                         k = int(0)
                         while k < reaching:
                             o = wp.max(k, 0)
-                            k += abreast  # the last few may be some that do not reach the strip: nobody reads theirs
+                            k += abreast  # the last few may not reach the strip; their values are not read
                             for lane in range(strip):
                                 for n in range(abreast):
                                     j = list[o + n] & bits
@@ -225,7 +225,7 @@ def make_kernels(real, tile_size: int):
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def contributions(
-        begin: int, splats: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), splat_ids: wp.array(dtype=int),
+        begin: int, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), gaussian_ids: wp.array(dtype=int),
         slots: wp.array(dtype=int), origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
         alpha_cut: real, alpha_max: real, whole_tiles: int, ends: wp.array(dtype=int),
         # outputs, zero on entry: sum and maximum of the weight of each instance
@@ -247,26 +247,28 @@ def make_kernels(real, tile_size: int):
                 end[p] = ends[(camera * height + top + row) * width + left + lane]
                 last = wp.max(last, end[p])
         for instance in range(ranges[tile, 0], last):
-            i = splat_ids[instance]
-            u11 = splats[i, 2]
-            bounds = f.bounds_of(splats[i, 0], splats[i, 1], u11, splats[i, 4], splats[i, 10], splats[i, 11], whole_tiles)
+            i = gaussian_ids[instance]
+            u11 = projected[i, 2]
+            bounds = f.bounds_of(
+                projected[i, 0], projected[i, 1], u11, projected[i, 4], projected[i, 10], projected[i, 11], whole_tiles
+            )
             for lane in range(strip):
                 ramp[lane] = f.apart(u11 * real(lane))
             weight_sum = real(0.0)
             weight_max = real(0.0)
             for row in range(side):
-                dy = real(origin_y + top + row) + real(0.5) - splats[i, 1]
-                e2 = splats[i, 4] * dy
-                e12 = f.apart(splats[i, 3] * dy)
+                dy = real(origin_y + top + row) + real(0.5) - projected[i, 1]
+                e2 = projected[i, 4] * dy
+                e12 = f.apart(projected[i, 3] * dy)
                 e22 = f.apart(e2 * e2)
                 for part in range(parts):
                     x = real(origin_x + left + part * strip) + real(0.5)
-                    start = f.apart(u11 * (x - splats[i, 0])) + e12
+                    start = f.apart(u11 * (x - projected[i, 0])) + e12
                     if f.reaches(start, u11, e22, bounds[0], bounds[1]):
                         for lane in range(strip):
                             p = row * side + part * strip + lane
                             e1 = start + ramp[lane]
-                            alpha = wp.min(alpha_max, splats[i, 5] * f.falloff(e1 * e1 + e22))
+                            alpha = wp.min(alpha_max, projected[i, 5] * f.falloff(e1 * e1 + e22))
                             if alpha >= alpha_cut and instance < end[p]:
                                 w = alpha * t[p]
                                 t[p] = t[p] * (real(1.0) - alpha)

@@ -1,4 +1,4 @@
-"""The backward blending kernel in plain Warp, one task per tile: the CPU's, and in float64 that of every device."""
+"""The backward blending kernel in plain Warp, one task per tile: that of the CPU, and of float64 on every device."""
 
 import functools
 
@@ -8,12 +8,12 @@ from warpgs.kernels.compiler import ROLLED
 from warpgs.kernels.falloff import ABREAST, STRIP, make_functions
 
 VALUES = 10
-"""Gradient values of an instance."""
+"""Number of gradient values of an instance."""
 
 
 @functools.cache
 def make_backward(real, tile_size: int):
-    """The kernel for one scalar type and tile size."""
+    """Make the kernel for one scalar type and tile size."""
     f = make_functions(real)
     # The tile lies in columns as wide as a strip, one beside the other. One row longer than it: see `make_kernels`.
     count = tile_size * (tile_size // STRIP)
@@ -36,7 +36,7 @@ def make_backward(real, tile_size: int):
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def backward(
-        begin: int, splats: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), splat_ids: wp.array(dtype=int),
+        begin: int, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), gaussian_ids: wp.array(dtype=int),
         slots: wp.array(dtype=int), backgrounds: wp.array2d(dtype=real),
         origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
         alpha_cut: real, alpha_max: real, whole_tiles: int,
@@ -116,22 +116,22 @@ def make_backward(real, tile_size: int):
         totals = value_reals()
         ahead = real(0.0)
         if instance > ranges[tile, 0]:
-            ahead = splats[splat_ids[instance - 1], 0]
+            ahead = projected[gaussian_ids[instance - 1], 0]
         while instance > ranges[tile, 0]:
             instance -= 1
-            i = splat_ids[instance]
+            i = gaussian_ids[instance]
             mx = ahead
-            ahead = splats[splat_ids[wp.max(instance - 1, 0)], 0]  # asked for early, as it may be far away
-            my = splats[i, 1]
-            u11 = splats[i, 2]
-            u12 = splats[i, 3]
-            u22 = splats[i, 4]
-            opacity = splats[i, 5]
-            c0 = splats[i, 6]
-            c1 = splats[i, 7]
-            c2 = splats[i, 8]
-            distance = splats[i, 9]
-            bounds = f.bounds_of(mx, my, u11, u22, splats[i, 10], splats[i, 11], whole_tiles)
+            ahead = projected[gaussian_ids[wp.max(instance - 1, 0)], 0]  # loaded early, as it may be far away
+            my = projected[i, 1]
+            u11 = projected[i, 2]
+            u12 = projected[i, 3]
+            u22 = projected[i, 4]
+            opacity = projected[i, 5]
+            c0 = projected[i, 6]
+            c1 = projected[i, 7]
+            c2 = projected[i, 8]
+            distance = projected[i, 9]
+            bounds = f.bounds_of(mx, my, u11, u22, projected[i, 10], projected[i, 11], whole_tiles)
             for row in range(side):
                 dy = real(origin_y + top + row) + real(0.5) - my
                 e2 = u22 * dy
@@ -169,7 +169,7 @@ def make_backward(real, tile_size: int):
             k = int(0)
             while k < reaching:
                 base = wp.max(k, 0)
-                k += abreast  # the last few may be some that are not reached: nobody reads theirs
+                k += abreast  # the last few may not be reached; their values are not read
                 for lane in range(strip):
                     for n in range(abreast):
                         o = list[base + n] & bits
@@ -181,11 +181,11 @@ def make_backward(real, tile_size: int):
                         raw = opacity * g[n]
                         alpha = wp.where(alpha_max < raw, alpha_max, raw)
                         until = end[(list[base + n] & bits) * strip + lane]
-                        drawn = alpha >= alpha_cut and instance < until
-                        alpha = wp.where(drawn, alpha, real(0.0))
+                        blended = alpha >= alpha_cut and instance < until
+                        alpha = wp.where(blended, alpha, real(0.0))
                         alphas[q] = alpha
                         inverses[q] = real(1.0) / (real(1.0) - alpha)
-                        slopes[q] = wp.where(drawn and raw <= alpha_max, g[n], real(0.0))
+                        slopes[q] = wp.where(blended and raw <= alpha_max, g[n], real(0.0))
             k = int(0)
             while k < reaching:
                 base = wp.max(k, 0) * strip

@@ -1,26 +1,27 @@
-"""Blending kernels for CUDA in float32, native bodies: warps that own 8 x 4 blocks of pixels, and gradients by chunks.
+"""Blending kernels for CUDA in float32, with native bodies: warps that own 8 x 4 blocks of pixels, and gradients by chunks.
 
 Warp has no shuffles, no ballots and no 16-byte loads, so the bodies are CUDA. They compute what the generic kernels of
 blend_cpu.py compute (docs/blend.md); tests hold them against each other.
 """
 
 import functools
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 import torch
 import warp as wp
 
-from warpgs.constants import Rule
-from warpgs.kernels import bridge
-from warpgs.kernels.memory import TORCH, Memory
+from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.native import source
-from warpgs.kernels.tiles import Tiles, grid
+from warpgs.kernels.tiles import Tiles
+from warpgs.runtime import interop
+from warpgs.runtime.allocator import TORCH, Allocator
 
 CHUNKS = (64, 128)
-"""Instances that one warp of the backward pass works through: the first in pictures of up to MANY tiles, to have enough
-warps, the second in larger ones, to load the pixels less often. The forward pass leaves the state of every pixel at each
-multiple of this, so that a long list is worked on in many places at once. Multiples of 32."""
-MANY = 4096
+"""Instances that one warp of the backward pass takes: the first number in images of up to MAX_SMALL_TILES tiles, to have enough
+warps, the second in larger ones, to load the pixels less often. The forward pass saves the state of every pixel at each
+multiple of this, so that several warps can share a long list. Multiples of 32."""
+MAX_SMALL_TILES = 4096
 """Tiles beyond which the larger chunk is the faster one (docs/decisions/005-cuda-blending.md)."""
 STATE = 5
 """Floats of that state: transmittance, colour and depth sum so far."""
@@ -29,30 +30,31 @@ WARPS = 2
 THREADS = 1024
 """Threads of the one block that puts tiles in order."""
 STRIDE = 12
-"""Floats from one instance's sums to the next, so that rows are 16-byte aligned. There are ten at most: along the two factor
-rows, three for the factor, opacity, colour, depth."""
+"""Floats from one instance's sums to the next, so that rows are 16-byte aligned. There are at most ten sums: two along the rows
+of the factor, three for the factor, opacity, colour, depth."""
 
 # 2^-(e1^2 + e2^2) = exp(-|U d|^2 / 2) where e = SCALE U d
 SCALE = "0.84932180028801904272f"  # sqrt(log2(e) / 2)
 
 
 def _source(name: str, tile_size: int, **numbers) -> str:
-    """A body, behind what all bodies share."""
+    """Return the CUDA text of one body, after the text that all bodies share."""
     numbers |= {"SIDE": tile_size, "STATE": STATE, "SCALE": SCALE, "WARPS": WARPS, "STRIDE": STRIDE}
     return source("blend_common.cu", f"blend_{name}.cu", **numbers)
 
 
 @functools.cache
 def make_kernels(tile_size: int):
-    """Forward and contribution kernels for one tile size.
+    """Make the forward and contribution kernels for one tile size.
 
-    Images and records are flat; what there is per instance has rows, as a flat array could be too long for 32-bit sizes.
+    Images and projected Gaussians are flat arrays. Arrays with a row per instance have two axes, since a flat one could be too
+    long for 32-bit sizes.
     """
 
     @wp.func_native(_source("forward", tile_size))
     def forward_body(
-        item: int, splats: wp.array(dtype=float), order: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        splat_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
+        item: int, projected: wp.array(dtype=float), order: wp.array(dtype=int), ranges: wp.array(dtype=int),
+        gaussian_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
         origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int, stop: float, inclusive: int, chunk: int,
         rgb: wp.array(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
@@ -65,7 +67,7 @@ def make_kernels(tile_size: int):
 
     @wp.func_native(_source("contributions", tile_size))
     def contributions_body(
-        tile: int, splats: wp.array(dtype=float), ranges: wp.array(dtype=int), splat_ids: wp.array(dtype=int),
+        tile: int, projected: wp.array(dtype=float), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int),
         slots: wp.array(dtype=int), origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
         alpha_cut: float, alpha_max: float, ends: wp.array(dtype=int), instance_weights: wp.array(dtype=float),
     ): ...  # fmt: skip
@@ -75,8 +77,8 @@ def make_kernels(tile_size: int):
 
     @wp.kernel(**options)
     def forward(
-        begin: int, splats: wp.array(dtype=float), order: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        splat_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
+        begin: int, projected: wp.array(dtype=float), order: wp.array(dtype=int), ranges: wp.array(dtype=int),
+        gaussian_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
         origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int, stop: float, inclusive: int, chunk: int,
         # outputs
@@ -85,7 +87,8 @@ def make_kernels(tile_size: int):
         states: wp.array2d(dtype=float),
     ):  # fmt: skip
         forward_body(
-            wp.tid() // 32, splats, order, ranges, splat_ids, backgrounds, origin_x, origin_y, width, height, columns, tiles,
+            wp.tid() // 32, projected, order, ranges, gaussian_ids, backgrounds,
+            origin_x, origin_y, width, height, columns, tiles,
             alpha_cut, alpha_max, whole_tiles, stop, inclusive, chunk,
             rgb, alpha_out, depth, transmittances, weights, ends, states,
         )  # fmt: skip
@@ -100,14 +103,14 @@ def make_kernels(tile_size: int):
 
     @wp.kernel(**options)
     def contributions(
-        begin: int, splats: wp.array(dtype=float), ranges: wp.array(dtype=int), splat_ids: wp.array(dtype=int),
+        begin: int, projected: wp.array(dtype=float), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int),
         slots: wp.array(dtype=int), origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
         alpha_cut: float, alpha_max: float, ends: wp.array(dtype=int),
         # outputs, zero on entry
         weights: wp.array(dtype=float),
     ):  # fmt: skip
         contributions_body(
-            wp.tid() // threads, splats, ranges, splat_ids, slots, origin_x, origin_y, width, height, columns, tiles,
+            wp.tid() // threads, projected, ranges, gaussian_ids, slots, origin_x, origin_y, width, height, columns, tiles,
             alpha_cut, alpha_max, ends, weights,
         )  # fmt: skip
 
@@ -116,16 +119,20 @@ def make_kernels(tile_size: int):
 
 @functools.cache
 def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
-    """Backward kernels: sums per instance, then per Gaussian; ``with_depth`` with gradients of depth and alpha.
+    """Make the backward kernels: sums per instance, then per Gaussian.
 
-    ``atomic``: sums are added to their Gaussian's without slots, in no fixed order.
+    Args:
+        tile_size: Side of a tile [px].
+        with_depth: True for gradients of depth and alpha, too.
+        chunk: Instances per warp.
+        atomic: True to add each sum to its Gaussian's at once, in no fixed order, instead of by slots.
     """
     numbers = {"CHUNK": chunk, "WITH_DEPTH": str(with_depth).lower(), "ATOMIC": str(atomic).lower()}
 
     @wp.func_native(_source("backward", tile_size, **numbers))
     def backward_body(
-        item: int, splats: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        splat_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
+        item: int, projected: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
+        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
         backgrounds: wp.array(dtype=float),
         origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int, no_tile: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int,
@@ -137,8 +144,8 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
 
     @wp.func_native(_source("gather", tile_size, **numbers))
     def gather_body(
-        i: int, splats: wp.array(dtype=float), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
-        v_slots: wp.array2d(dtype=float), v_splats: wp.array(dtype=float),
+        i: int, projected: wp.array(dtype=float), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
+        v_slots: wp.array2d(dtype=float), v_projected: wp.array(dtype=float),
     ): ...  # fmt: skip
 
     name = f"warpgs.kernels.blend_cuda.backward.{tile_size}.{int(with_depth)}.{chunk}.{int(atomic)}"
@@ -148,8 +155,8 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
 
     @wp.kernel(**registers, **options)
     def backward(
-        begin: int, splats: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        splat_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
+        begin: int, projected: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
+        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
         backgrounds: wp.array(dtype=float),
         origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int, no_tile: int,
         alpha_cut: float, alpha_max: float, whole_tiles: int,
@@ -160,74 +167,91 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
         v_slots: wp.array2d(dtype=float),
     ):  # fmt: skip
         backward_body(
-            wp.tid() // 32, splats, keys, ranges, splat_ids, slots, totals, capacity, backgrounds,
+            wp.tid() // 32, projected, keys, ranges, gaussian_ids, slots, totals, capacity, backgrounds,
             origin_x, origin_y, width, height, columns, tiles, no_tile, alpha_cut, alpha_max, whole_tiles,
             rgb, depth, transmittances, weights, ends, states, v_rgb, v_alpha, v_depth, v_slots,
         )  # fmt: skip
 
     @wp.kernel(**options)
     def gather(
-        begin: int, splats: wp.array(dtype=float), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
+        begin: int, projected: wp.array(dtype=float), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
         v_slots: wp.array2d(dtype=float),
         # outputs
-        v_splats: wp.array(dtype=float),
+        v_projected: wp.array(dtype=float),
     ):  # fmt: skip
-        gather_body(wp.tid(), splats, starts, counts, v_slots, v_splats)
+        gather_body(wp.tid(), projected, starts, counts, v_slots, v_projected)
 
     return SimpleNamespace(backward=backward, gather=gather)
 
 
-def _floats(*tensors: torch.Tensor) -> list[bridge.View]:
-    return [bridge.view(t.view(-1), wp.float32) for t in tensors]
+def _floats(*tensors: torch.Tensor) -> list[interop.View]:
+    return [interop.view(t.view(-1), wp.float32) for t in tensors]
 
 
-def _ints(*tensors: torch.Tensor) -> list[bridge.View]:
-    return [bridge.view(t.view(-1), wp.int32) for t in tensors]
-
-
-def _frame(origin: tuple[int, int], width: int, height: int, tile_size: int) -> list[int]:
-    columns, rows = grid(width, height, tile_size)
-    return [*origin, width, height, columns, columns * rows]
+def _ints(*tensors: torch.Tensor) -> list[interop.View]:
+    return [interop.view(t.view(-1), wp.int32) for t in tensors]
 
 
 def chunk_of(tiles: Tiles, deterministic: bool) -> int:
-    """Instances per chunk of the backward pass; the larger one, which takes less memory, where memory is asked for."""
-    return CHUNKS[int(tiles.ranges.shape[0] > MANY or not deterministic)]
+    """Return the instances per chunk: the larger number, which takes less memory, also where order is given up for memory."""
+    return CHUNKS[int(tiles.ranges.shape[0] > MAX_SMALL_TILES or not deterministic)]
 
 
 def forward(
-    splats, tiles: Tiles, backgrounds, origin: tuple[int, int], width: int, height: int, rule: Rule, keep: bool,
-    deterministic: bool, memory: Memory = TORCH,
-):  # fmt: skip
-    """Pictures and what the backward pass needs of them: rgb, alpha, depth, transmittances, weights, ends, states."""
-    device = splats.device
-    shape = (backgrounds.shape[0], height, width)
-    rgb, alpha, depth = (memory.own(s, torch.float32, device) for s in ((*shape, 3), shape, shape))
-    transmittances, weights = memory.kept((2, *shape), torch.float32, device).unbind()
-    ends = memory.kept(shape, torch.int32, device)
+    projected: torch.Tensor,
+    tiles: Tiles,
+    backgrounds: torch.Tensor,
+    settings: BlendSettings,
+    *,
+    save: bool,
+    allocator: Allocator = TORCH,
+) -> tuple[torch.Tensor, ...]:
+    """Return what `blend.composite` returns: rgb, alpha, depth, transmittances, weights, ends, states."""
+    device, rule = projected.device, settings.rule
+    shape = (backgrounds.shape[0], settings.height, settings.width)
+    rgb, alpha, depth = (allocator.output(s, torch.float32, device) for s in ((*shape, 3), shape, shape))
+    transmittances, weights = allocator.saved((2, *shape), torch.float32, device).unbind()
+    ends = allocator.saved(shape, torch.int32, device)
     pixels = tiles.size * tiles.size
-    chunk = chunk_of(tiles, deterministic) if keep else bridge.MAX_SIZE  # of which no instance is a multiple but the first
-    states = memory.kept((tiles.slots.shape[0] // chunk + 1, STATE * pixels), torch.float32, device)
+    # without gradients no state is saved: no instance but the first is a multiple of this
+    chunk = chunk_of(tiles, settings.deterministic) if save else interop.MAX_SIZE
+    states = allocator.saved((tiles.slots.shape[0] // chunk + 1, STATE * pixels), torch.float32, device)
     k, count = make_kernels(tiles.size), tiles.ranges.shape[0]
-    order = memory.scratch((count,), torch.int32, device)
-    bridge.launch(k.order_tiles, THREADS, [*_ints(tiles.ranges), count, *_ints(order)], device, block_dim=THREADS)
+    order = allocator.workspace((count,), torch.int32, device)
+    interop.launch(k.order_tiles, THREADS, [*_ints(tiles.ranges), count, *_ints(order)], device, block_dim=THREADS)
     inputs = [
-        *_floats(splats), *_ints(order, tiles.ranges, tiles.splat_ids), *_floats(backgrounds),
-        *_frame(origin, width, height, tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
+        *_floats(projected), *_ints(order, tiles.ranges, tiles.gaussian_ids), *_floats(backgrounds),
+        *settings.window_inputs(tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
         rule.transmittance_stop, int(rule.inclusive_stop), chunk,
-        *_floats(rgb, alpha, depth, transmittances, weights), *_ints(ends), bridge.view(states, wp.float32),
+        *_floats(rgb, alpha, depth, transmittances, weights), *_ints(ends), interop.view(states, wp.float32),
     ]  # fmt: skip
-    bridge.launch(k.forward, count * pixels, inputs, device, block_dim=32 * WARPS)
+    interop.launch(k.forward, count * pixels, inputs, device, block_dim=32 * WARPS)
     return rgb, alpha, depth, transmittances, weights, ends, states
 
 
 def backward(
-    splats, tiles: Tiles, backgrounds, origin: tuple[int, int], width: int, height: int, rule: Rule, deterministic: bool,
-    saved, v_rgb, v_alpha, v_depth, memory: Memory = TORCH,
-):  # fmt: skip
-    """Gradient of the records, shape [C, N, 12], from what `forward` returned and the gradients of its pictures."""
+    projected: torch.Tensor,
+    tiles: Tiles,
+    backgrounds: torch.Tensor,
+    settings: BlendSettings,
+    saved: Sequence[torch.Tensor],
+    v_images: Sequence[torch.Tensor | None],
+    allocator: Allocator = TORCH,
+) -> torch.Tensor:
+    """Return the gradient of ``projected``, shape [C, N, 12].
+
+    Args:
+        projected: As given to `forward`, like the next three.
+        tiles: See there.
+        backgrounds: See there.
+        settings: See there.
+        saved: The results of `forward` but for ``alpha``.
+        v_images: Gradients of ``rgb``, ``alpha`` and ``depth``; the last two may be None.
+        allocator: Provider of the gradient's memory.
+    """
     rgb, depth, transmittances, weights, ends, states = saved
-    device, count = splats.device, tiles.slots.shape[0]
+    v_rgb, v_alpha, v_depth = v_images
+    device, count, rule, deterministic = projected.device, tiles.slots.shape[0], settings.rule, settings.deterministic
     with_depth = v_alpha is not None or v_depth is not None
     chunk = chunk_of(tiles, deterministic)
     k = make_backward(tiles.size, with_depth, chunk, not deterministic)
@@ -235,33 +259,40 @@ def backward(
         v_alpha, v_depth = (torch.zeros_like(depth) if v is None else v.contiguous() for v in (v_alpha, v_depth))
     else:
         v_alpha = v_depth = depth  # never read
-    v_splats = memory.own(splats.shape, torch.float32, device)
+    v_projected = allocator.output(projected.shape, torch.float32, device)
     if deterministic:
-        v_slots = memory.scratch((count, STRIDE), torch.float32, device)
+        v_slots = allocator.workspace((count, STRIDE), torch.float32, device)
     else:
-        v_slots = v_splats.zero_().view(-1, STRIDE)
+        v_slots = v_projected.zero_().view(-1, STRIDE)
     inputs = [
-        *_floats(splats), *_ints(tiles.tile_ids, tiles.ranges, tiles.splat_ids, tiles.slots),
-        bridge.view(tiles.total, wp.int64), count, *_floats(backgrounds), *_frame(origin, width, height, tiles.size),
+        *_floats(projected), *_ints(tiles.tile_ids, tiles.ranges, tiles.gaussian_ids, tiles.slots),
+        interop.view(tiles.total, wp.int64), count, *_floats(backgrounds), *settings.window_inputs(tiles.size),
         tiles.ranges.shape[0], rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
-        *_floats(rgb, depth, transmittances, weights), *_ints(ends), bridge.view(states, wp.float32),
-        *_floats(v_rgb.contiguous(), v_alpha, v_depth), bridge.view(v_slots, wp.float32),
+        *_floats(rgb, depth, transmittances, weights), *_ints(ends), interop.view(states, wp.float32),
+        *_floats(v_rgb.contiguous(), v_alpha, v_depth), interop.view(v_slots, wp.float32),
     ]  # fmt: skip
-    bridge.launch(k.backward, 32 * -(-count // chunk), inputs, device, block_dim=32 * WARPS)
-    inputs = [*_floats(splats), *_ints(tiles.starts, tiles.counts), bridge.view(v_slots, wp.float32), *_floats(v_splats)]
-    bridge.launch(k.gather, -(-tiles.counts.shape[0] // 256) * 256, inputs, device)
-    return v_splats
+    interop.launch(k.backward, 32 * -(-count // chunk), inputs, device, block_dim=32 * WARPS)
+    inputs = [*_floats(projected), *_ints(tiles.starts, tiles.counts), interop.view(v_slots, wp.float32), *_floats(v_projected)]
+    interop.launch(k.gather, -(-tiles.counts.shape[0] // 256) * 256, inputs, device)
+    return v_projected
 
 
-def instance_weights(splats, tiles: Tiles, origin: tuple[int, int], width: int, height: int, rule: Rule, ends) -> torch.Tensor:
-    """Sum and maximum over a tile's pixels of the blending weight, for each instance at its slot, shape [M, 2]."""
-    weights = splats.new_zeros(tiles.slots.shape[0], 2)
+def instance_weights(projected: torch.Tensor, tiles: Tiles, settings: BlendSettings, ends: torch.Tensor) -> torch.Tensor:
+    """Return sum and maximum over a tile's pixels of the blending weight, for each instance at its slot, shape [M, 2].
+
+    Args:
+        projected: As given to `forward`, like the next two.
+        tiles: See there.
+        settings: See there.
+        ends: One past the last instance that was blended into each pixel, as `forward` returns it.
+    """
+    rule, weights = settings.rule, projected.new_zeros(tiles.slots.shape[0], 2)
     inputs = [
-        *_floats(splats), *_ints(tiles.ranges, tiles.splat_ids, tiles.slots), *_frame(origin, width, height, tiles.size),
+        *_floats(projected), *_ints(tiles.ranges, tiles.gaussian_ids, tiles.slots), *settings.window_inputs(tiles.size),
         rule.alpha_cut, rule.alpha_max, *_ints(ends), *_floats(weights),
     ]  # fmt: skip
     pixels = tiles.size * tiles.size
-    bridge.launch(
-        make_kernels(tiles.size).contributions, tiles.ranges.shape[0] * pixels, inputs, splats.device, block_dim=pixels
+    interop.launch(
+        make_kernels(tiles.size).contributions, tiles.ranges.shape[0] * pixels, inputs, projected.device, block_dim=pixels
     )
     return weights

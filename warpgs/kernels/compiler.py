@@ -1,4 +1,4 @@
-"""How kernels whose inner loops must vectorise on a CPU are compiled."""
+"""Compiler options of kernels whose inner loops must vectorise on a CPU."""
 
 import warp as wp
 
@@ -11,8 +11,8 @@ _FLAGS = (
 )
 
 ROLLED = {
-    # Warp would spell out loops of constant length, and the vectoriser looks for loops.
+    # Warp would unroll loops of constant length, and the vectoriser needs loops.
     "max_unroll": 0,
     "cpu_compiler_flags": " ".join(_FLAGS),
 }
-"""Options of a module of its own (``module="unique"``; elsewhere Warp ignores them)."""
+"""Module options, for kernels with ``module="unique"`` (elsewhere Warp ignores them)."""

@@ -5,15 +5,15 @@ import functools
 import torch
 import warp as wp
 
-from warpgs.kernels import bridge
+from warpgs.runtime import interop
 
 
 @functools.cache
 def make_kernel():
-    """The kernel; its settings are in memory, so that it can be recorded once and replayed."""
+    """Make the kernel; its settings are in memory, so that a CUDA graph can replay it."""
 
     @wp.kernel(enable_backward=False, module="warpgs.kernels.dropout")
-    def draw(
+    def sample(
         begin: int, settings: wp.array(dtype=float), seed: int,
         # outputs
         factors: wp.array(dtype=float),
@@ -24,14 +24,14 @@ def make_kernel():
         state = wp.rand_init(wp.randi(wp.rand_init(seed, int(settings[1]))), i)
         factors[i] = wp.where(wp.randf(state) >= p, 1.0 / (1.0 - p), 0.0)
 
-    return draw
+    return sample
 
 
 def opacity_dropout(count: int, settings: torch.Tensor, seed: int) -> torch.Tensor:
-    """Factors for the opacities of ``count`` Gaussians: 0 with probability p, else 1 / (1 - p).
+    """Return factors for the opacities of ``count`` Gaussians: 0 with probability p, else 1 / (1 - p).
 
-    The expected opacity stays. The factors depend on seed, step and row alone: the same on every device, and again after a
-    fit is continued.
+    The expected opacity stays. The factors depend on seed, step and row alone, so they are the same on every device and in a
+    resumed fit.
 
     Args:
         count: Number of Gaussians N.
@@ -44,8 +44,8 @@ def opacity_dropout(count: int, settings: torch.Tensor, seed: int) -> torch.Tens
     Raises:
         ValueError: ``settings`` is not of shape [2].
     """
-    bridge.check(settings=(settings, "2"))
+    interop.check(settings=(settings, "2"))
     factors = torch.empty(count, dtype=torch.float32, device=settings.device)
-    inputs = [bridge.view(settings, wp.float32), seed, bridge.view(factors, wp.float32)]
-    bridge.launch(make_kernel(), count, inputs, settings.device)
+    inputs = [interop.view(settings, wp.float32), seed, interop.view(factors, wp.float32)]
+    interop.launch(make_kernel(), count, inputs, settings.device)
     return factors

@@ -1,4 +1,4 @@
-"""What the CPU's blending passes compute alike, to the bit: which pixels a Gaussian reaches, and how it falls off."""
+"""Functions that all blending passes of the CPU share, to the bit: the pixels that a Gaussian reaches, and its falloff."""
 
 import functools
 from types import SimpleNamespace
@@ -6,14 +6,14 @@ from types import SimpleNamespace
 import warp as wp
 
 STRIP = 8
-"""Pixels of a row that are worked on together. More would not leave the sums of a strip in the 16 registers of AVX2."""
+"""Pixels of a row that are processed together. With more, the sums of a strip would not fit the 16 registers of AVX2."""
 ABREAST = 4
-"""Falloffs computed side by side: each is a chain of twenty operations that wait for one another."""
+"""Falloffs that are computed side by side, since each is a chain of twenty operations that wait for one another."""
 
 
 @functools.cache
 def make_falloffs(real, count: int):
-    """exp(-x / 2) for ``count`` numbers x >= 0. In float32 by a polynomial: a call to the C library would not vectorise."""
+    """Make exp(-x / 2) of ``count`` numbers x >= 0; in float32 a polynomial, since calls to the C library do not vectorise."""
     reals = wp.types.vector(count, real)
 
     if real is wp.float64:
@@ -51,7 +51,7 @@ def make_falloffs(real, count: int):
 
 @functools.cache
 def make_falloff(real):
-    """The same for one number."""
+    """Make exp(-x / 2) of one number."""
     one = wp.types.vector(1, real)
     falloffs = make_falloffs(real, 1)
 
@@ -64,13 +64,13 @@ def make_falloff(real):
 
 @functools.cache
 def make_functions(real):
-    """The functions for one scalar type."""
+    """Make the functions for one scalar type."""
     vec2 = wp.types.vector(2, real)
     half_strip = wp.constant(real((STRIP - 1) / 2))
 
     @wp.func
     def apart(product: real) -> real:
-        """The product itself, rounded: kept from being fused with the sum it goes into.
+        """Return the product itself, rounded, so that it is not fused with the sum it goes into.
 
         Where a compiler moves it out of a loop it is rounded anyway, and then one pass would see another alpha than the other.
         """
@@ -78,7 +78,7 @@ def make_functions(real):
 
     @wp.func
     def bounds_of(mx: real, my: real, u11: real, u22: real, half_width: real, half_height: real, whole_tiles: wp.int32) -> vec2:
-        """How far e1 at the middle of a strip may lie from 0, less the ellipse; and the ellipse: the largest |U d|^2."""
+        """Return how far e1 at the middle of a strip may lie from 0, less the ellipse; and the ellipse, the largest |U d|^2."""
         margin = real(0.01) + real(2.0e-6) * (wp.abs(mx) + half_width)
         slack = real(0.01) + real(2.0e-6) * (wp.abs(my) + half_height)
         radius = u22 * (half_height + slack)
@@ -86,7 +86,7 @@ def make_functions(real):
 
     @wp.func
     def reaches(start: real, u11: real, e22: real, aside: real, limit: real) -> bool:
-        """Whether the ellipse touches a strip, whose first pixel has ``start`` for e1: the least |U d|^2 on it is in."""
+        """Return whether the ellipse touches a strip whose first pixel has ``start`` for e1 (its least |U d|^2 is inside)."""
         least = wp.max(wp.abs(start + u11 * half_strip) - aside, real(0.0))
         return least * least + e22 <= limit
 

@@ -1,16 +1,17 @@
-"""Warp functions by scalar type that kernels share: rotations, the projected ellipse, tile spans."""
+"""Warp functions that several kernels share, by scalar type: rotations, the projected ellipse, tile spans."""
 
 import functools
 from types import SimpleNamespace
 
 import warp as wp
 
-from warpgs.constants import FAR, FARTHEST_PIXEL, FRUSTUM_MARGIN, LARGEST_AXIS, SHORTEST_QUAT, SMALLEST_DETERMINANT
+from warpgs.constants import FARTHEST_PIXEL, LARGEST_AXIS, SHORTEST_QUAT, SMALLEST_DETERMINANT
+from warpgs.kernels.cameras.base import CAMERA_MODELS
 
 
 @functools.cache
 def make_rotations(real):
-    """Quaternion and rotation functions for one scalar type (docs/project.md, section 2)."""
+    """Make the quaternion and rotation functions for one scalar type (docs/project.md, section 2)."""
     vec4 = wp.types.vector(4, real)
     mat33 = wp.types.matrix((3, 3), real)
 
@@ -64,23 +65,39 @@ def make_rotations(real):
 
 
 @functools.cache
-def make_projection(real):
-    """The steps of the projection that forward and backward share (docs/project.md has the derivation)."""
+def make_types(real):
+    """Make the vector and matrix types that the kernels of one scalar type share."""
+    return SimpleNamespace(
+        vec2=wp.types.vector(2, real), vec3=wp.types.vector(3, real), vec4=wp.types.vector(4, real),
+        mat33=wp.types.matrix((3, 3), real), mat44=wp.types.matrix((4, 4), real),
+    )  # fmt: skip
+
+
+@functools.cache
+def make_projection(real, camera_model: str):
+    """Make the steps of the projection that forward and backward share (derivation: docs/project.md).
+
+    Args:
+        real: wp.float32 or wp.float64.
+        camera_model: Name of the camera model, whose functions are compiled in.
+    """
     r = make_rotations(real)
-    vec2 = wp.types.vector(2, real)
-    vec3 = wp.types.vector(3, real)
-    vec4 = wp.types.vector(4, real)
-    mat33 = wp.types.matrix((3, 3), real)
-    mat44 = wp.types.matrix((4, 4), real)
+    camera = CAMERA_MODELS.find(camera_model).make_functions(real)
+    t = make_types(real)
+    vec2 = t.vec2
+    vec3 = t.vec3
+    vec4 = t.vec4
+    mat33 = t.mat33
+    mat44 = t.mat44
 
     @wp.struct
     class Ellipse:
-        """What is left of one Gaussian in one camera, before colour."""
+        """One Gaussian in one camera, before colour."""
 
         valid: wp.int32
         position: vec3  # in the camera [u]
         pixel: vec2  # [px]
-        clamped: vec2  # pixel that the Jacobian is taken at [px]
+        expansion_point: vec2  # pixel at which the Jacobian is taken [px]
         quat: vec4  # unit
         quat_length: real
         scales: vec3  # [u]
@@ -108,15 +125,11 @@ def make_projection(real):
             view[0, 0], view[0, 1], view[0, 2], view[1, 0], view[1, 1], view[1, 2], view[2, 0], view[2, 1], view[2, 2]
         )
         e.position = rotation * mean + vec3(view[0, 3], view[1, 3], view[2, 3])
-        x = e.position[0]
-        y = e.position[1]
-        z = e.position[2]
         # Guards are phrased so that a NaN fails them.
-        if not (z >= near and z <= real(FAR)):
+        if not camera.in_range(e.position, near):
             return e
-        px = K[0, 0] * x / z + K[0, 2]
-        py = K[1, 1] * y / z + K[1, 2]
-        if not (wp.abs(px) <= real(FARTHEST_PIXEL) and wp.abs(py) <= real(FARTHEST_PIXEL)):
+        pixel = camera.pixel_of(e.position, K)
+        if not (wp.abs(pixel[0]) <= real(FARTHEST_PIXEL) and wp.abs(pixel[1]) <= real(FARTHEST_PIXEL)):
             return e
         e.quat_length = r.quat_length(q)
         if not (e.quat_length >= real(SHORTEST_QUAT) and e.quat_length * real(SHORTEST_QUAT) <= real(1.0)):
@@ -125,27 +138,12 @@ def make_projection(real):
             return e
         e.quat = q / e.quat_length
         e.scales = vec3(wp.exp(log_scale[0]), wp.exp(log_scale[1]), wp.exp(log_scale[2]))
-        e.pixel = vec2(px, py)
-        margin = real(FRUSTUM_MARGIN)
-        e.clamped = vec2(
-            wp.clamp(px, -margin * width, width + margin * width),
-            wp.clamp(py, -margin * height, height + margin * height),
-        )
+        e.pixel = pixel
+        e.expansion_point = camera.expansion_point(pixel, width, height)
         e.axes = rotation * r.rotation(e.quat) * wp.diag(e.scales)
-        jx = K[0, 0] / z
-        jy = K[1, 1] / z
-        jxz = (K[0, 2] - e.clamped[0]) / z
-        jyz = (K[1, 2] - e.clamped[1]) / z
-        m1 = vec3(
-            jx * e.axes[0, 0] + jxz * e.axes[2, 0],
-            jx * e.axes[0, 1] + jxz * e.axes[2, 1],
-            jx * e.axes[0, 2] + jxz * e.axes[2, 2],
-        )
-        m2 = vec3(
-            jy * e.axes[1, 0] + jyz * e.axes[2, 0],
-            jy * e.axes[1, 1] + jyz * e.axes[2, 1],
-            jy * e.axes[1, 2] + jyz * e.axes[2, 2],
-        )
+        rows = camera.project_axes(e.position, K, e.expansion_point, e.axes)
+        m1 = rows.first
+        m2 = rows.second
         if not (finite3(m1) and finite3(m2)):
             return e
         # det grows with the fourth power of the axes: shrink them below 2^16 px by exact powers of two.
@@ -181,7 +179,7 @@ def make_projection(real):
 
     @wp.func
     def direction(mean: vec3, view: mat44) -> vec4:
-        """Unit vector from the camera centre to the mean, and the distance; zero where they coincide."""
+        """Return the unit vector from the camera centre to the mean, and the distance; zeros where the two coincide."""
         centered = mean + vec3(
             view[0, 0] * view[0, 3] + view[1, 0] * view[1, 3] + view[2, 0] * view[2, 3],
             view[0, 1] * view[0, 3] + view[1, 1] * view[1, 3] + view[2, 1] * view[2, 3],
@@ -198,23 +196,24 @@ def make_projection(real):
     return SimpleNamespace(
         Ellipse=Ellipse, ellipse=ellipse, sigmoid=sigmoid, direction=direction, finite3=finite3,
         rotation=r.rotation, rotation_backward=r.rotation_backward,
-        vec3=vec3, vec4=vec4, mat33=mat33, mat44=mat44,
+        axes_backward=camera.axes_backward, position_backward=camera.position_backward,
+        vec2=vec2, vec3=vec3, vec4=vec4, mat33=mat33, mat44=mat44,
     )  # fmt: skip
 
 
 @functools.cache
 def make_spans(real):
-    """Functions that decide which tiles a projected Gaussian touches, for one scalar type (docs/tiles.md).
+    """Make the functions that decide which tiles a projected Gaussian touches, for one scalar type (docs/tiles.md).
 
     Counting and emitting call the same functions. Every bound is widened by a margin that covers the rounding of its
-    own arithmetic, so a pixel that blending would draw is never missed; a tile listed in excess draws nothing.
+    own arithmetic, so a pixel that blending would change is never missed; a tile listed in excess changes nothing.
     """
     vec3 = wp.types.vector(3, real)
     vec2i = wp.types.vector(2, wp.int32)
 
     @wp.func
     def pixel_range(lo: real, hi: real, begin: wp.int32, size: wp.int32) -> vec2i:
-        """Pixels from ``begin`` on whose centres lie in [lo, hi], clipped in floating point before the cast."""
+        """Return the first and last pixel, from ``begin`` on, whose centres lie in [lo, hi]; clipped before the cast to int."""
         limit = real(begin + size)
         first = wp.ceil(wp.clamp(lo - real(0.5), real(begin), limit))
         last = wp.floor(wp.clamp(hi - real(0.5), real(begin) - real(1.0), limit - real(1.0)))
@@ -222,7 +221,7 @@ def make_spans(real):
 
     @wp.func
     def tile_rows(my: real, half_height: real, origin_y: wp.int32, height: wp.int32, tile_size: wp.int32) -> vec2i:
-        """First tile row of the picture, and one past the last, that my +- half_height touches within the window."""
+        """Return the first tile row of the image, and one past the last, that my +- half_height touches in the window."""
         margin = real(0.01) + real(2.0e-6) * (wp.abs(my) + half_height)
         rows = pixel_range(my - half_height - margin, my + half_height + margin, origin_y, height)
         if rows[1] < rows[0]:
@@ -234,7 +233,7 @@ def make_spans(real):
         mx: real, my: real, factor: vec3, reach: real, half_width: real, half_height: real,
         row: wp.int32, origin_x: wp.int32, width: wp.int32, tile_size: wp.int32,
     ) -> vec2i:  # fmt: skip
-        """First tile column and one past the last that the ellipse |U d| <= reach touches in a row of tiles.
+        """Return the first tile column, and one past the last, that the ellipse |U d| <= reach touches in a row of tiles.
 
         ``reach`` 0 asks for the whole box instead of the ellipse.
         """
@@ -263,7 +262,7 @@ def make_spans(real):
 
     @wp.func
     def reach_of(opacity: real, alpha_cut: real, square_sigma: real) -> real:
-        """Mahalanobis radius at which alpha falls to the cut: o exp(-r^2/2) = cut; 0 stands for the whole box."""
+        """Return the Mahalanobis radius r at which alpha falls to the cut, o exp(-r^2/2) = cut; 0 stands for the whole box."""
         if alpha_cut > real(0.0) and square_sigma == real(0.0):
             # the last term covers the rounding of the logarithm and of alpha itself
             return wp.sqrt(real(2.0) * wp.log(opacity / alpha_cut) + real(1.0e-5)) * real(1.00001)

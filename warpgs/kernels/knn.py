@@ -7,18 +7,19 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from warpgs.kernels import bridge
+from warpgs.runtime import interop
 
 BOX = 32
-"""Points per box, boxes per box of the level above, and most boxes of the highest level. A query enters a box only if it lies
-closer than the neighbours so far."""
+"""Points per box, boxes per box of the level above, and most boxes of the highest level. A query enters a box only if it is
+closer than the neighbours found so far."""
 
 MAX_NEIGHBORS = 8
+"""Most neighbours of a query."""
 
 
 @functools.cache
 def make_kernels(real):
-    """Kernels for one scalar type; points are sorted along the Morton curve."""
+    """Make the kernels for one scalar type; points are sorted along the Morton curve."""
     vec3 = wp.types.vector(3, real)
     vec8 = wp.types.vector(MAX_NEIGHBORS, real)
 
@@ -39,11 +40,12 @@ def make_kernels(real):
 
     @wp.func
     def gap_squared(lo: vec3, hi: vec3, p: vec3) -> real:
+        """Return the squared distance of a point to a box."""
         return wp.length_sq(wp.max(wp.max(lo - p, p - hi), vec3()))
 
     @wp.func
     def insert(nearest: vec8, k: wp.int32, squared: real) -> vec8:
-        """Keep the k smallest squared distances in ascending order."""
+        """Return the k smallest squared distances in ascending order, with one more taken into account."""
         if squared < nearest[k - 1]:
             j = k - 1
             while j > 0 and nearest[wp.max(j - 1, 0)] > squared:
@@ -95,7 +97,7 @@ def make_kernels(real):
 
 
 def _spread(bits: torch.Tensor) -> torch.Tensor:
-    """Put two zero bits between the 21 low bits (Morton order)."""
+    """Return numbers with two zero bits put between their 21 low bits (Morton order)."""
     for shift, mask in (
         (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
         (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249),
@@ -105,7 +107,7 @@ def _spread(bits: torch.Tensor) -> torch.Tensor:
 
 
 def morton_codes(points: torch.Tensor) -> torch.Tensor:
-    """Position of each point along a Morton curve through the cloud's box, int64, shape [N]; points [N, 3]."""
+    """Return the position of each point [N, 3] along a Morton curve through the cloud's box, int64, shape [N]."""
     lower = points.amin(0)
     extent = (points.amax(0) - lower).clamp_min(torch.finfo(points.dtype).tiny)
     cells = ((points - lower) / extent * (2**21 - 1)).to(torch.int64)
@@ -113,7 +115,7 @@ def morton_codes(points: torch.Tensor) -> torch.Tensor:
 
 
 def mean_square_distances(points: torch.Tensor, k: int = 3) -> torch.Tensor:
-    """Mean squared distance [u^2] of each point to its min(k, N - 1) nearest other points. Exact, not differentiable.
+    """Return the mean squared distance [u^2] of each point to its min(k, N - 1) nearest other points. Not differentiable.
 
     Args:
         points: Finite positions [u], shape [N, 3]. Coincident points have distance 0 from each other.
@@ -126,14 +128,14 @@ def mean_square_distances(points: torch.Tensor, k: int = 3) -> torch.Tensor:
         TypeError: The scalar type is neither float32 nor float64.
         ValueError: The shape is wrong, k is out of range, or a position is not finite.
     """
-    count = bridge.check(points=(points, "N 3"))["N"]
+    count = interop.check(points=(points, "N 3"))["N"]
     if not 1 <= k <= MAX_NEIGHBORS:
         raise ValueError(f"k must be 1 to {MAX_NEIGHBORS}, not {k}")
     if not bool(torch.isfinite(points).all()):
         raise ValueError("points holds positions that are not finite")
     if count < 2:
         return points.new_zeros(count)
-    real, device = bridge.real_of(points), points.device
+    real, device = interop.real_of(points), points.device
     kernels = make_kernels(real)
     points = points.detach()
     order = torch.argsort(morton_codes(points), stable=True)
@@ -148,10 +150,12 @@ def mean_square_distances(points: torch.Tensor, k: int = 3) -> torch.Tensor:
     inside = (ordered, ordered)
     for begin, end in itertools.pairwise(starts):
         level = (lower[begin:end], upper[begin:end])
-        bridge.launch(kernels.bounds, end - begin, [bridge.view(t, kernels.vec3) for t in (*inside, *level)], device, cost=BOX)
+        interop.launch(
+            kernels.bounds, end - begin, [interop.view(t, kernels.vec3) for t in (*inside, *level)], device, cost=BOX
+        )
         inside = level
-    inputs = [bridge.view(t, kernels.vec3) for t in (ordered, lower, upper)]
-    inputs += [bridge.view(torch.tensor(starts, dtype=torch.int32, device=device), wp.int32), min(k, count - 1)]
-    bridge.launch(kernels.search, count, [*inputs, bridge.view(ordered_result, real)], device, cost=1000)
+    inputs = [interop.view(t, kernels.vec3) for t in (ordered, lower, upper)]
+    inputs += [interop.view(torch.tensor(starts, dtype=torch.int32, device=device), wp.int32), min(k, count - 1)]
+    interop.launch(kernels.search, count, [*inputs, interop.view(ordered_result, real)], device, cost=1000)
     result[order] = ordered_result
     return result

@@ -1,4 +1,4 @@
-"""CUDA functions where plain Warp has no means: between the threads of a warp or block, and loads of 16 bytes."""
+"""CUDA functions that plain Warp cannot express: exchange between the threads of a warp or block, and 16-byte loads."""
 
 import functools
 import importlib.resources
@@ -8,13 +8,13 @@ from types import SimpleNamespace
 import warp as wp
 
 BLOCK = 128
-"""Threads of a block that `compact` works in."""
+"""Threads of a block in kernels that call `compact` or `clear_rows`."""
 
 
 def source(*names: str, **numbers) -> str:
-    """CUDA text of the files of those names, one after the other, with names in capitals replaced by numbers."""
+    """Return the CUDA text of some files of the folder ``cuda``, joined, with names in capitals replaced by numbers."""
     folder = importlib.resources.files("warpgs.kernels") / "cuda"
-    text = "".join((folder / name).read_text() for name in names)
+    text = "".join((folder / name).read_text("utf-8") for name in names)
     for name, number in numbers.items():
         text = re.sub(rf"\b{name}\b", str(number), text)
     return text
@@ -168,12 +168,12 @@ _COLOR_BACKWARD = """
 
 @functools.cache
 def make_functions():
-    """The functions, for CUDA; those on colours for float32."""
+    """Make the functions, for CUDA; those on colours are for float32."""
     vec12, vec16 = wp.types.vector(12, wp.float32), wp.types.vector(16, wp.float32)
 
     @wp.func_native(_COMPACT.replace("BLOCK", str(BLOCK)))
     def compact(item: int, wanted: int) -> int:
-        """The items of the block's threads that are wanted, dealt to its first threads in order; -1 for the others.
+        """Return the wanted items of the block's threads, dealt to its first threads in order; -1 for the others.
 
         All BLOCK threads of the block must call it.
         """
@@ -185,23 +185,23 @@ def make_functions():
         row[1] = make_float4(v[4], v[5], v[6], v[7]);
         row[2] = make_float4(v[8], v[9], v[10], v[11]);
     """)
-    def store_record(records: wp.array2d(dtype=float), i: int, v: vec12):
-        """Write row i of records of 12 floats, 16-byte aligned."""
+    def store_row(records: wp.array2d(dtype=float), i: int, v: vec12):
+        """Write row i of an array of rows of 12 floats, 16-byte aligned."""
         ...
 
     @wp.func_native(_CLEAR.replace("BLOCK", str(BLOCK)))
     def clear_rows(item: int, kept: int, sh: wp.array2d(dtype=wp.vec3)):
-        """Set the rows of the block's items to zero but for those that are kept. All BLOCK threads must call it."""
+        """Set the rows of the block's items to zero, except those that are kept. All BLOCK threads must call it."""
         ...
 
     @wp.func_native("return (int)__ballot_sync(0xffffffffu, wanted != 0);")
     def ballot(wanted: int) -> int:
-        """Bit l is set where lane l of the warp wants; all 32 lanes must call it, as with the next two."""
+        """Return a mask with bit l set where lane l wants. All 32 lanes of the warp must call this and the next three."""
         ...
 
     @wp.func_native("return __shfl_sync(0xffffffffu, value, lane);")
     def broadcast(value: int, lane: int) -> int:
-        """The value that a lane of the warp holds."""
+        """Return the value that a lane of the warp holds."""
         ...
 
     @wp.func_native(
@@ -215,7 +215,7 @@ def make_functions():
         """
     )
     def running_sum(value: int) -> int:
-        """Sum over this lane of the warp and those before it."""
+        """Return the sum over this lane of the warp and those before it."""
         ...
 
     @wp.func_native(
@@ -227,17 +227,17 @@ def make_functions():
         """
     )
     def whole_sum(value: wp.int64) -> wp.int64:
-        """Sum over all lanes of the warp, which all of them must ask for."""
+        """Return the sum over all lanes of the warp."""
         ...
 
     @wp.func_native("return __ffs(mask) - 1;")
     def lowest(mask: int) -> int:
-        """Position of the lowest bit set, -1 for none."""
+        """Return the position of the lowest bit set, -1 for none."""
         ...
 
     @wp.func_native(_COLOR)
     def color(sh: wp.array2d(dtype=wp.vec3), n: int, count: int, weights: vec16) -> wp.vec4:
-        """Weighted sum of the first ``count`` coefficients of row n, and the largest of their magnitudes (NaN aside)."""
+        """Return the weighted sum of the first ``count`` coefficients of row n, and their largest magnitude (ignoring NaN)."""
         ...
 
     @wp.func_native(_COLOR_BACKWARD)
@@ -245,16 +245,16 @@ def make_functions():
         sh: wp.array2d(dtype=wp.vec3), n: int, count: int, weights: vec16, v: wp.vec3, add: int,
         v_sh: wp.array2d(dtype=wp.vec3),
     ) -> vec16:  # fmt: skip
-        """Gradients of `color`, upstream ``v``: the row's are stored (0 past ``count``) or added, the weights' returned."""
+        """Return the weights' gradient of `color` for upstream ``v``; store (0 past ``count``) or add that of the row."""
         ...
 
     @wp.func_native(_COLOR_WEIGHTS)
     def color_weights(sh: wp.array2d(dtype=float), n: int, count: int, upstream: wp.vec3) -> vec16:
-        """The weights' gradient alone, of rows that lie flat: sh [N, 3 K]."""
+        """Return the weights' gradient alone, of flat rows: sh [N, 3 K]."""
         ...
 
     return SimpleNamespace(
-        compact=compact, store_record=store_record, clear_rows=clear_rows, ballot=ballot, broadcast=broadcast,
+        compact=compact, store_row=store_row, clear_rows=clear_rows, ballot=ballot, broadcast=broadcast,
         running_sum=running_sum, whole_sum=whole_sum, lowest=lowest, color=color, color_backward=color_backward,
         color_weights=color_weights,
     )  # fmt: skip

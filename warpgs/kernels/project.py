@@ -1,54 +1,82 @@
-"""Project 3D Gaussians to image-space ellipses: activations, EWA covariance, its factor, colour, and tile counts."""
+"""Projection of 3D Gaussians to ellipses in the image: activations, EWA covariance and its factor, colour, tile counts."""
 
 import functools
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
 from warpgs.constants import LARGEST_COEFFICIENT, Rule
-from warpgs.kernels import bridge, sh
-from warpgs.kernels.functions import make_projection, make_spans
-from warpgs.kernels.memory import TORCH, Memory
+from warpgs.kernels import sh
+from warpgs.kernels.cameras.base import CAMERA_MODELS
+from warpgs.kernels.functions import make_projection, make_spans, make_types
 from warpgs.kernels.native import BLOCK
 from warpgs.kernels.native import make_functions as make_native
 from warpgs.kernels.project_backward import make_backward
+from warpgs.runtime import interop
+from warpgs.runtime.allocator import TORCH, Allocator
 
-RECORD = 12
-"""Floats of a projected Gaussian ("splat"), 16-byte aligned in float32:
+PROJECTED_SIZE = 12
+"""Numbers of a projected Gaussian, 16-byte aligned in float32:
 0:2 mean [px], 2:5 factor u11 u12 u22 [1/px], 5 opacity, 6:9 colour, 9 z-depth [u],
 10:12 half width and half height [px] of the box that holds every pixel with alpha at or above the cut."""
 
 
+@dataclass(frozen=True)
+class ProjectSettings:
+    """Everything that a projection depends on besides tensors."""
+
+    size: tuple[int, int]
+    """Width and height of the image [px]."""
+    window: tuple[int, int, int, int]
+    """Left, top, width and height [px] of the part that is rendered, from a tile's corner on."""
+    sh_count: int
+    """Spherical-harmonics coefficients a channel that are used."""
+    rule: Rule
+    """Cut-offs."""
+    tile_size: int
+    """Side of a tile [px]."""
+    camera_model: str
+    """Name of the camera model."""
+
+
 @functools.cache
-def make_forward(real, native: bool):
-    """The forward kernel for one scalar type; ``native`` for CUDA and float32."""
-    m = make_projection(real)
+def make_forward(real, native: bool, camera_model: str):
+    """Make the forward kernel.
+
+    Args:
+        real: wp.float32 or wp.float64.
+        native: True for CUDA and float32.
+        camera_model: Name of the camera model, whose functions are compiled in.
+    """
+    m = make_projection(real, camera_model)
     s = make_spans(real)
     basis = sh.make_functions(real).basis
     vec3 = m.vec3
     color_of = make_native().color if native else None
-    vec12 = wp.types.vector(RECORD, real)
+    vec12 = wp.types.vector(PROJECTED_SIZE, real)
 
     @wp.func
-    def store_values(splats: wp.array2d(dtype=real), i: int, record: vec12):
-        for k in range(wp.static(RECORD)):
-            splats[i, k] = record[k]
+    def store_values(projected: wp.array2d(dtype=real), i: int, values: vec12):
+        for k in range(wp.static(PROJECTED_SIZE)):
+            projected[i, k] = values[k]
 
-    store = make_native().store_record if native else store_values
+    store = make_native().store_row if native else store_values
+    module = f"warpgs.kernels.project.forward.{real.__name__}.{int(native)}.{camera_model}"
 
     @wp.func
-    def draw(
+    def project_one(
         i: int, n: int, view: m.mat44, K: m.mat33,
         means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
         logit_opacities: wp.array(dtype=real), opacity_factors: wp.array(dtype=real),
         coefficients: wp.array2d(dtype=m.vec3),
         width: int, height: int, origin_x: int, origin_y: int, window_width: int, window_height: int,
         tile_size: int, sh_count: int,
-        near: real, low_pass: real, alpha_cut: real, square_sigma: real, splats: wp.array2d(dtype=real),
+        near: real, low_pass: real, alpha_cut: real, square_sigma: real, projected: wp.array2d(dtype=real),
     ):  # fmt: skip
-        """Write the record of Gaussian n; returns the tiles it touches, 0 where it is culled and nothing is written."""
+        """Project Gaussian n; return the number of tiles it touches. Where that is 0 it is culled, and nothing is written."""
         e = m.ellipse(
             means[n], quats[n], log_scales[n], view, K, real(width), real(height), near, low_pass
         )  # fmt: skip
@@ -90,7 +118,7 @@ def make_forward(real, native: bool):
         if tiles == 0:
             return 0
 
-        # last, since most of what is read belongs to it
+        # last, since it reads the most
         d = m.direction(means[n], view)
         y = basis(vec3(d[0], d[1], d[2]))
         color = vec3(real(0.5), real(0.5), real(0.5))
@@ -106,22 +134,22 @@ def make_forward(real, native: bool):
                     largest = wp.max(largest, wp.max(wp.abs(coefficients[n, k])))
         if not (m.finite3(color) and largest <= real(LARGEST_COEFFICIENT)):  # the maximum passes a NaN by, the colour has it
             return 0
-        record = vec12()
-        record[0] = e.pixel[0]
-        record[1] = e.pixel[1]
-        record[2] = factor[0]
-        record[3] = factor[1]
-        record[4] = factor[2]
-        record[5] = opacity
+        result = vec12()
+        result[0] = e.pixel[0]
+        result[1] = e.pixel[1]
+        result[2] = factor[0]
+        result[3] = factor[1]
+        result[4] = factor[2]
+        result[5] = opacity
         for channel in range(3):
-            record[6 + channel] = wp.max(color[channel], real(0.0))
-        record[9] = e.position[2]
-        record[10] = half_width
-        record[11] = half_height
-        store(splats, i, record)
+            result[6 + channel] = wp.max(color[channel], real(0.0))
+        result[9] = e.position[2]
+        result[10] = half_width
+        result[11] = half_height
+        store(projected, i, result)
         return tiles
 
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.project.forward.{real.__name__}.{int(native)}")
+    @wp.kernel(enable_backward=False, module=module)
     def forward(
         begin: int,
         means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
@@ -131,121 +159,123 @@ def make_forward(real, native: bool):
         tile_size: int, sh_count: int,
         near: real, low_pass: real, alpha_cut: real, square_sigma: real,
         # outputs
-        splats: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
+        projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
     ):  # fmt: skip
         i = begin + wp.tid()
         count = means.shape[0]
         camera = i // count
         n = i - camera * count
-        tiles = draw(
+        tiles = project_one(
             i, n, viewmats[camera], Ks[camera], means, quats, log_scales, logit_opacities, opacity_factors, coefficients,
             width, height, origin_x, origin_y, window_width, window_height, tile_size, sh_count,
-            near, low_pass, alpha_cut, square_sigma, splats,
+            near, low_pass, alpha_cut, square_sigma, projected,
         )  # fmt: skip
         tile_counts[i] = tiles
         if tiles == 0:
-            store(splats, i, vec12())
+            store(projected, i, vec12())
 
     return forward
 
 
-def _inputs(means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks) -> list[wp.array]:
-    m = make_projection(bridge.real_of(means))
-    types = (m.vec3, m.vec4, m.vec3, bridge.real_of(means), m.vec3, m.mat44, m.mat33)
+def _inputs(means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks) -> list[interop.View]:
+    t = make_types(interop.real_of(means))
+    types = (t.vec3, t.vec4, t.vec3, interop.real_of(means), t.vec3, t.mat44, t.mat33)
     tensors = (means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks)
-    return [bridge.view(t, dtype) for t, dtype in zip(tensors, types)]
+    return [interop.view(tensor, dtype) for tensor, dtype in zip(tensors, types)]
 
 
 def _native(tensor: torch.Tensor) -> bool:
+    """Return whether the CUDA variants of the kernels apply."""
     return tensor.is_cuda and tensor.dtype == torch.float32
 
 
-def records(
-    tensors: Sequence[torch.Tensor], factors, size, window, sh_count, rule, tile, memory: Memory = TORCH
+def project_tensors(
+    tensors: Sequence[torch.Tensor], factors: torch.Tensor, settings: ProjectSettings, allocator: Allocator = TORCH
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """What `project` returns for contiguous tensors, as plain numbers. Nothing is checked.
+    """Return what `project` returns, for contiguous tensors. Nothing is checked, and no gradient is recorded.
 
     Args:
-        tensors: The seven that `project` takes.
-        factors: Those of opacities, or none, shape [0].
-        size: Width and height of the picture [px].
-        window: As in `project`, not None.
-        sh_count: Coefficients a channel that are used.
-        rule: Cut-offs.
-        tile: Side of a tile [px].
-        memory: Where to put the records.
+        tensors: The seven tensors that `project` takes.
+        factors: Opacity factors, shape [N]; shape [0] for none.
+        settings: Everything else.
+        allocator: Provider of the results' memory.
     """
-    means, real = tensors[0], bridge.real_of(tensors[0])
-    cameras, count = len(tensors[5]), len(means)
-    splats = memory.own((cameras, count, RECORD), means.dtype, means.device)
-    tile_counts = memory.own((cameras, count), torch.int32, means.device)
+    means, real = tensors[0], interop.real_of(tensors[0])
+    cameras, count, rule = len(tensors[5]), len(means), settings.rule
+    projected = allocator.output((cameras, count, PROJECTED_SIZE), means.dtype, means.device)
+    tile_counts = allocator.output((cameras, count), torch.int32, means.device)
     inputs = [
-        *_inputs(*tensors), bridge.view(factors, real), *size, *window, tile, sh_count,
-        rule.near, rule.low_pass, rule.alpha_cut, rule.square_sigma,
-        bridge.view(splats.view(-1, RECORD), real), bridge.view(tile_counts.view(-1), wp.int32),
+        *_inputs(*tensors), interop.view(factors, real), *settings.size, *settings.window,
+        settings.tile_size, settings.sh_count, rule.near, rule.low_pass, rule.alpha_cut, rule.square_sigma,
+        interop.view(projected.view(-1, PROJECTED_SIZE), real), interop.view(tile_counts.view(-1), wp.int32),
     ]  # fmt: skip
-    bridge.launch(make_forward(real, _native(means)), cameras * count, inputs, means.device, cost=5)
-    return splats, tile_counts
+    kernel = make_forward(real, _native(means), settings.camera_model)
+    interop.launch(kernel, cameras * count, inputs, means.device, cost=5)
+    return projected, tile_counts
 
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx, means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks, factors, size, window, sh_count, rule, tile
-    ):  # fmt: skip
+    def forward(ctx, means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks, factors, settings):
         tensors = [t.contiguous() for t in (means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks)]
-        splats, tile_counts = records(tensors, factors, size, window, sh_count, rule, tile)
-        ctx.save_for_backward(*tensors, splats, tile_counts)
-        ctx.how = (size, sh_count, rule)
+        projected, tile_counts = project_tensors(tensors, factors, settings)
+        ctx.save_for_backward(*tensors, projected, tile_counts)
+        ctx.settings = settings
         ctx.mark_non_differentiable(tile_counts)
         ctx.set_materialize_grads(False)  # else torch makes zeros for the counts
-        return splats, tile_counts
+        return projected, tile_counts
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, v_splats, _):
-        *tensors, splats, tile_counts = ctx.saved_tensors
+    def backward(ctx, v_projected, _):
+        *tensors, projected, tile_counts = ctx.saved_tensors
         wants_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
-        return *gradients(tensors, *ctx.how, splats, tile_counts, v_splats, wants_camera), *(None,) * 6
+        found = project_gradients(tensors, ctx.settings, projected, tile_counts, v_projected, wants_camera=wants_camera)
+        return *found, None, None
 
 
-def gradients(
-    tensors: Sequence[torch.Tensor], size, sh_count, rule, splats, tile_counts, v_splats, wants_camera: bool,
-    memory: Memory = TORCH,
-) -> list[torch.Tensor | None]:  # fmt: skip
-    """Gradients of the seven tensors from that of the records, which may be None. Nothing is checked.
+def project_gradients(
+    tensors: Sequence[torch.Tensor],
+    settings: ProjectSettings,
+    projected: torch.Tensor,
+    tile_counts: torch.Tensor,
+    v_projected: torch.Tensor | None,
+    *,
+    wants_camera: bool,
+    allocator: Allocator = TORCH,
+) -> list[torch.Tensor | None]:
+    """Return the gradients of the seven tensors that `project` takes. Nothing is checked.
 
     Args:
-        tensors: The seven that `project` takes, contiguous.
-        size: Width and height of the picture [px].
-        sh_count: Coefficients a channel that are used.
-        rule: Cut-offs.
-        splats: What `records` returned, as is the next.
-        tile_counts: See there.
-        v_splats: Gradient of the records.
-        wants_camera: Whether those of viewmats and Ks are wanted; else they are None.
-        memory: Where to put the gradients.
+        tensors: The seven tensors, contiguous.
+        settings: The settings of the forward pass.
+        projected: First result of `project_tensors`.
+        tile_counts: Second result of `project_tensors`.
+        v_projected: Gradient of ``projected``; None for zero.
+        wants_camera: True to compute the gradients of viewmats and Ks; else they are None.
+        allocator: Provider of the gradients' memory.
     """
-    real, device = bridge.real_of(splats), splats.device
-    m = make_projection(real)
-    v_splats = torch.zeros_like(splats) if v_splats is None else v_splats.contiguous()
-    native = _native(splats)  # writes zeros itself
-    found = [memory.own(t.shape, t.dtype, device) for t in tensors[:5]]
+    real, device = interop.real_of(projected), projected.device
+    t, (width, height), rule = make_types(real), settings.size, settings.rule
+    v_projected = torch.zeros_like(projected) if v_projected is None else v_projected.contiguous()
+    native = _native(projected)  # writes zeros itself
+    found = [allocator.output(tensor.shape, tensor.dtype, device) for tensor in tensors[:5]]
     if not native:
-        for t in found:
-            t.zero_()
+        for gradient in found:
+            gradient.zero_()
     cameras, count = len(tensors[5]), len(tensors[0])
     rows = (cameras, count) if wants_camera else (0, 0)
-    v_viewmats, v_Ks = (splats.new_zeros(*rows, n, n) if wants_camera else splats.new_empty(*rows, n, n) for n in (4, 3))
-    outputs = [bridge.view(g, t) for g, t in zip(found, (m.vec3, m.vec4, m.vec3, real, m.vec3))]
+    v_viewmats, v_Ks = (projected.new_zeros(*rows, n, n) if wants_camera else projected.new_empty(*rows, n, n) for n in (4, 3))
+    outputs = [interop.view(g, dtype) for g, dtype in zip(found, (t.vec3, t.vec4, t.vec3, real, t.vec3))]
     inputs = [
-        *_inputs(*tensors), *size, sh_count, rule.near, rule.low_pass,
-        bridge.view(splats.view(-1, RECORD), real), bridge.view(tile_counts.view(-1), wp.int32),
-        bridge.view(v_splats.view(-1, RECORD), real),
-        int(wants_camera), *outputs, bridge.view(v_viewmats, m.mat44), bridge.view(v_Ks, m.mat33),
+        *_inputs(*tensors), width, height, settings.sh_count, rule.near, rule.low_pass,
+        interop.view(projected.view(-1, PROJECTED_SIZE), real), interop.view(tile_counts.view(-1), wp.int32),
+        interop.view(v_projected.view(-1, PROJECTED_SIZE), real),
+        int(wants_camera), *outputs, interop.view(v_viewmats, t.mat44), interop.view(v_Ks, t.mat33),
     ]  # fmt: skip
     threads = -(-count // BLOCK) * BLOCK if native else count
-    bridge.launch(make_backward(real, native), threads, inputs, device, cost=10 * cameras, block_dim=BLOCK)
+    kernel = make_backward(real, native, settings.camera_model)
+    interop.launch(kernel, threads, inputs, device, cost=10 * cameras, block_dim=BLOCK)
     return [*found, *((v_viewmats.sum(1), v_Ks.sum(1)) if wants_camera else (None, None))]
 
 
@@ -265,11 +295,12 @@ def project(
     tile_size: int = 16,
     opacity_factors: torch.Tensor | None = None,
     window: tuple[int, int, int, int] | None = None,
+    camera_model: str = "pinhole",
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Project N Gaussians into C cameras (EWA, first order).
 
-    Differentiable in every tensor. A Gaussian is culled, with an all-zero record and zero gradients, where its depth is
-    below ``rule.near``, its opacity below the cut, its box outside the image, a parameter that is read not finite, or
+    Differentiable in every tensor. A Gaussian is culled, with zeros for results and gradients, where its depth is
+    below ``rule.near``, its opacity below the cut, its box outside the image, or a parameter that is read not finite or
     outside the ranges of docs/conventions.md (depth 1e10 u, projected mean 1e9 px, axes 1e30 px, coefficients 1e6).
     Derivation of the backward pass: docs/project.md.
 
@@ -278,7 +309,7 @@ def project(
         quats: Rotations wxyz of any length from 1e-15 to 1e15, shape [N, 4].
         log_scales: Logarithm of the axis lengths [u], shape [N, 3].
         logit_opacities: Inverse sigmoid of the opacity, shape [N].
-        sh_coefficients: Colour coefficients, shape [N, K, 3].
+        sh_coefficients: Spherical-harmonics coefficients of the colour, shape [N, K, 3].
         viewmats: camera_from_world, shape [C, 4, 4].
         Ks: Intrinsics [px] with zero skew, shape [C, 3, 3].
         width: Image width [px].
@@ -286,20 +317,23 @@ def project(
         degree: Spherical-harmonics degree used, 0 to 3.
         rule: Cut-offs.
         tile_size: Side of a tile [px].
-        opacity_factors: Numbers that the opacities are multiplied by, at least 0, shape [N]; None for 1. Not differentiable.
-        window: Left, top, width and height [px] of the part of the image that is wanted, from a tile's corner on; None for all.
-            What touches no tile in it is culled.
+        opacity_factors: Factors of the opacities, at least 0, shape [N]; None for 1. Not differentiable.
+        window: Left, top, width and height [px] of the part of the image to render, from a tile's corner on; None for all.
+            Gaussians that touch no tile in it are culled.
+        camera_model: Name of the camera model (`warpgs.kernels.cameras`).
 
     Returns:
-        ``splats`` [C, N, 12], records laid out as ``RECORD`` says, and ``tile_counts`` [C, N] int32, the number of tiles
+        ``projected`` [C, N, 12], laid out as `PROJECTED_SIZE` says, and ``tile_counts`` [C, N] int32, the number of tiles
         each touches (0 where culled; no gradient).
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
+        UsageError: The camera model is unknown.
         ValueError: A shape or device disagrees; the message names argument, wanted and found.
     """
+    CAMERA_MODELS.find(camera_model)
     sh_count = sh.coefficient_count(degree)
-    sizes = bridge.check(
+    sizes = interop.check(
         means=(means, "N 3"), quats=(quats, "N 4"), log_scales=(log_scales, "N 3"),
         logit_opacities=(logit_opacities, "N"), sh=(sh_coefficients, "N K 3"),
         viewmats=(viewmats, "C 4 4"), Ks=(Ks, "C 3 3"),
@@ -311,10 +345,9 @@ def project(
     if opacity_factors is None:
         opacity_factors = means.new_empty(0)
     else:
-        bridge.check(means=(means, "N 3"), opacity_factors=(opacity_factors, "N"))
+        interop.check(means=(means, "N 3"), opacity_factors=(opacity_factors, "N"))
     factors = opacity_factors.detach().contiguous()
-    size, window = (width, height), window or (0, 0, width, height)
+    settings = ProjectSettings((width, height), window or (0, 0, width, height), sh_count, rule, tile_size, camera_model)
     return _Project.apply(
-        means, quats, log_scales, logit_opacities, sh_coefficients, viewmats, Ks,
-        factors, size, window, sh_count, rule, tile_size,
+        means, quats, log_scales, logit_opacities, sh_coefficients, viewmats, Ks, factors, settings,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The backward kernel of `project`; docs/project.md has the derivation, by whose sections the comments go."""
+"""The backward kernel of `project`. Comments name the sections of docs/project.md, which has the derivation."""
 
 import functools
 from types import SimpleNamespace
@@ -11,9 +11,10 @@ from warpgs.kernels.native import make_functions as make_native
 
 
 @functools.cache
-def make_functions(real):
-    """The gradients of one Gaussian from that of its record, for one scalar type."""
-    m = make_projection(real)
+def make_functions(real, camera_model: str):
+    """Make the functions that take the gradients of one projected Gaussian to those of its parameters."""
+    m = make_projection(real, camera_model)
+    vec2 = m.vec2
     vec3 = m.vec3
     vec4 = m.vec4
     vec16 = sh.make_functions(real).vec16
@@ -22,9 +23,9 @@ def make_functions(real):
 
     @wp.struct
     class ShapeGradient:
-        """What the mean in the image, the factor and the depth of a record say."""
+        """Gradients by way of the mean in the image, the factor and the depth of one projected Gaussian."""
 
-        mean: vec3  # without what the colour adds
+        mean: vec3  # less the part that comes by way of the colour
         quat: vec4
         log_scale: vec3
         position: vec3  # of the position in the camera
@@ -35,13 +36,10 @@ def make_functions(real):
     @wp.func
     def shape(
         mean: vec3, quat: vec4, log_scale: vec3, view: m.mat44, K: mat33,
-        width: real, height: real, near: real, low_pass: real, v_splats: wp.array2d(dtype=real), i: int,
+        width: real, height: real, near: real, low_pass: real, v_projected: wp.array2d(dtype=real), i: int,
     ) -> ShapeGradient:  # fmt: skip
         g = ShapeGradient()
         e = m.ellipse(mean, quat, log_scale, view, K, width, height, near, low_pass)
-        x = e.position[0]
-        y = e.position[1]
-        z = e.position[2]
         rotation = mat33(
             view[0, 0], view[0, 1], view[0, 2],
             view[1, 0], view[1, 1], view[1, 2],
@@ -51,13 +49,13 @@ def make_functions(real):
         # factor -> projected axes (section 4); v_u and u are both per shrunk pixel
         inv_c = real(1.0) / wp.sqrt(e.c)
         inv_det = real(1.0) / wp.sqrt(e.det)
-        t11 = v_splats[i, 2] * e.shrink * (e.c * inv_c * inv_det)
-        t12 = v_splats[i, 3] * e.shrink * (-e.b * inv_c * inv_det)
-        t22 = v_splats[i, 4] * e.shrink * inv_c
+        t11 = v_projected[i, 2] * e.shrink * (e.c * inv_c * inv_det)
+        t12 = v_projected[i, 3] * e.shrink * (-e.b * inv_c * inv_det)
+        t22 = v_projected[i, 4] * e.shrink * inv_c
         # twice v_det det and v_c c, times shrink; det and c divide vectors of their own size, or needles overflow
         s_det = -(t11 + t12) * e.shrink
         s_c = (t11 - t12 - t22) * e.shrink
-        v_b = -v_splats[i, 3] * e.shrink * inv_c * (e.shrink * inv_det)
+        v_b = -v_projected[i, 3] * e.shrink * inv_c * (e.shrink * inv_det)
         blur = low_pass * e.shrink * e.shrink
         normal = wp.cross(e.m1, e.m2)
         per_det = real(1.0) / e.det
@@ -65,72 +63,43 @@ def make_functions(real):
         v_m1 = s_det * (per_det * (wp.cross(e.m2, normal) + blur * e.m1)) + v_b * e.m2
         v_m2 = s_det * (per_det * (wp.cross(normal, e.m1) + blur * e.m2)) + v_b * e.m1 + s_c * (per_c * e.m2)
 
-        # projected axes -> camera axes and Jacobian (section 3)
-        fx = K[0, 0]
-        fy = K[1, 1]
-        inv_z = real(1.0) / z
-        jx = fx * inv_z
-        jy = fy * inv_z
-        jxz = (K[0, 2] - e.clamped[0]) * inv_z
-        jyz = (K[1, 2] - e.clamped[1]) * inv_z
+        # projected axes -> camera axes (section 3)
+        v_axes = m.axes_backward(e.position, K, e.expansion_point, v_m1, v_m2)
         axes0 = vec3(e.axes[0, 0], e.axes[0, 1], e.axes[0, 2])
         axes1 = vec3(e.axes[1, 0], e.axes[1, 1], e.axes[1, 2])
         axes2 = vec3(e.axes[2, 0], e.axes[2, 1], e.axes[2, 2])
-        v_jx = wp.dot(v_m1, axes0)
-        v_jxz = wp.dot(v_m1, axes2)
-        v_jy = wp.dot(v_m2, axes1)
-        v_jyz = wp.dot(v_m2, axes2)
-        g0 = jx * v_m1
-        g1 = jy * v_m2
-        g2 = jxz * v_m1 + jyz * v_m2
-        v_axes = mat33(g0[0], g0[1], g0[2], g1[0], g1[1], g1[2], g2[0], g2[1], g2[2])
+        g0 = vec3(v_axes[0, 0], v_axes[0, 1], v_axes[0, 2])
+        g1 = vec3(v_axes[1, 0], v_axes[1, 1], v_axes[1, 2])
+        g2 = vec3(v_axes[2, 0], v_axes[2, 1], v_axes[2, 2])
         g.log_scale = wp.cw_mul(g0, axes0) + wp.cw_mul(g1, axes1) + wp.cw_mul(g2, axes2)
         v_turned = v_axes * wp.diag(e.scales)  # gradient of camera rotation times Gaussian rotation
         v_unit = m.rotation_backward(e.quat, wp.transpose(rotation) * v_turned)
         g.quat = (v_unit - e.quat * wp.dot(e.quat, v_unit)) / e.quat_length
 
         # mean in the image, Jacobian and depth -> position in the camera (section 3)
-        v_px = v_splats[i, 0]
-        v_py = v_splats[i, 1]
-        v_K = mat33()
-        v_x = v_px * jx
-        v_y = v_py * jy
-        v_z = -(v_px * jx * x + v_py * jy * y + v_jx * jx + v_jy * jy + v_jxz * jxz + v_jyz * jyz) * inv_z + v_splats[i, 9]
-        v_K[0, 0] = (v_px * x + v_jx) * inv_z
-        v_K[1, 1] = (v_py * y + v_jy) * inv_z
-        v_K[0, 2] = v_px
-        v_K[1, 2] = v_py
-        if e.clamped[0] == e.pixel[0]:  # the Jacobian moves with the mean: cx - px = -fx x / z
-            v_x -= v_jxz * jx * inv_z
-            v_z += v_jxz * jx * x * inv_z * inv_z
-            v_K[0, 0] = v_K[0, 0] - v_jxz * x * inv_z * inv_z
-        else:
-            v_K[0, 2] = v_K[0, 2] + v_jxz * inv_z
-        if e.clamped[1] == e.pixel[1]:
-            v_y -= v_jyz * jy * inv_z
-            v_z += v_jyz * jy * y * inv_z * inv_z
-            v_K[1, 1] = v_K[1, 1] - v_jyz * y * inv_z * inv_z
-        else:
-            v_K[1, 2] = v_K[1, 2] + v_jyz * inv_z
-        g.position = vec3(v_x, v_y, v_z)
+        v_pixel = vec2(v_projected[i, 0], v_projected[i, 1])
+        c = m.position_backward(
+            e.position, K, e.pixel, e.expansion_point, e.axes, v_m1, v_m2, v_pixel, v_projected[i, 9]
+        )  # fmt: skip
+        g.position = c.v_position
         g.mean = wp.transpose(rotation) * g.position
         g.turned = v_turned
         g.unit = e.quat
-        g.K = v_K
+        g.K = c.v_K
         return g
 
     @wp.func
-    def color(splats: wp.array2d(dtype=real), v_splats: wp.array2d(dtype=real), i: int) -> vec3:
-        """Gradient of the colour before its clamp at zero (section 5)."""
-        v_color = vec3(v_splats[i, 6], v_splats[i, 7], v_splats[i, 8])
+    def color(projected: wp.array2d(dtype=real), v_projected: wp.array2d(dtype=real), i: int) -> vec3:
+        """Return the gradient of the colour before its clamp at zero (section 5)."""
+        v_color = vec3(v_projected[i, 6], v_projected[i, 7], v_projected[i, 8])
         for channel in range(3):
-            if not (splats[i, 6 + channel] > real(0.0)):  # clamped at zero
+            if not (projected[i, 6 + channel] > real(0.0)):  # clamped at zero
                 v_color[channel] = real(0.0)
         return v_color
 
     @wp.func
     def centered(d: vec4, w: vec16) -> vec3:
-        """Gradient of the mean by way of the direction ``d`` that it is seen in; ``w`` is that of the basis (section 5)."""
+        """Return the gradient of the mean by way of its viewing direction ``d``; ``w`` is that of the basis (section 5)."""
         v_centered = vec3()
         if d[3] > real(0.0):
             unit = vec3(d[0], d[1], d[2])
@@ -139,21 +108,25 @@ def make_functions(real):
         return v_centered
 
     @wp.func
-    def logit(splats: wp.array2d(dtype=real), v_splats: wp.array2d(dtype=real), i: int, logit_opacity: real) -> real:
-        """Gradient of the opacity's logit (section 6)."""
-        return v_splats[i, 5] * splats[i, 5] * m.sigmoid(-logit_opacity)
+    def logit(projected: wp.array2d(dtype=real), v_projected: wp.array2d(dtype=real), i: int, logit_opacity: real) -> real:
+        """Return the gradient of the opacity's logit (section 6)."""
+        return v_projected[i, 5] * projected[i, 5] * m.sigmoid(-logit_opacity)
 
     return SimpleNamespace(shape=shape, color=color, centered=centered, logit=logit)
 
 
 @functools.cache
-def make_backward(real, native: bool):
-    """The backward kernel for one scalar type: one thread per Gaussian, over all cameras, so no sum needs atomics.
+def make_backward(real, native: bool, camera_model: str):
+    """Make the backward kernel: one thread per Gaussian, over all cameras, so no sum needs atomics.
 
-    ``native`` is for CUDA and float32: the Gaussians that some camera sees are dealt to the first threads of each block.
+    Args:
+        real: wp.float32 or wp.float64.
+        native: True for CUDA and float32. The Gaussians that some camera sees are then dealt to the first threads of each
+            block.
+        camera_model: Name of the camera model, whose functions are compiled in.
     """
-    m = make_projection(real)
-    f = make_functions(real)
+    m = make_projection(real, camera_model)
+    f = make_functions(real, camera_model)
     functions = sh.make_functions(real)
     vec3 = m.vec3
     vec4 = m.vec4
@@ -165,15 +138,16 @@ def make_backward(real, native: bool):
 
     # four blocks to a multiprocessor
     registers = {"cuda_max_registers": 128} if native else {}
+    module = f"warpgs.kernels.project.backward.{real.__name__}.{int(native)}.{camera_model}"
 
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.project.backward.{real.__name__}.{int(native)}", **registers)
+    @wp.kernel(enable_backward=False, module=module, **registers)
     def backward(
         begin: int,
         means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
         logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
         viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33),
         width: int, height: int, sh_count: int, near: real, low_pass: real,
-        splats: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), v_splats: wp.array2d(dtype=real),
+        projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), v_projected: wp.array2d(dtype=real),
         camera_gradients: int,
         # outputs, zero on entry where not native
         v_means: wp.array(dtype=m.vec3), v_quats: wp.array(dtype=m.vec4), v_log_scales: wp.array(dtype=m.vec3),
@@ -206,17 +180,27 @@ def make_backward(real, native: bool):
             if tile_counts[i] > 0:
                 view = viewmats[camera]
                 g = f.shape(
-                    means[n], quats[n], log_scales[n], view, Ks[camera], real(width), real(height), near, low_pass, v_splats, i
+                    means[n],
+                    quats[n],
+                    log_scales[n],
+                    view,
+                    Ks[camera],
+                    real(width),
+                    real(height),
+                    near,
+                    low_pass,
+                    v_projected,
+                    i,
                 )
                 v_mean += g.mean
                 v_quat += g.quat
                 v_log_scale += g.log_scale
                 # before the colour: its loads need not wait for what is stored there
-                v_logit += f.logit(splats, v_splats, i, logit_opacities[n])
+                v_logit += f.logit(projected, v_projected, i, logit_opacities[n])
 
                 d = m.direction(means[n], view)
                 basis = functions.basis(vec3(d[0], d[1], d[2]))
-                v_color = f.color(splats, v_splats, i)
+                v_color = f.color(projected, v_projected, i)
                 w = vec16()
                 if wp.static(native):
                     w = color_backward(coefficients, n, sh_count, basis, v_color, stored, v_coefficients)

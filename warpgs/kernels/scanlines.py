@@ -5,23 +5,23 @@ import functools
 import torch
 import warp as wp
 
-from warpgs.kernels import bridge
+from warpgs.runtime import interop
 
 BLOCK = 32
-"""Threads of a block: there are some hundred lines, which more blocks spread over more multiprocessors."""
+"""Threads of a block: few, so that some hundred lines spread over many multiprocessors."""
 FAR_AWAY = 2**20
-"""More than any path costs."""
+"""Number above every path cost."""
 LARGEST = 2**13 - 1
-"""Costs plus penalties up to this keep the sum of four paths within 16 bits with a sign."""
+"""Largest cost plus penalties for which the sum of four paths fits into 16 bits with a sign."""
 
 
 @functools.cache
 def make_kernel():
-    """The kernel; a thread owns a line."""
+    """Make the kernel; a thread owns a line."""
 
     @wp.kernel(enable_backward=False, module="warpgs.kernels.scanlines")
     def follow(
-        begin: int, costs: wp.array2d(dtype=wp.int16), limits: wp.array(dtype=int), small: int, planes: int,
+        begin: int, costs: wp.array2d(dtype=wp.int16), bounds: wp.array(dtype=int), small: int, planes: int,
         # pixels of a line: where it starts, from one to the next, how many; the same for the steps between them
         line_step: int, pixel_step: int, length: int, line_edge: int, pixel_edge: int,
         # outputs
@@ -38,9 +38,9 @@ def make_kernel():
                     j = length - 1 - k
                     edge = j
                 pixel = line * line_step + j * pixel_step
-                most = int(0)  # what any change of depth may add to the best of the pixel before
+                most = int(0)  # the most that any change of depth may add to the best of the pixel before
                 if k > 0:
-                    most = lowest + limits[line * line_edge + edge * pixel_edge]
+                    most = lowest + bounds[line * line_edge + edge * pixel_edge]
                 left = int(FAR_AWAY)
                 here = path[line, 0]
                 least = int(FAR_AWAY)
@@ -60,7 +60,7 @@ def make_kernel():
 
 
 def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor, small: int) -> torch.Tensor:
-    """Sum of the path costs from above, below, left and right.
+    """Return the sum of the path costs from above, below, left and right.
 
     A path's cost at pixel k and plane d is L(k, d) = C(k, d) + min(L(k-1, d), L(k-1, d +- 1) + small, min_i L(k-1, i) + limit)
     - min_i L(k-1, i), with the limit of the step from k - 1 to k (Hirschmüller 2008, eq. 13). Not differentiable.
@@ -88,15 +88,15 @@ def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor
                 f"not {tensor.dtype} of shape {list(tensor.shape)} on {tensor.device}"
             )
     total = torch.zeros_like(costs, memory_format=torch.contiguous_format)
-    flat = [bridge.view(t.contiguous().view(-1, planes), wp.int16) for t in (costs, total)]
-    for lines, length, steps, limits, edges in (
+    flat = [interop.view(t.contiguous().view(-1, planes), wp.int16) for t in (costs, total)]
+    for lines, length, steps, bounds, edges in (
         (width, height, (1, width), down, (1, width)),
         (height, width, (width, 1), across, (width - 1, 1)),
     ):
         path = torch.empty(lines, planes + 1, dtype=torch.int32, device=costs.device)
         inputs = [
-            flat[0], bridge.view(limits.contiguous().view(-1), wp.int32), small, planes, *steps, length, *edges,
-            bridge.view(path, wp.int32), flat[1],
+            flat[0], interop.view(bounds.contiguous().view(-1), wp.int32), small, planes, *steps, length, *edges,
+            interop.view(path, wp.int32), flat[1],
         ]  # fmt: skip
-        bridge.launch(make_kernel(), lines, inputs, costs.device, cost=max(1, length * planes // 2), block_dim=BLOCK)
+        interop.launch(make_kernel(), lines, inputs, costs.device, cost=max(1, length * planes // 2), block_dim=BLOCK)
     return total

@@ -1,15 +1,13 @@
-"""Spherical harmonics up to degree 3: the basis that projection uses, and the basis as an op of its own."""
+"""Spherical harmonics up to degree 3: constants, the basis, and its gradient (docs/sh.md)."""
 
 import functools
 from types import SimpleNamespace
 
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
-
-from warpgs.kernels import bridge
 
 MAX_DEGREE = 3
+"""Highest degree of the basis."""
 
 # Normalisations of the real basis: sqrt((2l+1)/(4 pi) (l-|m|)!/(l+|m|)!) times the factor of each polynomial below.
 C0 = 0.28209479177387814  # 1/2 sqrt(1/pi)
@@ -25,21 +23,39 @@ C322 = 1.445305721320277  # 1/4 sqrt(105/pi)
 
 
 def coefficient_count(degree: int) -> int:
-    """Number of coefficients per channel up to a degree; ValueError outside 0..3."""
+    """Return the number of coefficients per channel up to a degree.
+
+    Raises:
+        ValueError: The degree is not 0 to 3.
+    """
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"spherical-harmonics degree must be 0 to {MAX_DEGREE}, not {degree}")
     return (degree + 1) ** 2
 
 
+def basis(directions: torch.Tensor) -> torch.Tensor:
+    """Return the 16 basis values [N, 16] at unit directions [N, 3], for references; kernels use `make_functions`."""
+    x, y, z = directions.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
+    values = [
+        C0 * torch.ones_like(x), -C1 * y, C1 * z, -C1 * x,
+        C2 * x * y, -C2 * y * z, C20 * (2 * zz - xx - yy), -C2 * x * z, C22 * (xx - yy),
+        -C33 * y * (3 * xx - yy), C32 * x * y * z, -C31 * y * (4 * zz - xx - yy),
+        C30 * z * (2 * zz - 3 * xx - 3 * yy), -C31 * x * (4 * zz - xx - yy), C322 * z * (xx - yy),
+        -C33 * x * (xx - 3 * yy),
+    ]  # fmt: skip
+    return torch.stack(values, -1)
+
+
 @functools.cache
 def make_functions(real):
-    """The basis and its gradient for one scalar type, with the signs of Kerbl et al. 2023."""
+    """Make the basis and its gradient for one scalar type, with the signs of Kerbl et al. 2023."""
     vec3 = wp.types.vector(3, real)
     vec16 = wp.types.vector(16, real)
 
     @wp.func
     def basis(d: vec3) -> vec16:
-        """The 16 basis values at a unit direction."""
+        """Return the 16 basis values at a unit direction."""
         x = d[0]
         y = d[1]
         z = d[2]
@@ -67,7 +83,7 @@ def make_functions(real):
 
     @wp.func
     def basis_backward(d: vec3, w: vec16) -> vec3:
-        """Gradient of sum(w * basis(d)) for a free vector d."""
+        """Return the gradient of sum(w * basis(d)) for a free vector d."""
         x = d[0]
         y = d[1]
         z = d[2]
@@ -97,95 +113,3 @@ def make_functions(real):
         return vec3(v_x, v_y, v_z)
 
     return SimpleNamespace(basis=basis, basis_backward=basis_backward, vec3=vec3, vec16=vec16)
-
-
-@functools.cache
-def make_kernels(real):
-    """Forward and backward of the op for one scalar type."""
-    f = make_functions(real)
-    vec3 = f.vec3
-    vec16 = f.vec16
-
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.sh.{real.__name__}")
-    def forward(
-        begin: int, sh: wp.array2d(dtype=vec3), dirs: wp.array(dtype=vec3), count: int,
-        # outputs
-        colors: wp.array(dtype=vec3),
-    ):  # fmt: skip
-        n = begin + wp.tid()
-        y = f.basis(dirs[n])
-        color = vec3()
-        for k in range(16):
-            if k < count:
-                color += y[k] * sh[n, k]
-        colors[n] = color
-
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.sh.{real.__name__}")
-    def backward(
-        begin: int, sh: wp.array2d(dtype=vec3), dirs: wp.array(dtype=vec3), count: int, v_colors: wp.array(dtype=vec3),
-        # outputs
-        v_sh: wp.array2d(dtype=vec3), v_dirs: wp.array(dtype=vec3),
-    ):  # fmt: skip
-        n = begin + wp.tid()
-        d = dirs[n]
-        v = v_colors[n]
-        y = f.basis(d)
-        w = vec16()
-        for k in range(16):
-            if k < count:
-                v_sh[n, k] = y[k] * v
-                w[k] = wp.dot(sh[n, k], v)
-        v_dirs[n] = f.basis_backward(d, w)
-
-    return SimpleNamespace(forward=forward, backward=backward, vec3=vec3)
-
-
-class _EvaluateSh(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, sh, dirs, count):
-        k = make_kernels(bridge.real_of(sh))
-        sh, dirs = sh.contiguous(), dirs.contiguous()
-        colors = torch.empty_like(dirs)
-        with bridge.stream_of(sh.device):
-            inputs = [bridge.view(sh, k.vec3), bridge.view(dirs, k.vec3), count, bridge.view(colors, k.vec3)]
-            bridge.launch(k.forward, len(dirs), inputs, sh.device, cost=2)
-        ctx.save_for_backward(sh, dirs)
-        ctx.count = count
-        return colors
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, v_colors):
-        sh, dirs = ctx.saved_tensors
-        k = make_kernels(bridge.real_of(sh))
-        v_colors = v_colors.contiguous()
-        v_sh, v_dirs = torch.zeros_like(sh), torch.empty_like(dirs)
-        arrays = [bridge.view(t, k.vec3) for t in (v_colors, v_sh, v_dirs)]
-        with bridge.stream_of(sh.device):
-            inputs = [bridge.view(sh, k.vec3), bridge.view(dirs, k.vec3), ctx.count, *arrays]
-            bridge.launch(k.backward, len(dirs), inputs, sh.device, cost=4)
-        return v_sh, v_dirs, None
-
-
-def evaluate_sh(sh: torch.Tensor, dirs: torch.Tensor, degree: int) -> torch.Tensor:
-    """Evaluate spherical harmonics, without the 0.5 that projection adds.
-
-    Differentiable in ``sh`` and in ``dirs``, the latter as free vectors. Derivation: docs/sh.md.
-
-    Args:
-        sh: Coefficients, shape [N, K, 3] with K at least (degree + 1)^2.
-        dirs: Unit directions from the camera to the Gaussian, shape [N, 3].
-        degree: Highest degree evaluated, 0 to 3.
-
-    Returns:
-        Colours, shape [N, 3].
-
-    Raises:
-        TypeError: A scalar type is not float32 or float64, or the two differ.
-        ValueError: A shape or device disagrees, or K is too small for the degree.
-    """
-    count = coefficient_count(degree)
-    sizes = bridge.check(sh=(sh, "N K 3"), dirs=(dirs, "N 3"))
-    if sizes["K"] < count:
-        raise ValueError(f"sh holds {sizes['K']} coefficients a channel, degree {degree} needs {count}")
-    return _EvaluateSh.apply(sh, dirs, count)

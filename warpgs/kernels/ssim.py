@@ -1,6 +1,6 @@
 """Structural similarity with an 11 x 11 Gaussian window (Wang et al. 2004), separable, forward and backward.
 
-Five sums run through the window: of a, b, a^2, b^2 and (a - b)^2; backward, three. Images are flat rows of width * channels.
+Five sums run through the window, of a, b, a^2, b^2 and (a - b)^2; backward three. Images are flat rows of width * channels.
 """
 
 import functools
@@ -10,13 +10,14 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from warpgs.kernels import bridge, ssim_cpu, ssim_cuda
+from warpgs.kernels import ssim_cpu, ssim_cuda
 from warpgs.kernels.ssim_cpu import BLOCK, CHANNELS, LANES, PADDING, RADIUS, make_functions
+from warpgs.runtime import interop
 
 
 @functools.cache
 def make_kernels(real):
-    """Kernels for float64 on CUDA, a task per element: vertical passes write to global memory, with zeros on both sides."""
+    """Make the kernels for float64 on CUDA, a task per element: vertical passes write to memory, with zeros on both sides."""
     f = make_functions(real)
     kernel = functools.partial(wp.kernel, enable_backward=False, module=f"warpgs.kernels.ssim.{real.__name__}")
 
@@ -91,11 +92,11 @@ def make_kernels(real):
     return SimpleNamespace(vertical=vertical, similarity=similarity, vertical_backward=vertical_backward, combine=combine)
 
 
-class _Plan:
-    """Sizes, scratch memory and launches for one image shape [B, H, W, 3]."""
+class _Launcher:
+    """Sizes, workspace and launches for one image shape [B, H, W, 3]."""
 
     def __init__(self, image: torch.Tensor, summed: bool = False):
-        self.device, self.real = image.device, bridge.real_of(image)
+        self.device, self.real = image.device, interop.real_of(image)
         batch, self.height, width, _ = image.shape
         self.rows, self.columns = batch * self.height, width * CHANNELS
         self.blocks = -(-self.height // BLOCK)
@@ -103,22 +104,27 @@ class _Plan:
         self.blocked = self.device.type == "cpu"
         self.kernels = ssim_cpu.make_kernels(self.real, summed) if self.blocked else make_kernels(self.real)
 
-    def flat(self, tensor: torch.Tensor) -> wp.array:
-        return bridge.view(tensor.view(-1), self.real)
+    def flat(self, tensor: torch.Tensor) -> interop.View:
+        """Return a tensor as a flat kernel argument."""
+        return interop.view(tensor.view(-1), self.real)
 
-    def padded(self, count: int, like: torch.Tensor) -> list[wp.array]:
+    def padded(self, count: int, like: torch.Tensor) -> list[interop.View]:
+        """Return zeros for that many sums at each element, with padding beside each row."""
         return [self.flat(m) for m in like.new_zeros(count, self.rows * (self.columns + 2 * PADDING))]
 
     def launch(self, kernel, inputs: list, outputs: list) -> None:
-        bridge.launch(kernel, self.rows * self.columns, [*inputs, self.columns, *outputs], self.device)
+        """Launch a kernel of one task per element."""
+        interop.launch(kernel, self.rows * self.columns, [*inputs, self.columns, *outputs], self.device)
 
     def launch_blocks(self, kernel, inputs: list, sums: int, outputs: list, like: torch.Tensor) -> None:
-        scratch = like.new_empty(self.tasks * sums * (self.columns + 2 * PADDING))
-        inputs = [*inputs, self.height, self.blocks, self.columns, self.flat(scratch), *map(self.flat, outputs)]
-        bridge.launch(kernel, self.tasks, inputs, self.device, cost=BLOCK * self.columns)
+        """Launch a kernel of one task per block of rows, with workspace for that many sums."""
+        workspace = like.new_empty(self.tasks * sums * (self.columns + 2 * PADDING))
+        inputs = [*inputs, self.height, self.blocks, self.columns, self.flat(workspace), *map(self.flat, outputs)]
+        interop.launch(kernel, self.tasks, inputs, self.device, cost=BLOCK * self.columns)
 
 
 def _native(image: torch.Tensor) -> bool:
+    """Return whether the CUDA kernels apply."""
     return image.is_cuda and image.dtype == torch.float32
 
 
@@ -130,17 +136,17 @@ class _Ssim(torch.autograd.Function):
             result, *partials = ssim_cuda.forward(image, target, summed=False)
             ctx.save_for_backward(image, target, *partials)
             return result
-        plan = _Plan(image)
+        launcher = _Launcher(image)
         result = torch.empty_like(image)
         partials = [torch.empty_like(image) for _ in range(3)]
-        pair = [plan.flat(image), plan.flat(target)]
-        if plan.blocked:
-            plan.launch_blocks(plan.kernels.forward, pair, 5, [result, *partials], image)
+        pair = [launcher.flat(image), launcher.flat(target)]
+        if launcher.blocked:
+            launcher.launch_blocks(launcher.kernels.forward, pair, 5, [result, *partials], image)
         else:
-            moments = plan.padded(5, image)
-            with bridge.stream_of(plan.device):
-                plan.launch(plan.kernels.vertical, [*pair, plan.height], moments)
-                plan.launch(plan.kernels.similarity, moments, [plan.flat(t) for t in (result, *partials)])
+            moments = launcher.padded(5, image)
+            with interop.stream_of(launcher.device):
+                launcher.launch(launcher.kernels.vertical, [*pair, launcher.height], moments)
+                launcher.launch(launcher.kernels.similarity, moments, [launcher.flat(t) for t in (result, *partials)])
         ctx.save_for_backward(image, target, *partials)
         return result
 
@@ -150,18 +156,18 @@ class _Ssim(torch.autograd.Function):
         image, target, *partials = ctx.saved_tensors
         if _native(image):
             return ssim_cuda.backward(image, target, partials, v_result, summed=False), None
-        plan = _Plan(image)
-        v_image, pair = torch.empty_like(image), [plan.flat(image), plan.flat(target)]
-        if plan.blocked:
-            fields = [plan.flat(v_result * t) for t in partials]
-            inputs = [*pair, *fields, fields[0]]  # the last is read only where sums are wanted
-            plan.launch_blocks(plan.kernels.backward, inputs, 3, [v_image], image)
+        launcher = _Launcher(image)
+        v_image, pair = torch.empty_like(image), [launcher.flat(image), launcher.flat(target)]
+        if launcher.blocked:
+            fields = [launcher.flat(v_result * t) for t in partials]
+            inputs = [*pair, *fields, fields[0]]  # the last is read only for sums
+            launcher.launch_blocks(launcher.kernels.backward, inputs, 3, [v_image], image)
         else:
-            sums = plan.padded(3, image)
-            with bridge.stream_of(plan.device):
-                inputs = [plan.flat(t) for t in (v_result.contiguous(), *partials)]
-                plan.launch(plan.kernels.vertical_backward, [*inputs, plan.height], sums)
-                plan.launch(plan.kernels.combine, [*sums, *pair], [plan.flat(v_image)])
+            sums = launcher.padded(3, image)
+            with interop.stream_of(launcher.device):
+                inputs = [launcher.flat(t) for t in (v_result.contiguous(), *partials)]
+                launcher.launch(launcher.kernels.vertical_backward, [*inputs, launcher.height], sums)
+                launcher.launch(launcher.kernels.combine, [*sums, *pair], [launcher.flat(v_image)])
         return v_image, None
 
 
@@ -173,11 +179,11 @@ class _Differences(torch.autograd.Function):
             sums, *partials = ssim_cuda.forward(image, target, summed=True)
             ctx.save_for_backward(image, target, *partials)
             return sums.sum(0)
-        plan = _Plan(image, summed=True)
-        sums = image.new_empty(plan.tasks, 2)
+        launcher = _Launcher(image, summed=True)
+        sums = image.new_empty(launcher.tasks, 2)
         partials = [torch.empty_like(image) for _ in range(3)]
-        pair = [plan.flat(image), plan.flat(target)]
-        plan.launch_blocks(plan.kernels.forward, pair, 5, [sums, *partials], image)
+        pair = [launcher.flat(image), launcher.flat(target)]
+        launcher.launch_blocks(launcher.kernels.forward, pair, 5, [sums, *partials], image)
         ctx.save_for_backward(image, target, *partials)
         return sums.sum(0)
 
@@ -187,24 +193,24 @@ class _Differences(torch.autograd.Function):
         image, target, *partials = ctx.saved_tensors
         if _native(image):
             return ssim_cuda.backward(image, target, partials, v_sums, summed=True), None
-        plan = _Plan(image, summed=True)
+        launcher = _Launcher(image, summed=True)
         v_image = torch.empty_like(image)
-        inputs = [plan.flat(t) for t in (image, target, *partials, v_sums.contiguous())]
-        plan.launch_blocks(plan.kernels.backward, inputs, 3, [v_image], image)
+        inputs = [launcher.flat(t) for t in (image, target, *partials, v_sums.contiguous())]
+        launcher.launch_blocks(launcher.kernels.backward, inputs, 3, [v_image], image)
         return v_image, None
 
 
 def _check(image: torch.Tensor, target: torch.Tensor) -> None:
+    """Check shapes, types and devices of two images or batches."""
     pattern = "B H W 3" if isinstance(image, torch.Tensor) and image.ndim == 4 else "H W 3"
-    bridge.check(image=(image, pattern), target=(target, pattern))
+    interop.check(image=(image, pattern), target=(target, pattern))
 
 
 def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Structural similarity at every pixel and channel, the variant of the 3DGS papers.
+    """Return the structural similarity at every pixel and channel, in the variant of the 3DGS papers.
 
-    Gaussian window of 11 x 11 px with sigma 1.5, zeros outside the image, data range 1; it works for images of any size.
-    Differentiable in ``image`` only. A variance that rounding makes negative counts as 0 and passes no
-    gradient. Equal images score exactly 1.
+    Gaussian window of 11 x 11 px with sigma 1.5, zeros outside the image, data range 1, images of any size. Differentiable in
+    ``image`` only. A variance that rounding makes negative counts as 0 and passes no gradient. Equal images score exactly 1.
     Derivation: docs/ssim.md.
 
     Args:
@@ -229,10 +235,10 @@ def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
 
 def differences(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Sums over all pixels and channels of 1 - `ssim` and of |image - target|, what a photometric loss is made of.
+    """Return the sums over all pixels and channels of 1 - `ssim` and of |image - target|, for photometric losses.
 
-    One pass gives both, and the backward pass their gradient; for tiny images, and for float64 on CUDA, torch adds up the
-    map of `ssim`.
+    One pass computes both, and the backward pass their gradient. For tiny images, and for float64 on CUDA, torch sums the map
+    of `ssim`.
 
     Args:
         image: Colours in [0, 1], shape [H, W, 3] or [B, H, W, 3].

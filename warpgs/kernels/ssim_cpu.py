@@ -13,30 +13,33 @@ RADIUS = 5
 SIGMA = 1.5
 """Standard deviation of the window [px]."""
 C1 = 0.01**2
+"""(K1 L)^2 of Wang et al. 2004 for a data range L of 1."""
 C2 = 0.03**2
-"""(K1 L)^2 and (K2 L)^2 of Wang et al. 2004 for a data range L of 1."""
+"""(K2 L)^2 of the same."""
 
 
 def _window() -> list[float]:
+    """Return the weights of the window along one axis."""
     weights = [math.exp(-0.5 * (k / SIGMA) ** 2) for k in range(-RADIUS, RADIUS + 1)]
     return [w / sum(weights) for w in weights]
 
 
 WINDOW = _window()
+"""Weights of the window along one axis; their sum is 1."""
 
 CHANNELS = 3
-"""Colours of a pixel, and so the distance between horizontal neighbours."""
+"""Channels of a pixel, and so the distance between horizontal neighbours."""
 PADDING = RADIUS * CHANNELS
-"""Zeros beside a row of sums, so that a horizontal pass needs no border."""
+"""Number of zeros beside a row of sums, so that a horizontal pass needs no border."""
 LANES = 16
-"""Neighbouring elements that are computed together on a CPU: a loop that vectorises."""
+"""Neighbouring elements that are computed together on a CPU, in a loop that vectorises."""
 BLOCK = 8
-"""Rows that one task computes on a CPU. The sums of a row stay in its cache between the vertical and the horizontal pass."""
+"""Rows that one task computes on a CPU. The sums of a row stay in cache between the vertical and the horizontal pass."""
 
 
 @functools.cache
 def make_functions(real):
-    """What the kernels for both kinds of device share, for one scalar type."""
+    """Make the functions that the kernels of both kinds of device share, for one scalar type."""
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)
     vec5 = wp.types.vector(5, real)
@@ -46,13 +49,13 @@ def make_functions(real):
 
     @wp.func
     def tap(k: wp.int32) -> real:
-        """Weight at a distance of |k| rows or columns, 0 beyond the window."""
+        """Return the weight at a distance of |k| rows or columns, 0 beyond the window."""
         w = vec6(w0, w1, w2, w3, w4, w5)
         return wp.where(wp.abs(k) <= RADIUS, w[wp.min(wp.abs(k), RADIUS)], real(0.0))
 
     @wp.func
     def at(first: wp.int32, lane: wp.int32) -> wp.int32:
-        """An index that the compiler can see is not negative.
+        """Return an index that the compiler can see is not negative.
 
         Warp counts negative ones from the end of the array. Where that cannot be ruled out, the loads of neighbouring lanes
         are not known to be neighbours, and each lane is fetched on its own.
@@ -61,7 +64,7 @@ def make_functions(real):
 
     @wp.func
     def across(m: wp.array(dtype=real), first: wp.int32, lane: wp.int32) -> real:
-        """Weighted sum over the columns of the window; ``first`` + ``lane`` is its leftmost."""
+        """Return the weighted sum over the columns of the window; ``first`` + ``lane`` is its leftmost."""
         o = at(first, lane)
         s = w5 * (m[o] + m[o + 10 * channels])
         s += w4 * (m[o + channels] + m[o + 9 * channels])
@@ -73,7 +76,7 @@ def make_functions(real):
 
     @wp.func
     def add_pair(s: vec5, w: real, p: real, q: real) -> vec5:
-        """The five sums with one pixel more."""
+        """Return the five sums with one pixel more."""
         d = p - q
         u = w * p
         v = w * q
@@ -81,7 +84,7 @@ def make_functions(real):
 
     @wp.func
     def score(s0: real, s1: real, s2: real, s3: real, s4: real) -> vec4:
-        """The similarity, and its partials by mean, variance and gap, from the five sums."""
+        """Return the similarity, and its partials by mean, variance and gap, from the five sums."""
         ma = s0
         mb = s1
         # rounding can make these differences slightly negative
@@ -108,10 +111,14 @@ def make_functions(real):
 
 @functools.cache
 def make_kernels(real, summed: bool):
-    """Kernels of one task per block of rows, for a CPU, either for a map or, ``summed``, for sums over the image.
+    """Make the kernels for a CPU, of one task per block of rows.
 
-    The sums of a row stand in ``scratch``, where each task has a few rows of its own. A row is walked in steps of `LANES`
-    elements; the last step starts early rather than run over the end, and what it repeats comes out the same.
+    The sums of a row are in ``scratch``, where each task has a few rows of its own. A row is processed in steps of `LANES`
+    elements; the last step starts early rather than run over the end, and repeated elements get the same values.
+
+    Args:
+        real: wp.float32 or wp.float64.
+        summed: True for sums over the image instead of a map.
     """
     f = make_functions(real)
     vec11 = wp.types.vector(2 * RADIUS + 1, real)
@@ -121,7 +128,7 @@ def make_kernels(real, summed: bool):
 
     @wp.func
     def starts_of(y: wp.int32, height: wp.int32, image: wp.int32, columns: wp.int32) -> vec11i:
-        """First elements of the rows in the window of row y; rows outside the image are replaced, and then weigh 0."""
+        """Return the first elements of the rows in the window of row y; rows outside the image are replaced, and weigh 0."""
         o = vec11i()
         for k in range(2 * RADIUS + 1):
             o[k] = (image * height + wp.clamp(y + k - RADIUS, 0, height - 1)) * columns

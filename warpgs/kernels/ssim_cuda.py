@@ -1,4 +1,4 @@
-"""Kernels of structural similarity for CUDA in float32: both passes of the window in shared memory, one launch each way."""
+"""Structural similarity for CUDA in float32: both passes of the window in shared memory, one launch each way."""
 
 import functools
 from types import SimpleNamespace
@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from warpgs.kernels import bridge
 from warpgs.kernels.native import source
 from warpgs.kernels.ssim_cpu import C1, C2, WINDOW
+from warpgs.runtime import interop
 
 SIDE = 16
 """Side [px] of the square that a thread block works on."""
@@ -18,7 +18,7 @@ THREADS = 256
 
 @functools.cache
 def make_kernels():
-    """Forward and backward. ``summed``: of the two sums that a photometric loss is made of, else of the map."""
+    """Make the forward and backward kernels; their argument ``summed`` is 1 for the two sums of `differences`, 0 for a map."""
     numbers = {"WINDOW": ", ".join(f"{w!r}f" for w in WINDOW), "C1": f"{C1!r}f", "C2": f"{C2!r}f"}
 
     @wp.func_native(source("ssim_forward.cu", **numbers))
@@ -60,27 +60,27 @@ def make_kernels():
 
 
 def _shape(image: torch.Tensor) -> tuple[int, int, int]:
-    """Number of blocks, and height and row length [elements] of a picture; image [B, H, W, 3]."""
+    """Return the number of blocks, and height and row length [elements] of an image; image [B, H, W, 3]."""
     batch, height, width, channels = image.shape
     return batch * -(-height // SIDE) * -(-width // SIDE), height, width * channels
 
 
 def forward(image: torch.Tensor, target: torch.Tensor, summed: bool) -> tuple[torch.Tensor, ...]:
-    """The similarities [B, H, W, 3], or per block the sums of 1 - similarity and |image - target| [blocks, 2]; 3 partials."""
+    """Return similarities [B, H, W, 3] and three partials; or, ``summed``, first the two sums per block [blocks, 2]."""
     blocks, height, columns = _shape(image)
     result = image.new_empty(blocks, 2) if summed else torch.empty_like(image)
     partials = [torch.empty_like(image) for _ in range(3)]
-    arrays = [bridge.view(t.view(-1), wp.float32) for t in (image, target, result, *partials)]
+    arrays = [interop.view(t.view(-1), wp.float32) for t in (image, target, result, *partials)]
     inputs = [*arrays[:2], height, columns, int(summed), *arrays[2:]]
-    bridge.launch(make_kernels().forward, blocks * THREADS, inputs, image.device, block_dim=THREADS)
+    interop.launch(make_kernels().forward, blocks * THREADS, inputs, image.device, block_dim=THREADS)
     return result, *partials
 
 
 def backward(image: torch.Tensor, target: torch.Tensor, partials, v_result: torch.Tensor, summed: bool) -> torch.Tensor:
-    """Gradient of the image, from that of the similarities or of the two sums [2]."""
+    """Return the gradient of the image, from that of the similarities or of the two sums [2]."""
     blocks, height, columns = _shape(image)
     v_image = torch.empty_like(image)
-    arrays = [bridge.view(t.view(-1), wp.float32) for t in (image, target, v_result.contiguous(), *partials)]
-    inputs = [*arrays, height, columns, int(summed), bridge.view(v_image.view(-1), wp.float32)]
-    bridge.launch(make_kernels().backward, blocks * THREADS, inputs, image.device, block_dim=THREADS)
+    arrays = [interop.view(t.view(-1), wp.float32) for t in (image, target, v_result.contiguous(), *partials)]
+    inputs = [*arrays, height, columns, int(summed), interop.view(v_image.view(-1), wp.float32)]
+    interop.launch(make_kernels().backward, blocks * THREADS, inputs, image.device, block_dim=THREADS)
     return v_image

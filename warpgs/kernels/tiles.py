@@ -1,7 +1,6 @@
-"""Bin projected Gaussians into image tiles, front to back: depth sort, emission, stable tile sort (docs/tiles.md)."""
+"""Binning of projected Gaussians into tiles, front to back: depth sort, emission, stable tile sort (docs/tiles.md)."""
 
 import functools
-import os
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -10,27 +9,25 @@ import warp as wp
 
 from warpgs.constants import Rule
 from warpgs.errors import ResourceError
-from warpgs.kernels import bridge
 from warpgs.kernels.functions import make_spans
-from warpgs.kernels.memory import TORCH, Memory
 from warpgs.kernels.native import make_functions as make_native
+from warpgs.runtime import interop
+from warpgs.runtime.allocator import TORCH, Allocator
+from warpgs.runtime.device_memory import available_bytes, installed_bytes
 
 LIST_BYTES = 20
-"""Of an instance while the lists are made: two sort buffers of (key, slot), and the owner."""
+"""Bytes of an instance while the lists are made: two sort buffers of (key, slot), and the owner."""
 BYTES_PER_INSTANCE = LIST_BYTES + 48 + 80
-"""The same and, of the backward pass on CUDA, the gradient slot and the share of the states that blending leaves
-(blend_cuda.CHUNKS)."""
+"""Bytes of an instance with the gradient slot and the part of the saved states (blend_cuda.CHUNKS) on CUDA."""
 
 VISIBLE = 2**36
-"""What a visible Gaussian adds to a running sum of tile counts, so that one sum has both; more are counted apart first."""
+"""Number that a visible Gaussian adds to a running sum of tile counts, so that one sum counts both."""
 MAX_VISIBLE = 2**63 // VISIBLE - 1
-"""Visible Gaussians that such a sum has room for."""
-
+"""Most visible Gaussians that such a sum can count."""
 SMALL = 32
-"""Tiles of a Gaussian that one CUDA thread lists alone."""
-
-MAX_INSTANCES = bridge.MAX_SIZE // 2
-"""A radix sort wants one array of twice that size."""
+"""Most tiles of a Gaussian that one CUDA thread lists alone."""
+MAX_INSTANCES = interop.MAX_SIZE // 2
+"""Most instances: a radix sort needs one array of twice that size."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +41,10 @@ class Tiles:
     """Side of a tile [px]."""
     ranges: torch.Tensor
     """First instance of each tile and one past its last, int32, shape [C * tiles, 2]."""
-    splat_ids: torch.Tensor
+    gaussian_ids: torch.Tensor
     """Flat Gaussian number of each instance, int32, shape [M]."""
     slots: torch.Tensor
-    """Where an instance stood before the tile sort, int32, shape [M]: there the instances of a Gaussian are neighbours,
+    """Position of an instance before the tile sort, int32, shape [M]: there the instances of a Gaussian are neighbours,
     so each owns a row that gradients can be written to and then summed in a fixed order, without atomics."""
     starts: torch.Tensor
     """First slot of each Gaussian that has any, int32, shape [C * N]."""
@@ -59,31 +56,31 @@ class Tiles:
     """M, int64, shape [1], where kernels can read it."""
 
     def tensors(self) -> tuple[torch.Tensor, ...]:
-        """All but the size, in the order in which the constructor takes them."""
-        return self.ranges, self.splat_ids, self.slots, self.starts, self.counts, self.tile_ids, self.total
+        """Return all fields but the size, in the order in which the constructor takes them."""
+        return self.ranges, self.gaussian_ids, self.slots, self.starts, self.counts, self.tile_ids, self.total
 
 
 def grid(width: int, height: int, tile_size: int) -> tuple[int, int]:
-    """Columns and rows of tiles that cover an image."""
+    """Return the columns and rows of tiles that cover an image."""
     return -(-width // tile_size), -(-height // tile_size)
 
 
 @functools.cache
 def make_kernels(real, native: bool):
-    """Kernels for one scalar type; ``native`` is for CUDA, where a running sum has one entry for the 32 items of a warp."""
+    """Make the kernels for one scalar type; ``native`` is for CUDA, where a running sum has one entry for a warp's 32 items."""
     lanes, per = make_native() if native else None, wp.constant(32 if native else 1)
     module = f"warpgs.kernels.tiles.{real.__name__}.{int(native)}"
 
     @wp.kernel(enable_backward=False, module=module)
     def depth_keys(
-        begin: int, splats: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
+        begin: int, projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
         # outputs
         keys: wp.array(dtype=real), ids: wp.array(dtype=int),
     ):  # fmt: skip
         i = begin + wp.tid()
         ids[i] = i
         if tile_counts[i] > 0:
-            keys[i] = splats[i, 9]
+            keys[i] = projected[i, 9]
         else:
             keys[i] = real(wp.inf)
 
@@ -104,7 +101,7 @@ def make_kernels(real, native: bool):
 
     @wp.kernel(enable_backward=False, module=module)
     def visible_keys(
-        begin: int, splats: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), packed: wp.array(dtype=wp.int64),
+        begin: int, projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), packed: wp.array(dtype=wp.int64),
         # outputs
         keys: wp.array(dtype=real), ids: wp.array(dtype=int),
     ):  # fmt: skip
@@ -116,7 +113,7 @@ def make_kernels(real, native: bool):
             after = lanes.broadcast(rank, 31) - rank
         if seen == 1:
             j = int(packed[i // per] / wp.int64(VISIBLE)) - 1 - after
-            keys[j] = splats[i, 9]
+            keys[j] = projected[i, 9]
             ids[j] = i
 
     @wp.kernel(enable_backward=False, module=module)
@@ -137,7 +134,7 @@ def make_kernels(real, native: bool):
     ):  # fmt: skip
         i = begin + wp.tid()
         tile = keys[i]
-        slot = slots[i]  # asked for before its tile is known, as are the neighbours: the waits overlap
+        slot = slots[i]  # loaded before its tile is known, like the neighbours: the waits overlap
         before = keys[wp.max(i - 1, 0)]
         after = keys[wp.min(i + 1, count - 1)]
         if tile == no_tile:
@@ -157,7 +154,7 @@ def make_kernels(real, native: bool):
 
 @functools.cache
 def make_emit(real, native: bool):
-    """The kernel that writes the instances of each Gaussian, row by row of tiles.
+    """Make the kernel that writes the instances of each Gaussian, row by row of tiles.
 
     ``native`` is for CUDA: a Gaussian of more than SMALL tiles is written by its whole warp, a lane a row.
     """
@@ -168,18 +165,18 @@ def make_emit(real, native: bool):
 
     @wp.func
     def span_of(
-        splats: wp.array2d(dtype=real), i: int, row: int, alpha_cut: real, square_sigma: real,
+        projected: wp.array2d(dtype=real), i: int, row: int, alpha_cut: real, square_sigma: real,
         origin_x: int, width: int, tile_size: int,
     ) -> vec2i:  # fmt: skip
-        factor = vec3(splats[i, 2], splats[i, 3], splats[i, 4])
-        reach = s.reach_of(splats[i, 5], alpha_cut, square_sigma)
+        factor = vec3(projected[i, 2], projected[i, 3], projected[i, 4])
+        reach = s.reach_of(projected[i, 5], alpha_cut, square_sigma)
         return s.tile_columns(
-            splats[i, 0], splats[i, 1], factor, reach, splats[i, 10], splats[i, 11], row, origin_x, width, tile_size
+            projected[i, 0], projected[i, 1], factor, reach, projected[i, 10], projected[i, 11], row, origin_x, width, tile_size
         )
 
     @wp.kernel(enable_backward=False, module=f"warpgs.kernels.tiles.emit.{real.__name__}.{int(native)}")
     def emit(
-        begin: int, splats: wp.array2d(dtype=real), order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
+        begin: int, projected: wp.array2d(dtype=real), order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
         ends: wp.array(dtype=wp.int64), count: int, per_camera: int,
         origin_x: int, origin_y: int, width: int, height: int, tile_size: int,
         alpha_cut: real, square_sigma: real, columns: int, tiles: int, no_tile: int, capacity: int,
@@ -188,7 +185,7 @@ def make_emit(real, native: bool):
         overflow: wp.array(dtype=int),
     ):  # fmt: skip
         j = begin + wp.tid()
-        corner = (origin_y // tile_size) * columns + origin_x // tile_size  # rows and columns count from the picture's corner
+        corner = (origin_y // tile_size) * columns + origin_x // tile_size  # rows and columns count from the image's corner
         i = int(0)
         touched = int(0)
         slot = int(0)
@@ -197,7 +194,7 @@ def make_emit(real, native: bool):
             i = order[j]
             touched = tile_counts[i]
             last_slot = ends[j]
-            if last_slot > wp.int64(capacity):  # the lists are cut, and nobody may use them; see `bin_tiles`
+            if last_slot > wp.int64(capacity):  # the lists are cut, and must not be used; see `bin_tiles`
                 overflow[0] = 1
                 touched = int(wp.max(wp.int64(touched) - (last_slot - wp.int64(capacity)), wp.int64(0)))
                 last_slot = wp.int64(capacity)
@@ -206,10 +203,10 @@ def make_emit(real, native: bool):
             slot = end - touched
             starts[i] = slot
         if touched > 0 and wp.static(SMALL if native else 2**31 - 1) >= touched:
-            rows = s.tile_rows(splats[i, 1], splats[i, 11], origin_y, height, tile_size)
+            rows = s.tile_rows(projected[i, 1], projected[i, 11], origin_y, height, tile_size)
             base = (i // per_camera) * tiles - corner
             for row in range(rows[0], rows[1]):
-                span = span_of(splats, i, row, alpha_cut, square_sigma, origin_x, width, tile_size)
+                span = span_of(projected, i, row, alpha_cut, square_sigma, origin_x, width, tile_size)
                 for column in range(span[0], span[1]):
                     if slot < end:
                         keys[slot] = base + row * columns + column
@@ -232,13 +229,13 @@ def make_emit(real, native: bool):
                 at = lanes.broadcast(slot, owner)
                 last = lanes.broadcast(end, owner)
                 base = (g // per_camera) * tiles - corner
-                rows = s.tile_rows(splats[g, 1], splats[g, 11], origin_y, height, tile_size)
+                rows = s.tile_rows(projected[g, 1], projected[g, 11], origin_y, height, tile_size)
                 first = rows[0]
                 while first < rows[1]:
                     row = first + lane
                     span = vec2i(0, 0)
                     if row < rows[1]:
-                        span = span_of(splats, g, row, alpha_cut, square_sigma, origin_x, width, tile_size)
+                        span = span_of(projected, g, row, alpha_cut, square_sigma, origin_x, width, tile_size)
                     wide = span[1] - span[0]
                     sum = lanes.running_sum(wide)
                     to = at + sum - wide
@@ -260,23 +257,8 @@ def make_emit(real, native: bool):
     return emit
 
 
-def available_bytes(device: torch.device) -> int:
-    """Memory that is free now on a device [bytes]."""
-    if device.type == "cuda":
-        free, _ = torch.cuda.mem_get_info(device)
-        return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-
-
-@functools.cache
-def installed_bytes(device: torch.device) -> int:
-    """Memory of a device [bytes]."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_properties(device).total_memory
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-
-
 def _check_total(total: int, visible: int, device: torch.device, tiles: int, budget_bytes: int | None) -> None:
+    """Raise ResourceError where the instances exceed the budget, or what kernels can number."""
     needed = total * BYTES_PER_INSTANCE
     # asking what is free costs 0.1 ms or more: not worth it for a twentieth of the machine
     countable = total <= MAX_INSTANCES and visible <= MAX_VISIBLE
@@ -294,8 +276,44 @@ def _check_total(total: int, visible: int, device: torch.device, tiles: int, bud
     )
 
 
+def _depth_order(
+    projected: torch.Tensor, counts: torch.Tensor, tiles: int, *,
+    budget_bytes: int | None, capacity: int | None, allocator: Allocator,
+) -> tuple[torch.Tensor, int, int]:  # fmt: skip
+    """Return Gaussian numbers from front to back, int32; how many of them are visible; and the number of instances.
+
+    With a capacity nothing is read from the device: all Gaussians count as visible, those that are not come last, and the
+    number of instances is the capacity. ``projected`` is [C * N, 12], ``counts`` [C * N], ``tiles`` the tiles of an image.
+    """
+    device, count, real, native = projected.device, len(counts), interop.real_of(projected), projected.is_cuda
+    k = make_kernels(real, native)
+    projected_view, counts_view = interop.view(projected, real), interop.view(counts, wp.int32)
+    if capacity is not None:
+        visible, total = count, capacity
+    else:
+        if count * tiles >= VISIBLE or count > MAX_VISIBLE:
+            many = torch.stack([(counts > 0).sum(), counts.sum(dtype=torch.int64)])
+            _check_total(*reversed(many.tolist()), device, tiles, budget_bytes)
+        # One read from the device, before the sorts, tells how many are visible and how many tiles they touch.
+        sums, threads = (-(-count // 32), -(-count // 256) * 256) if native else (count, count)
+        packed = allocator.workspace((sums,), torch.int64, device)
+        interop.launch(k.pack_counts, threads, [counts_view, interop.view(packed, wp.int64)], device)
+        torch.cumsum(packed, 0, out=packed)
+        visible, total = divmod(int(packed[-1]), VISIBLE)
+        _check_total(total, visible, device, tiles, budget_bytes)
+    depths, order = (allocator.workspace((2 * visible,), t, device) for t in (projected.dtype, torch.int32))
+    depths_view, order_view = interop.view(depths, real), interop.view(order, wp.int32)
+    if capacity is not None:
+        interop.launch(k.depth_keys, count, [projected_view, counts_view, depths_view, order_view], device)
+    else:
+        inputs = [projected_view, counts_view, interop.view(packed, wp.int64), depths_view, order_view]
+        interop.launch(k.visible_keys, threads, inputs, device)
+    wp.utils.radix_sort_pairs(depths_view.array(), order_view.array(), visible)
+    return order, visible, total
+
+
 def bin_tiles(
-    splats: torch.Tensor,
+    projected: torch.Tensor,
     tile_counts: torch.Tensor,
     *,
     width: int,
@@ -306,27 +324,27 @@ def bin_tiles(
     capacity: int | None = None,
     overflow: torch.Tensor | None = None,
     origin: tuple[int, int] = (0, 0),
-    memory: Memory = TORCH,
+    allocator: Allocator = TORCH,
 ) -> Tiles:
-    """List for every tile the Gaussians that touch it, front to back. Not differentiable.
+    """Return for every tile the Gaussians that touch it, front to back. Not differentiable.
 
     Args:
-        splats: Records of `project`, shape [C, N, 12].
+        projected: Projected Gaussians of `project`, shape [C, N, 12].
         tile_counts: Tiles that each touches, int32, shape [C, N].
         width: Image width [px].
         height: Image height [px].
         tile_size: Side of a tile [px].
         rule: Cut-offs, the same as given to `project`.
-        budget_bytes: Memory the instances may take; None for four fifths of what is free.
-        capacity: Make room for this many instances instead of asking the device how many there are, so that the work can be
-            recorded once and replayed. What is over is marked as no tile's.
+        budget_bytes: Memory that the instances may take; None for four fifths of the free memory.
+        capacity: Number of instances to allocate memory for, instead of asking the device how many there are, so that the work
+            can be captured as a CUDA graph. Unused entries are marked as no tile's.
         overflow: Set to 1 where there are more instances than ``capacity``: the lists are then cut short and must not be
             used. Int32, shape [1]; needed with ``capacity``.
         origin: Left and top [px] of the window of that width and height which `project` was given; a tile's corner.
-        memory: Where to put the lists.
+        allocator: Provider of the lists' memory.
 
     Returns:
-        The sorted instances; M is ``capacity`` where one is given.
+        Sorted instances; M is ``capacity`` where one is given.
 
     Raises:
         ResourceError: The instances, counted in 64 bits before anything is allocated, exceed the budget or 2^30 - 1; or
@@ -334,67 +352,49 @@ def bin_tiles(
         TypeError: A scalar type is neither float32 nor float64.
         ValueError: A shape disagrees.
     """
-    sizes = bridge.check(splats=(splats, "C N 12"))
+    sizes = interop.check(projected=(projected, "C N 12"))
     if tuple(tile_counts.shape) != (sizes["C"], sizes["N"]) or tile_counts.dtype != torch.int32:
         raise ValueError(f"tile_counts must be int32 of shape {[sizes['C'], sizes['N']]}, not {list(tile_counts.shape)}")
-    device, real, native = splats.device, bridge.real_of(splats), splats.is_cuda
+    device, real, native = projected.device, interop.real_of(projected), projected.is_cuda
     k = make_kernels(real, native)
     (columns, rows), count = grid(width, height, tile_size), sizes["C"] * sizes["N"]
     tiles, no_tile = columns * rows, sizes["C"] * columns * rows
-    if no_tile > bridge.MAX_SIZE:
+    if no_tile > interop.MAX_SIZE:
         raise ResourceError(
             f"{sizes['C']:,} images of {width} x {height} px have {no_tile:,} tiles of {tile_size} px, beyond the "
-            f"{bridge.MAX_SIZE:,} that can be numbered; draw fewer cameras at once, or a window of each"
+            f"{interop.MAX_SIZE:,} that can be numbered; render fewer cameras at once, or a window of each"
         )
     counts = tile_counts.contiguous().view(-1)
-    ranges = memory.kept((no_tile, 2), torch.int32, device).zero_()
+    ranges = allocator.saved((no_tile, 2), torch.int32, device).zero_()
     if count == 0:
         return Tiles(tile_size, ranges, counts, counts, counts, counts, counts, counts.new_zeros(1, dtype=torch.int64))
 
-    splats = splats.detach().contiguous().view(count, -1)
-    splats_view, counts_view, fixed = bridge.view(splats, real), bridge.view(counts, wp.int32), capacity is not None
-    with bridge.stream_of(device):
-        if fixed:
-            visible, total = count, capacity
-        else:
-            if count * tiles >= VISIBLE or count > MAX_VISIBLE:
-                many = torch.stack([(counts > 0).sum(), counts.sum(dtype=torch.int64)])
-                _check_total(*reversed(many.tolist()), device, tiles, budget_bytes)
-            # One look at the device, before the sorts, tells how many are visible and how many tiles they touch.
-            sums, threads = (-(-count // 32), -(-count // 256) * 256) if native else (count, count)
-            packed = memory.scratch((sums,), torch.int64, device)
-            bridge.launch(k.pack_counts, threads, [counts_view, bridge.view(packed, wp.int64)], device)
-            torch.cumsum(packed, 0, out=packed)
-            visible, total = divmod(int(packed[-1]), VISIBLE)
-            _check_total(total, visible, device, tiles, budget_bytes)
-        depths, order = (memory.scratch((2 * visible,), t, device) for t in (splats.dtype, torch.int32))
-        depths_view, order_view = bridge.view(depths, real), bridge.view(order, wp.int32)
-        if fixed:
-            bridge.launch(k.depth_keys, count, [splats_view, counts_view, depths_view, order_view], device)
-        else:
-            inputs = [splats_view, counts_view, bridge.view(packed, wp.int64), depths_view, order_view]
-            bridge.launch(k.visible_keys, threads, inputs, device)
-        wp.utils.radix_sort_pairs(depths_view.array(), order_view.array(), visible)
-        ends = memory.kept((max(visible, 1),), torch.int64, device)
-        ends_view = bridge.view(ends, wp.int64)
-        bridge.launch(k.ordered_counts, visible, [order_view, counts_view, ends_view], device)
+    projected = projected.detach().contiguous().view(count, -1)
+    projected_view, counts_view, fixed = interop.view(projected, real), interop.view(counts, wp.int32), capacity is not None
+    with interop.stream_of(device):
+        limits = {"budget_bytes": budget_bytes, "capacity": capacity, "allocator": allocator}
+        order, visible, total = _depth_order(projected, counts, tiles, **limits)
+        order_view = interop.view(order, wp.int32)
+        ends = allocator.saved((max(visible, 1),), torch.int64, device)
+        ends_view = interop.view(ends, wp.int64)
+        interop.launch(k.ordered_counts, visible, [order_view, counts_view, ends_view], device)
         ends = torch.cumsum(ends, 0, out=ends) if visible > 0 else ends.zero_()
-        starts, keys, slots = (memory.kept((n,), torch.int32, device) for n in (count, 2 * total, 2 * total))
-        owners = memory.scratch((total,), torch.int32, device)
+        starts, keys, slots = (allocator.saved((n,), torch.int32, device) for n in (count, 2 * total, 2 * total))
+        owners = allocator.workspace((total,), torch.int32, device)
         if fixed:
             keys[:total].fill_(no_tile)
-        keys_view, slots_view, owners_view = (bridge.view(t, wp.int32) for t in (keys, slots, owners))
+        keys_view, slots_view, owners_view = (interop.view(t, wp.int32) for t in (keys, slots, owners))
         inputs = [
-            splats_view, order_view, counts_view, ends_view, visible, sizes["N"],
+            projected_view, order_view, counts_view, ends_view, visible, sizes["N"],
             *origin, width, height, tile_size, rule.alpha_cut, rule.square_sigma, columns, tiles, no_tile, total,
-            bridge.view(starts, wp.int32), keys_view, slots_view, owners_view,
-            bridge.view(overflow if fixed else starts, wp.int32),
+            interop.view(starts, wp.int32), keys_view, slots_view, owners_view,
+            interop.view(overflow if fixed else starts, wp.int32),
         ]  # fmt: skip
         threads = -(-visible // 256) * 256 if native else visible
-        bridge.launch(make_emit(real, native), threads, inputs, device, cost=10)
+        interop.launch(make_emit(real, native), threads, inputs, device, cost=10)
         wp.utils.radix_sort_pairs(keys_view.array(), slots_view.array(), total, end_bit=no_tile.bit_length())
-        # the second half of the sorted buffers is free again
-        ids = slots[total:]
-        inputs = [keys_view, slots_view, owners_view, total, no_tile, bridge.view(ids, wp.int32), bridge.view(ranges, wp.int32)]
-        bridge.launch(k.find_ranges, total, inputs, device)
+        ids = slots[total:]  # the second half of the sorted buffers is free again
+        outputs = [interop.view(ids, wp.int32), interop.view(ranges, wp.int32)]
+        inputs = [keys_view, slots_view, owners_view, total, no_tile, *outputs]
+        interop.launch(k.find_ranges, total, inputs, device)
     return Tiles(tile_size, ranges, ids, slots[:total], starts, counts, keys[:total], ends[-1:])

@@ -1,1 +1,1 @@
-"""Evidence about a scene beyond its pixels: one file per source."""
+"""Priors: evidence about a scene beyond its pixels, one file per source."""

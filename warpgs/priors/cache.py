@@ -1,4 +1,4 @@
-"""Maps that a network made of a photograph, kept on disk under the hash of everything that decides them."""
+"""A disk cache of the maps that networks make of images, keyed by the hash of everything that decides them."""
 
 from __future__ import annotations
 
@@ -14,32 +14,37 @@ import numpy as np
 
 from warpgs.errors import ResourceError
 from warpgs.files import write_bytes
+from warpgs.runtime.folders import cache_home, private_folder
 
 CODE = 1
-"""Version of the code between photograph and maps: counts up whenever the same inputs give other maps."""
+"""Version of the code between image and maps; it counts up whenever the same inputs give other maps."""
 
 
 def cache_folder() -> Path:
-    """Where warpgs may keep what it can make again: WARPGS_CACHE, or the place that the system has for such files."""
+    """Return where warpgs may keep what it can make again: WARPGS_CACHE, or the place that the system has for such files.
+
+    Where the user has no home folder it is a private folder of this process, and a line on stderr says so.
+
+    Raises:
+        ResourceError: There is no home folder, and no folder for temporary files either.
+    """
     if own := os.environ.get("WARPGS_CACHE"):
         return Path(own)
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local") / "warpgs" / "Cache"
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "warpgs"
-    # the XDG rules ask to pass over a relative path
-    base = Path(os.environ.get("XDG_CACHE_HOME") or "")
-    return (base if base.is_absolute() else Path.home() / ".cache") / "warpgs"
+    home = cache_home()
+    if home is None:
+        print("warpgs: there is no home folder, so maps are kept for this run alone; WARPGS_CACHE names one", file=sys.stderr)
+        return private_folder() / "maps"
+    return home / "warpgs" / "Cache" if sys.platform == "win32" else home / "warpgs"
 
 
 @dataclass
 class MapCache:
-    """A folder of maps; an entry that is not whole is made again, and a folder that cannot be written is done without."""
+    """A folder of maps; a damaged entry is made again, and a folder that cannot be written is noted and not used."""
 
     folder: Path
-    """Where entries lie."""
+    """Folder of the entries."""
     notes: list[str] = field(default_factory=list)
-    """What a user must know: entries that were broken, a folder that took none."""
+    """Messages for the user: entries that were damaged, a folder that cannot be written."""
     found: int = 0
     """Entries taken from disk."""
     made: int = 0
@@ -48,16 +53,16 @@ class MapCache:
     def maps(
         self, image: np.ndarray, names: tuple[str, ...], decided_by: dict, make: Callable[[], tuple[np.ndarray, ...]]
     ) -> tuple[np.ndarray, ...]:
-        """Maps of an image, from disk or made now.
+        """Return the maps of an image, from disk or made now.
 
         Args:
             image: Colours, float32, shape [H, W, 3].
-            names: What the maps are called.
+            names: Names of the maps.
             decided_by: Everything else that the maps depend on, as JSON can hold it.
-            make: Computes them, float32 [H, W] in [0, 1] each.
+            make: Function that computes the maps, float32 [H, W] in [0, 1] each.
 
         Returns:
-            One array per name.
+            One map per name, float32, shape [H, W].
         """
         path = self._path(image, names, decided_by)
         stored = self._read(path, names, image.shape[:2])

@@ -1,33 +1,33 @@
-"""Depth where nothing confirms one: carried over from confirmed pixels, along the surfaces that the picture shows."""
+"""Completion of a depth map from its consistent pixels, along the surfaces that the image shows."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from warpgs.priors.opencv import alone
+from warpgs.priors.opencv import single_threaded_opencv
 
 SMOOTHNESS = (1e2, 1e4, 1e6)
-"""Strengths tried in turn; a stronger one reaches farther, and a pixel takes the first that reaches it."""
+"""Strengths of the smoother, tried in turn; a stronger one reaches farther, and a pixel takes the first that reaches it."""
 COLOR_SIGMA = 8.0
-"""Step of the picture, of 255, at which neighbours stop sharing depth."""
-REACHED = 1e-3
-"""Share of a smoothed value that must come from confirmed pixels."""
+"""Colour difference [1/255] at which neighbours stop having one depth, times e."""
+MIN_FRACTION = 1e-3
+"""Smallest fraction of a smoothed value that must come from consistent pixels."""
 
 
 def complete(depth: np.ndarray, valid: np.ndarray, image: np.ndarray) -> np.ndarray:
     """Fill a depth map by edge-aware averages of inverse depth.
 
-    The fast global smoother (Min et al. 2014) of the confirmed inverse depths over that of the mask: planes stay planes in
-    inverse depth, and what is far is not pulled near. Measured in docs/decisions/007-coarse-start.md.
+    The result is the fast global smoother (Min et al. 2014) of the consistent inverse depths divided by that of the mask.
+    Planes stay planes in inverse depth, and far surfaces are not pulled near. Measured in docs/decisions/007-coarse-start.md.
 
     Args:
         depth: z-depths [u], float32, shape [H, W].
-        valid: Where they count, bool, shape [H, W].
+        valid: True where the depth counts, bool, shape [H, W].
         image: Colours in [0, 1], shape [H, W, 3].
 
     Returns:
-        Depths [u], float32, shape [H, W]: unchanged where valid, the median where nothing reaches, 0 everywhere where
-        nothing is valid.
+        z-depths [u], float32, shape [H, W]: unchanged where valid, the median where no consistent pixel reaches; 0 everywhere
+        where nothing is valid.
     """
     import cv2
 
@@ -37,12 +37,12 @@ def complete(depth: np.ndarray, valid: np.ndarray, image: np.ndarray) -> np.ndar
     guide = (image * 255).round().clip(0, 255).astype(np.uint8)
     filled = np.full(depth.shape, np.median(inverse[valid]))
     left = np.ones(depth.shape, bool)
-    with alone():
+    with single_threaded_opencv():
         for strength in SMOOTHNESS:
             smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, strength, COLOR_SIGMA)
-            share = smoother.filter(valid.astype(np.float32))
-            reached = left & (share > REACHED)
-            filled[reached] = smoother.filter(inverse)[reached] / share[reached]
-            left &= ~reached
+            fraction = smoother.filter(valid.astype(np.float32))
+            filled_now = left & (fraction > MIN_FRACTION)
+            filled[filled_now] = smoother.filter(inverse)[filled_now] / fraction[filled_now]
+            left &= ~filled_now
     low, high = inverse[valid].min(), inverse[valid].max()
     return np.where(valid, depth, 1 / filled.clip(low, high)).astype(np.float32)

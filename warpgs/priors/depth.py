@@ -1,31 +1,31 @@
-"""Relative inverse depth of a photograph: from a monocular network, or completed from what other views confirm."""
+"""Relative inverse depth of an image: from a monocular network, or completed from depths that are consistent between views."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.priors.opencv import alone
+from warpgs.priors.opencv import single_threaded_opencv
 from warpgs.priors.preprocess import HALF, Preprocessing, resize
 from warpgs.priors.session import Network
 
-USUAL = Preprocessing(384, 32, *HALF, output="disparity")
-"""DPT (Ranftl et al. 2021), the paper's network."""
+DEFAULTS = Preprocessing(384, 32, *HALF, output="disparity")
+"""Input and output of DPT (Ranftl et al. 2021), the paper's network."""
 CLIP = (0.5, 99.5)
-"""Percentiles that confirmed inverse depths are clipped to: one wrong match must not decide the range of the map."""
+"""Percentiles to which consistent inverse depths are clipped: one wrong match must not decide the range of the map."""
 COLOR_SIGMA = 8.0
-"""Colour difference [1/255] that the completion takes for an edge, times e."""
+"""Colour difference [1/255] at which the smoother takes neighbours for different surfaces, times e."""
 REACHES = ((10.0, 1.0), (100.0, 1e-3), (1000.0, 1e-6))
-"""Lengths [px] over which confirmed depths spread within an even surface, and how much each counts: the far ones matter only
-where nothing near says anything."""
-WORST = 1e3
-"""Largest ratio of an error to the median error that is told apart: no confirmed depth counts less than a millionth."""
-FLOOR = 1e-9
-"""Weight of the mean of all confirmed depths, for pixels that edges shut off from every one of them."""
+"""Pairs (length [px] over which consistent depths spread within an even surface, weight): a long one counts only where no
+consistent depth is near."""
+MAX_ERROR_RATIO = 1e3
+"""Largest ratio of an error to the median error that matters: no consistent depth has a weight below a millionth."""
+MEAN_WEIGHT = 1e-9
+"""Weight of the mean of all consistent depths, for pixels that edges separate from all of them."""
 
 
 def unit_range(values: np.ndarray) -> np.ndarray:
-    """Values scaled to [0, 1] by their minimum and maximum, float32; 0 everywhere where both are equal."""
+    """Return values scaled to [0, 1] by their minimum and maximum, float32; 0 everywhere where both are equal."""
     low, high = float(values.min()), float(values.max())
     if not high > low:
         return np.zeros(values.shape, np.float32)
@@ -33,11 +33,11 @@ def unit_range(values: np.ndarray) -> np.ndarray:
 
 
 def network_disparity(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> np.ndarray:
-    """Disparity that a monocular network (DPT, MiDaS, Depth Anything and their like) sees in a photograph.
+    """Return the disparity of an image by a monocular network (DPT, MiDaS, Depth Anything and the like).
 
     Args:
         network: The opened model; its output is [1, h, w], [1, 1, h, w], [1, h, w, 1] or [h, w].
-        preprocessing: How to feed it, and whether it gives disparity or depth.
+        preprocessing: Size and colours of its input, and whether it gives disparity or depth.
         image: Colours in [0, 1], shape [H, W, 3].
 
     Returns:
@@ -69,9 +69,9 @@ def network_disparity(network: Network, preprocessing: Preprocessing, image: np.
 def complete_disparity(image: np.ndarray, depth: np.ndarray, valid: np.ndarray, sensitivity: np.ndarray) -> np.ndarray:
     """Fill the gaps of a depth map in inverse depth, along surfaces of even colour and not across colour edges.
 
-    Inverse depths spread by a fast global smoother (Min et al. 2014), a solver of weighted least squares that the photograph
-    guides, as the ratio of smoothed ``w / z`` and smoothed ``w``. The weight w falls with the change of 1 / z as the match
-    slides by a pixel, so that badly conditioned depths yield to their neighbours.
+    The result is the ratio of smoothed ``w / z`` and smoothed ``w``, by the fast global smoother (Min et al. 2014), a solver
+    of weighted least squares that the image guides. The weight w falls with the change of 1 / z as the match slides by a
+    pixel, so that badly conditioned depths yield to their neighbours.
 
     Args:
         image: Colours in [0, 1], shape [H, W, 3].
@@ -97,23 +97,23 @@ def complete_disparity(image: np.ndarray, depth: np.ndarray, valid: np.ndarray, 
     error = sensitivity[valid] * inverse[valid] ** 2  # |d(1/z)/dpx|
     known = error[np.isfinite(error)]
     scale = max(float(np.median(known)) if len(known) else 0.0, 1e-6 * high)
-    ratio = np.minimum(np.where(np.isfinite(error), error, np.inf) / scale, WORST)
+    ratio = np.minimum(np.where(np.isfinite(error), error, np.inf) / scale, MAX_ERROR_RATIO)
     weight = np.zeros(depth.shape, np.float32)
     weight[valid] = 1 / (1 + ratio**2)
     return unit_range(_spread(image, ((inverse - low) / (high - low)).astype(np.float32), weight))
 
 
 def _spread(image: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Weighted smooth values [H, W]: near where there are any, from ever farther where there are none."""
+    """Return smoothed values [H, W] by weight: from nearby pixels where they have any, else from ever farther ones."""
     import cv2
 
     guide = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
-    received = np.full(values.shape, FLOOR)
+    received = np.full(values.shape, MEAN_WEIGHT)
     total = received * np.average(values, weights=weight)
-    with alone():
-        for reach, share in REACHES:
+    with single_threaded_opencv():
+        for reach, fraction in REACHES:
             # in one dimension the smoother's response falls as exp(-x / sqrt(lambda))
             smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, reach**2, COLOR_SIGMA)
-            total += share * smoother.filter(weight * values)
-            received += share * smoother.filter(weight)
+            total += fraction * smoother.filter(weight * values)
+            received += fraction * smoother.filter(weight)
     return total / received

@@ -1,7 +1,7 @@
-"""Depth from optical flow between views with known poses: epipolar lines, their feet, and which source view to believe.
+"""Depth from optical flow between views with known poses: epipolar lines, checks, and the blending of source views.
 
-After NexusGS (Zheng et al. 2025), with what its released code lacks: a sign test, a floor of parallax, the foot inside the
-image, a round trip of the flow, and a sensitivity that is the true derivative. Derivation: docs/flow_epipolar.md.
+After NexusGS (Zheng et al. 2025), with tests that its released code lacks: signs of both depths, smallest parallax, foot of
+the match inside the image, round trip of the flow, and the true derivative as sensitivity. Derivation: docs/flow_epipolar.md.
 """
 
 from __future__ import annotations
@@ -12,11 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpgs.errors import UsageError
+from warpgs.geometry import check_pinhole
 from warpgs.scene import Camera, View, ViewDepth
 
 BLENDS = ("least_sensitive", "nearest_first", "mean_valid", "inverse_sensitivity")
 STEP = 0.5
-"""Slide along the epipolar line for the central difference of the sensitivity [px]."""
+"""Step along the epipolar line for the central difference of the sensitivity [px]."""
 
 FlowBetween = Callable[[int, int], np.ndarray | None]
 """Flow [px], float32 [H, W, 2], from the pixels of view i to view j; None where there is none."""
@@ -24,16 +25,16 @@ FlowBetween = Callable[[int, int], np.ndarray | None]
 
 @dataclass(frozen=True)
 class EpipolarConfig:
-    """Which matches give a depth, and which depth a pixel takes."""
+    """Settings of the checks on matches, and of the blending of depths."""
 
     max_residual: float = 1.0
-    """A match must lie nearer than this to its epipolar line [px] (NexusGS)."""
+    """Largest distance of a match from its epipolar line [px] (NexusGS)."""
     max_round_trip: float = 1.5
-    """Flow there and back must end nearer than this to where it began [px]; infinite to leave the check out."""
+    """Largest distance between a pixel and the end of the flow there and back [px]; infinite leaves the check out."""
     min_parallax: float = 0.5
     """Smallest angle between the two rays of a match [deg]; below it depth is noise."""
     near_count: int = 4
-    """Nearest other views that each view is matched with."""
+    """Number of nearest other views with which each view is matched."""
     blend: str = "least_sensitive"
     """least_sensitive (the paper), nearest_first (what the code of NexusGS does), mean_valid or inverse_sensitivity."""
 
@@ -49,7 +50,7 @@ class EpipolarConfig:
 
 @dataclass(frozen=True)
 class PairDepth:
-    """What one ordered pair of views says about N pixels of its first view."""
+    """Depths of N pixels of a view from their matches in a second view."""
 
     depth: np.ndarray
     """z-depth in the first view [u], float64, shape [N]; NaN where the geometry has no answer."""
@@ -62,27 +63,34 @@ class PairDepth:
 
 
 def pixel_grid(camera: Camera) -> np.ndarray:
-    """Pixel centres [px], float64, shape [H * W, 2], row by row."""
+    """Return the pixel centres [px] of an image, float64, shape [H * W, 2], row by row."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     return np.stack([x.ravel(), y.ravel()], 1)
 
 
 def nearest_views(views: Sequence[View], index: int, count: int) -> list[int]:
-    """The other views, nearest camera centre first (ties by order), at most ``count``."""
+    """Return the indices of at most ``count`` other views, nearest camera centre first (ties by order)."""
     centers = np.array([v.camera.center for v in views])
     distances = np.linalg.norm(centers - centers[index], axis=1)
     return [int(j) for j in np.argsort(distances, kind="stable") if j != index][:count]
 
 
-def _homogeneous(pixels: np.ndarray) -> np.ndarray:
+def homogeneous(pixels: np.ndarray) -> np.ndarray:
+    """Return pixels [N, 2] as homogeneous coordinates (x, y, 1), shape [N, 3]."""
     return np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
 
 
 def fundamental(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """F [3, 3] with ``F (x, y, 1)`` the epipolar line in the second image; R_st [3, 3] from first to second; tau [3].
+    """Return the fundamental matrix F [3, 3], the rotation R_st [3, 3] and the translation tau [3] of a pair of cameras.
 
-    ``X_second = R_st (X_first + tau)``: -tau is the second camera's centre in the frame of the first.
+    ``F (x, y, 1)`` is the epipolar line in the second image of a pixel of the first. ``X_second = R_st (X_first + tau)``: -tau
+    is the second camera's centre in the frame of the first.
+
+    Raises:
+        UsageError: A camera is no pinhole.
     """
+    check_pinhole(first)
+    check_pinhole(second)
     R_s, t_s = first.viewmat[:3, :3], first.viewmat[:3, 3]
     R_t, t_t = second.viewmat[:3, :3], second.viewmat[:3, 3]
     R_st = R_t @ R_s.T
@@ -95,31 +103,31 @@ def fundamental(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray, 
 def epipolar_depth(
     first: Camera, second: Camera, pixels: np.ndarray, matches: np.ndarray, min_parallax: float = 0.5
 ) -> PairDepth:
-    """Depth of pixels of the first view from their matches in the second (method: docs/flow_epipolar.md, equations 1 to 6).
+    """Return depths of pixels of the first view from their matches in the second (docs/flow_epipolar.md, equations 1 to 6).
 
     Args:
         first: Camera whose pixels get a depth.
         second: Camera that the matches lie in.
         pixels: Positions in the first image [px], shape [N, 2].
-        matches: Where each is found in the second image [px], shape [N, 2]; NaN where nowhere.
+        matches: Position of each in the second image [px], shape [N, 2]; NaN where there is no match.
         min_parallax: Smallest angle between the rays [deg].
 
     Returns:
-        Depth, residual, sensitivity and validity; a match off its line is judged by the foot on it. Without a baseline
-        nothing is valid.
+        Depth, residual, sensitivity and validity of N pixels; a match off its line is replaced by its foot on the line.
+        Without a baseline nothing is valid.
     """
     F, R_st, tau = fundamental(first, second)
-    rays = _homogeneous(pixels) @ np.linalg.inv(first.K).T
-    lines = _homogeneous(pixels) @ F.T
+    rays = homogeneous(pixels) @ np.linalg.inv(first.K).T
+    lines = homogeneous(pixels) @ F.T
     to_first = np.linalg.inv(second.K).T @ R_st
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         lines /= np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
         signed = (lines[:, :2] * matches).sum(1) + lines[:, 2]
         feet = matches - signed[:, None] * lines[:, :2]
-        depth, along, sine = _triangulate(rays, _homogeneous(feet) @ to_first, tau)
+        depth, along, sine = _triangulate(rays, homogeneous(feet) @ to_first, tau)
         direction = np.stack([-lines[:, 1], lines[:, 0]], 1)
-        ahead, ahead_along, _ = _triangulate(rays, _homogeneous(feet + STEP * direction) @ to_first, tau)
-        behind, behind_along, _ = _triangulate(rays, _homogeneous(feet - STEP * direction) @ to_first, tau)
+        ahead, ahead_along, _ = _triangulate(rays, homogeneous(feet + STEP * direction) @ to_first, tau)
+        behind, behind_along, _ = _triangulate(rays, homogeneous(feet - STEP * direction) @ to_first, tau)
         sensitivity = np.abs(ahead - behind) / (2 * STEP)
         inside = (feet >= 0).all(1) & (feet[:, 0] < second.width) & (feet[:, 1] < second.height)
         valid = (depth > 0) & (along > 0) & (sine > np.sin(np.radians(min_parallax))) & inside & np.isfinite(depth)
@@ -128,7 +136,7 @@ def epipolar_depth(
 
 
 def _triangulate(rays: np.ndarray, others: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Signed lengths z, mu of ``z ray + tau = mu other`` and the sine of the angle between both, shape [N] each."""
+    """Return the signed lengths z and mu in ``z ray + tau = mu other`` and the sine of the rays' angle, shape [N] each."""
     normal = np.cross(rays, others)
     square = (normal**2).sum(1)
     z = (np.cross(others, tau) * normal).sum(1) / square
@@ -139,7 +147,7 @@ def _triangulate(rays: np.ndarray, others: np.ndarray, tau: np.ndarray) -> tuple
 
 
 def round_trip(matches: np.ndarray, pixels: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """Distance [px], shape [N], between pixels and where the flow ``back`` [H, W, 2] takes their matches; inf outside."""
+    """Return distances [px], shape [N], from pixels to their matches moved by the flow ``back`` [H, W, 2]; inf outside."""
     import cv2
 
     height, width = back.shape[:2]
@@ -155,17 +163,17 @@ def round_trip(matches: np.ndarray, pixels: np.ndarray, back: np.ndarray) -> np.
 
 
 def blend(depths: np.ndarray, sensitivities: np.ndarray, valid: np.ndarray, mode: str) -> tuple[np.ndarray, np.ndarray]:
-    """One depth and sensitivity per pixel from the candidates of S source views.
+    """Return one depth and sensitivity per pixel from the candidates of S source views.
 
     Args:
         depths: Candidates [u], shape [S, N], nearest source first.
         sensitivities: |dz/dpx| of each [u/px], at least 0, shape [S, N].
-        valid: Which candidates count, shape [S, N].
+        valid: True where a candidate counts, shape [S, N].
         mode: least_sensitive takes the candidate that a slide along its line changes least, the nearest of equal ones;
             nearest_first the first valid one; mean_valid the mean; inverse_sensitivity the mean weighted by 1 / |dz/dpx|.
 
     Returns:
-        Depths [N], 0 where no candidate is valid, and sensitivities [N], infinite there.
+        Depths [u], shape [N], 0 where no candidate is valid; and sensitivities [u/px], shape [N], infinite there.
 
     Raises:
         UsageError: There is no such mode.
@@ -190,12 +198,12 @@ def blend(depths: np.ndarray, sensitivities: np.ndarray, valid: np.ndarray, mode
 
 
 def flow_depth(views: Sequence[View], index: int, flow: FlowBetween, config: EpipolarConfig) -> ViewDepth:
-    """Depth of one view by flow to its nearest others.
+    """Return the depth of one view by flow to its nearest others.
 
     Args:
-        views: The views, all of them.
-        index: The one that gets a depth.
-        flow: Flow of an ordered pair.
+        views: All views.
+        index: Index of the view that gets a depth.
+        flow: Function that gives the flow of an ordered pair.
         config: Checks and blending.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Networks for `--depth-model` and `--segmentation-model`, written as ONNX from public implementations."""
+"""Export of public networks as ONNX files, for `--depth-model` and `--segmentation-model`."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ if TYPE_CHECKING:
 
 MODELS = ("dpt", "fcn-resnet18", "fcn-resnet50")
 DPT_WEIGHTS = "Intel/dpt-large"
-"""On the Hugging Face hub, Apache-2.0: the network of Ranftl et al. 2021, which the paper uses."""
+"""Name on the Hugging Face hub (Apache-2.0) of the network of Ranftl et al. 2021, which the paper uses."""
 MULTIPLE = 32
 """Coarsest stride of all three networks [px]."""
-AGREEMENT = 1e-4
-"""Largest difference between onnxruntime and torch, in standard deviations of the output."""
-LARGEST_FILE = 2**31
-"""No protobuf message is longer [bytes]."""
+MAX_DIFFERENCE = 1e-4
+"""Largest allowed difference between onnxruntime and torch, in standard deviations of the output."""
+MAX_FILE_BYTES = 2**31
+"""Largest size of a protobuf message, hence of a model in one file [bytes]."""
 REMEDY = "`pip install warpgs[export]`"
 
 
 @dataclass(frozen=True)
 class ExportRequest:
-    """Which network to write, and how."""
+    """Choice of the network to write, its weights and its input size."""
 
     model: str
     """dpt (depth); fcn-resnet18, the paper's segmentation network; fcn-resnet50, one that torchvision has weights for."""
     weights: str | None = None
-    """dpt: a Hugging Face name or folder instead of Intel/dpt-large. fcn-resnet18: a safetensors file of one's own."""
+    """dpt: a Hugging Face name or folder instead of Intel/dpt-large. fcn-resnet18: a safetensors file of your own."""
     random_weights: bool = False
-    """Small, untrained: for trying the way only."""
+    """Take a small untrained network, to try the export only."""
     size: int = 384
-    """Both sides of the input [px], a multiple of 32; photographs are stretched to it, and the map back."""
+    """Both sides of the input [px], a multiple of 32; images are stretched to it, and the map back."""
 
     def __post_init__(self):
         if self.model not in MODELS:
@@ -76,7 +76,7 @@ def _dpt(request: ExportRequest) -> torch.nn.Module:
 
 
 def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
-    """FCN-8s (Long et al. 2015) on ResNet-18 (He et al. 2016): class scores at strides 8, 16 and 32, summed at stride 8."""
+    """Return FCN-8s (Long et al. 2015) on ResNet-18 (He et al. 2016): class scores at strides 8, 16, 32, summed at stride 8."""
     import torch
     from transformers import ResNetBackbone, ResNetConfig
 
@@ -151,7 +151,7 @@ def _depth_alone(network: torch.nn.Module) -> torch.nn.Module:
 
 
 def build(request: ExportRequest) -> torch.nn.Module:
-    """The network in torch, ready to infer: [1, 3, h, w] to disparity [1, h, w] or to scores [1, 21, h, w].
+    """Return the network in torch, ready to infer: [1, 3, h, w] to disparity [1, h, w] or to scores [1, 21, h, w].
 
     Raises:
         ResourceError: A package of the extra ``export`` is missing.
@@ -169,7 +169,7 @@ def build(request: ExportRequest) -> torch.nn.Module:
     return (_depth_alone(network) if request.model == "dpt" else network).eval()
 
 
-def _onnx_bytes(network: torch.nn.Module, picture: torch.Tensor, output: str) -> bytes:
+def _onnx_bytes(network: torch.nn.Module, image: torch.Tensor, output: str) -> bytes:
     import torch
 
     try:
@@ -184,7 +184,7 @@ def _onnx_bytes(network: torch.nn.Module, picture: torch.Tensor, output: str) ->
             warnings.simplefilter("ignore")
             path = Path(folder) / "network.onnx"
             torch.onnx.export(
-                network, (picture,), path, input_names=["image"], output_names=[output],
+                network, (image,), path, input_names=["image"], output_names=[output],
                 dynamo=True, external_data=False, verbose=False,
             )  # fmt: skip
             return path.read_bytes()
@@ -193,17 +193,17 @@ def _onnx_bytes(network: torch.nn.Module, picture: torch.Tensor, output: str) ->
 
 
 def export_network(request: ExportRequest, out: Path) -> list[str]:
-    """Write a network as ONNX, and beside it the JSON file that says how to feed it.
+    """Write a network as ONNX, and beside it the JSON file that describes its input and output.
 
     Args:
-        request: Which, and at what input size.
-        out: The ONNX file.
+        request: The network, its weights and its input size.
+        out: The ONNX file to write.
 
     Returns:
         Lines for the user, one on how well onnxruntime and torch agree.
 
     Raises:
-        DataError: The weights cannot be had, the file would be too large, or onnxruntime gives something else than torch.
+        DataError: The weights cannot be had, the file would be too large, or onnxruntime and torch disagree.
         ResourceError: A package is missing, or the file cannot be written.
         UsageError: There are no weights of that network.
     """
@@ -211,21 +211,21 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
 
     network = build(request)
     weight = sum(p.numel() * p.element_size() for p in network.parameters())
-    if not weight < LARGEST_FILE:
+    if not weight < MAX_FILE_BYTES:
         raise DataError(
             f"{request.model}: {weight / 2**30:.1f} GiB of weights do not fit into one ONNX file; choose smaller ones"
         )
-    picture = torch.rand(1, 3, request.size, request.size, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    image = torch.rand(1, 3, request.size, request.size, generator=torch.Generator().manual_seed(0)) * 2 - 1
     output = "disparity" if request.model == "dpt" else "scores"
     with torch.no_grad():
-        wanted = network(picture).numpy()
-        write_bytes(out, _onnx_bytes(network, picture, output))
+        wanted = network(image).numpy()
+        write_bytes(out, _onnx_bytes(network, image, output))
     mean, std = HALF if request.model == "dpt" else IMAGENET
     values = {"output": "disparity" if request.model == "dpt" else "classes", "mean": mean, "std": std}
     write_text(side_file(out), json.dumps(values) + "\n")
-    found = open_network(out).run(picture[0].permute(1, 2, 0).numpy())
+    found = open_network(out).run(image[0].permute(1, 2, 0).numpy())
     difference = float(np.abs(found - wanted).max() / wanted.std())
-    if not difference < AGREEMENT:
+    if not difference < MAX_DIFFERENCE:
         raise DataError(
             f"{out}: onnxruntime and torch differ by {difference:.1e} standard deviations; try other versions of both"
         )

@@ -13,30 +13,29 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError, UsageError
-from warpgs.files import write_bytes
-from warpgs.priors.epipolar import FlowBetween, fundamental
+from warpgs.priors.epipolar import FlowBetween, fundamental, homogeneous
 from warpgs.scene import View
 
 KINDS = ("dis", "deepflow", "sparse")
 FLO_MAGIC = np.float32(202021.25)
 """First four bytes of a .flo file (Baker et al. 2011, vision.middlebury.edu/flow)."""
-UNKNOWN = 1e9
-"""Components of this size or more mean unknown flow (same source)."""
+MIN_UNKNOWN = 1e9
+"""Smallest size of a component that means unknown flow (same source)."""
 MAX_SIDE = 1 << 15
 RATIO = 0.8
 """Lowe's ratio test for the matches of kind sparse."""
 LINE_DISTANCE = 2.0
-"""A sparse match must lie this near to its epipolar line [px]."""
+"""Largest distance of a sparse match from its epipolar line [px]."""
 MIN_SPARSE = 16
-"""Matches below which nothing is interpolated."""
+"""Smallest number of matches from which flow is interpolated."""
 NET_STRIDE = 8
-"""Networks of the RAFT kind take sides that are multiples of this."""
+"""Side length [px] of whose multiples networks of the RAFT kind take images."""
 RANGES = {"255": (255.0, 0.0), "unit": (1.0, 0.0), "signed": (2.0, -1.0)}
 """Factor and offset from colours in [0, 1] to a network's input: RAFT's original code takes 0..255, torchvision's -1..1."""
 
 
 def read_flo(path: Path) -> np.ndarray:
-    """Flow of a Middlebury file, float32 [H, W, 2], NaN where unknown.
+    """Return the flow of a Middlebury file, float32, shape [H, W, 2]; NaN where unknown.
 
     Raises:
         DataError: The file is missing, of another kind, or cut short.
@@ -56,23 +55,11 @@ def read_flo(path: Path) -> np.ndarray:
             "way. Copy or write it anew"
         )
     flow = np.frombuffer(raw, "<f4", offset=12).reshape(height, width, 2)
-    return np.where((np.abs(flow) < UNKNOWN).all(2, keepdims=True), flow, np.float32(np.nan)).astype(np.float32)
-
-
-def write_flo(path: Path, flow: np.ndarray) -> None:
-    """Write flow [H, W, 2] as a Middlebury file, atomically; what is not finite is written as unknown.
-
-    Raises:
-        ResourceError: The file cannot be written.
-    """
-    height, width = flow.shape[:2]
-    known = np.isfinite(flow).all(2, keepdims=True)
-    values = np.where(known, flow, 10 * UNKNOWN).astype("<f4")
-    write_bytes(path, FLO_MAGIC.astype("<f4").tobytes(), np.array([width, height], "<i4").tobytes(), values.tobytes())
+    return np.where((np.abs(flow) < MIN_UNKNOWN).all(2, keepdims=True), flow, np.float32(np.nan)).astype(np.float32)
 
 
 def resize_flow(flow: np.ndarray, width: int, height: int, second: tuple[int, int] | None = None) -> np.ndarray:
-    """Flow at another image size: resampled, u and v scaled with the sides.
+    """Return flow at another image size: resampled, with u and v scaled like the sides.
 
     Args:
         flow: Flow between two images of its own size, shape [h, w, 2].
@@ -81,7 +68,7 @@ def resize_flow(flow: np.ndarray, width: int, height: int, second: tuple[int, in
         second: New width and height of the second image [px], where they differ from the first's.
 
     Returns:
-        Flow [height, width, 2].
+        Flow [px], float32, shape [height, width, 2].
     """
     import cv2
 
@@ -97,7 +84,7 @@ def resize_flow(flow: np.ndarray, width: int, height: int, second: tuple[int, in
 
 
 def flo_names(views: Sequence[View], i: int, j: int) -> list[str]:
-    """File names under which the flow from view i to view j is looked for, in this order.
+    """Return the file names under which the flow from view i to view j is looked for, in order.
 
     ``A-to-B.flo`` with the stems of both image names; then NexusGS's ``A_i_j.flo``, with i and j counted in the sorted list of
     training views.
@@ -131,7 +118,7 @@ def _gray(view: View) -> np.ndarray:
 
 
 def _same_size(views: Sequence[View], i: int, j: int, compute: Callable[[View, View], np.ndarray | None]) -> np.ndarray | None:
-    """Flow by a method that wants both images of one size: the second is brought to the first's."""
+    """Return flow by a method that needs both images at one size: the second is resized to the first's."""
     import cv2
 
     first, second = views[i], views[j]
@@ -160,7 +147,7 @@ def _classic(kind: str) -> Callable[[View, View], np.ndarray]:
 
 
 def _sparse(views: Sequence[View]) -> FlowBetween:
-    """SIFT matches on their epipolar lines, interpolated along edges (Revaud et al. 2015)."""
+    """Return a function for the flow from SIFT matches near epipolar lines, interpolated along edges (Revaud et al. 2015)."""
     import cv2
 
     sift, matcher = cv2.SIFT_create(contrastThreshold=0.01), cv2.BFMatcher(cv2.NORM_L2)
@@ -178,7 +165,7 @@ def _sparse(views: Sequence[View]) -> FlowBetween:
         a, b = a[ids[:, 0]], b[ids[:, 1]]
         F = fundamental(views[i].camera, views[j].camera)[0]
         # OpenCV's pixel centres are at whole numbers
-        lines = np.concatenate([a + 0.5, np.ones((len(a), 1))], 1) @ F.T
+        lines = homogeneous(a + 0.5) @ F.T
         with np.errstate(divide="ignore", invalid="ignore"):
             off = np.abs((lines[:, :2] * (b + 0.5)).sum(1) + lines[:, 2]) / np.linalg.norm(lines[:, :2], axis=1)
         a, b = a[off < LINE_DISTANCE], b[off < LINE_DISTANCE]
@@ -196,7 +183,7 @@ def _sparse(views: Sequence[View]) -> FlowBetween:
 
 
 def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]:
-    """A network of two images [1, 3, h, w] to flow [1, 2, h, w] at the size of its input; the last such output counts."""
+    """Return a function for the flow by a network of two images [1, 3, h, w]; its last output [1, 2, h, w] counts."""
     import cv2
     import onnxruntime
 
@@ -234,7 +221,7 @@ def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]
 
 
 def flow_between(views: Sequence[View], kind: str, value_range: str = "255") -> FlowBetween:
-    """A function that gives the flow of an ordered pair of views, computed or read once each.
+    """Return a function that gives the flow of an ordered pair of views, computed or read once each.
 
     Args:
         views: Training views.

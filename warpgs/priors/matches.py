@@ -10,17 +10,17 @@ from warpgs import geometry
 from warpgs.scene import PointCloud, View
 
 RATIO = 0.8
-"""Lowe's ratio test: the best match must be this much nearer than the second."""
+"""Largest ratio of the distances to the best and to the second match (Lowe's test)."""
 MAX_ERROR = 2.0
 """Largest reprojection error in either view [px]."""
 MIN_ANGLE = 1.0
 """Smallest angle between the two rays [deg]; below it depth is noise."""
 MAX_PAIRS = 30
-"""Pairs of views looked at, nearest first."""
+"""Largest number of pairs of views that are matched, nearest first."""
 
 
 def _triangulate(a: View, b: View, pixels_a: np.ndarray, pixels_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points midway between the two rays of each match [N, 3], and which of them are trustworthy [N]."""
+    """Return the points [u] midway between the rays of each match, shape [N, 3], and True where they pass the checks [N]."""
     origins = [v.camera.center for v in (a, b)]
     rays = []
     for view, pixels in ((a, pixels_a), (b, pixels_b)):
@@ -41,9 +41,10 @@ def _triangulate(a: View, b: View, pixels_a: np.ndarray, pixels_b: np.ndarray) -
 
 
 def triangulate_matches(views: list[View]) -> PointCloud:
-    """Match SIFT features between pairs of views (Lowe 2004) and triangulate what the known poses confirm.
+    """Match SIFT features between pairs of views (Lowe 2004) and triangulate the matches that agree with the known poses.
 
-    Returns a cloud with pixel colours; it is empty where nothing matched.
+    Returns:
+        N points [u] with the colours of their pixels in [0, 1]; none where nothing matched.
     """
     import cv2
 

@@ -1,4 +1,4 @@
-"""What an ONNX file holds, read from its bytes before onnxruntime sees them: nothing outside the file may be pulled in.
+"""Check of an ONNX file by its bytes, before onnxruntime loads it: nothing outside the file may be pulled in.
 
 The wire format is protobuf; field numbers are those of onnx.proto (ONNX IR version 3 and later).
 """
@@ -11,9 +11,9 @@ from pathlib import Path
 from warpgs.errors import DataError
 
 DOMAINS = ("", "ai.onnx", "ai.onnx.ml", "com.microsoft")
-"""Operator sets that onnxruntime itself brings; any other needs a library of foreign code, or a function in the file."""
+"""Operator sets that onnxruntime has itself; any other needs a library of foreign code, or a function in the file."""
 MAX_NESTING = 32
-"""Graphs within graphs (If, Loop, Scan) go no deeper in a sane model."""
+"""Largest depth of graphs within graphs (If, Loop, Scan) that is accepted."""
 
 MODEL_GRAPH, MODEL_OPSET, MODEL_FUNCTION = 7, 8, 25
 GRAPH_NODE, GRAPH_INITIALIZER, GRAPH_SPARSE = 1, 5, 15
@@ -39,7 +39,7 @@ def _varint(data: memoryview, at: int) -> tuple[int, int]:
 
 
 def _message(data: memoryview) -> Message:
-    """Field numbers with their values: whole numbers, or bytes; ValueError or IndexError where it is no protobuf."""
+    """Return field numbers and values, whole numbers or bytes; ValueError or IndexError where the data is no protobuf."""
     fields, at = [], 0
     while at < len(data):
         key, at = _varint(data, at)
@@ -66,7 +66,7 @@ def _text(message: Message, number: int) -> str:
 
 
 class _Walk:
-    """Goes through every node and tensor of a model."""
+    """A walk through every node and tensor of a model that refuses what needs other files or foreign code."""
 
     def __init__(self, path: Path, own: set[tuple[str, str]]):
         self.path, self.own = path, own
@@ -109,14 +109,14 @@ class _Walk:
 
 
 def check_onnx(data: bytes, path: Path) -> None:
-    """See that bytes are an ONNX model that needs nothing but itself: no external data, no operators of other domains.
+    """Check that bytes are an ONNX model that needs nothing but itself: no external data, no operators of other domains.
 
     Args:
         data: The whole file.
         path: Its name, for messages.
 
     Raises:
-        DataError: It is no ONNX model, keeps weights elsewhere (even where that file exists), or uses custom operators.
+        DataError: The bytes are no ONNX model, keep weights elsewhere (even where that file exists), or use custom operators.
     """
     try:
         model = _message(memoryview(data))

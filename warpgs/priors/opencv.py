@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 
 @contextlib.contextmanager
-def alone() -> Iterator[None]:
+def single_threaded_opencv() -> Iterator[None]:
     """Keep OpenCV from starting threads, in this process; our own call it side by side.
 
     Many of its calls here are so short that starting threads takes longer than they save, and last digits of some depend on
@@ -24,7 +24,7 @@ def alone() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def own_code() -> None:
+def without_ipp() -> None:
     """Turn IPP off for the calling thread: it takes other instructions, with other last digits, on another processor."""
     import cv2
 

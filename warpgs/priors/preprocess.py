@@ -1,4 +1,4 @@
-"""What a network wants its picture to look like: told by flags, by a small JSON file beside the model, or assumed and said."""
+"""Input and output of a network, described by flags, by a JSON file beside the model, or assumed with a note."""
 
 from __future__ import annotations
 
@@ -13,41 +13,40 @@ from warpgs.errors import DataError, UsageError
 from warpgs.priors.session import Network
 
 IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
-"""Mean and standard deviation of ImageNet's colours: what torchvision's and Depth Anything's networks take."""
+"""Mean and standard deviation of ImageNet's colours, which torchvision's and Depth Anything's networks expect."""
 HALF = ((0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
-"""Colours in [-1, 1]: what DPT (Ranftl et al. 2021) takes."""
+"""Mean and standard deviation for colours in [-1, 1], which DPT (Ranftl et al. 2021) expects."""
 
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """Size and colours of a network's input, and what its output means."""
+    """Size and colours of a network's input, and the meaning of its output."""
 
     size: int
     """Shorter side [px] of the input where the graph leaves it free."""
     multiple: int
     """Both sides are made multiples of this [px] where the graph leaves them free."""
     mean: tuple[float, float, float]
-    """Subtracted from colours in [0, 1], red first."""
+    """Colour subtracted from colours in [0, 1], red first."""
     std: tuple[float, float, float]
-    """What the difference is divided by."""
+    """Divisor of the difference, red first."""
     output: str
-    """What the output is: disparity, depth or classes."""
+    """Meaning of the output: disparity, depth or classes."""
 
     def prepare(self, network: Network, image: np.ndarray) -> np.ndarray:
-        """The input [h, w, 3], float32, for a photograph [H, W, 3] in [0, 1]; both cover the same field of view."""
+        """Return the input, float32, shape [h, w, 3], for an image [H, W, 3] in [0, 1]; both have the same field of view."""
         height, width = network.size or self.free_size(*image.shape[:2])
-        picture = resize(image, height, width)
-        return (picture - np.float32(self.mean)) / np.float32(self.std)
+        return (resize(image, height, width) - np.float32(self.mean)) / np.float32(self.std)
 
     def free_size(self, height: int, width: int) -> tuple[int, int]:
-        """Input size with the photograph's proportions, rounded to the nearest multiple [px]."""
+        """Return an input size (height, width) [px] with the proportions of an image, rounded to `multiple`."""
         scale = self.size / min(height, width)
         h, w = (max(1, round(scale * side / self.multiple)) * self.multiple for side in (height, width))
         return h, w
 
 
 def resize(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """An image [H, W] or [H, W, C] at another size, float32, pixel centres aligned at +0.5.
+    """Return an image [H, W] or [H, W, C] at another size, float32, pixel centres aligned at +0.5.
 
     Bilinear where it grows; averages over areas where it shrinks, so that fine texture does not alias.
     """
@@ -81,10 +80,10 @@ KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
 
 
 def check_value(key: str, value: object, where: str, error: type[Exception] = UsageError) -> None:
-    """See that a value may describe a network's input or output.
+    """Check that a value may describe a network's input or output.
 
     Raises:
-        UsageError: It may not; or ``error`` where given.
+        UsageError: It may not; ``error`` instead where given.
     """
     wanted, good = KEYS[key]
     if not good(value):
@@ -92,15 +91,15 @@ def check_value(key: str, value: object, where: str, error: type[Exception] = Us
 
 
 def side_file(model: Path) -> Path:
-    """The JSON file that describes a model: its name with .json behind."""
+    """Return the path of the JSON file that describes a model: its name with .json behind."""
     return model.with_name(model.name + ".json")
 
 
 def read_side_file(model: Path) -> dict:
-    """What the JSON file beside a model says; empty where there is none.
+    """Return the entries of the JSON file beside a model; none where there is no such file.
 
     Raises:
-        DataError: It is no JSON object, or holds a key or a value that means nothing.
+        DataError: The file is no JSON object, or holds a key or a value that means nothing.
     """
     path = side_file(model)
     if not path.exists():
@@ -108,7 +107,7 @@ def read_side_file(model: Path) -> dict:
     try:
         values = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as e:
-        raise DataError(f"{path}: cannot be read ({e}); mend or remove it") from e
+        raise DataError(f"{path}: cannot be read ({e}); fix or remove it") from e
     if not isinstance(values, dict):
         raise DataError(f"{path}: holds no JSON object; write one with the keys {', '.join(KEYS)}")
     for key, value in values.items():
@@ -118,17 +117,17 @@ def read_side_file(model: Path) -> dict:
     return values
 
 
-def describe(network: Network, flags: dict, usual: Preprocessing, flag: str) -> tuple[Preprocessing, list[str]]:
-    """How to feed a network: flags come before the file beside the model, and that before what is usual.
+def describe(network: Network, flags: dict, defaults: Preprocessing, flag: str) -> tuple[Preprocessing, list[str]]:
+    """Return the description of a network: flags come before the file beside the model, and that before the defaults.
 
     Args:
         network: The opened model.
         flags: Values of flags by field name; None or 0 where a flag was not given.
-        usual: What holds where neither says anything.
+        defaults: Description that holds where neither has a value.
         flag: Beginning of the flags' names, for notes.
 
     Returns:
-        The description, and a note on what was assumed.
+        The description, and notes on values that were assumed.
 
     Raises:
         DataError: The file beside the model is not what it must be.
@@ -141,12 +140,14 @@ def describe(network: Network, flags: dict, usual: Preprocessing, flag: str) -> 
         raise UsageError(f"--{flag}-size {given['size']}: {network.path} takes {width} x {height} px only; leave the flag out")
     needed = ["mean", "std"] + ([] if network.size else ["size", "multiple"]) + (["output"] if flag == "depth" else [])
     assumed = [k for k in needed if k not in values]
-    values = asdict(usual) | values
+    values = asdict(defaults) | values
     values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     notes = []
     if assumed:
-        said = ", ".join(
+        assumed_text = ", ".join(
             f"{k} {' '.join(map(str, v)) if isinstance(v, tuple) else v}" for k, v in values.items() if k in assumed
         )
-        notes.append(f"{network.path.name}: assumed {said}; flags --{flag}-... or {side_file(network.path).name} say otherwise")
+        notes.append(
+            f"{network.path.name}: assumed {assumed_text}; flags --{flag}-... or {side_file(network.path).name} say otherwise"
+        )
     return Preprocessing(**values), notes

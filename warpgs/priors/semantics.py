@@ -1,4 +1,4 @@
-"""What a photograph shows, as three maps: how sure the labels are, where they change, and what is not background.
+"""Semantics of an image as three maps: confidence of the labels, their boundaries, and foreground.
 
 Paper, Multi-Modal Importance Assessment: S_semantic = F_seg(I) (omega_boundary + omega_foreground).
 """
@@ -13,29 +13,29 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.priors.opencv import alone, own_code
+from warpgs.priors.opencv import single_threaded_opencv, without_ipp
 from warpgs.priors.preprocess import IMAGENET, Preprocessing, resize
 from warpgs.priors.session import Network
 
 CLASSES = 21
-"""PASCAL VOC: background first, then 20 kinds of things."""
-USUAL = Preprocessing(512, 32, *IMAGENET, output="classes")
+"""Number of PASCAL VOC classes: background first, then 20 kinds of things."""
+DEFAULTS = Preprocessing(512, 32, *IMAGENET, output="classes")
 BOUNDARY_WIDTH = 2 / 500
 """Standard deviation of omega_boundary, in image widths: 2 px at 500 px."""
-LEAST_FOREGROUND = 0.01
-"""With a smaller mean the network knows nothing that the photograph shows."""
-EVENNESS = 1000.0
-"""Strength by which saliency is evened out within flat pieces [px^2]."""
+MIN_FOREGROUND = 0.01
+"""Smallest mean foreground; below it the network knows nothing that the image shows."""
+SMOOTHING = 1000.0
+"""Strength of the smoothing of saliency within flat regions [px^2]."""
 L0_WEIGHT, L0_GROWTH = 0.04, 2.0
-"""Weight of a gradient, and growth per round, of L0 smoothing (Xu et al. 2011, who use 0.02 and 2 for photographs: twice that
-weight drops foliage and gravel and keeps outlines)."""
+"""Weight of a gradient, and growth per round, of L0 smoothing. Xu et al. 2011 use 0.02 and 2 for photographs; twice that weight
+drops foliage and gravel and keeps outlines."""
 EDGE_LOW, EDGE_HIGH = 100.0, 250.0
-"""Canny's thresholds on the smoothed picture, sums of absolute Sobel derivatives of 8-bit colours."""
+"""Canny's thresholds on the smoothed image: sums of absolute Sobel derivatives of 8-bit colours."""
 
 
 @dataclass(frozen=True)
 class SemanticMaps:
-    """float32, shape [H, W], in [0, 1]; see `warpgs.scene.Prior`."""
+    """The semantic maps of `warpgs.scene.Prior`: float32, shape [H, W], in [0, 1]."""
 
     confidence: np.ndarray
     boundary: np.ndarray
@@ -48,9 +48,12 @@ def _softmax(logits: np.ndarray) -> np.ndarray:
 
 
 def class_probabilities(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> np.ndarray:
-    """Probability of each of the 21 classes at every pixel, float32, shape [H, W, 21], for a photograph [H, W, 3] in [0, 1].
+    """Return the probability of each of the 21 classes at every pixel of an image [H, W, 3] in [0, 1].
 
     An output that already sums to one is taken for probabilities; any other for logits, resized before the softmax.
+
+    Returns:
+        Probabilities, float32, shape [H, W, 21].
 
     Raises:
         DataError: The output is not 1 x 21 x h x w or 1 x h x w x 21.
@@ -68,10 +71,10 @@ def class_probabilities(network: Network, preprocessing: Preprocessing, image: n
 
 
 def boundary_weight(labels: np.ndarray) -> np.ndarray:
-    """omega_boundary of a label map [H, W]: exp(-d^2 / 2 s^2), float32.
+    """Return omega_boundary of a label map [H, W]: exp(-d^2 / 2 s^2), float32, shape [H, W].
 
-    d is the distance [px] to the nearest pixel with a neighbour (of four) of another label, s = 2 px per 500 px of width. 0
-    everywhere where all labels are the same.
+    d is the distance [px] to the nearest pixel with a neighbour (of four) of another label, and s = 2 px per 500 px of width.
+    The result is 0 everywhere where all labels are the same.
     """
     edge = np.zeros(labels.shape, bool)
     across, down = labels[:, 1:] != labels[:, :-1], labels[1:] != labels[:-1]
@@ -83,7 +86,7 @@ def boundary_weight(labels: np.ndarray) -> np.ndarray:
 
 
 def _falloff(edge: np.ndarray) -> np.ndarray:
-    """exp(-d^2 / 2 s^2) of the distance to the nearest True pixel [H, W]; 0 where there is none."""
+    """Return exp(-d^2 / 2 s^2) of the distance d to the nearest True pixel, shape [H, W]; 0 where there is none."""
     import cv2
 
     if not edge.any():
@@ -94,10 +97,10 @@ def _falloff(edge: np.ndarray) -> np.ndarray:
 
 
 def network_semantics(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> SemanticMaps:
-    """The three maps that a segmentation network gives for a photograph [H, W, 3] in [0, 1].
+    """Return the maps of an image [H, W, 3] in [0, 1] by a segmentation network.
 
     Raises:
-        DataError: As `class_probabilities`.
+        DataError: The output is not 1 x 21 x h x w or 1 x h x w x 21.
     """
     p = class_probabilities(network, preprocessing, image)
     foreground = np.clip(1 - p[..., 0], 0, 1)
@@ -105,11 +108,14 @@ def network_semantics(network: Network, preprocessing: Preprocessing, image: np.
 
 
 def classical_semantics(image: np.ndarray) -> SemanticMaps:
-    """The three maps without a network, from colours [H, W, 3] in [0, 1] alone.
+    """Return the maps of an image [H, W, 3] in [0, 1] without a network, from its colours alone.
 
-    L0 smoothing (Xu et al. 2011) flattens texture; what Canny finds in the rest are the boundaries. Foreground is
-    fine-grained saliency (Montabone and Soto 2010), evened out within the flat pieces. Confidence is that of a decision
-    between foreground and background.
+    L0 smoothing (Xu et al. 2011) flattens texture; Canny's edges in the result are the boundaries. Foreground is
+    fine-grained saliency (Montabone and Soto 2010), smoothed within the flat regions. Confidence is the larger of foreground
+    and 1 - foreground.
+
+    Raises:
+        DataError: OpenCV cannot compute the saliency.
     """
     import cv2
 
@@ -118,8 +124,8 @@ def classical_semantics(image: np.ndarray) -> SemanticMaps:
     boundary = _falloff(cv2.Canny(flat, EDGE_LOW, EDGE_HIGH) > 0)
     done, saliency = cv2.saliency.StaticSaliencyFineGrained_create().computeSaliency(pixels)
     if not done:
-        raise DataError(f"the saliency of a photograph of {image.shape[1]} x {image.shape[0]} px cannot be computed")
-    even = cv2.ximgproc.fastGlobalSmootherFilter(flat, saliency.astype(np.float32), EVENNESS, 8.0)
+        raise DataError(f"the saliency of an image of {image.shape[1]} x {image.shape[0]} px cannot be computed")
+    even = cv2.ximgproc.fastGlobalSmootherFilter(flat, saliency.astype(np.float32), SMOOTHING, 8.0)
     low, high = np.percentile(even, [2, 98])
     foreground = np.clip((even - low) / max(high - low, 1e-6), 0, 1).astype(np.float32)
     return SemanticMaps(np.maximum(foreground, 1 - foreground), boundary, foreground)
@@ -127,15 +133,15 @@ def classical_semantics(image: np.ndarray) -> SemanticMaps:
 
 def classical_maps(images: Sequence[np.ndarray]) -> list[SemanticMaps]:
     """Return `classical_semantics` of each image; a thread works on one, so results do not depend on the number of threads."""
-    with alone(), ThreadPoolExecutor(os.cpu_count() or 1, initializer=own_code) as pool:  # OpenCV lets other threads run
+    with single_threaded_opencv(), ThreadPoolExecutor(os.cpu_count() or 1, initializer=without_ipp) as pool:
         return list(pool.map(classical_semantics, images))
 
 
 def knows_foreground(maps: SemanticMaps) -> bool:
-    """Whether the maps tell an object from its background.
+    """Return True where the maps tell an object from its background.
 
     They do not where the mean foreground stays below 1 % (tabletop scans hold no VOC class), or where every pixel is labelled
-    background, however unsurely.
+    background with a mean foreground below a half.
     """
     mean = float(maps.foreground.mean())
-    return mean >= LEAST_FOREGROUND and (bool(maps.boundary.any()) or mean >= 0.5)
+    return mean >= MIN_FOREGROUND and (bool(maps.boundary.any()) or mean >= 0.5)

@@ -1,9 +1,8 @@
-"""Networks that turn a photograph into a map, run by onnxruntime from one ONNX file that the user names."""
+"""Networks that turn an image into a map, run by onnxruntime from one ONNX file that the user names."""
 
 from __future__ import annotations
 
 import hashlib
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +11,7 @@ import numpy as np
 
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.priors.onnx_file import check_onnx
+from warpgs.runtime.processor import usable_cores
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -23,10 +23,10 @@ ERRORS_ONLY = 3
 
 @dataclass(frozen=True)
 class Network:
-    """An opened model with one picture as input and one map as output."""
+    """An opened model with one image as input and one map as output."""
 
     path: Path
-    """Its file."""
+    """File of the model."""
     sha256: str
     """SHA-256 of the file, hexadecimal."""
     session: InferenceSession
@@ -34,22 +34,22 @@ class Network:
     layout: str
     """Order of the input's axes: nchw or nhwc."""
     size: tuple[int, int] | None
-    """Height and width [px] that the graph demands; None where both are free."""
+    """Height and width [px] that the graph fixes; None where both are free."""
     type: type
     """Scalar type of the input."""
 
     @property
     def title(self) -> str:
-        """File name and the first digits of the hash, for reports."""
+        """File name and first digits of the hash, for reports."""
         return f"{self.path.name} (SHA-256 {self.sha256[:12]})"
 
-    def run(self, picture: np.ndarray) -> np.ndarray:
-        """The output, float32 of any shape, for one prepared picture [h, w, 3].
+    def run(self, image: np.ndarray) -> np.ndarray:
+        """Return the output, float32 of any shape, for one prepared image [h, w, 3].
 
         Raises:
             DataError: onnxruntime cannot run the graph, or the output is NaN, infinite, or the same number everywhere.
         """
-        batch = picture[None] if self.layout == "nhwc" else picture.transpose(2, 0, 1)[None]
+        batch = image[None] if self.layout == "nhwc" else image.transpose(2, 0, 1)[None]
         feed = {self.session.get_inputs()[0].name: np.ascontiguousarray(batch, dtype=self.type)}
         try:
             (output,) = self.session.run(None, feed)
@@ -85,8 +85,7 @@ def _start(data: bytes, path: Path, provider: str, threads: int) -> InferenceSes
             f"--onnx-provider {provider}: this onnxruntime {ort.__version__} has only {', '.join(there)}. {remedy}"
         )
     options = ort.SessionOptions()
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    options.intra_op_num_threads = threads or usable
+    options.intra_op_num_threads = threads or usable_cores()
     options.inter_op_num_threads = 1
     options.log_severity_level = ERRORS_ONLY
     options.use_deterministic_compute = True
@@ -102,28 +101,24 @@ def _start(data: bytes, path: Path, provider: str, threads: int) -> InferenceSes
 
 
 def _input_axes(path: Path, shape: list) -> tuple[str, tuple[int, int] | None]:
-    """Layout and fixed size of an input shape; names and None stand for free axes."""
+    """Return layout and fixed size (height, width) of an input shape; names and None stand for free axes."""
     dims = [d if isinstance(d, int) and d > 0 else None for d in shape]
     text = " x ".join(str(d) for d in shape)
     if len(dims) != 4 or dims[0] not in (1, None):
-        raise DataError(
-            f"{path}: its input is {text}; one picture, 1 x 3 x height x width or 1 x height x width x 3, is needed"
-        )
+        raise DataError(f"{path}: its input is {text}; one image, 1 x 3 x height x width or 1 x height x width x 3, is needed")
     if dims[1] in (3, None) and (dims[1] == 3 or dims[3] != 3):
         layout, sides = "nchw", (dims[2], dims[3])
     elif dims[3] == 3:
         layout, sides = "nhwc", (dims[1], dims[2])
     else:
-        raise DataError(f"{path}: neither the second nor the last axis of its input, {text}, has the 3 channels of a picture")
+        raise DataError(f"{path}: neither the second nor the last axis of its input, {text}, has the 3 channels of an image")
     if (sides[0] is None) != (sides[1] is None):
-        raise DataError(
-            f"{path}: its input, {text}, fixes only one side of the picture; export it with both fixed or both free"
-        )
+        raise DataError(f"{path}: its input, {text}, fixes only one side of the image; export it with both fixed or both free")
     return layout, None if sides[0] is None else sides
 
 
 def open_network(path: str | Path, *, provider: str = "cpu", threads: int = 0) -> Network:
-    """Open an ONNX file and see that it maps one picture to one output.
+    """Open an ONNX file and check that it maps one image to one output.
 
     Args:
         path: The file; its weights must be inside.

@@ -1,4 +1,4 @@
-"""`sweep` on a GPU: costs and parabola by torch, in float32, paths by a kernel, in the same whole numbers."""
+"""Costs, paths and best planes of a depth sweep on a GPU: torch for costs and parabola, a Warp kernel for the paths."""
 
 from __future__ import annotations
 
@@ -8,20 +8,29 @@ import numpy as np
 import torch
 
 from warpgs.kernels.scanlines import scanline_costs
-from warpgs.priors.sweep import NO_OPINION, NOISE, PLANES_AT_ONCE, UNIT, SweepConfig, gray_of, plane_homography, step_limits
+from warpgs.priors.sweep_planes import (
+    NEUTRAL_COST,
+    NOISE,
+    PLANES_AT_ONCE,
+    UNIT,
+    SweepConfig,
+    gray_of,
+    plane_homography,
+    step_limits,
+)
 from warpgs.scene import View
 
 MAPS = 24
-"""Float32 maps of a plane that its costs take while they are computed."""
+"""Number of float32 maps of a plane that exist while its costs are computed."""
 
 
 def needed_bytes(view: View, planes: int) -> int:
-    """Device memory that `inverse_depths` takes for a view and that many planes, at most [bytes]."""
+    """Return the largest device memory [bytes] that `inverse_depths` takes for a view and that many planes."""
     return view.camera.width * view.camera.height * (4 * planes + 4 * MAPS * min(planes, PLANES_AT_ONCE))
 
 
 def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, window: int, device: torch.device) -> torch.Tensor:
-    """As `sweep.matching_costs`, but in units of 1 / `UNIT`, int16, shape [H, W, D], on the device."""
+    """Return the costs of `sweep_cpu.matching_costs` in units of 1 / `UNIT`, int16, shape [H, W, D], on the device."""
 
     def box(maps: torch.Tensor) -> torch.Tensor:
         r = window // 2
@@ -49,7 +58,7 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
             m = box(warped)
             v = (box(warped * warped) - m * m).clamp(min=0) + NOISE
             cost = 0.5 - 0.5 * (box(own * warped) - mean * m) / (variance * v).sqrt()
-            cost = torch.where(warped >= 0, cost, NO_OPINION)
+            cost = torch.where(warped >= 0, cost, NEUTRAL_COST)
             total = total + cost
             least = cost if least is None else torch.minimum(least, cost)
         found = (0.5 * least + total * (0.5 / len(others))).clamp(0, 1) * UNIT
@@ -58,7 +67,7 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
 
 
 def path_costs(costs: torch.Tensor, image: np.ndarray, small_step: float, large_step: float) -> torch.Tensor:
-    """As the sum of `sweep.path_costs` down and across, of costs [H, W, D] on their device."""
+    """Return the sum of `sweep_cpu.path_costs` down and across, of costs [H, W, D] on their device."""
     down, across = (
         torch.from_numpy(step_limits(colors, small_step, large_step).astype(np.int32)).to(costs.device)
         for colors in (image, image.swapaxes(0, 1))
@@ -67,7 +76,7 @@ def path_costs(costs: torch.Tensor, image: np.ndarray, small_step: float, large_
 
 
 def best_inverse(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
-    """As `sweep.best_inverse`: inverse depths, float64, shape [H, W], on the host."""
+    """Return the inverse depths [1/u] of `sweep_cpu.best_inverse`, float64, shape [H, W], on the host."""
     k = costs.argmin(2, keepdim=True).clamp(1, len(inverses) - 2)
     left, middle, right = (costs.gather(2, k + o).double() for o in (-1, 0, 1))
     bend = left - 2 * middle + right
@@ -79,6 +88,6 @@ def best_inverse(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
 def inverse_depths(
     view: View, others: Sequence[View], planes: np.ndarray, config: SweepConfig, device: torch.device
 ) -> np.ndarray:
-    """Inverse depths [1/u] of a view, float64, shape [H, W], by sweeping the planes against at least one other view."""
+    """Return inverse depths [1/u] of a view, float64, shape [H, W], by sweeping planes against at least one other view."""
     costs = matching_costs(view, others, planes, config.window, device)
     return best_inverse(path_costs(costs, view.image, config.small_step, config.large_step), planes)

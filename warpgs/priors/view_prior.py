@@ -1,4 +1,4 @@
-"""One `Prior` per view: which network or classical method makes it, and what the user must know of that."""
+"""One `Prior` per view, by a network or a classical method, with notes for the user."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from warpgs.scene import Prior, View
 if TYPE_CHECKING:
     from warpgs.scene import ViewDepth
 
-MIN_CONFIRMED = 50
-"""Pixels with a confirmed depth below which a view's depth is taken for unknown."""
-LARGEST_OBJECT = 0.9
-"""A region of a larger share of the photograph is no object but what a mask leaves."""
+MIN_CONSISTENT = 50
+"""Smallest number of pixels with a geometrically consistent depth; below it a view's depth counts as unknown."""
+MAX_OBJECT_FRACTION = 0.9
+"""Largest fraction of the image that an object's region covers; a larger region is what a mask leaves."""
 FLAGS = ("size", "multiple", "mean", "std")
 OUTPUTS = ("auto", "disparity", "depth")
 
@@ -33,32 +33,32 @@ Colors = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class PriorConfig:
-    """Networks to take priors from, and how to feed them; classical methods where none is named."""
+    """Networks that make priors, and their inputs; classical methods where none is named."""
 
     depth_model: str | None = None
     """ONNX file of a monocular depth network (DPT, MiDaS, Depth Anything); without one, depth comes from the other views."""
     depth_output: str = "auto"
-    """What it gives: disparity (inverse depth), depth, or auto: what FILE.json beside it says, else disparity."""
+    """Meaning of its output: disparity (inverse depth), depth, or auto: what FILE.json beside it says, else disparity."""
     depth_size: int = 0
     """Shorter side of its input [px] where the file leaves it free; 0 for what FILE.json says, else 384."""
     depth_multiple: int = 0
-    """Its sides are multiples of this [px]; 0 for what FILE.json says, else 32. Depth Anything needs 14."""
+    """Divisor of both sides of its input [px]; 0 for what FILE.json says, else 32. Depth Anything needs 14."""
     depth_mean: Colors | None = None
-    """Subtracted from colours in [0, 1]; else what FILE.json says, else 0.5 0.5 0.5."""
+    """Colour subtracted from colours in [0, 1]; else what FILE.json says, else 0.5 0.5 0.5."""
     depth_std: Colors | None = None
-    """Divides them; else what FILE.json says, else 0.5 0.5 0.5."""
+    """Divisor of the difference; else what FILE.json says, else 0.5 0.5 0.5."""
     segmentation_model: str | None = None
     """ONNX file of a segmentation network for the 21 PASCAL VOC classes; without one, saliency and edges stand in."""
     segmentation_size: int = 0
     """Shorter side of its input [px] where the file leaves it free; 0 for what FILE.json says, else 512."""
     segmentation_multiple: int = 0
-    """Its sides are multiples of this [px]; 0 for what FILE.json says, else 32."""
+    """Divisor of both sides of its input [px]; 0 for what FILE.json says, else 32."""
     segmentation_mean: Colors | None = None
-    """Subtracted from colours in [0, 1]; else what FILE.json says, else ImageNet's 0.485 0.456 0.406."""
+    """Colour subtracted from colours in [0, 1]; else what FILE.json says, else ImageNet's 0.485 0.456 0.406."""
     segmentation_std: Colors | None = None
-    """Divides them; else what FILE.json says, else ImageNet's 0.229 0.224 0.225."""
+    """Divisor of the difference; else what FILE.json says, else ImageNet's 0.229 0.224 0.225."""
     onnx_provider: str = "cpu"
-    """What runs the networks: cpu or cuda."""
+    """Device of the networks: cpu or cuda."""
     cache: bool = True
     """Keep what networks give in the user's cache folder, or in WARPGS_CACHE."""
 
@@ -79,21 +79,21 @@ class PriorConfig:
             raise UsageError("--depth-output describes a network; name it by --depth-model, or leave the flag out")
 
     def flags(self, kind: str) -> dict:
-        """Values of the flags on how to feed a network, ``kind`` depth or segmentation, by the rest of their names."""
+        """Return the flags that describe the input of a network, ``kind`` depth or segmentation, by the rest of their names."""
         return {key: getattr(self, f"{kind}_{key}") for key in FLAGS}
 
 
 DisparitySource = Callable[[int], tuple[np.ndarray, str]]
-"""Disparity of the i-th view, and a phrase on where it comes from."""
+"""Function from the index of a view to its disparity, float32 [H, W], and a phrase on its source."""
 
 
 def _depth_network(views: Sequence[View], config: PriorConfig, threads: int, cache: MapCache | None, notes: list[str]):
     network = open_network(config.depth_model, provider=config.onnx_provider, threads=threads)
     output = None if config.depth_output == "auto" else config.depth_output
-    how, said = describe(network, {**config.flags("depth"), "output": output}, depth.USUAL, "depth")
+    how, messages = describe(network, {**config.flags("depth"), "output": output}, depth.DEFAULTS, "depth")
     if how.output not in ("disparity", "depth"):
         raise DataError(f"{network.path}: described as giving {how.output}, so it is no depth network; check --depth-model")
-    notes += [f"depth: {network.title} gives {how.output}", *said]
+    notes += [f"depth: {network.title} gives {how.output}", *messages]
     decided_by = {"model": network.sha256, "provider": config.onnx_provider, **asdict(how)}
 
     def disparity(i: int) -> tuple[np.ndarray, str]:
@@ -112,33 +112,34 @@ def _depth_views(views: Sequence[View], depths: Sequence[ViewDepth] | None, note
     if depths is None:
         notes.append("depth: none, since there is neither a network nor a depth from other views; geometry does not count")
         return lambda i: (np.zeros(views[i].image.shape[:2], np.float32), "none")
-    shares = [float(d.valid.mean()) for d in depths]
+    fractions = [float(d.valid.mean()) for d in depths]
     notes.append(
-        f"depth: from the other views, {min(shares):.1%} to {max(shares):.1%} of a view's pixels, completed along even colours"
+        f"depth: from the other views, {min(fractions):.1%} to {max(fractions):.1%} of a view's pixels, then filled in"
     )
-    poor = [v.name for v, d in zip(views, depths) if d.valid.sum() < MIN_CONFIRMED]
+    poor = [v.name for v, d in zip(views, depths) if d.valid.sum() < MIN_CONSISTENT]
     if poor:
-        notes.append(f"no depth is confirmed in {', '.join(poor)}: geometry does not count there; --depth-model would help")
+        notes.append(f"no depth is consistent in {', '.join(poor)}: geometry does not count there; --depth-model would help")
 
     def disparity(i: int) -> tuple[np.ndarray, str]:
         view, d = views[i], depths[i]
-        if d.valid.sum() < MIN_CONFIRMED:
+        if d.valid.sum() < MIN_CONSISTENT:
             return np.zeros(d.depth.shape, np.float32), "none"
         found = complete_disparity(view.image, d.depth, d.valid, d.sensitivity)
-        return found, f"depth that other views confirm at {shares[i]:.1%} of the pixels, completed"
+        return found, f"depth consistent with other views at {fractions[i]:.1%} of the pixels, completed"
 
     return disparity
 
 
 SemanticsSource = Callable[[int], tuple[SemanticMaps, str]]
+"""Function from the index of a view to its semantic maps and a phrase on their source."""
 
 
 def _segmentation_network(views: Sequence[View], config: PriorConfig, threads: int, cache: MapCache | None, notes: list[str]):
     network = open_network(config.segmentation_model, provider=config.onnx_provider, threads=threads)
-    how, said = describe(network, config.flags("segmentation"), semantics.USUAL, "segmentation")
+    how, messages = describe(network, config.flags("segmentation"), semantics.DEFAULTS, "segmentation")
     if how.output != "classes":
         raise DataError(f"{network.path}: described as giving {how.output}, so it is no segmentation network; check the flags")
-    notes += [f"semantics: {network.title}, {semantics.CLASSES} classes", *said]
+    notes += [f"semantics: {network.title}, {semantics.CLASSES} classes", *messages]
     decided_by = {"model": network.sha256, "provider": config.onnx_provider, **asdict(how)}
 
     def maps(i: int) -> tuple[SemanticMaps, str]:
@@ -164,18 +165,18 @@ def _classical(views: Sequence[View], notes: list[str]) -> SemanticsSource:
 
 
 def _stands_out(region: np.ndarray | None) -> bool:
-    """Whether a region shows an object: not where a mask only cuts off a frame or a passer-by."""
-    return region is not None and 0 < float(region.mean()) <= LARGEST_OBJECT
+    """Return True where a region shows an object: False where a mask only cuts off a frame or a passer-by."""
+    return region is not None and 0 < float(region.mean()) <= MAX_OBJECT_FRACTION
 
 
 def _fall_back(found: list[tuple[SemanticMaps, str]], views: Sequence[View], regions, classical: bool, notes: list[str]):
-    """The region of a view in place of a foreground that is not known; nothing where it has no region either."""
+    """Replace a foreground that is not known by the region of the view; by zeros where it has no region either."""
     replaced, empty, result = [], [], []
     for (maps, source), view, region in zip(found, views, regions):
         if _stands_out(region) and (classical or not knows_foreground(maps)):
             replaced.append(view.name)
             foreground, source = region.astype(np.float32), f"{source}; foreground from the view's mask or black background"
-            if classical:  # saliency is a guess, a region is knowledge
+            if classical:  # saliency is an estimate, a region is known
                 maps = SemanticMaps(np.ones_like(foreground), maps.boundary, foreground)
             else:
                 maps = SemanticMaps(maps.confidence, boundary_weight(region), foreground)
@@ -208,18 +209,19 @@ def view_priors(
     threads: int = 0,
     cache: Path | None = None,
 ) -> tuple[list[Prior], list[str]]:
-    """What is believed about the pixels of each view, before anything is fitted.
+    """Return a prior for the pixels of each view, before anything is fitted.
 
     Args:
         views: The training views.
-        config: Networks and how to feed them.
-        depths: Gives for each view the depth that the others confirm; asked last, and where no depth network is named.
-        regions: For each view the pixels that show its object, bool [H, W], or None: stands in where the foreground is unknown.
+        config: Networks and their inputs.
+        depths: Function that gives for each view the depth consistent with the others, or None for no depth; called last, and
+            only where no depth network is named.
+        regions: For each view the pixels that show its object, bool [H, W], or None; it replaces an unknown foreground.
         threads: CPU threads of a network; 0 for as many as the process may use.
-        cache: Folder that keeps what networks give; None, or ``config.cache`` off, for no keeping.
+        cache: Folder that keeps the maps of networks; None, or ``config.cache`` False, keeps none.
 
     Returns:
-        A prior per view, and notes on what was chosen, assumed and missing.
+        A prior per view, and notes on what was chosen, assumed or missing.
 
     Raises:
         DataError: A model is not what it must be, or its output is no map.

@@ -1,1 +1,1 @@
-"""What a run shows of itself: progress, logs, pictures, films and the report page."""
+"""Report of a run: progress, logs, images, films and the HTML page."""

@@ -1,4 +1,4 @@
-"""A sheet of labelled pictures: what is known of one view, at a glance."""
+"""Contact sheets: the labelled images and maps of one view on one sheet."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warpgs.report.pictures import colored, resized
+from warpgs.report.images import colored, resized
 
 PAPER, INK, SOFT, LINE = (251, 251, 249), (27, 29, 33), (102, 108, 118), (223, 226, 231)
 LABEL_SIZE, TEXT_SIZE, TITLE_SIZE = 15, 13, 22  # [px]
@@ -15,54 +15,54 @@ MARGIN, GAP, HEAD = 28, 18, 30  # [px]; HEAD is the height of a label
 LEGEND = (72, 8)  # width and height of a colour bar [px]
 DOT = (240, 78, 35)
 """Colour of dots."""
-DOTTED = 0.08
-"""Share of a picture that dots may cover: many are drawn smaller."""
+MAX_DOT_FRACTION = 0.08
+"""Largest fraction of an image that dots cover: many dots are smaller."""
 
 
 @dataclass(frozen=True)
 class Tile:
-    """One picture of a sheet."""
+    """One image of a sheet."""
 
     label: str
-    """What it shows, in a few words."""
+    """Name of the content, in a few words."""
     values: np.ndarray
     """Colours [H, W, 3] in [0, 1], or values [H, W]."""
     colors: str = "INFERNO"
     """Colour map of values."""
     largest: float = 1.0
-    """Value of the map's last colour; the first is 0."""
+    """Value of the last colour of the map; the first is 0."""
     dots: np.ndarray | None = None
     """Rows and columns of pixels to mark, shape [S, 2]."""
 
 
-def _picture(tile: Tile, size: tuple[int, int]):
-    """A tile's pixels at a size (width, height), as a Pillow image."""
+def _tile_image(tile: Tile, size: tuple[int, int]):
+    """Return a tile's pixels at a size (width, height) [px], as a Pillow image."""
     values = tile.values
     if values.ndim == 2:
         values = colored(values / tile.largest, tile.colors)
-    picture = resized(values, *size)
-    return picture if tile.dots is None else _dotted(picture, (tile.dots + 0.5) * (size[0] / tile.values.shape[1]))
+    image = resized(values, *size)
+    return image if tile.dots is None else _dotted(image, (tile.dots + 0.5) * (size[0] / tile.values.shape[1]))
 
 
-def _dotted(picture, centers: np.ndarray):
-    """A picture with small discs at rows and columns [px], shape [S, 2]; drawn large and shrunk, for their edges."""
+def _dotted(image, centers: np.ndarray):
+    """Return an image with small discs at rows and columns [px], shape [S, 2], anti-aliased by supersampling."""
     from PIL import Image, ImageDraw
 
-    least, most = 0.9, max(1.4, picture.width / 220)
-    radius = min(most, max(least, (DOTTED * picture.width * picture.height / (np.pi * max(1, len(centers)))) ** 0.5))
+    least, most = 0.9, max(1.4, image.width / 220)
+    radius = min(most, max(least, (MAX_DOT_FRACTION * image.width * image.height / (np.pi * max(1, len(centers)))) ** 0.5))
     fine = 4
-    cover = Image.new("L", (fine * picture.width, fine * picture.height))
+    cover = Image.new("L", (fine * image.width, fine * image.height))
     draw = ImageDraw.Draw(cover)
     for y, x in fine * centers:
         draw.ellipse((x - fine * radius, y - fine * radius, x + fine * radius, y + fine * radius), 255)
-    picture.paste(DOT, mask=cover.reduce(fine))
-    return picture
+    image.paste(DOT, mask=cover.reduce(fine))
+    return image
 
 
 def contact_sheet(
     title: str, lines: list[str], tiles: list[Tile], *, columns: int = 4, tile_width: int = 440, text: float = 1.0
 ) -> np.ndarray:
-    """Draw labelled tiles in rows, a colour bar with its range at each map, and lines of text in the place after the last.
+    """Arrange labelled tiles in rows, with a colour bar at each map and lines of text in the place after the last.
 
     Args:
         title: Headline.
@@ -100,13 +100,13 @@ def contact_sheet(
             break
         tile = tiles[i]
         draw.text((x, y + head // 5), tile.label, INK, fonts[label_size])
-        sheet.paste(_picture(tile, (tile_width, tile_height)), (x, y + head))
+        sheet.paste(_tile_image(tile, (tile_width, tile_height)), (x, y + head))
         if tile.values.ndim == 2:
             middle, right = y + head // 2, x + tile_width
             largest = f"{tile.largest:g}"
-            room = round(draw.textlength(largest, fonts[text_size]))
+            text_width = round(draw.textlength(largest, fonts[text_size]))
             bar = Tile("", np.linspace(0, 1, LEGEND[0], dtype=np.float32)[None].repeat(LEGEND[1], 0), tile.colors)
             draw.text((right, middle), largest, SOFT, fonts[text_size], anchor="rm")
-            sheet.paste(_picture(bar, LEGEND), (right - room - 6 - LEGEND[0], middle - LEGEND[1] // 2))
-            draw.text((right - room - 12 - LEGEND[0], middle), "0", SOFT, fonts[text_size], anchor="rm")
+            sheet.paste(_tile_image(bar, LEGEND), (right - text_width - 6 - LEGEND[0], middle - LEGEND[1] // 2))
+            draw.text((right - text_width - 12 - LEGEND[0], middle), "0", SOFT, fonts[text_size], anchor="rm")
     return np.asarray(sheet, np.float32) / 255

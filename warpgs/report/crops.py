@@ -1,25 +1,25 @@
-"""Where pictures of one view differ most: the places worth enlarging."""
+"""Windows in which images of one view differ most: the places worth enlarging."""
 
 from __future__ import annotations
 
 import numpy as np
 
 
-def disagreement(images: list[np.ndarray], truth: np.ndarray) -> np.ndarray:
-    """How far apart pictures [H, W, 3] are at each pixel, [H, W]: largest minus smallest value, mean over channels.
+def disagreement(images: list[np.ndarray], reference: np.ndarray) -> np.ndarray:
+    """Return the largest minus the smallest value of images [H, W, 3] at each pixel, averaged over channels, [H, W].
 
-    Of a single picture its absolute error to ``truth``.
+    For a single image the result is its absolute error to ``reference`` [H, W, 3].
     """
     if len(images) == 1:
-        return np.abs(images[0] - truth).mean(-1)
+        return np.abs(images[0] - reference).mean(-1)
     stack = np.stack(images)
     return (stack.max(0) - stack.min(0)).mean(-1)
 
 
 def crops(values: np.ndarray, width: int, height: int, count: int) -> list[tuple[int, int]]:
-    """Corners (x, y) [px] of the ``count`` windows with the largest sums of ``values`` [H, W], most first.
+    """Return the corners (x, y) [px] of the ``count`` windows with the largest sums of ``values`` [H, W], largest first.
 
-    Windows share no pixel; fewer come back where no more fit. Where nothing differs the first lies in the middle.
+    Windows do not overlap; fewer are returned where no more fit. Where nothing differs the first lies in the middle.
     """
     H, W = values.shape
     width, height = min(width, W), min(height, H)

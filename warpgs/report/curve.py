@@ -10,7 +10,7 @@ MAX_POINTS = 300
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """Three to six round numbers that span a range."""
+    """Return three to six round numbers that span a range."""
     rough = (high - low) / 4
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(m * power for m in (1, 2, 2.5, 5, 10) if m * power >= rough)
@@ -19,14 +19,14 @@ def ticks(low: float, high: float) -> list[float]:
 
 
 def tick_label(value: float) -> str:
-    """A number as people write it on axes."""
+    """Return a number as written on axes: 20000 gives 20k."""
     if abs(value) >= 1e6:
         return f"{value / 1e6:g}M"
     return f"{value / 1e3:g}k" if abs(value) >= 1e4 else f"{value:g}"
 
 
 def curve(title: str, xs: list[float], ys: list[float], unit: str = "") -> str:
-    """A chart of ``ys`` over ``xs`` (steps); long series are shown by the means of at most 300 groups.
+    """Return an SVG chart of ``ys`` over ``xs`` (steps); long series are shown by the means of at most 300 groups.
 
     Points that are not finite are left out; without any finite point the chart says so.
     """

@@ -1,4 +1,4 @@
-"""The record of a fit: one JSON object per line of metrics.jsonl, appended as the steps go by."""
+"""Event log of a fit: one JSON object per line of metrics.jsonl, appended during the fit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from warpgs.files import write_bytes
 
 
 class EventLog:
-    """Appends events to a file and, where a fit goes on, first forgets what came after the state it goes on from."""
+    """A log to which events are appended; a resumed fit first drops the events after its checkpoint."""
 
     def __init__(self, path: Path, step: int = 0):
         """Open the log of a fit that has done ``step`` steps: events of later steps are dropped, 0 starts empty.
@@ -51,7 +51,7 @@ class EventLog:
             raise self._failure(e) from e
 
     def close(self) -> None:
-        """Flush and close; the log takes no further events."""
+        """Flush and close the log, which takes no further events."""
         try:
             self._file.close()
         except OSError as e:
@@ -62,10 +62,10 @@ class EventLog:
 
 
 def read_events(path: Path) -> list[dict]:
-    """All events of a log in file order.
+    """Return all events of a log in file order.
 
-    A line that is no object with a whole-numbered ``step`` is skipped: a killed run may leave its last one torn. Null
-    is read as NaN, so that a series has a number at every step.
+    A line that is no object with a whole-numbered ``step`` is skipped, because a killed run may leave its last line
+    incomplete. Null is read as NaN, so that a series has a number at every step.
     """
     events = []
     for line in Path(path).read_bytes().splitlines():
@@ -79,6 +79,6 @@ def read_events(path: Path) -> list[dict]:
 
 
 def _line(event: dict) -> bytes:
-    """An event as a line; what is not finite becomes null, which JSON can hold."""
+    """Return an event as a line; numbers that are not finite become null, which JSON can hold."""
     plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in event.items()}
     return (json.dumps(plain, allow_nan=False) + "\n").encode()

@@ -1,4 +1,4 @@
-"""Frames to an mp4 film."""
+"""Writing of frames as an mp4 film."""
 
 from __future__ import annotations
 

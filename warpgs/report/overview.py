@@ -1,15 +1,14 @@
-"""A picture of cameras and points in space, drawn by pyvista in a process of its own."""
+"""Overview image of cameras and points in space, rendered by pyvista in a process of its own."""
 
 from __future__ import annotations
 
-import os
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
+from warpgs.runtime.subprocesses import run_python
 from warpgs.scene import Camera
 
 REMEDY = "install a software renderer: on Debian or Ubuntu `apt-get install libegl1 libgl1 libgl1-mesa-dri libxrender1`"
@@ -23,17 +22,9 @@ PROBE = (
 
 
 def _python(code: str, *arguments: str) -> tuple[bool, str]:
-    """Run Python apart from this process, since VTK ends the process where it finds no way to draw."""
-    environment = {**os.environ, "VTK_DEFAULT_OPENGL_WINDOW": "vtkEGLRenderWindow"}
+    """Run Python code in a process of its own, since VTK ends the process where it cannot render; return success and reason."""
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", code, *arguments],
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=TIMEOUT,
-            check=False,
-        )
+        done = run_python(code, *arguments, timeout=TIMEOUT, environment={"VTK_DEFAULT_OPENGL_WINDOW": "vtkEGLRenderWindow"})
     except subprocess.TimeoutExpired:
         return False, f"pyvista did not finish within {TIMEOUT} s"
     if done.returncode == 0:
@@ -47,13 +38,13 @@ def _remedy(why: str) -> str:
 
 
 def probe_rendering() -> tuple[bool, str]:
-    """Whether pyvista can draw here, and the reason with a remedy if not."""
+    """Return whether pyvista can render on this machine, and how; or the reason why not, with a remedy."""
     works, why = _python(PROBE)
     return works, "off-screen through EGL" if works else f"{why}; {_remedy(why)}"
 
 
 def _frusta(cameras: list[Camera], size: float) -> np.ndarray:
-    """Line segments [S, 2, 3] of camera pyramids whose image planes lie ``size`` [u] away."""
+    """Return line segments [S, 2, 3] of camera pyramids whose image planes lie ``size`` [u] away."""
     lines = []
     for c in cameras:
         corners = np.array([[0, 0, 1], [c.width, 0, 1], [c.width, c.height, 1], [0, c.height, 1]], float)
@@ -63,7 +54,7 @@ def _frusta(cameras: list[Camera], size: float) -> np.ndarray:
     return np.array(lines)
 
 
-DRAW = f"""
+RENDER_SCRIPT = f"""
 import sys, numpy as np, pyvista as pv
 d = np.load(sys.argv[1])
 p = pv.Plotter(off_screen=True, window_size=({WIDTH}, {HEIGHT}))
@@ -81,12 +72,12 @@ p.screenshot(sys.argv[2])
 
 
 def _framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Eye, focal point and up vector [3, 3] from which all of ``shown`` [N, 3] [u] is in the picture.
+    """Return eye, focal point and up vector, shape [3, 3], from which all points of ``shown`` are in the image.
 
     Args:
-        shown: What must be seen.
-        direction: From the scene to the eye, any length.
-        up: Roughly up; any perpendicular to the view serves where it lies along ``direction``.
+        shown: Points that must be seen [u], shape [N, 3].
+        direction: Direction from the scene to the eye, any length, shape [3].
+        up: Rough upward direction, shape [3]; replaced by any perpendicular where it lies along ``direction``.
     """
     length = np.linalg.norm(direction)
     forward = -direction / length if length > 0 else np.array([0.0, 0.0, 1.0])
@@ -98,7 +89,7 @@ def _framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray) -> np.nda
     seen = shown @ axes.T
     middle = (seen.min(0) + seen.max(0)) / 2
     x, y, z = np.abs(seen[:, 0] - middle[0]), np.abs(seen[:, 1] - middle[1]), seen[:, 2] - middle[2]
-    # Near content fills more of the picture: every point asks for its own distance, and the largest serves all.
+    # Near content fills more of the image: every point asks for its own distance, and the largest serves all.
     slope = np.tan(np.radians(VIEW_ANGLE / 2))
     distance = 1.06 * max(float((np.maximum(y / slope, x / (slope * WIDTH / HEIGHT)) - z).max()), 1e-6)
     focus = middle @ axes
@@ -108,13 +99,13 @@ def _framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray) -> np.nda
 def render_overview(
     train: list[Camera], test: list[Camera], points: np.ndarray, colors: np.ndarray
 ) -> tuple[bytes | None, str]:
-    """Draw training and held-out cameras among points [N, 3] [u] with colours in [0, 1] [N, 3].
+    """Render training and held-out cameras among points [N, 3] [u] with colours in [0, 1] [N, 3].
 
     Returns:
-        PNG bytes and an empty string; or None and the reason with a remedy, where this machine cannot draw.
+        PNG bytes and an empty string; or None and the reason with a remedy, where this machine cannot render.
     """
     if not (len(points) and train):
-        return None, "no overview picture: there are no points or no training cameras to draw"
+        return None, "no overview image: there are no points or no training cameras to show"
     centers = np.array([c.center for c in train])
     low, high = np.percentile(points, [5, 95], axis=0)
     inside = ((points >= low - (high - low)) & (points <= high + (high - low))).all(1)
@@ -130,12 +121,12 @@ def render_overview(
     core = points[((points >= low) & (points <= high)).all(1)]
     view = _framing(np.concatenate([core, *(f.reshape(-1, 3) for f in frusta.values())]), direction, up)
     with tempfile.TemporaryDirectory() as folder:
-        source, target = Path(folder) / "scene.npz", Path(folder) / "overview.png"
+        source, target = (Path(folder).resolve() / name for name in ("scene.npz", "overview.png"))
         np.savez(
             source, points=points[inside].astype(np.float32),
             colors=np.round(255 * np.clip(colors[inside], 0, 1)).astype(np.uint8), view=view, **frusta,
         )  # fmt: skip
-        works, why = _python(DRAW, str(source), str(target))
+        works, why = _python(RENDER_SCRIPT, str(source), str(target))
         if works and target.is_file():
             return target.read_bytes(), ""
-    return None, f"no overview picture: {why}; {_remedy(why)}"
+    return None, f"no overview image: {why}; {_remedy(why)}"

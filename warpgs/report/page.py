@@ -1,4 +1,4 @@
-"""The report of a fit: one HTML file with everything in it."""
+"""Report page of a fit: one HTML file with everything in it."""
 
 from __future__ import annotations
 
@@ -56,25 +56,25 @@ SCRIPT = (
 
 
 @dataclass(frozen=True)
-class ViewPictures:
-    """What the page shows of one view; pictures are PNG bytes."""
+class ViewImages:
+    """Images of one held-out view, as PNG bytes."""
 
     name: str
     caption: str
     render: bytes
-    truth: bytes
+    reference: bytes
     error: bytes
     depth: bytes
 
 
 @dataclass(frozen=True)
-class SamplingStory:
-    """What the page says of the sampling events of a fit."""
+class SamplingReport:
+    """Section of the page on the sampling events of a fit."""
 
     words: str
-    """Sentences that say what the pictures show."""
-    pictures: list[tuple[str, bytes]]
-    """Caption and PNG of each pictured event, the first shown, the others on request."""
+    """Sentences that explain the images."""
+    images: list[tuple[str, bytes]]
+    """Caption and PNG of each event that has an image; the first is open, the others open on request."""
     table: list[list[str]]
     """Header row, then rows."""
 
@@ -88,13 +88,13 @@ def _figure(data: bytes, caption: str) -> str:
     return f"<figure>{_embed(data, caption)}<figcaption>{html.escape(caption)}</figcaption></figure>"
 
 
-def _view(v: ViewPictures) -> str:
+def _view(v: ViewImages) -> str:
     name = html.escape(v.name)
     return (
-        f'<div class="view"><div class="row"><figure><div class="slider">{_embed(v.truth, f"photograph {v.name}")}'
-        f'<div class="top">{_embed(v.render, f"rendering {v.name}")}</div><div class="bar"></div>'
-        '<span class="tag" style="left:8px">rendering</span><span class="tag" style="right:8px">photograph</span>'
-        f'<input type="range" min="0" max="100" value="50" aria-label="rendering against photograph of {name}"></div>'
+        f'<div class="view"><div class="row"><figure><div class="slider">{_embed(v.reference, f"reference image {v.name}")}'
+        f'<div class="top">{_embed(v.render, f"render {v.name}")}</div><div class="bar"></div>'
+        '<span class="tag" style="left:8px">render</span><span class="tag" style="right:8px">reference</span>'
+        f'<input type="range" min="0" max="100" value="50" aria-label="render against reference image of {name}"></div>'
         f"<figcaption><b>{name}</b> &nbsp; {html.escape(v.caption)}</figcaption></figure>"
         f'<div class="stack">{_figure(v.error, "absolute error, 0 to 0.3")}'
         f"{_figure(v.depth, 'depth, near red, far blue')}</div>"
@@ -102,17 +102,25 @@ def _view(v: ViewPictures) -> str:
     )
 
 
-def _sampling(s: SamplingStory) -> str:
+def _sampling(s: SamplingReport) -> str:
     parts = [f"<h2>Why Gaussians were placed</h2><p>{html.escape(s.words)}</p>{_table(s.table)}"]
-    for i, (caption, data) in enumerate(s.pictures):
-        picture = f'<figure class="wide">{_embed(data, caption)}<figcaption>{html.escape(caption)}</figcaption></figure>'
-        parts.append(picture if i == 0 else f"<details><summary>{html.escape(caption)}</summary>{picture}</details>")
+    for i, (caption, data) in enumerate(s.images):
+        image = f'<figure class="wide">{_embed(data, caption)}<figcaption>{html.escape(caption)}</figcaption></figure>'
+        parts.append(image if i == 0 else f"<details><summary>{html.escape(caption)}</summary>{image}</details>")
     return "".join(parts)
 
 
 def _table(rows: list[list[str]]) -> str:
     head, *body = ["".join(f"<{t}>{html.escape(c)}</{t}>" for c in row) for t, row in zip(["th"] + ["td"] * len(rows), rows)]
     return f"<table><tr>{head}</tr>{''.join(f'<tr>{r}</tr>' for r in body)}</table>"
+
+
+def _document(title: str, body: str) -> str:
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,'
+        f'initial-scale=1"><title>{html.escape(title)}</title><style>{STYLE}</style></head><body><main>'
+        f"{body}</main><script>{SCRIPT}</script></body></html>\n"
+    )
 
 
 def write_page(
@@ -123,14 +131,14 @@ def write_page(
     figures: list[tuple[str, str]],
     notes: list[str],
     table: list[list[str]],
-    views: list[ViewPictures],
+    views: list[ViewImages],
     curves: list[str],
-    sampling: SamplingStory | None,
+    sampling: SamplingReport | None,
     overview: bytes | None,
     protocol: dict[str, str],
     details: dict,
 ) -> None:
-    """Write the report, self-contained and without a link to anywhere.
+    """Write the report page: one file that refers to nothing outside it.
 
     Args:
         path: The HTML file.
@@ -139,11 +147,11 @@ def write_page(
         figures: Label and value of each key figure.
         notes: Choices made for the user.
         table: Header row, then a row per held-out view.
-        views: Pictures of held-out views.
+        views: Images of held-out views.
         curves: SVG charts.
         sampling: The fit's sampling events, or None where it had none.
-        overview: Picture of cameras and points, or None.
-        protocol: What scores must agree in to be compared, and what each figure is, by name.
+        overview: Image of cameras and points, or None.
+        protocol: Settings in which two scores must agree to be compared, and the definition of each figure, by name.
         details: Configuration, versions and data, shown as JSON on request.
 
     Raises:
@@ -173,9 +181,4 @@ def write_page(
     sections.append(
         f"<h2>Settings</h2><details><summary>configuration, versions, data</summary><pre>{settings}</pre></details>"
     )
-    write_text(
-        path,
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,'
-        f'initial-scale=1"><title>{html.escape(title)}</title><style>{STYLE}</style></head><body><main>'
-        f"{''.join(sections)}</main><script>{SCRIPT}</script></body></html>\n",
-    )
+    write_text(path, _document(title, "".join(sections)))

@@ -1,4 +1,4 @@
-"""What a fit shows while it runs: a live panel in a terminal, plain lines elsewhere."""
+"""Progress display of a fit: a live panel in a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SMOOTHING = 0.05
 
 
 def duration(seconds: float) -> str:
-    """A time span in the fewest words: 8 s, 2 min 05 s, 1 h 10 min."""
+    """Return a time span in words: 8 s, 2 min 05 s, 1 h 10 min."""
     seconds = int(round(seconds))
     if seconds < 60:
         return f"{seconds} s"
@@ -22,10 +22,10 @@ def duration(seconds: float) -> str:
 
 
 class Progress:
-    """Shows step, loss, PSNR, number of Gaussians, time per step and time left; a context manager."""
+    """Context manager that shows step, loss, PSNR, number of Gaussians, time per step and time left."""
 
     def __init__(self, total: int, done: int = 0, *, live: bool | None = None):
-        """Prepare for ``total`` steps of which ``done`` are done; ``live`` None looks whether stdout is a terminal."""
+        """Prepare for ``total`` steps of which ``done`` are done; ``live`` None shows the panel where stdout is a terminal."""
         self.total, self.first, self.step = total, done, done
         self.live = sys.stdout.isatty() if live is None else live
         self.loss = self.psnr = None
@@ -50,7 +50,7 @@ class Progress:
             print(self._line(), flush=True)
 
     def update(self, *, step: int, loss: float, psnr: float, count: int) -> None:
-        """Take in one step."""
+        """Show the numbers of one finished step."""
         self.step, self.count = step, count
         keep = 1 - SMOOTHING
         self.loss = loss if self.loss is None else keep * self.loss + SMOOTHING * loss

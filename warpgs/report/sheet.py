@@ -1,4 +1,4 @@
-"""A figure of pictures beside each other: one row per view, one column per method, with enlarged crops, as PNG."""
+"""Figure of images side by side: one row per view, one column per method, with enlarged crops, as PNG."""
 
 from __future__ import annotations
 
@@ -7,53 +7,53 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warpgs.report.pictures import resized
+from warpgs.report.images import resized
 
 INK, SOFT, PAPER = (27, 29, 33), (102, 108, 118), (255, 255, 255)
 BOXES = ((240, 78, 35), (0, 158, 190), (240, 190, 0))
-"""Colours of the boxes and of the frames of their crops."""
-LARGEST_WIDTH = 2600
-"""Width that a figure of many columns keeps to [px]."""
+"""Colours of the boxes, and of the frames of their crops."""
+MAX_WIDTH = 2600
+"""Largest width of a figure of many columns [px], while columns are not narrower than `CELL` allows."""
 CELL = (180, 480)
-"""Narrowest and widest column [px]."""
+"""Smallest and largest width of a column [px]."""
 GAP, MARGIN, HEAD, CAPTION = 8, 20, 38, 32
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One picture of a row."""
+    """One image of a row."""
 
     image: np.ndarray
     """Colours in [0, 1], [H, W, 3], one size in a row."""
     caption: str
-    """Printed below it."""
+    """Text below the image."""
 
 
 @dataclass(frozen=True)
 class Strip:
-    """One view."""
+    """One row: the images of a view by every method."""
 
     title: str
-    """Printed above the row."""
+    """Text above the row."""
     cells: tuple[Cell, ...]
     crops: tuple[tuple[int, int, int, int], ...]
     """Windows to enlarge: x, y, width, height [px]."""
 
 
 def _column(count: int, widest: int) -> int:
-    room = (LARGEST_WIDTH - 2 * MARGIN + GAP) // count - GAP
-    return max(CELL[0], min(CELL[1], room, max(widest, 320)))
+    available = (MAX_WIDTH - 2 * MARGIN + GAP) // count - GAP
+    return max(CELL[0], min(CELL[1], available, max(widest, 320)))
 
 
 def sheet(headings: list[str], strips: list[Strip]) -> bytes:
-    """The figure as PNG.
+    """Return a figure as PNG bytes.
 
     Args:
-        headings: Of the columns, from left to right.
+        headings: Headings of the columns, from left to right.
         strips: Rows; each has a cell per heading.
 
     Returns:
-        An 8-bit RGB PNG; pictures are scaled to one column width, crops below them to half of it.
+        An 8-bit RGB PNG; images are scaled to one column width, crops below them to half of it.
     """
     from PIL import Image, ImageDraw, ImageFont
 

@@ -6,7 +6,7 @@ constexpr bool with_depth = WITH_DEPTH, atomic = ATOMIC;
 const int total = (int)min(totals.data[0], (long long)capacity);  // of a cut list, what there is
 const int floor = item * CHUNK;
 constexpr int values = with_depth ? 10 : 9;
-// which of the sums this lane holds after the reduction below
+// number of the sum that this lane holds after the reduction below
 int held = 0;
 {
     int n = values, size = values;
@@ -33,9 +33,9 @@ while (top_instance > floor) {
     }
     const int stop_at = top_instance;
     top_instance = first;
-    // the Gaussian of this lane in a batch is known a batch before its record is loaded
+    // the Gaussian of this lane is known a batch before it is loaded
     int batch = (stop_at - 1) & ~31;
-    int next_id = splat_ids.data[min(batch + lane, stop_at - 1)];
+    int next_id = gaussian_ids.data[min(batch + lane, stop_at - 1)];
     const int camera = tile / tiles, in_camera = tile - camera * tiles;
     const int left = (in_camera % columns) * SIDE, top = (in_camera / columns) * SIDE;
     const float px = origin_x + left + lane % 8 + 0.5f, py = origin_y + top + lane / 8 + 0.5f;  // of the pixel in the first block
@@ -79,7 +79,7 @@ while (top_instance > floor) {
                 }
                 behind[k] = T_end * (background[0] * g0[k] + background[1] * g1[k] + background[2] * g2[k]);
                 if (last[k] > stop_at) {
-                    // something was blended behind this chunk: all of the picture less what lies up to here
+                    // something was blended behind this chunk: the whole image less what lies up to here
                     const float* state = states.data + (long long)(stop_at / CHUNK) * (STATE * PIXELS) + k * 32 + lane;
                     T[k] = state[0];
                     behind[k] = (rgb.data[3 * o] - state[PIXELS]) * g0[k]
@@ -94,7 +94,7 @@ while (top_instance > floor) {
     for (; batch + 32 > first; batch -= 32) {
         const int i = batch + lane, id = next_id;
         const bool mine = i >= first && i < stop_at;
-        next_id = splat_ids.data[max(i - 32, 0)];
+        next_id = gaussian_ids.data[max(i - 32, 0)];
         unsigned mask = 0;
         int target = 0;
         __syncwarp();
@@ -102,7 +102,7 @@ while (top_instance > floor) {
             target = atomic ? id : slots.data[i];
             if (i < part_last) {
                 Splat s;
-                s.load(splats.data, id);
+                s.load(projected.data, id);
                 s.rescale();
                 const float limit = limit_of(s.b.y, alpha_cut);
                 #pragma unroll
@@ -145,11 +145,11 @@ while (top_instance > floor) {
                     const float e1 = __fmaf_rn(a.w, dy, p[column]);
                     const float g = falloff(e1, e2);
                     const float raw = __fmul_rn(b.y, g), alpha = fminf(alpha_max, raw);
-                    const bool drawn = alpha >= alpha_cut && batch + j < last[k];
-                    if (!__any_sync(ALL, drawn))
+                    const bool blended = alpha >= alpha_cut && batch + j < last[k];
+                    if (!__any_sync(ALL, blended))
                         continue;
                     any = true;
-                    if (drawn) {
+                    if (blended) {
                         const float inverse = __fdividef(1.0f, 1.0f - alpha);
                         T[k] *= inverse;
                         const float w = alpha * T[k];

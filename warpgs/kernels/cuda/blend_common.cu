@@ -1,13 +1,13 @@
-// What the blending bodies share. Upper-case names are replaced by numbers before compilation (blend_cuda.py).
+// Declarations that the blending bodies share. Upper-case names are replaced by numbers before compilation (blend_cuda.py).
 // A tile is cut into blocks of 8 x 4 pixels, one pixel a lane. Products and sums that decide alpha are spelled with their
 // rounding: the compiler's choice of fused operations may differ between kernels, and both passes must see one alpha.
 constexpr unsigned ALL = 0xffffffffu;
 constexpr int WIDE = SIDE / 8, BLOCKS = WIDE * (SIDE / 4), PIXELS = SIDE * SIDE;
 const int lane = threadIdx.x % 32;
 struct Splat {
-    float4 a, b, c;  // the record; u11 = a.z, u12 = a.w, u22 = b.x in units where the falloff is 2^-|U d|^2
-    __device__ void load(const float* splats, int i) {
-        const float4* record = reinterpret_cast<const float4*>(splats) + 3ll * i;
+    float4 a, b, c;  // a projected Gaussian; u11 = a.z, u12 = a.w, u22 = b.x in units where the falloff is 2^-|U d|^2
+    __device__ void load(const float* projected, int i) {
+        const float4* record = reinterpret_cast<const float4*>(projected) + 3ll * i;
         a = record[0];
         b = record[1];
         c = record[2];
@@ -19,7 +19,7 @@ struct Splat {
     }
     // Whether some pixel centre of the 8 x 4 block at (left, top) may have alpha at or above the cut, where 2^-limit
     // does: the least |U d|^2 over the block lies on one of the two edges that face the mean. Distances are
-    // widened by what rounding can take from them. A NaN is kept; it draws nothing.
+    // widened by what rounding can take from them. A NaN is kept; it changes nothing.
     __device__ bool touches(float left, float top, float limit) const {
         const float slack_x = 0.01f + 2e-6f * (fabsf(a.x) + c.z), slack_y = 0.01f + 2e-6f * (fabsf(a.y) + c.w);
         const float x0 = left + 0.5f - a.x - slack_x, x1 = left + 7.5f - a.x + slack_x;

@@ -15,7 +15,7 @@ for (int first = begin; first < end; first += BATCH) {
     __syncthreads();
     if (t < count) {
         Splat s;
-        s.load(splats.data, splat_ids.data[first + t]);
+        s.load(projected.data, gaussian_ids.data[first + t]);
         s.rescale();
         s_a[t] = s.a;
         s_b[t] = s.b;

@@ -18,8 +18,8 @@ const int begin = ranges.data[2 * tile], end = ranges.data[2 * tile + 1];
 int i = (begin & ~31) + lane;
 Splat s;
 if (i >= begin && i < end)
-    s.load(splats.data, splat_ids.data[i]);
-int next_id = i + 32 < end ? splat_ids.data[i + 32] : 0;  // known a batch before its record is loaded
+    s.load(projected.data, gaussian_ids.data[i]);
+int next_id = i + 32 < end ? gaussian_ids.data[i + 32] : 0;  // known a batch before it is loaded
 for (int batch = begin & ~31; batch < end; batch += 32) {
     if (__all_sync(ALL, done))
         break;
@@ -47,13 +47,13 @@ for (int batch = begin & ~31; batch < end; batch += 32) {
         s_i[warp][slot] = i + 1;
     }
     if (lane < AHEAD)
-        s_i[warp][count + lane] = 0;  // what fills up the last group draws nothing
+        s_i[warp][count + lane] = 0;  // the entries that fill up the last group blend nothing
     __syncwarp();
     i += 32;
     if (i < end)
-        s.load(splats.data, next_id);  // under way while this batch is blended
+        s.load(projected.data, next_id);  // under way while this batch is blended
     if (i + 32 < end)
-        next_id = splat_ids.data[i + 32];
+        next_id = gaussian_ids.data[i + 32];
     for (int j = 0; j < count; j += AHEAD) {
         float alpha[AHEAD];
         #pragma unroll

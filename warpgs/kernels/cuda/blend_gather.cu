@@ -1,4 +1,4 @@
-// Gradient of one record from the sums of its instances. Their slots are neighbours: a thread sums a short list, the warp
+// Gradient of one projected Gaussian from the sums of its instances. Their slots are neighbours: a thread sums a short list, the warp
 // shares a long one. The factors common to all pixels are applied here, once.
 constexpr int SHORT = 32;
 constexpr bool with_depth = WITH_DEPTH, atomic = ATOMIC;
@@ -38,10 +38,10 @@ while (heavy) {
     }
 }
 if (valid) {
-    float4* row = reinterpret_cast<float4*>(v_splats.data) + 3ll * i;
+    float4* row = reinterpret_cast<float4*>(v_projected.data) + 3ll * i;
     if (count > 0) {
-        const float4* record = reinterpret_cast<const float4*>(splats.data) + 3ll * i;
-        const float4 a = record[0], b = record[1];
+        const float4* values_of = reinterpret_cast<const float4*>(projected.data) + 3ll * i;
+        const float4 a = values_of[0], b = values_of[1];
         constexpr float back = 1.0f / SCALE;
         const float s1 = back * v[0], s2 = back * v[1];
         row[0] = make_float4(-a.z * s1, -(a.w * s1 + b.x * s2), back * v[2], back * v[3]);

@@ -1,7 +1,7 @@
 // Tiles with long lists first, so that none of them starts when the others are done: a counting sort by the number of binary
 // digits of the length, in one thread block. The order among equals differs from run to run; no result depends on it.
-constexpr int HELD = 8;  // lengths that a thread asks for before it needs the first: one block alone cannot hide the waits
-__shared__ int s_starts[THREADS];  // by rank: 0 for the longest lists, 32 for empty ones, 33 for what is no tile
+constexpr int HELD = 8;  // lengths that a thread loads before it uses the first: one block alone cannot hide the waits
+__shared__ int s_starts[THREADS];  // by rank: 0 for the longest lists, 32 for empty ones, 33 past the last tile
 const int lane = threadIdx.x % 32;
 s_starts[threadIdx.x] = 0;
 __syncthreads();
@@ -17,7 +17,7 @@ auto deal = [&](bool place) {
         }
         #pragma unroll
         for (int k = 0; k < HELD; ++k) {
-            // one addition for all lanes of a rank: most tiles have one of a few, and additions to one number wait in line
+            // one addition for all lanes of a rank: most tiles have one of a few ranks, and additions to one number are serial
             const unsigned alike = __match_any_sync(0xffffffffu, rank[k]);
             const int leader = __ffs(alike) - 1;
             int at = 0;

@@ -5,9 +5,9 @@ __shared__ float s_f[3][TALL][SPAN];
 __shared__ float s_m[3][ROWS][SPAN];
 const int t = threadIdx.x;
 const int across = (columns + COLUMNS - 1) / COLUMNS, down = (height + ROWS - 1) / ROWS;
-const int picture = block / (across * down), inner = block - picture * across * down;
+const int image = block / (across * down), inner = block - image * across * down;
 const int top = (inner / across) * ROWS, left = (inner % across) * COLUMNS;
-const long long base = (long long)picture * height * columns;
+const long long base = (long long)image * height * columns;
 // summed: the upstream gradients of the sums of 1 - similarity and of |a - b|; else that of each similarity
 const float v_unlike = summed ? v_result.data[0] : 0.0f, v_error = summed ? v_result.data[1] : 0.0f;
 for (int i = t; i < TALL * SPAN; i += 256) {

@@ -7,9 +7,9 @@ __shared__ float s_m[5][ROWS][SPAN];
 __shared__ float s_sums[2][8];
 const int t = threadIdx.x;
 const int across = (columns + COLUMNS - 1) / COLUMNS, down = (height + ROWS - 1) / ROWS;
-const int picture = block / (across * down), inner = block - picture * across * down;
+const int image = block / (across * down), inner = block - image * across * down;
 const int top = (inner / across) * ROWS, left = (inner % across) * COLUMNS;
-const long long base = (long long)picture * height * columns;
+const long long base = (long long)image * height * columns;
 for (int i = t; i < TALL * SPAN; i += 256) {
     const int r = i / SPAN, c = i % SPAN, y = top + r - HALO, x = left + c - 3 * HALO;
     const bool inside = y >= 0 && y < height && x >= 0 && x < columns;

@@ -1,0 +1,178 @@
+"""The trainer as benches use it: no other module of the benches knows how a fit is set up and stepped."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import torch
+
+from warpgs.pipeline.model.table import Table
+from warpgs.pipeline.train.complexity import complexity_figures
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loss import LossConfig, built_in_terms
+from warpgs.pipeline.train.schedule import OptimizerConfig
+from warpgs.pipeline.train.step import MAX_BATCH, Learned, StepBuffers, StepGraphs, StepPlan, eager_renderer, step
+from warpgs.pipeline.train.strategies.base import Strategy
+from warpgs.pipeline.train.trainer import Trainer, run
+from warpgs.pipeline.train.views import ViewStack
+from warpgs.scene import Camera, Gaussians, PointCloud, View
+
+BLACK = (0.0, 0.0, 0.0)
+KIND = "image"
+"""Name of the only kind of view of `Steps`."""
+
+
+def make_trainer(
+    views: list[View], points: PointCloud | None, config: FitConfig, device: torch.device, background=BLACK
+) -> Trainer:
+    """Return a trainer at step 0."""
+    return Trainer(views, points, config, device, background)
+
+
+def finish(trainer: Trainer) -> None:
+    """Take all remaining steps, save nothing, and wait for the device."""
+    run(trainer, lambda _: None, lambda _: None, lambda: False)
+    if trainer.device.type == "cuda":
+        torch.cuda.synchronize(trainer.device)
+
+
+def take_steps(trainer: Trainer, count: int) -> int:
+    """Take at least ``count`` steps as a fit does, and return how many were taken."""
+    done = 0
+    while done < count:
+        done += len(trainer.advance(count - done))
+    return done
+
+
+def one_step(trainer: Trainer) -> None:
+    """Take one step as a fit does: on CUDA a graph, elsewhere from Python."""
+    trainer.advance()
+
+
+def sort_along_curve(trainer: Trainer) -> None:
+    """Put the Gaussians in Morton order."""
+    trainer.table.sort_along_curve()
+
+
+def model_bytes(trainer: Trainer) -> int:
+    """Return the bytes of the model, each Gaussian with the coefficients of its own degree."""
+    return complexity_figures(trainer)["complexity"]["bytes"]
+
+
+def with_cap(config: FitConfig, most: int) -> FitConfig:
+    """Return the settings with at most so many Gaussians."""
+    return dataclasses.replace(config, max_gaussians=most)
+
+
+def with_strategy(config: FitConfig, name: str) -> FitConfig:
+    """Return the settings with another density strategy."""
+    return dataclasses.replace(config, strategy=name, strategy_config=None)
+
+
+def with_holdout(config: FitConfig) -> FitConfig:
+    """Return the settings with the size of the model decided by held-out blocks."""
+    return with_strategy(config, "holdout")
+
+
+def without_density(config: FitConfig) -> FitConfig:
+    """Return the settings with the set of Gaussians left as it starts."""
+    return dataclasses.replace(config, density=dataclasses.replace(config.density, start=config.steps))
+
+
+@dataclass(frozen=True)
+class StepParts:
+    """Inputs of the stages of a trainer's step."""
+
+    camera: Camera
+    target: torch.Tensor
+    """Image of the first training view, shape [H, W, 3]."""
+    parameters: dict[str, torch.Tensor]
+    """Parameters by name, in the order in which `project` takes them."""
+    background: torch.Tensor
+    """Colour, shape [3]."""
+    rule: str
+    optimize: Callable[[], None]
+    """Adam over all parameters, with gradients of zero."""
+
+
+def step_parts(trainer: Trainer) -> StepParts:
+    """Return the inputs of a step on the first training view."""
+    view, table, device = trainer.views[0], trainer.table, trainer.device
+    row = table.lr_row(trainer.lrs(trainer.step + 1), trainer.step + 1, trainer.config.optimizer.head_lrs)
+    lrs, going = torch.tensor(row, device=device), torch.zeros(1, dtype=torch.int32, device=device)
+    gradients = {name: torch.zeros_like(p) for name, p in table.params.items()}
+    # leaves of their own: a live graph of the table's parameters would tie a captured step to this stream
+    parameters = {name: p.detach().requires_grad_() for name, p in table.gaussians.tensors().items()}
+    return StepParts(
+        view.camera, view.image, parameters, trainer.background, trainer.config.rule,
+        lambda: table.adam_step(gradients, lrs, going),
+    )  # fmt: skip
+
+
+class Steps:
+    """Training steps of given Gaussians on one image: image, L1 and SSIM, backward pass, Adam, as a fit takes them.
+
+    Args:
+        gaussians: The start; a copy of it is trained.
+        camera: A batch of one camera.
+        target: Image, shape [H, W, 3].
+        rule: Cut-offs of the rasterizer.
+        lr: Learning rate of all parameters; None for those of a fit in a scene of size 1.
+    """
+
+    def __init__(self, gaussians: Gaussians, camera: Camera, target: torch.Tensor, rule: str, lr: float | None = None):
+        device = target.device
+        self.rule, self.lr, self.background = rule, lr, torch.zeros(3, device=device)
+        self.table = Table.of_gaussians(gaussians, {})
+        self.buffers = StepBuffers(device, 3 * len(self.table.params))
+        strategy = Strategy(SimpleNamespace(config=FitConfig()))  # of the base class: it changes nothing
+        self.learned = Learned(self.table, Table({}, {}, device, 1), strategy, None)
+        numbers = torch.zeros(1, dtype=torch.int64, device=device)
+        self.views = ViewStack(camera.viewmat, camera.K, target[None], None, {}, numbers)
+        self.plan = StepPlan(gaussians.sh_degree, False, tuple(built_in_terms(LossConfig())), None)
+        self.graphs = StepGraphs(device) if device.type == "cuda" else None
+        self._load(range(1, MAX_BATCH + 1))
+
+    def _load(self, steps: range) -> None:
+        config = OptimizerConfig()
+        fixed = None if self.lr is None else dict.fromkeys(self.table.params, self.lr)
+        lrs, heads = (config.lrs(0.0, 1.0), config.head_lrs) if fixed is None else (fixed, {})
+        rows = [self.table.lr_row(lrs, k, heads) for k in steps]
+        self.buffers.load([0] * len(steps), rows, [(0.0, k, lrs["means"]) for k in steps])
+
+    def eager(self) -> None:
+        """Take the first step of a batch from Python, again and again: the same work each time."""
+        self.buffers.counter.zero_()
+        step(self.learned, self.views, self.buffers, self.plan, eager_renderer(self.rule, self.background, None))
+
+    def _graph(self) -> torch.cuda.CUDAGraph:
+        how = (self.learned, self.buffers, self.plan, self.rule, self.background, None)
+        return self.graphs.capture_all([KIND], {KIND: self.views}, *how)[0]
+
+    def replay(self) -> None:
+        """Take the first step of a batch as a CUDA graph, again and again; captured at the first call."""
+        graph = self._graph()
+        self.buffers.counter.zero_()
+        graph.replay()
+
+    def train(self, steps: int) -> list[float]:
+        """Take steps one after the other as CUDA graphs and return their losses.
+
+        Raises:
+            RuntimeError: A loss is not finite, or the instances outgrew the capacity.
+        """
+        losses: list[float] = []
+        while len(losses) < steps:
+            count = min(MAX_BATCH, steps - len(losses))
+            graph = self._graph()
+            self._load(range(len(losses) + 1, len(losses) + count + 1))
+            for _ in range(count):
+                graph.replay()
+            done, stop, history = self.buffers.result()
+            if stop:
+                raise RuntimeError(f"training stopped after {len(losses) + done} steps with code {stop}; use fewer Gaussians")
+            losses += [loss for loss, _ in history[:done]]
+        return losses

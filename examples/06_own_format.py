@@ -1,0 +1,151 @@
+"""Read a scene format of your own: define a Reader, pass it to warpgs.load_scene, or name it on the command line.
+
+The made-up format of this example is a folder with shots.csv, one line per image:
+
+    name, x, y, z, target_x, target_y, target_z, focal_px
+
+with the camera position, the point it looks at (both in any unit, +y down) and the focal length. Images lie beside the file.
+
+Run without arguments to write a small scene of that format, read it back and check it (a few seconds on a CPU):
+
+    python examples/06_own_format.py
+
+Fit it from the command line:
+
+    python examples/06_own_format.py --out shots
+    warpgs fit shots --reader examples/06_own_format.py:ShotsReader --out run
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+import warpgs
+from warpgs.errors import DataError
+from warpgs.geometry import look_at
+from warpgs.io.folders import ViewList, child, view_name
+from warpgs.io.images import Lens, load_image
+from warpgs.io.readers import Probe, Reader, ReadOptions
+from warpgs.report.images import png
+from warpgs.scene import Scene
+from warpgs.synthetic import raycast
+from warpgs.synthetic.demo import camera_path, still_life
+
+UP = np.array([0.0, -1.0, 0.0])
+"""Upward direction of the format: +y points down, as in an OpenCV camera."""
+
+
+class ShotsReader(Reader):
+    """The shots.csv format."""
+
+    name = "shots"
+    description = "shots.csv with images beside it"
+
+    def probe(self, folder: Path) -> Probe | None:
+        """Return the file that makes the format; None where it is not there."""
+        return Probe("shots.csv") if (folder / "shots.csv").is_file() else None
+
+    def read(self, folder: Path, options: ReadOptions) -> Scene:
+        """Return the scene in file coordinates; DataError names the line that cannot be understood."""
+        path = folder / "shots.csv"
+        views = ViewList()
+        with path.open(newline="", encoding="utf-8") as file:
+            for number, row in enumerate(csv.reader(file), 1):
+                where = f"{path}, line {number}"
+                name, position, target, focal = parse(row, where)
+                image = load_image(
+                    child(folder, name, where, allow_outside=options.allow_outside),
+                    lambda width, height: centred_lens(focal, width, height).checked(where),  # noqa: B023 - called at once
+                    downscale=options.downscale,
+                )
+                views.add(view_name(name), look_at(position, target, UP), image)
+        return self.scene(folder, views.views, views.notes())
+
+
+def parse(row: list[str], where: str) -> tuple[str, np.ndarray, np.ndarray, float]:
+    """Return name, position [3], target [3] and focal length [px] of a row.
+
+    Raises:
+        DataError: The row does not hold a name and seven finite numbers, or the camera looks nowhere.
+    """
+    try:
+        name, *numbers = (word.strip() for word in row)
+        values = np.array([float(word) for word in numbers])
+    except ValueError as e:
+        raise DataError(f"{where}: cannot be understood ({e}); write a name and seven numbers") from e
+    if len(values) != 7 or not np.isfinite(values).all():
+        raise DataError(f"{where}: needs a name and seven finite numbers, has {len(values)}; write the line again")
+    position, target = values[:3], values[3:6]
+    direction = target - position
+    if not np.linalg.norm(np.cross(direction, UP)) > 1e-9:
+        raise DataError(f"{where}: the camera looks straight up or down, or at itself; move its target")
+    return name, position, target, float(values[6])
+
+
+def centred_lens(focal: float, width: int, height: int) -> Lens:
+    """Return a pinhole lens whose principal point is the middle of the image; all arguments in px."""
+    return Lens(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), width, height)
+
+
+def write_shots(folder: Path, count: int = 8, width: int = 64, height: int = 48) -> None:
+    """Write the still life of the synthetic demo in the shots.csv format, ``count`` images of ``width`` x ``height`` px."""
+    folder.mkdir(parents=True, exist_ok=True)
+    shapes, light, focal = still_life(), raycast.Light(), 0.95 * width
+    lines = []
+    for i, camera in enumerate(camera_path(count, width, height)):
+        # numbers as the file has them, so that image and pose agree to the last digit
+        position = camera.center.round(6)
+        target = (position + 5 * camera.viewmat[2, :3]).round(6)
+        viewmat = look_at(position, target, UP)
+        rgb = raycast.render(shapes, light, centred_lens(focal, width, height).K, viewmat, width, height)
+        (folder / f"shot{i}.png").write_bytes(png(rgb))
+        lines.append(", ".join([f"shot{i}.png", *(f"{v:.6f}" for v in (*position, *target, focal))]))
+    (folder / "shots.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def check(scene: Scene) -> float:
+    """Render every view again from the pose that was read.
+
+    Returns:
+        The smallest PSNR [dB] between image and rendering: about 59 dB, the rounding to 8 bits, where position, direction,
+        focal length and axes all are right.
+    """
+    shapes, light, worst = still_life(), raycast.Light(), math.inf
+    n = scene.normalization
+    for view in scene.views:
+        viewmat = np.array(view.camera.viewmat)
+        # back from scene units to those of the file
+        viewmat[:3, 3] = viewmat[:3, 3] / n.scale - viewmat[:3, :3] @ n.offset
+        rgb = raycast.render(shapes, light, np.asarray(view.camera.K), viewmat, view.camera.width, view.camera.height)
+        worst = min(worst, -10 * math.log10(float(np.mean((rgb - view.image) ** 2))))
+    return worst
+
+
+def main(arguments: list[str] | None = None) -> float:
+    """Write, read and check a scene; return the PSNR [dB] of `check`.
+
+    Raises:
+        SystemExit: The poses that were read do not fit the images.
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, help="folder to keep the scene in; without it a temporary one is used")
+    out = parser.parse_args(arguments).out
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = out or Path(temporary)
+        write_shots(folder)
+        scene = warpgs.load_scene(folder, reader=ShotsReader())
+        psnr = check(scene)
+    if psnr < 50:
+        raise SystemExit(f"the poses that were read do not fit the images: {psnr:.1f} dB; at least 50 dB are expected")
+    print(f"{scene.format}: {len(scene.views)} views read; rendered again, they equal their images to {psnr:.1f} dB")
+    return psnr
+
+
+if __name__ == "__main__":
+    main()

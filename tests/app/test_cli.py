@@ -1,0 +1,235 @@
+"""The commands as a user types them: results, exit codes, and one line for every mistake."""
+
+import json
+import os
+import stat
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from warpgs.app.cli import main
+from warpgs.export.ply import read_ply
+from warpgs.pipeline.metrics.lpips_weights import NETS, convert_lpips
+from warpgs.synthetic.demo import split_spec, write_demo
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A small demo scene."""
+    folder = tmp_path_factory.mktemp("data") / "scene"
+    write_demo(folder, views=9, width=64, height=48)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(scene):
+    """A short run on it."""
+    out = scene.parent / "run"
+    assert main(["fit", str(scene), "--split", split_spec(9), "--steps", "40", "--out", str(out), "--device", "cpu"]) == 0
+    return out
+
+
+def test_help_is_fast_and_imports_nothing_heavy():
+    """`warpgs --help` lists the commands without loading torch or Warp."""
+    code = (
+        "import sys; from warpgs.app.cli import main; main(['--help']); "
+        "print(sorted({'torch', 'warp', 'cv2'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip().endswith("[]")
+    assert all(name in done.stdout for name in ("fit", "eval", "render", "export", "demo", "doctor"))
+
+
+def test_a_fit_starts_without_libraries_that_it_does_not_need_yet(scene, tmp_path):
+    """Up to the first step: no search trees, no metrics, no 3D overview, no networks, no compiler of torch's."""
+    code = (
+        "import sys\n"
+        "from warpgs.app.cli import main\n"
+        "from warpgs.pipeline.train import trainer\n"
+        "def stop(*_): raise KeyboardInterrupt\n"
+        "trainer.Trainer.advance = stop\n"
+        f"flags = ['--out', {str(tmp_path / 'run')!r}, '--device', 'cpu', '--init.source', 'random']\n"
+        f"code = main(['fit', {str(scene)!r}, *flags])\n"
+        "late = {'scipy', 'skimage', 'pyvista', 'onnxruntime', 'torch._dynamo', 'torch._inductor'}\n"
+        "print(code, sorted(late & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip().endswith("130 []")
+
+
+def test_run_folder_holds_what_it_promises(run):
+    """Configuration, logs, scores, checkpoint, PLY, pictures, report; and the scores are the same everywhere."""
+    metrics = json.loads((run / "metrics.json").read_text())
+    config = json.loads((run / "config.json").read_text())
+    assert len(metrics["views"]) == len(config["test"]) > 0 and set(config["train"]).isdisjoint(config["test"])
+    assert metrics["test"]["psnr"] == pytest.approx(np.mean([v["psnr"] for v in metrics["views"]]))
+    assert {"warpgs", "torch", "warp-lang"} <= set(config["versions"]) and len(config["fingerprint"]) == 64
+    assert len((run / "metrics.jsonl").read_text().splitlines()) == 40
+    for name in config["test"]:
+        assert (run / "renders" / name).is_file() and (run / "depth" / name).is_file()
+    protocol = metrics["protocol"]
+    assert protocol["split"] == split_spec(9) and protocol["ground_truth"] == "images as stored"
+    assert protocol["resolution"] == ["64 x 48"] and protocol["held_out_views"] == len(config["test"])
+    assert metrics["variants"]["lpips"].startswith("not measured") and "8 bits" in metrics["variants"]["psnr"]
+    assert metrics["config_hash"] == config["config_hash"]
+    page = (run / "report.html").read_text()
+    assert "images as stored" in page and "not measured" in page and metrics["config_hash"] in page
+    assert f"{metrics['test']['psnr']:.2f} dB" in page and "pixels by sweep" in page
+    assert len(read_ply(run / "point_cloud.ply")) == metrics["gaussians"]
+    events, layers = metrics["events"], metrics["layers"]
+    assert 0 < events["added"] <= 0.03 * 6 * 64 * 48 * events["count"] and sum(layers.values()) == metrics["gaussians"]
+    assert "Why Gaussians were placed" in page and len(list((run / "sampling").glob("*.png"))) == 2
+    memory = metrics["memory"]
+    assert 0 < memory["planned"] < memory["planned_at_cap"] and memory["limit"] is None and "planned for a step now" in page
+
+
+def test_eval_repeats_the_scores(run, capsys):
+    """Scoring the checkpoint again gives the figures of the fit."""
+    assert main(["eval", str(run), "--device", "cpu"]) == 0
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert f"PSNR {metrics['test']['psnr']:.2f} dB" in capsys.readouterr().out.splitlines()[-1]
+    assert json.loads((run / "eval.json").read_text())["test"] == metrics["test"]
+
+
+def test_eval_measures_lpips(run, tmp_path, capsys):
+    """With weights the figures stand in eval.json, named by net and mode; a file that holds none is refused first."""
+    torch.manual_seed(0)
+    net = NETS["alex"]
+    state = {name: torch.randn(shape).abs() / 10 for name, shape in net.shapes().items()}
+    torch.save({k: v for k, v in state.items() if k.startswith("features")}, tmp_path / "b.pth")
+    torch.save({k: v for k, v in state.items() if k.startswith("lin")}, tmp_path / "h.pth")
+    convert_lpips(tmp_path / "b.pth", tmp_path / "h.pth", tmp_path / "l.safetensors")
+    assert main(["eval", str(run), "--device", "cpu", "--lpips-weights", str(tmp_path / "l.safetensors")]) == 0
+    assert "LPIPS-Alex [0, 1]" in capsys.readouterr().out
+    result = json.loads((run / "eval.json").read_text())
+    assert result["test"]["lpips_alex_legacy"] == pytest.approx(np.mean([v["lpips_alex_legacy"] for v in result["views"]]))
+    assert "[-1, 1]" in result["variants"]["lpips_alex_standard"] and result["steps"] == 40 and len(result["config_hash"]) == 12
+    foreign = str(run / "point_cloud.ply")
+    assert "warpgs convert-lpips" in failure(capsys, 3, "eval", str(run), "--lpips-weights", foreign)
+
+
+@pytest.mark.parametrize(("path", "pictures"), [("orbit", 4), ("spiral", 4), ("views", 9)])
+def test_render_paths(run, tmp_path, path, pictures):
+    """Every path gives its pictures and a film."""
+    flags = ["--path", path, "--frames", "4", "--out", str(tmp_path), "--device", "cpu"]
+    assert main(["render", str(run), *flags]) == 0
+    assert len(list(tmp_path.glob("*.png"))) == pictures and (tmp_path / "film.mp4").stat().st_size > 0
+
+
+def test_export_equals_the_run(run, tmp_path):
+    """The exported PLY is the run's own."""
+    target = tmp_path / "x.ply"
+    assert main(["export", str(run), "--to", str(target)]) == 0
+    assert target.read_bytes() == (run / "point_cloud.ply").read_bytes()
+
+
+def test_exported_points_are_in_the_files_coordinates(run, scene):
+    """The model's centre lies among the reconstruction's points, not in normalised coordinates."""
+    lines = (scene / "sparse" / "0" / "points3D.txt").read_text().splitlines()
+    points = np.array([line.split()[1:4] for line in lines if not line.startswith("#")], float)
+    means = read_ply(run / "point_cloud.ply").means.numpy()
+    low, high = np.percentile(points, [5, 95], axis=0)
+    inside = ((means > low - 0.3 * (high - low)) & (means < high + 0.3 * (high - low))).all(1)
+    assert inside.mean() > 0.8
+
+
+def failure(capsys, code: int, *arguments: str) -> str:
+    """Run a command that must fail with that code and one line on stderr; returns the line."""
+    assert main(list(arguments)) == code
+    text = capsys.readouterr().err.strip()
+    assert text.startswith("warpgs: ") and "Traceback" not in text and "internal error" not in text
+    return text
+
+
+def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys):
+    """2 usage, 3 data, 4 resources; each names the thing and the way out, and no folder is left behind."""
+    out = str(tmp_path / "new")
+    assert "no command 'train'" in failure(capsys, 2, "train")
+    assert "choose another --out" in failure(capsys, 2, "fit", str(scene), "--out", str(run))
+    assert "preset 'best'" in failure(capsys, 2, "fit", str(scene), "--out", out, "--preset", "best")
+    assert "device 'tpu'" in failure(capsys, 2, "fit", str(scene), "--out", out, "--device", "tpu")
+    assert "steps must be at least 1" in failure(capsys, 2, "fit", str(scene), "--out", out, "--steps", "0")
+    assert "--downscale must be a whole number of at least 1" in failure(
+        capsys, 2, "fit", str(scene), "--out", out, "--downscale", "0"
+    )
+    assert "no config.json" in failure(capsys, 2, "fit", str(scene), "--out", out, "--resume")
+    assert "no such folder" in failure(capsys, 3, "fit", str(tmp_path / "nowhere"), "--out", str(tmp_path / "b"))
+    assert "no view 'x.png'" in failure(capsys, 3, "fit", str(scene), "--out", str(tmp_path / "c"), "--split", "train=x.png")
+    assert "not understood" in failure(capsys, 2, "fit", str(scene), "--out", str(tmp_path / "d"), "--split", "third:3")
+    assert "cannot be read" in failure(capsys, 3, "eval", str(tmp_path))
+    assert "path 'zigzag'" in failure(capsys, 2, "render", str(run), "--path", "zigzag")
+    assert "format .obj is not supported" in failure(capsys, 2, "export", str(run), "--to", str(tmp_path / "a.obj"))
+    assert not any((tmp_path / name).exists() for name in ("new", "b", "c", "d"))
+    assert "steps" in failure(
+        capsys, 2, "fit", str(scene), "--split", split_spec(9), "--steps", "50", "--out", str(run), "--resume"
+    )
+
+
+def test_cuda_where_there_is_none(scene, tmp_path, capsys, monkeypatch):
+    """Asking for CUDA without a device is a resource error that names the way out."""
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    text = failure(capsys, 4, "fit", str(scene), "--out", str(tmp_path / "x"), "--device", "cuda")
+    assert "warpgs doctor" in text and "--device cpu" in text
+
+
+@pytest.mark.skipif(getattr(os, "geteuid", int)() == 0, reason="root, and Windows, may write anywhere")
+def test_unwritable_output(scene, tmp_path, capsys):
+    """A folder that cannot be written is found out before the scene is read."""
+    tmp_path.chmod(stat.S_IRUSR | stat.S_IXUSR)
+    assert "cannot be written" in failure(capsys, 4, "fit", str(scene), "--out", str(tmp_path / "x"))
+
+
+def test_output_below_a_file(scene, capsys):
+    """A path through a file cannot become a folder."""
+    below = scene / "images" / "000.png" / "run"
+    assert "cannot be written" in failure(capsys, 4, "fit", str(scene), "--out", str(below))
+
+
+CUDA_FULL = "CUDA out of memory. Tried to allocate 48.00 MiB. GPU 0 has a total capacity of 139.80 GiB."
+
+
+@pytest.mark.parametrize("error", [RuntimeError(CUDA_FULL), MemoryError()], ids=["CUDA", "Python"])
+def test_no_memory_left_is_no_defect(error, capsys, monkeypatch):
+    """Where memory runs out, one line says so and how to need less."""
+
+    def full(*_):
+        raise error
+
+    monkeypatch.setattr("warpgs.pipeline.runs.commands.export", full)
+    line = failure(capsys, 4, "export", "run", "--to", "x.ply")
+    assert "--memory-limit" in line and "--resume" in line and "total capacity" not in line
+
+
+def test_defects_are_called_defects(tmp_path, capsys, monkeypatch):
+    """An unexpected error is one line with a file that holds the details."""
+    monkeypatch.setattr("warpgs.pipeline.runs.commands.export", lambda *a: 1 / 0)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert main(["export", "run", "--to", "x.ply"]) == 5
+    text = capsys.readouterr().err
+    assert "internal error, ZeroDivisionError" in text and "Traceback" not in text
+    assert "Traceback" in next(tmp_path.glob("warpgs-error-*.txt")).read_text()
+
+
+def test_changed_data_are_noticed(scene, run, tmp_path, capsys):
+    """eval refuses a scene whose photographs are no longer those of the fit."""
+    import shutil
+
+    moved = tmp_path / "scene"
+    shutil.copytree(scene, moved)
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    record = json.loads((copy / "config.json").read_text())
+    record["scene"]["path"] = str(moved)
+    (copy / "config.json").write_text(json.dumps(record))
+    (moved / "images" / "000.png").write_bytes((moved / "images" / "001.png").read_bytes())
+    assert "are not those" in failure(capsys, 3, "eval", str(copy), "--device", "cpu")
+
+
+def test_demo_command_tells_the_next_step(tmp_path, capsys):
+    """The printed command uses the split that the scene was made for."""
+    assert main(["demo", str(tmp_path / "d"), "--views", "8", "--width", "48", "--height", "36"]) == 0
+    assert f"--split '{split_spec(8)}'" in capsys.readouterr().out
+    assert main(["--version"]) == 0

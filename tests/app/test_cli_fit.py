@@ -1,0 +1,201 @@
+"""The flags of `warpgs fit`: derived from the settings, with those of plug-ins, and safe where code of others is named."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from warpgs.app.cli import main
+from warpgs.app.cli_fit import fit
+from warpgs.app.flags import field_docs, flags_of, settings_of
+from warpgs.pipeline.train.config import PRESETS, FitConfig
+from warpgs.pipeline.train.loss import DepthCorrelation
+from warpgs.pipeline.train.strategies.mcmc import MCMCConfig
+from warpgs.synthetic.demo import split_spec, write_demo
+
+BASE = ["scene", "--out", "run", "--device", "cpu"]
+PLUG_INS = '''
+from dataclasses import dataclass
+
+import warpgs.io.readers as readers
+import warpgs.pipeline.train.loss as loss
+import warpgs.pipeline.train.strategies.base as base
+
+
+@dataclass(frozen=True)
+class Settings:
+    rate: float = 0.5
+    """Rate of nothing,
+    on two lines."""
+
+
+class Folder(readers.Reader):
+    def probe(self, folder):
+        return readers.Probe("everything")
+
+    def read(self, folder, options):
+        return readers.READERS.find("colmap")().read(folder, options)
+
+
+class SlowGrowth(base.Strategy):
+    Config = Settings
+
+
+@dataclass(frozen=True)
+class Opaque(loss.LossTerm):
+    weight: float = 0.25
+    """Weight of the mean alpha."""
+
+    def __call__(self, render, target, gaussians):
+        return self.weight * render.alpha.mean()
+'''
+
+
+def parsed(*flags):
+    """The settings that a command line leads to."""
+    return fit([*BASE, *flags], "").config
+
+
+def squeezed(text):
+    """A text without its layout: frames and white space."""
+    return "".join(text.replace("│", "").split())
+
+
+def leaves(kind, prefix=""):
+    """Every flag that a settings dataclass stands for, with the docstring of its field."""
+    docs = field_docs(kind)
+    for f in dataclasses.fields(kind):
+        default = f.default_factory() if f.default_factory is not dataclasses.MISSING else f.default
+        if dataclasses.is_dataclass(default):
+            yield from leaves(type(default), "" if f.name == "priors" else f"{prefix}{f.name.replace('_', '-')}.")
+        elif f.name != "strategy_config":
+            yield f"--{prefix}{f.name.replace('_', '-')}", docs[f.name]
+
+
+def test_every_setting_is_a_flag_with_its_own_help(capsys, monkeypatch):
+    """Whatever FitConfig and its parts hold is in the help, word for word, without a second text."""
+    monkeypatch.setenv("COLUMNS", "110")
+    with pytest.raises(SystemExit) as end:
+        fit(["--help", "--strategy", "mcmc", "--loss-terms", "depth_correlation"], "")
+    text = squeezed(capsys.readouterr().out)
+    flags = [*leaves(FitConfig), *leaves(MCMCConfig, "mcmc."), *leaves(DepthCorrelation, "depth-correlation.")]
+    assert end.value.code == 0 and len(flags) > 80
+    for flag, doc in flags:
+        assert flag in text and squeezed(doc) in text, flag
+    assert "--strategy-config" not in text
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_without_flags_the_settings_are_the_presets(preset):
+    """Nothing is lost or changed on the way through the command line, types included."""
+    found = parsed("--preset", preset)
+    assert found == PRESETS[preset] and found.fingerprint() == PRESETS[preset].fingerprint()
+    assert type(found) is FitConfig and type(found.init) is type(PRESETS[preset].init)
+    assert settings_of(FitConfig, flags_of(FitConfig, found)[1]) == found
+
+
+def test_flags_change_what_they_name(capsys):
+    """Sizes with units, nested settings, the preset that depends on the device, and both forms of a flag."""
+    found = parsed("--memory-limit", "2GiB", "--init.source=random", "--no-cuda-graph", "--max-gaussians", "900")
+    assert (found.memory_limit, found.init.source, found.cuda_graph, found.max_gaussians) == (2 * 2**30, "random", False, 900)
+    assert found.preset == "quick" and "preset quick, as usual on cpu" in capsys.readouterr().out
+    found = parsed(
+        "--strategy=mcmc", "--mcmc.noise-lr", "1e4", "--loss-terms", "depth_correlation", "--depth-correlation.until", "0.5"
+    )
+    assert found.strategy_config == MCMCConfig(noise_lr=1e4) and found.loss_terms == (DepthCorrelation(until=0.5),)
+    assert parsed("--preset", "mcmc", "--mcmc.every", "7").strategy_config.every == 7
+    assert parsed("--preset", "mcmc", "--strategy", "clone_split").strategy_config is None
+
+
+def test_mistakes_are_named_before_anything_starts(tmp_path, capsys):
+    """One line and exit code 2 for names, sizes and plug-ins that cannot be."""
+    (tmp_path / "broken.py").write_text("x = 1\ny = 1 / 0\n")
+    (tmp_path / "crooked.py").write_text("def f(:\n")
+    (tmp_path / "clash.py").write_text(PLUG_INS.replace("SlowGrowth", "Init"))
+    (tmp_path / "needy.py").write_text(PLUG_INS.replace(" = 0.25", ""))
+    for flags, message in [
+        (["--memory-limit", "2 cows"], "2 cows"),
+        (["--strategy", "best"], "there is no strategy 'best'; choose one of"),
+        (["--loss-terms", "depth_correlation,depth_correlation"], "two terms have the flags --depth_correlation"),
+        (["--strategy", f"{tmp_path}/none.py:A"], "there is no file"),
+        (["--strategy", "json:JSONDecoder"], "must be a class that derives from"),
+        (["--strategy", f"{tmp_path}/broken.py:A"], "ZeroDivisionError: division by zero"),
+        (["--strategy", f"{tmp_path}/broken.py:A"], "broken.py, line 2"),
+        (["--strategy", f"{tmp_path}/crooked.py:A"], "crooked.py, line 1"),
+        (["--strategy", f"{tmp_path}/clash.py:Init"], "whose flags --init there are already"),
+        (["--loss-terms", f"{tmp_path}/needy.py:Opaque"], "has a setting without a default"),
+    ]:
+        assert main(["fit", *BASE, *flags]) == 2
+        text = capsys.readouterr().err
+        assert message in text and "Traceback" not in text and len(text.splitlines()) == 1, (flags, text)
+
+
+@pytest.fixture(scope="module")
+def plugged(tmp_path_factory):
+    """A scene, a file with a strategy and a loss term, and a run with both."""
+    folder = tmp_path_factory.mktemp("plugged")
+    (folder / "mine.py").write_text(PLUG_INS)
+    write_demo(folder / "scene", views=8, width=32, height=32)
+    flags = ["--steps", "3", "--device", "cpu", "--preset", "3dgs", "--init.source", "random", "--init.random-count", "40"]
+    command = ["fit", str(folder / "scene"), "--split", split_spec(8), "--out", str(folder / "run"), *flags]
+    named = [
+        "--strategy",
+        f"{folder}/mine.py:SlowGrowth",
+        "--slow-growth.rate",
+        "0.75",
+        "--loss-terms",
+        f"{folder}/mine.py:Opaque",
+    ]
+    assert main([*command, *named, "--reader", f"{folder}/mine.py:Folder"]) == 0
+    return folder, command, named
+
+
+def test_settings_of_plug_ins_reach_the_run(plugged, capsys):
+    """Given as FILE.py:Class, with flags of their own that stand in the help and in config.json."""
+    folder, command, named = plugged
+    config = json.loads((folder / "run" / "config.json").read_text())["config"]
+    assert config["strategy"].endswith("mine.py:SlowGrowth") and config["strategy_config"] == {"rate": 0.75}
+    (term,) = config["loss_terms"]
+    assert term["name"].endswith("mine.py:Opaque") and term["weight"] == 0.25
+    with pytest.raises(SystemExit):
+        main([*command, *named, "--help"])
+    text = capsys.readouterr().out
+    assert "slow-growth options" in text and "Rate of nothing, on two lines." in text and "--opaque.weight" in text
+
+
+def test_a_run_folder_never_decides_what_code_is_loaded(plugged):
+    """In a new process: eval asks for the reader by name, --resume for strategy and term, and go on once they are named."""
+    folder, command, named = plugged
+    probe = (
+        "import sys\nfrom warpgs.app.cli import main\ncode = main(sys.argv[1:])\n"
+        "print('loaded', [n for n in sys.modules if 'mine' in n.rpartition('_warpgs_')[2] and '_warpgs_' in n])\nsys.exit(code)"
+    )
+
+    def run(*arguments):
+        return subprocess.run([sys.executable, "-c", probe, *arguments], capture_output=True, text=True, check=False)
+
+    reader = f"{folder}/mine.py:Folder"
+    done = run("eval", str(folder / "run"), "--device", "cpu")
+    assert done.returncode == 2 and "loaded []" in done.stdout and f"--reader {reader}" in done.stderr
+    assert run("eval", str(folder / "run"), "--device", "cpu", "--reader", reader).returncode == 0
+    done = run(*command, "--resume")
+    assert done.returncode == 2 and "loaded []" in done.stdout and f"--strategy {named[1]}" in done.stderr
+    done = run(*command, "--resume", *named[:4])
+    assert done.returncode == 2 and f"--loss-terms {named[5]}" in done.stderr
+    done = run(*command, "--resume", *named)
+    assert done.returncode == 0 and "continued from step 3" in done.stdout
+
+
+def test_the_current_folder_is_not_searched(plugged):
+    """`python -m warpgs` finds module:Class on PYTHONPATH, where its user put it, and not by standing beside it."""
+    folder, _, _ = plugged
+    command = [sys.executable, "-m", "warpgs", "fit", *BASE, "--strategy", "mine:SlowGrowth", "--help"]
+    root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+    for path, found in ((root, False), (f"{root}{os.pathsep}{folder}", True)):
+        environment = {**os.environ, "PYTHONPATH": path}
+        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+        assert ("--slow-growth.rate" in done.stdout) == found and (done.returncode == 0) == found, done.stderr
+        assert found or "'mine:SlowGrowth' cannot be imported" in done.stderr

@@ -1,0 +1,207 @@
+"""The report on the machine: never raises, names a remedy for what is missing, reads well in 80 columns."""
+
+import importlib
+import io
+import sys
+import types
+
+import pytest
+from rich.console import Console
+
+from warpgs.app import doctor
+from warpgs.app.doctor import MISSING, NOTE, OK, Finding
+from warpgs.errors import ResourceError
+from warpgs.runtime.kernel_cache import KernelCache
+
+
+def text_of(findings, width=80, terminal=False):
+    out = io.StringIO()
+    code = doctor.print_report(findings, Console(file=out, width=width, force_terminal=terminal))
+    return out.getvalue(), code
+
+
+def without(monkeypatch, name, error):
+    real = importlib.import_module
+
+    def fake(module, *args):
+        if module == name:
+            raise error
+        return real(module, *args)
+
+    monkeypatch.setattr(importlib, "import_module", fake)
+
+
+def by_topic(findings):
+    return {f.topic: f for f in findings}
+
+
+def test_this_machine_can_fit():
+    findings = doctor.diagnose()
+    topics = [f.topic for f in findings]
+    assert len(topics) == len(set(topics))
+    for topic in (
+        "Python",
+        "torch",
+        "warp-lang",
+        "CPU",
+        "Memory",
+        "Kernel cache",
+        "3D overview",
+        "MP4 encoder",
+        "Disk",
+    ):
+        assert topic in topics
+    assert any(t.startswith("CUDA") for t in topics)
+    assert all(f.remedy for f in findings if f.status == MISSING)
+    assert all(f.detail and f.status in (OK, MISSING, NOTE) for f in findings)
+    _, code = text_of(findings)
+    assert code == 0
+
+
+def test_a_missing_required_package(monkeypatch):
+    without(monkeypatch, "safetensors", ModuleNotFoundError("No module named 'safetensors'"))
+    findings = list(doctor._packages())
+    f = by_topic(findings)["safetensors"]
+    assert (f.status, f.remedy, f.required) == (MISSING, "pip install safetensors", True)
+    text, code = text_of(findings)
+    assert code == 4 and "pip install safetensors" in text and "cannot run yet: safetensors" in text
+
+
+def test_a_missing_optional_package_does_not_stop_a_fit(monkeypatch):
+    without(monkeypatch, "onnxruntime", ModuleNotFoundError("No module named 'onnxruntime'"))
+    findings = list(doctor._packages())
+    assert by_topic(findings)["onnxruntime"].status == NOTE
+    text, code = text_of(findings)
+    assert code == 0 and "pip install onnxruntime" in text
+
+
+def test_an_installed_package_that_lacks_a_system_library(monkeypatch):
+    without(monkeypatch, "cv2", ImportError("libGL.so.1: cannot open shared object file"))
+    f = by_topic(doctor._packages())["opencv-contrib-python-headless"]
+    assert f.status == MISSING and "libGL.so.1" in f.detail and "system library" in f.remedy
+
+
+def torch_like(cuda, available):
+    properties = types.SimpleNamespace(name="GPU X", total_memory=24 * 2**30, major=8, minor=9)
+    return types.SimpleNamespace(
+        __version__="9.9",
+        version=types.SimpleNamespace(cuda=cuda),
+        cuda=types.SimpleNamespace(
+            is_available=lambda: available, device_count=lambda: 2, get_device_properties=lambda i: properties
+        ),
+    )
+
+
+def test_a_torch_without_cuda(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", torch_like(None, False))
+    (f,) = doctor._cuda()
+    assert f.status == NOTE and "without CUDA" in f.detail and "CUDA build of torch" in f.remedy
+
+
+@pytest.mark.parametrize(("hidden", "word"), [("", "hides"), (None, "driver")])
+def test_no_usable_device(monkeypatch, hidden, word):
+    monkeypatch.setitem(sys.modules, "torch", torch_like("13.0", False))
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if hidden is not None:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", hidden)
+    (f,) = doctor._cuda()
+    assert f.status == NOTE and word in f.detail and f.remedy
+
+
+def test_devices_that_torch_sees_and_warp_does_not(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", torch_like("13.0", True))
+    monkeypatch.setattr(doctor, "_quiet_warp", lambda: types.SimpleNamespace(is_cuda_available=lambda: False))
+    first, second, warp = doctor._cuda()
+    assert first.topic == "CUDA 0" and second.topic == "CUDA 1" and "24.0 GiB" in first.detail
+    assert warp.status == MISSING and "--device cpu" in warp.remedy
+
+
+def test_devices_that_both_see(monkeypatch):
+    warp = types.SimpleNamespace(
+        is_cuda_available=lambda: True, get_cuda_device_count=lambda: 2, get_cuda_driver_version=lambda: (13, 1)
+    )
+    monkeypatch.setitem(sys.modules, "torch", torch_like("13.0", True))
+    monkeypatch.setattr(doctor, "_quiet_warp", lambda: warp)
+    *_, f = doctor._cuda()
+    assert f.status == OK and "13.1" in f.detail
+
+
+def test_the_prior_cache(monkeypatch, tmp_path):
+    """Its place and size; a place that cannot be written is a note, since a fit works without."""
+    monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "maps"))
+    (f,) = doctor._prior_cache()
+    assert f.status == OK and str(tmp_path / "maps") in f.detail and "0 B" in f.detail
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "file" / "maps"))
+    (f,) = doctor._prior_cache()
+    assert f.status == NOTE and "WARPGS_CACHE" in f.remedy and not f.required
+
+
+def test_a_kernel_cache_that_cannot_be_used(monkeypatch, tmp_path):
+    """A private one is a note: a fit works, and compiles each time; none at all stops it."""
+    monkeypatch.setattr(doctor, "prepare_kernel_cache", lambda: KernelCache(tmp_path, "it cannot be written"))
+    (f,) = doctor._kernel_cache()
+    assert f.status == NOTE and "cannot be written" in f.detail and "WARP_CACHE_PATH" in f.remedy
+
+    def refuse():
+        raise ResourceError("nowhere")
+
+    monkeypatch.setattr(doctor, "prepare_kernel_cache", refuse)
+    (f,) = doctor._kernel_cache()
+    assert f.status == MISSING and f.required and "WARP_CACHE_PATH" in f.remedy
+
+
+@pytest.mark.parametrize(("answer", "status"), [((True, "through EGL"), OK), ((False, "no display"), NOTE)])
+def test_rendering_is_what_the_probe_says(monkeypatch, answer, status):
+    overview = types.SimpleNamespace(probe_rendering=lambda: answer)
+    monkeypatch.setitem(sys.modules, "warpgs.report.overview", overview)
+    (f,) = doctor._rendering()
+    assert f.status == status and answer[1] in f.detail and bool(f.remedy) == (status != OK)
+
+
+def test_an_encoder_that_writes_nothing(monkeypatch):
+    import cv2
+
+    writer = types.SimpleNamespace(isOpened=lambda: False, release=lambda: None)
+    monkeypatch.setattr(cv2, "VideoWriter", lambda *a: writer)
+    (f,) = doctor._video()
+    assert f.status == NOTE and f.remedy
+
+
+def test_little_disk_and_memory_are_notes(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda p: types.SimpleNamespace(free=2**20))
+    monkeypatch.setattr(doctor, "machine_memory", lambda: (2**32, 2**30))
+    found = by_topic([*doctor._disk(), *doctor._processor()])
+    assert found["Disk"].status == found["Memory"].status == NOTE
+    assert found["Disk"].remedy and "4.0 GiB" in found["Memory"].detail
+
+
+def test_a_check_that_fails_is_a_finding(monkeypatch):
+    def _odd_check():
+        raise RuntimeError("no such thing")
+
+    monkeypatch.setattr(doctor, "CHECKS", (_odd_check,))
+    (f,) = doctor.diagnose()
+    assert f.topic == "Odd check" and f.status == NOTE and "no such thing" in f.detail
+
+
+def test_eighty_columns_keep_the_keys_whole():
+    findings = [
+        *(Finding(p.distribution, OK, "1.2.3") for p in doctor.PACKAGES),
+        Finding("Kernel cache", MISSING, "/a/very/long/path" * 9, "set WARP_CACHE_PATH " + "so " * 40, True),
+        Finding("CUDA", NOTE, "[bold]none[/bold] " + "word " * 30, "update"),
+    ]
+    text, code = text_of(findings)
+    rows = text.splitlines()
+    assert code == 4 and max(map(len, rows)) <= 80 and "\x1b" not in text
+    for key in ("opencv-contrib", "onnxruntime", "scikit-image", "Kernel cache"):
+        assert sum(row.strip().startswith(key) for row in rows) >= 1
+    assert "[bold]none[/bold]" in text  # what was found is shown as it is, never read as markup
+    assert text.replace("\n", "").replace(" ", "").count("/a/very/long/path") == 9
+
+
+def test_colours_only_on_a_terminal():
+    findings = [Finding("Python", OK, "3.12")]
+    assert "\x1b[" in text_of(findings, terminal=True)[0]
+    assert "\x1b" not in text_of(findings)[0]

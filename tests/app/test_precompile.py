@@ -1,0 +1,78 @@
+"""Warming the kernel cache: all that a fit launches, compiled once."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from tests.scenes import photos, priors, seeds
+from warpgs.app.precompile import fit_kernels
+from warpgs.pipeline.metrics.evaluate import render_view, score
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loss import LossConfig
+from warpgs.pipeline.train.schedule import PhaseConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
+from warpgs.pipeline.train.strategies.sampler import SamplerConfig
+from warpgs.pipeline.train.trainer import Trainer
+from warpgs.render.rasterize import RasterizeOptions
+from warpgs.runtime import interop
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+def test_a_fit_launches_nothing_else(device, recorded, monkeypatch):
+    """Start, steps with and without masks, density events and scores: every module and size of blocks is among the warmed."""
+    launched, launch = set(), interop.launch
+
+    def note(kernel, count, inputs, where, *, block_dim=256, **more):
+        launched.add((where.type, kernel.module, 1 if where.type == "cpu" else block_dim))
+        launch(kernel, count, inputs, where, block_dim=block_dim, **more)
+
+    monkeypatch.setattr(interop, "launch", note)
+    views = photos(3)
+    views[0] = dataclasses.replace(views[0], mask=np.ones(views[0].image.shape[:2], bool))
+    method = MethodConfig(
+        events=True, hier=True, pm=False, sampler=SamplerConfig(fraction=0.01, min_alpha=0.05, max_fraction=0.05)
+    )
+    config = FitConfig(
+        steps=20, dropout=0.2, cuda_graph=recorded, init=InitConfig(source="points"),
+        strategy="importance_sampling", method=method,
+        loss=LossConfig(depth_weight=0.1, depth_until=0.5),
+        density=DensityConfig(start=2, every=2), phases=PhaseConfig(4, 6, every=2),
+    )  # fmt: skip
+    fit = Trainer(views, seeds(), config, device, priors=priors(views))
+    while fit.step < 20:
+        fit.advance(100)
+    assert any(event["evicted"] for event in fit.strategy.events)
+    score(views[1], render_view(fit.gaussians, views[1], RasterizeOptions())[0])
+    warmed = {(kind, k.module, block) for kind in ("cpu", "cuda") for k, block in fit_kernels(kind == "cuda")}
+    assert len(launched) > 8 and launched <= warmed
+
+
+def test_the_second_call_finds_all_in_the_cache(tmp_path):
+    """One small module in an empty cache: compiled by the first process, found by the second."""
+    code = (
+        "import sys; from warpgs.app import precompile; from warpgs.app.cli import main; "
+        "from warpgs.kernels import tiles; import warp as wp; "
+        "precompile.fit_kernels = lambda cuda: [] if cuda else [(tiles.make_kernels(wp.float32, cuda).find_ranges, 1)]; "
+        "sys.exit(main(['doctor', '--warm']))"
+    )
+    environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path), "CUDA_VISIBLE_DEVICES": ""}
+    said = [
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment).stdout
+        for _ in range(2)
+    ]
+    assert "cpu: tiles.find_ranges, " in said[0] and "1 modules: 1 compiled, 0 were there" in said[0]
+    assert "find_ranges" not in said[1] and "1 modules: 0 compiled, 1 were there" in said[1]
+
+
+def test_kernels_of_both_kinds_of_device_are_named():
+    """Also where there is no CUDA device: their sources are found and their factories called."""
+    assert all(block == 1 for _, block in fit_kernels(False))
+    blocks = {block for _, block in fit_kernels(True)}
+    assert {64, 128, 256, 1024} <= blocks and torch.float32 in interop.REALS

@@ -1,0 +1,145 @@
+"""Readers plug in: built-in ones by name, a user's own as an object, a class or module:Class."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.io import scenes
+from tests.io.scenes import refused
+from warpgs.errors import UsageError
+from warpgs.io.load import load_scene
+from warpgs.io.readers import Probe, Reader, all_readers, find_reader
+from warpgs.scene import Camera, Normalization, Scene, View
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "06_own_format.py"
+FORMATS = ["colmap", "transforms", "llff", "dtu", "middlebury"]
+
+
+class Cameras(Reader):
+    """Views made in memory; `change` spoils the scene."""
+
+    name = "memory"
+    description = "cameras.mem (made up)"
+
+    def __init__(self, change=lambda scene: scene, missing=""):
+        self.change, self.missing = change, missing
+
+    def probe(self, folder):
+        return Probe("cameras.mem", self.missing) if (folder / "cameras.mem").is_file() else None
+
+    def read(self, folder, options):
+        image = np.full((scenes.HEIGHT, scenes.WIDTH, 3), 0.5, np.float32)
+        cameras = [Camera(m, scenes.K, scenes.WIDTH, scenes.HEIGHT) for m in scenes.VIEWMATS]
+        views = [View(f"{9 - i}.png", c, image) for i, c in enumerate(cameras)]
+        return self.change(self.scene(folder, views, ["made in memory"], pixels=f"downscale {options.downscale}"))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "cameras.mem").touch()
+    return tmp_path
+
+
+def test_every_format_registers_and_is_asked_in_order():
+    assert [r.name for r in all_readers()] == FORMATS
+    assert all(find_reader(name).name == name and find_reader(name).description for name in FORMATS)
+
+
+@pytest.mark.parametrize("own", [Cameras, Cameras(), "tests.io.test_readers:Cameras"])
+def test_a_reader_of_ones_own_is_given_as_class_object_or_name(own, folder):
+    scene = load_scene(folder, reader=own, downscale=3)
+    assert (scene.format, scene.pixels, scene.notes) == ("memory", "downscale 3", ("made in memory",))
+    assert [v.name for v in scene.views] == sorted(v.name for v in scene.views) and len(scene.fingerprint) == 64
+    # normalised like any other scene: centred, the farthest camera at 1 / 1.1
+    centers = np.array([v.camera.center for v in scene.views])
+    np.testing.assert_allclose(centers.mean(0), 0, atol=1e-12)
+    assert np.linalg.norm(centers, axis=1).max() == pytest.approx(1 / 1.1)
+
+
+def test_the_named_format_is_read_where_a_folder_holds_several(tmp_path):
+    scenes.write_transforms(scenes.write_colmap(tmp_path))
+    assert load_scene(tmp_path).format == "colmap"
+    named = load_scene(tmp_path, reader="transforms")
+    assert named.format == "transforms" and not any("is taken" in n for n in named.notes)
+
+
+def test_a_reader_that_does_not_find_its_format_is_refused(tmp_path):
+    scenes.write_llff(tmp_path)
+    refused(tmp_path, r"reader colmap does not find its format \(sparse/0.*; the folder holds poses_b", reader="colmap")
+    refused(tmp_path, r"reader memory does not find its format \(cameras.mem", reader=Cameras())
+    (tmp_path / "cameras.mem").touch()
+    refused(tmp_path, "cameras.mem lacks its sounds. Copy the whole scene", reader=Cameras(missing="its sounds"))
+    refused(tmp_path / "gone", "there is no such folder", reader=Cameras())
+
+
+def test_camera_models_arrive_and_change_the_fingerprint(folder):
+    def fisheye(scene):
+        return replace(scene, views=tuple(replace(v, camera=replace(v.camera, model="fisheye")) for v in scene.views))
+
+    plain, other = load_scene(folder, reader=Cameras()), load_scene(folder, reader=Cameras(fisheye))
+    assert {v.camera.model for v in other.views} == {"fisheye"} and plain.fingerprint != other.fingerprint
+
+
+def with_view(**changes):
+    return lambda scene: replace(scene, views=(replace(scene.views[0], **changes), *scene.views[1:]))
+
+
+@pytest.mark.parametrize(
+    "change,message",
+    [
+        (
+            with_view(image=np.zeros((3, 4, 3), np.float32)),
+            r"'9.png': its image is float32 \[3, 4, 3\], the camera needs",
+        ),
+        (with_view(image=np.zeros((12, 16, 3))), r"'9.png': its image is float64"),
+        (with_view(mask=np.ones((12, 16))), r"'9.png': its mask is float64 \[12, 16\], the camera needs bool"),
+        (with_view(camera=Camera(2 * np.eye(4), scenes.K, 16, 12)), r"'9.png': the pose is not rigid"),
+        (with_view(name="5.png"), r"the image '5.png' is listed twice"),
+        (lambda scene: replace(scene, views=scene.views[:1]), r"1 usable view \(made in memory\)"),
+    ],
+)
+def test_what_a_reader_returns_is_checked(change, message, folder):
+    refused(folder, message, reader=Cameras(change))
+
+
+@pytest.mark.parametrize("change", [lambda s: None, lambda s: replace(s, normalization=Normalization(np.zeros(3), 2.0))])
+def test_a_reader_must_return_a_scene_in_file_coordinates(change, folder):
+    with pytest.raises(UsageError, match="reader memory must return a Scene in file coordinates"):
+        load_scene(folder, reader=Cameras(change))
+
+
+@pytest.mark.parametrize(
+    "choice,message",
+    [
+        ("nerf", "there is no reader 'nerf'; choose one of colmap, dtu, llff, middlebury, transforms, or give module:Class"),
+        ("no_such_module:A", "the reader 'no_such_module:A' cannot be imported"),
+        ("no_such_file.py:A", "the reader 'no_such_file.py:A' cannot be imported"),
+        ("warpgs.io.colmap:Nothing", "warpgs.io.colmap has no class Nothing"),
+        ("warpgs.io.colmap:Pose", "is no reader: it must be a class that derives from"),
+        (dict, "dict is no reader"),
+        (3, "3 is no reader; give a name"),
+    ],
+)
+def test_choices_that_name_no_reader(choice, message, folder):
+    with pytest.raises(UsageError, match=message):
+        load_scene(folder, reader=choice)
+
+
+def test_the_example_reads_back_what_it_writes(tmp_path):
+    """Run as a user runs it, once per way of naming the reader."""
+    done = subprocess.run([sys.executable, EXAMPLE, "--out", tmp_path / "shots"], capture_output=True, text=True, check=True)
+    assert "shots: 8 views read" in done.stdout
+    scene = load_scene(tmp_path / "shots", reader=f"{EXAMPLE}:ShotsReader")
+    assert isinstance(scene, Scene) and scene.format == "shots" and len(scene.views) == 8
+    csv = tmp_path / "shots" / "shots.csv"
+    csv.write_text(csv.read_text().replace("shot3.png, ", "shot3.png, far, "))
+    refused(tmp_path / "shots", r"shots.csv, line 4: cannot be understood", reader=f"{EXAMPLE}:ShotsReader")
+
+
+def test_the_example_explains_itself():
+    done = subprocess.run([sys.executable, EXAMPLE, "--help"], capture_output=True, text=True, check=True)
+    assert "--reader examples/06_own_format.py:ShotsReader" in done.stdout

@@ -1,1 +1,0 @@
-"""Mutation check of the kernels: `python -m tests.mutate` (docs/mutation.md)."""

@@ -1,0 +1,181 @@
+"""Images and figures of sampling events: they show what the event saw, and say what it did."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from tests.scenes import photos, priors, seeds
+from warpgs.errors import ResourceError
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.runs import sampling_report
+from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
+from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, sampling_report_of, shown_steps, view_sheet
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig, ProtectConfig
+from warpgs.pipeline.train.strategies.sampler import SamplerConfig
+from warpgs.pipeline.train.trainer import Trainer
+from warpgs.report.contact_sheet import DOT, GAP, HEAD, MARGIN, TITLE_SIZE
+from warpgs.report.images import colored
+
+CPU = torch.device("cpu")
+NAMES = ["00.png", "01.png", "02.png"]
+METHOD = MethodConfig(
+    events=True, hier=True, sampler=SamplerConfig(fraction=0.01, min_alpha=0.05), protect=ProtectConfig(steps=10)
+)
+CONFIG = FitConfig(
+    steps=40, sh_every=10, dropout=0.2, init=InitConfig(source="points", max_sh_degree=1), strategy="importance_sampling",
+    density=DensityConfig(start=2, every=8, gradient=1e-5), phases=PhaseConfig(8, 12, every=5), method=METHOD,
+)  # fmt: skip
+
+
+def fitted(config: FitConfig, steps: int) -> Trainer:
+    """Some steps of a fit of three views."""
+    views = photos(3)
+    fit = Trainer(views, seeds(), config, CPU, priors=priors(views))
+    for _ in range(steps):
+        fit.advance()
+    return fit
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A finished fit with its folder, and the first event."""
+    out, seen = tmp_path_factory.mktemp("run"), []
+    views = photos(3)
+    fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
+    with images_kept(fit, NAMES, out):
+        draw = fit.strategy.on_event
+        fit.strategy.on_event = lambda step, event: (draw(step, event), seen.append((step, event)))
+        while fit.step < CONFIG.steps:
+            fit.advance()
+    return fit, out, seen
+
+
+def tile(sheet: np.ndarray, index: int, view, text: float = 1.25, width: int = 320) -> np.ndarray:
+    """The pixels of one tile of a sheet of five columns."""
+    height = round(width * view.camera.height / view.camera.width)
+    head, top = round(text * HEAD), MARGIN + round(text * TITLE_SIZE) + 18
+    x, y = MARGIN + index % 5 * (width + GAP), top + head + index // 5 * (head + height + GAP)
+    return sheet[y : y + height, x : x + width]
+
+
+def test_two_events_are_shown_steps():
+    """The first, and the first of the second half of phase 2; the same one where there is but one; none without events."""
+    phases = plan_phases(PhaseConfig(2000, 3000), 10_000)
+    first, middle = sorted(shown_steps(phases))
+    assert first == 2000 and 4500 <= middle < 4800 and middle in phases.events
+    assert shown_steps(dataclasses.replace(phases, events=(2000,))) == {2000}
+    assert shown_steps(dataclasses.replace(phases, events=())) == set()
+
+
+def test_pictures_lie_in_the_run_folder(run):
+    """A picture per pictured event with a sheet for each of the three views, and no other file."""
+    fit, out, _ = run
+    files = sorted((out / "sampling").iterdir())
+    assert [int(f.stem) for f in files] == sorted(shown_steps(fit.phases)) and len(files) == 2
+    first = cv2.imread(str(files[0]))
+    assert first.shape[0] % 3 == 0 and first.shape[1] == 2 * MARGIN + 5 * 320 + 4 * GAP
+
+
+def test_tiles_show_what_the_event_saw(run):
+    """Each map in its place, values as colours; dots at the drawn pixels and nowhere else; the gate in two colours."""
+    fit, _, seen = run
+    step, event = seen[0]
+    drawn, view = event.views[1], fit.views[1]
+    sheet = view_sheet("01.png", step, view, fit.disparities[1], drawn, METHOD)
+    big = {i: tile(sheet, i, view) for i in range(9)}
+    H, W = view.camera.height, view.camera.width
+    rows, columns = (((np.arange(n) + 0.5) * big[0].shape[i] / n).astype(int) for i, n in ((0, H), (1, W)))
+    small = {i: t[rows][:, columns] for i, t in big.items()}
+    np.testing.assert_allclose(small[0], drawn.rendered.numpy().clip(0, 1), atol=0.02)
+    np.testing.assert_allclose(small[1], view.image.numpy(), atol=0.02)
+    for i, score in zip((5, 6, 7, 8), (*drawn.scores, drawn.score)):
+        assert np.abs(small[i] - colored(score.numpy(), "INFERNO")).mean() < 0.02, i
+    assert np.abs(small[2] - colored(fit.disparities[1], "TURBO")).mean() < 0.03
+    gate = drawn.gate.numpy()
+    assert 0.05 < gate.mean() < 0.95 and np.array_equal(small[3].mean(-1) > 0.5, gate)
+    marked = np.abs(small[4] - np.float32(DOT) / 255).max(-1) < 0.02
+    wanted = np.zeros((H, W), bool)
+    wanted[tuple(drawn.at.T.numpy())] = True
+    assert wanted.sum() == len(drawn.at) > 5 and np.array_equal(marked, wanted)
+
+
+def test_figures_add_up(run):
+    """Counts are those of the fit's own list; layers make up the set."""
+    fit, _, seen = run
+    figures = event_figures(fit)
+    assert figures["events"] == {
+        "count": len(seen), "added": sum(len(e.change.parents) for _, e in seen), "evicted": sum(e.evicted for _, e in seen),
+        "samplings": 3 * len(seen), "widened": sum(v.quantile < 0.6 for _, e in seen for v in e.views),
+    }  # fmt: skip
+    assert figures["events"]["added"] > 0 and sum(figures["layers"].values()) == len(fit.gaussians)
+    assert figures["layers"]["fine"] == int(fit.strategy.fine.sum()) > 0
+
+
+def test_story_follows_the_switches(run, tmp_path):
+    """What is said of gate, draw and depth is what was asked for, and a widened gate is told; no events, no story."""
+    fit, out, _ = run
+    story = sampling_report_of(fit, out)
+    assert "sampled at random" in story.words and "above its 0.6 quantile" in story.words and "rendered depth" in story.words
+    assert [c for c, _ in story.images] == [f"sampling after step {s}" for s in sorted(shown_steps(fit.phases))]
+    assert story.images[0][1] == next(iter(sorted((out / "sampling").iterdir()))).read_bytes()
+    assert dict(zip(*story.table))["sampling events"] == str(len(fit.strategy.events))
+    sampler = dataclasses.replace(METHOD.sampler, fraction=0.2, depth="consistent")
+    method = dataclasses.replace(METHOD, agp=False, sampler=sampler)
+    other = fitted(dataclasses.replace(CONFIG, method=method), steps=8)
+    words = sampling_report_of(other, tmp_path).words
+    assert "the highest in S_importance" in words and "other views confirm and whose S_geometry" in words
+    assert "In 3 of 3 samplings the gate was widened" in words and "widened" not in story.words
+    free = fitted(dataclasses.replace(CONFIG, method=dataclasses.replace(method, ra=False)), steps=8)
+    assert "all pixels that Gaussians cover" in sampling_report_of(free, tmp_path).words
+    assert sampling_report_of(fitted(dataclasses.replace(CONFIG, method=type(METHOD)()), steps=1), tmp_path) is None
+
+
+def test_first_picture_outlives_a_continuation(run, tmp_path):
+    """Stopped after the first event and continued: the same pictures, byte for byte, as of the fit that never stopped."""
+    views = photos(3)
+
+    def go_on(until: int, begin=None) -> Trainer:
+        fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
+        if begin is not None:
+            fit.load(*begin)
+        with images_kept(fit, NAMES, tmp_path):
+            while fit.step < until:
+                fit.advance()
+        return fit
+
+    save_checkpoint(tmp_path, *go_on(10).state())
+    assert len(list((tmp_path / "sampling").iterdir())) == 1
+    go_on(CONFIG.steps, load_checkpoint(tmp_path))
+    straight, continued = ({f.name: f.read_bytes() for f in (d / "sampling").iterdir()} for d in (run[1], tmp_path))
+    assert straight == continued and len(straight) == 2
+
+
+def test_a_folder_that_cannot_be_made_is_said_before_the_first_step(tmp_path):
+    """A file stands where it should be."""
+    views = photos(3)
+    fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
+    (tmp_path / "sampling").write_text("in the way")
+    with pytest.raises(ResourceError, match="sampling: cannot be made"), images_kept(fit, NAMES, tmp_path):
+        pytest.fail("begun")
+
+
+@pytest.mark.parametrize("until", [CONFIG.steps, 10])
+def test_a_picture_that_cannot_be_written_is_said(tmp_path, monkeypatch, until):
+    """At the next event, or at the end of the block where there is none; the fit is left as it was."""
+
+    def full(path, data):
+        raise ResourceError(f"{path.name}: no space left")
+
+    monkeypatch.setattr(sampling_report, "write_bytes", full)
+    views = photos(3)
+    fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
+    with pytest.raises(ResourceError, match="no space left"), images_kept(fit, NAMES, tmp_path):
+        while fit.step < until:
+            fit.advance()
+    assert fit.strategy.on_event is None and (fit.step == 10) == (until == 10)

@@ -1,0 +1,128 @@
+"""Recorded steps on CUDA: the same bits as step by step, whatever happens on the way."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from tests.pipeline.test_importance_sampling import CONFIG as METHOD
+from tests.scenes import photos, priors, seeds
+from warpgs.errors import NotFiniteError
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.train import step
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loss import LossConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.trainer import Trainer
+from warpgs.scene import View
+
+pytestmark = pytest.mark.cuda
+
+BUSY = FitConfig(
+    steps=60, sh_every=15, init=InitConfig(source="points"),
+    density=DensityConfig(start=8, every=9, gradient=1e-5, reset_every=25),
+)  # fmt: skip
+
+
+def fitted(views: list[View], recorded: bool, config: FitConfig = BUSY) -> tuple[Trainer, list]:
+    """A fit of all steps on CUDA, and its reports."""
+    config = dataclasses.replace(config, cuda_graph=recorded)
+    fit = Trainer(views, seeds(61), config, torch.device("cuda", 0), priors=priors(views))
+    reports = []
+    while fit.step < config.steps:
+        reports += fit.advance(100)
+    return fit, reports
+
+
+def sizes() -> list[View]:
+    """Views of two sizes, one of them with a mask."""
+    views = photos(2) + photos(2, 24, 20)
+    views = [View(f"{i}", v.camera, v.image) for i, v in enumerate(views)]
+    mask = np.ones(views[0].image.shape[:2], bool)
+    mask[:, :8] = False
+    return [View("masked", views[0].camera, views[0].image, mask), *views[1:]]
+
+
+@pytest.mark.parametrize("views", [photos(4), sizes()], ids=["one size", "two sizes and a mask"])
+def test_recorded_steps_equal_single_steps(views):
+    """Through densification, opacity resets and changes of degree: the same Gaussians and the same reports, bit for bit."""
+    single, said = fitted(views, recorded=False)
+    recorded, reports = fitted(views, recorded=True)
+    a, b = single.state()[0], recorded.state()[0]
+    assert len(single.gaussians) != 61
+    assert all(torch.equal(a[k], b[k]) for k in a)
+    assert [(r.step, r.count) for r in said] == [(r.step, r.count) for r in reports]
+    assert np.allclose([r.loss for r in said], [r.loss for r in reports], rtol=1e-6)
+
+
+def test_recorded_method_equals_single_steps():
+    """With dropout, sampling events, two layers and protection: the same bits too."""
+    single, said = fitted(photos(3), recorded=False, config=METHOD)
+    recorded, reports = fitted(photos(3), recorded=True, config=METHOD)
+    a, b = single.state()[0], recorded.state()[0]
+    assert single.strategy.events == recorded.strategy.events and len(single.strategy.events) > 2
+    assert all(torch.equal(a[k], b[k]) for k in a) and [r.count for r in said] == [r.count for r in reports]
+
+
+def test_recordings_do_not_pile_up(monkeypatch):
+    """Memory of recordings that are no longer used goes back: a long fit holds no more than a short one of its size."""
+    torch.cuda.empty_cache()
+    monkeypatch.setattr(step, "DEAD_BYTES", 2**22)
+    fit, _ = fitted(photos(4), recorded=True)
+    held = []
+    for _ in range(40):
+        fit.graphs.clear()
+        fit.step -= 1
+        fit.advance(1)
+        held.append(torch.cuda.memory_reserved())
+    assert max(held[20:]) <= max(held[:10]) + 2**22
+
+
+def test_too_little_capacity_is_found_and_fixed(monkeypatch):
+    """Steps that would overflow change nothing; they are captured anew and taken, and the result is the same."""
+    reference, _ = fitted(photos(4), recorded=False)
+    honest, tries = step.instance_capacity, []
+
+    def scarce(*args):
+        tries.append(honest(*args))
+        return 16 if len(tries) % 2 else tries[-1]
+
+    monkeypatch.setattr(step, "instance_capacity", scarce)
+    fit, reports = fitted(photos(4), recorded=True)
+    assert len(tries) >= 4
+    a, b = reference.state()[0], fit.state()[0]
+    assert all(torch.equal(a[k], b[k]) for k in a) and [r.step for r in reports] == list(range(1, 61))
+
+
+def test_loss_that_is_no_number_stops_before_it_harms():
+    """A NaN in one photograph: the Gaussians are those of the step before."""
+    views = photos(4)
+    bad = [*views[:3], View("bad", views[3].camera, np.full_like(views[3].image, np.nan))]
+    config = dataclasses.replace(BUSY, density=DensityConfig(start=1000))
+    fit = Trainer(bad, seeds(), config, torch.device("cuda", 0))
+    with pytest.raises(NotFiniteError, match="became nan"):
+        fit.advance(100)
+    assert fit.step < 4 and all(bool(torch.isfinite(t).all()) for t in fit.gaussians.tensors().values())
+
+
+@pytest.mark.parametrize("views", [photos(4), sizes()], ids=["one size", "two sizes and a mask"])
+def test_recorded_depth_term_equals_single_steps(views):
+    """Halved at first, then whole, then without the term: the same bits, and others than without it throughout."""
+    loss = LossConfig(depth_weight=0.3, depth_until=0.7)
+    config = dataclasses.replace(BUSY, loss=loss, half_resolution=0.3)
+    single, _ = fitted(views, recorded=False, config=config)
+    recorded, _ = fitted(views, recorded=True, config=config)
+    without, _ = fitted(views, recorded=True, config=dataclasses.replace(config, loss=LossConfig()))
+    a, b = single.state()[0], recorded.state()[0]
+    assert all(torch.equal(a[k], b[k]) for k in a)
+    assert not torch.equal(recorded.gaussians.means[:10], without.gaussians.means[:10])
+
+
+def test_recorded_steps_at_half_size_equal_single_steps():
+    """Two sizes one after the other, through the change between them."""
+    config = dataclasses.replace(BUSY, half_resolution=0.5)
+    single, _ = fitted(photos(4), recorded=False, config=config)
+    recorded, _ = fitted(photos(4), recorded=True, config=config)
+    a, b = single.state()[0], recorded.state()[0]
+    assert all(torch.equal(a[k], b[k]) for k in a)

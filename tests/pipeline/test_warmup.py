@@ -1,0 +1,139 @@
+"""A rehearsal uses what a fit of the same settings uses, says what goes wrong, and leaves no trace in the fit."""
+
+import dataclasses
+import threading
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from tests.scenes import photos, priors, seeds
+from warpgs.errors import DataError
+from warpgs.pipeline.model import init
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.train import setup
+from warpgs.pipeline.train import warmup as warmups
+from warpgs.pipeline.train.config import PRESETS
+from warpgs.pipeline.train.setup import prepare
+from warpgs.pipeline.train.strategies.importance_sampling import ImportanceSampling
+from warpgs.pipeline.train.trainer import Trainer, run
+from warpgs.pipeline.train.warmup import POINTS, STEPS, rehearsal, warm_up
+from warpgs.scene import ViewDepth
+
+CPU, CUDA = torch.device("cpu"), torch.device("cuda")
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_part_of_a_fit_is_used(preset, monkeypatch):
+    """Every step is taken, Gaussians are added by refinement, events sample where the preset has any, and a view is scored."""
+    scored, config = [], PRESETS[preset]
+    score = warmups.score
+    monkeypatch.setattr(warmups, "score", lambda view, image: scored.append(score(view, image)))
+    fit = warm_up(config, CPU)
+    assert fit.step == STEPS and len(fit.gaussians) > POINTS
+    assert isinstance(fit.strategy, ImportanceSampling) == config.method.events
+    assert not config.method.events or len(fit.strategy.events) == 1
+    assert len(scored) == 1 and 0 < scored[0].psnr < 30 and fit.graphs is None
+
+
+def test_limits_of_the_real_fit_do_not_stop_it():
+    """A memory limit is for the real fit alone; a bound on Gaussians holds."""
+    fit = warm_up(dataclasses.replace(PRESETS["quick"], memory_limit=1, half_resolution=0.5, max_gaussians=50), CPU)
+    assert fit.step == STEPS and len(fit.gaussians) <= 50
+
+
+def test_only_a_free_gpu_rehearses(monkeypatch):
+    """Nothing is begun on a CPU, nor where networks for priors run on the GPU."""
+    monkeypatch.setattr(warmups, "warm_up", lambda *_: pytest.fail("begun"))
+    networks = dataclasses.replace(PRESETS["paper"].priors, onnx_provider="cuda")
+    for config, device in ((PRESETS["paper"], CPU), (dataclasses.replace(PRESETS["paper"], priors=networks), CUDA)):
+        with rehearsal(config, device) as ready:
+            assert ready() is None
+
+
+def test_what_goes_wrong_is_raised(monkeypatch):
+    """By what waits for the end, in the thread that waits."""
+
+    def fail(*_):
+        raise RuntimeError("out of order")
+
+    monkeypatch.setattr(warmups, "warm_up", fail)
+    monkeypatch.setattr(torch.cuda, "device", lambda _: torch.no_grad())  # there may be none here
+    with rehearsal(PRESETS["paper"], CUDA) as ready, pytest.raises(RuntimeError, match="out of order"):
+        ready()
+
+
+def test_nothing_goes_on_after_the_block(monkeypatch):
+    """An error in the block, such as a scene with nothing to start from, ends the rehearsal after the step it is in."""
+    steps = []
+
+    def endless(config, device, stopped):
+        while not stopped():
+            steps.append(1)
+            time.sleep(0.01)
+
+    monkeypatch.setattr(warmups, "warm_up", endless)
+    monkeypatch.setattr(torch.cuda, "device", lambda _: torch.no_grad())
+    with pytest.raises(DataError), rehearsal(PRESETS["paper"], CUDA):
+        raise DataError("nothing to start from")
+    done = len(steps)
+    time.sleep(0.05)
+    assert len(steps) == done and not any(t.name.startswith("rehearsal") for t in threading.enumerate())
+
+
+def test_a_rehearsal_that_nobody_waits_for_stops():
+    """Between its steps."""
+    with pytest.raises(KeyboardInterrupt):
+        warm_up(PRESETS["quick"], CPU, lambda: True)
+
+
+@pytest.mark.parametrize("changes", [{}, {"memory_limit": 10**9}, {"init": InitConfig(source="random")}])
+def test_the_device_is_asked_for_last(changes, monkeypatch):
+    """Semantics are found before `ready` is called, and a sweep comes after it, on the device or, under a limit, on the CPU."""
+    order = []
+    views = photos(3)
+    monkeypatch.setattr(setup, "view_priors", lambda *a, depths, **k: (order.append("semantics"), depths(), ([], []))[-1])
+    monkeypatch.setattr(init, "sweep_depths", lambda v, b, c, device: (order.append(str(device)), consistent(v))[1])
+    config = dataclasses.replace(PRESETS["paper"], **changes)
+    made = prepare(views, None, config, np.random.default_rng(0), CUDA, None, lambda: order.append("ready"))
+    swept = ["ready", "cpu" if "memory_limit" in changes else "cuda"] if "init" not in changes else []
+    assert order == ["semantics", *swept, "ready"] and len(made.start.cloud) > 100
+
+
+def consistent(views):
+    """A depth of three units everywhere."""
+    size = views[0].image.shape[:2]
+    return [ViewDepth(np.full(size, 3.0, np.float32), np.ones(size, bool), np.ones(size, np.float32)) for _ in views]
+
+
+def test_missing_points_are_said_before_anything_takes_time(monkeypatch):
+    """Before networks run and before the device is waited for."""
+    monkeypatch.setattr(setup, "view_priors", lambda *a, **k: pytest.fail("begun"))
+    config = dataclasses.replace(PRESETS["paper"], init=InitConfig(source="points"))
+    with pytest.raises(DataError, match="no 3D points"):
+        prepare(photos(2), None, config, np.random.default_rng(0), CPU, None, lambda: pytest.fail("asked"))
+
+
+@pytest.mark.parametrize("preset", ["paper", "3dgs"])
+def test_only_fits_that_sweep_rehearse_a_sweep(preset, monkeypatch):
+    """And none under a memory limit, which leaves the sweep to the CPU."""
+    swept = []
+    monkeypatch.setattr(warmups, "sweep_depths", lambda views, *_: swept.append(len(views)))
+    warm_up(PRESETS[preset], CPU)
+    warm_up(dataclasses.replace(PRESETS[preset], memory_limit=10**9), CPU)
+    assert swept == ([2] if preset == "paper" else [])
+
+
+@pytest.mark.cuda
+def test_a_fit_is_the_same_after_a_rehearsal():
+    """Bit for bit that of a fit without one."""
+    device, views = torch.device("cuda"), photos(3)
+    config = dataclasses.replace(PRESETS["quick"], steps=20)
+    fits = []
+    for warmed_up in (False, True):
+        with rehearsal(config, device if warmed_up else CPU) as ready:
+            fit = Trainer(views, seeds(), config, device, priors=priors(views), ready=ready)
+        run(fit, lambda _: None, lambda _: None, lambda: False)
+        fits.append(fit.gaussians.tensors())
+    assert all(torch.equal(fits[0][n], fits[1][n]) for n in fits[0])

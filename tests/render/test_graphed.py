@@ -1,0 +1,235 @@
+"""Graphed calls as far as they need no GPU: which are captured, when, and the results without graphs."""
+
+import dataclasses
+import gc
+import itertools
+import weakref
+
+import pytest
+import torch
+
+from tests.gaussians import camera, cloud, leaves
+from warpgs.constants import RULES
+from warpgs.render import graphed
+from warpgs.render.graphed import MIN_CALLS, Recorder, call_key
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.settings import RenderSettings
+from warpgs.runtime.cuda_graph import MIN_REPLAYS, GraphPool
+from warpgs.scene import Camera, Gaussians
+
+CPU = torch.device("cpu")
+SETTINGS = RenderSettings(18, 17, (0, 0, 18, 17), 1, RULES["exact"], 16)
+
+
+class Counted:
+    """A rasterizer that renders nothing, for calls of `seen` instances."""
+
+    made, seen = 0, 100
+
+    def __init__(self, settings, cameras, capacity, graphs):
+        type(self).made += 1
+        self.limit, self.instances, self.rendered = capacity - 1024, 0, 0
+
+    def render(self, sources, backgrounds):
+        self.instances = type(self).seen
+        fits = self.instances <= self.limit
+        self.rendered += fits
+        return "images" if fits else None
+
+
+class NoGraphPool(GraphPool):
+    """A pool whose captures run out of memory at the end."""
+
+    def capture(self, work):
+        work()
+        raise torch.OutOfMemoryError
+
+
+@pytest.fixture
+def surroundings(monkeypatch):
+    """Treat calls on a CPU as ones that can be captured."""
+    monkeypatch.setattr(graphed, "_can_capture", lambda device: True)
+
+
+@pytest.fixture
+def recorder(monkeypatch, surroundings) -> Recorder:
+    """A recorder whose rasterizers render nothing; a call has `Counted.seen` instances."""
+    Counted.made, Counted.seen = 0, 100
+    monkeypatch.setattr(graphed, "GraphedRasterizer", Counted)
+    monkeypatch.setattr(graphed.project, "project", lambda *_, **__: (None, torch.tensor([Counted.seen])))
+    return Recorder(GraphPool(CPU))
+
+
+def sources_of(gaussians: Gaussians, cam: Camera) -> tuple[torch.Tensor, ...]:
+    return (*gaussians.tensors().values(), cam.viewmat[None], cam.K[None])
+
+
+def batch(**size) -> tuple[torch.Tensor, ...]:
+    return sources_of(leaves(cloud(20)), camera(dtype=torch.float32, **size))
+
+
+def test_the_third_of_equal_calls_is_captured(recorder):
+    """Another camera is the same call; other tensors, settings or another background are not, and begin anew."""
+    own, other = batch(), batch()
+    moved = (*own[:5], own[5] + 1, own[6] * 2)
+    background = torch.zeros(1, 3)
+    assert [recorder.render(s, None, SETTINGS) for s in (own, moved, own, own)] == [None] * (MIN_CALLS - 1) + ["images"] * 2
+    assert Counted.made == 1
+    assert recorder.render(other, None, SETTINGS) is None and recorder.rasterizer is None
+    assert recorder.render(own, background, SETTINGS) is None
+    assert recorder.render(own, None, dataclasses.replace(SETTINGS, degree=0)) is None
+    recorder.clear()
+    assert [recorder.render(other, None, SETTINGS) for _ in range(3)][-1] == "images" and Counted.made == 2
+
+
+def test_a_rasterizer_that_is_too_small_is_made_anew_for_the_most_seen(recorder):
+    """With four cameras in turn, of which one sees twice as much, it is made twice in all, not in every round."""
+    own, found = batch(), []
+    for step in range(400):
+        Counted.seen = 200 if step % 4 == 3 else 100
+        found.append(recorder.render(own, None, SETTINGS))
+    assert Counted.made == 2 and found.count("images") > 380 and None not in found[40:]
+
+
+def test_rasterizers_that_do_not_pay_are_made_less_and_less(recorder):
+    """Two models are trained five steps each in turn; after one that rendered often enough a new one is made soon."""
+    own, other = batch(), batch()
+    for step in range(1000):
+        recorder.render(own if step // 5 % 2 else other, None, SETTINGS)
+    assert 1 <= Counted.made <= 3
+    recorder.clear()
+    for tensors in (own, other, own):
+        assert [recorder.render(tensors, None, SETTINGS) for _ in range(MIN_REPLAYS + MIN_CALLS)].count(None) == MIN_CALLS - 1
+
+
+def test_calls_that_cannot_be_captured_are_not(recorder, monkeypatch):
+    """No gradients, float64, rows that are not contiguous, too many Gaussians, too little memory."""
+    own = batch()
+    monkeypatch.setattr(graphed, "MAX_PROJECTED", 19)
+    assert call_key(own, None, SETTINGS) is None
+    monkeypatch.setattr(graphed, "MAX_PROJECTED", 20)
+    assert call_key(own, None, SETTINGS) is not None
+    with torch.no_grad():
+        assert call_key(own, None, SETTINGS) is None
+    assert call_key(tuple(t.detach() for t in own), None, SETTINGS) is None
+    assert call_key(tuple(t.double() for t in own), None, SETTINGS) is None
+    assert call_key((own[0].T.contiguous().T, *own[1:]), None, SETTINGS) is None
+    assert call_key(own, torch.zeros(1, 3), SETTINGS) is not None and call_key(own, torch.zeros(3), SETTINGS) is None
+    monkeypatch.setattr(graphed, "available_bytes", lambda device: 0)
+    assert [recorder.render(own, None, SETTINGS) for _ in range(5)] == [None] * 5 and Counted.made == 0
+
+
+def test_options_beyond_the_image_are_not_captured():
+    """Each of them by itself excludes a capture."""
+    assert RasterizeOptions(background=torch.ones(3), sh_degree=1).repeatable()
+    assert not RasterizeOptions(record=False).repeatable()
+    for other in (
+        {"deterministic": False}, {"contributions": True}, {"capacity": 5}, {"memory_budget": 5},
+        {"max_instances": 5}, {"opacity_factors": torch.ones(3)},
+    ):  # fmt: skip
+        assert not RasterizeOptions(**other).repeatable()
+
+
+def results(gaussians, cam, background, recorder=None):
+    """Return images, projected Gaussians, counts and all gradients, with those of the cameras."""
+    params = list(gaussians.tensors().values())
+    cam = dataclasses.replace(cam, viewmat=cam.viewmat.clone().requires_grad_(), K=cam.K.clone().requires_grad_())
+    background = background.clone().requires_grad_()
+    if recorder is None:
+        r = rasterize(gaussians, cam, RasterizeOptions(background=background))
+        rgb, alpha, depth, projected, counts = r.rgb, r.alpha, r.depth, r.projected, r.tile_counts
+    else:
+        settings = RenderSettings(cam.width, cam.height, (0, 0, cam.width, cam.height), gaussians.sh_degree, RULES["exact"], 16)
+        found = recorder.render((*params, cam.viewmat, cam.K), background, settings)
+        if found is None:
+            return None
+        (rgb, alpha, depth), projected, counts = found
+    loss = (rgb**2).sum() + alpha.sum() + 0.1 * depth.sum()
+    gradients = torch.autograd.grad(loss, [*params, projected, cam.viewmat, cam.K, background], retain_graph=True)
+    only_alpha = torch.autograd.grad(alpha.sum(), [*params, background], retain_graph=True)
+    (v_unused,) = torch.autograd.grad(projected[..., :2].sum(), params[0])
+    return [t.detach() for t in (rgb, alpha, depth, projected, counts, *gradients, *only_alpha, v_unused)]
+
+
+def test_a_graphed_rasterizer_gives_the_same_bits(surroundings):
+    """Batches, backgrounds and gradients of cameras are included; nothing can be captured here."""
+    g, own = leaves(cloud(300)), Recorder(NoGraphPool(CPU))
+    cams = camera(70, 50, 3, torch.float32)
+    backgrounds = torch.rand(3, 3, generator=torch.Generator().manual_seed(3))
+    found = [results(g, cams, backgrounds, own) for _ in range(MIN_CALLS + 1)]
+    assert found[: MIN_CALLS - 1] == [None] * (MIN_CALLS - 1)
+    wanted = results(g, cams, backgrounds)
+    for each in found[MIN_CALLS - 1 :]:
+        assert all(torch.equal(a, b) for a, b in itertools.zip_longest(each, wanted))
+
+
+def test_a_rasterizer_that_is_too_small_says_so(surroundings):
+    """The call runs without graphs, and the next rasterizer has the capacity."""
+    g, own = leaves(cloud(300)), Recorder(NoGraphPool(CPU))
+    cam = camera(70, 50, 1, torch.float32)
+    sources = (*g.tensors().values(), cam.viewmat, cam.K)
+    settings = RenderSettings(70, 50, (0, 0, 70, 50), g.sh_degree, RULES["exact"], 16)
+    for _ in range(MIN_CALLS):
+        found = own.render(sources, None, settings)
+    assert found is not None
+    own.rasterizer.capacity = own.rasterizer.instances - 1
+    assert own.render(sources, None, settings) is None and own.rasterizer is None
+    for _ in range(2 * MIN_CALLS):
+        found = own.render(sources, None, settings)
+    assert found is not None and own.rasterizer.capacity > own.rasterizer.instances
+
+
+def first_graphed(own: Recorder, g: Gaussians, cam: Camera):
+    """Return the result of the first call that a graphed rasterizer renders."""
+    settings = RenderSettings(cam.width, cam.height, (0, 0, cam.width, cam.height), g.sh_degree, RULES["exact"], 16)
+    return [own.render((*g.tensors().values(), cam.viewmat, cam.K), None, settings) for _ in range(MIN_CALLS)][-1]
+
+
+def test_a_rasterizer_is_freed_when_nobody_holds_it(surroundings):
+    """It needs no garbage collection: graphs hold memory of the device. A backward pass still to come holds it."""
+    g, own = leaves(cloud(50)), Recorder(NoGraphPool(CPU))
+    cam = camera(70, 50, 1, torch.float32)
+    found = first_graphed(own, g, cam)
+    gone, loss = weakref.ref(own.rasterizer), found[0][0].sum()
+    gc.disable()
+    try:
+        own.clear()
+        del found
+        assert gone() is not None
+        loss.backward()
+        del loss
+        assert gone() is None and bool(g.means.grad.any())
+    finally:
+        gc.enable()
+
+
+def test_after_a_failed_capture_calls_run_without_graphs(recorder):
+    """They do so until the recorder is cleared."""
+    own = batch()
+    recorder.graphs.failed = True
+    assert [recorder.render(own, None, SETTINGS) for _ in range(9)] == [None] * 9
+    recorder.clear()
+    assert [recorder.render(own, None, SETTINGS) for _ in range(MIN_CALLS)][-1] == "images"
+
+
+def test_torchs_default_type_does_not_matter(surroundings):
+    """A default background is of the Gaussians' type."""
+    g, own = leaves(cloud(50)), Recorder(NoGraphPool(CPU))
+    cam = camera(70, 50, 1, torch.float32)
+    usual = torch.get_default_dtype()
+    torch.set_default_dtype(torch.bfloat16)
+    try:
+        found = first_graphed(own, g, cam)
+    finally:
+        torch.set_default_dtype(usual)
+    assert torch.equal(found[0][0], rasterize(g, cam).rgb)
+
+
+def test_gaussians_that_change_in_number_before_the_backward_pass(surroundings):
+    """A swap that autograd does not see is an error, not a write beside the gradients."""
+    g, own = leaves(cloud(50)), Recorder(NoGraphPool(CPU))
+    cam = camera(70, 50, 1, torch.float32)
+    found = first_graphed(own, g, cam)
+    g.means.data = torch.zeros(70, 3)
+    with pytest.raises(RuntimeError, match="50 Gaussians were rendered, and now there are 70"):
+        found[0][0].sum().backward()

@@ -1,0 +1,160 @@
+"""The public op: shapes, gradients through everything, options, and errors."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+import warpgs
+from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
+from tests.scenes import ring, three_gaussians
+from warpgs.errors import ResourceError, UsageError
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.scene import Camera, Gaussians
+
+
+def test_public_names_load_on_use():
+    """The package offers what its __all__ says, and nothing else by accident."""
+    assert warpgs.rasterize is rasterize
+    assert all(hasattr(warpgs, name) for name in warpgs.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'rasterise'"):
+        _ = warpgs.rasterise
+
+
+def test_one_camera_has_no_leading_axis(device):
+    """A single camera gives images without a batch axis, equal to a batch of one; numpy cameras work too."""
+    gaussians, cam = cloud(50, device=device), camera(20, 12, dtype=torch.float32, device=device)
+    single = rasterize(gaussians, cam)
+    batch = rasterize(gaussians, dataclasses.replace(cam, viewmat=cam.viewmat[None], K=cam.K[None]))
+    assert single.rgb.shape == (12, 20, 3) and single.alpha.shape == single.depth.shape == (12, 20)
+    assert torch.equal(single.rgb, batch.rgb[0]) and single.visible.shape == (1, 50)
+    plain = Camera(cam.viewmat.cpu().double().numpy(), cam.K.cpu().double().numpy(), 20, 12)
+    assert isinstance(plain.viewmat, np.ndarray) and torch.equal(rasterize(gaussians, plain).rgb, single.rgb)
+
+
+def test_gradcheck_end_to_end(device):
+    """Gaussians, pose, intrinsics and background at once, by finite differences through every kernel."""
+    gaussians, cam = leaves(hand_placed(device=device)), camera(12, 11, device=device)
+    background = torch.rand(3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).to(device)
+    inputs = [*gaussians.tensors().values(), cam.viewmat.clone(), cam.K.clone(), background]
+    inputs = [t.detach().requires_grad_() for t in inputs]
+
+    def images(means, quats, scales, opacities, sh, viewmat, K, behind):
+        g = warpgs.Gaussians(means, quats, scales, opacities, sh)
+        r = rasterize(g, Camera(viewmat, K, 12, 11), RasterizeOptions(rule=SMOOTH, background=behind))
+        return r.rgb, r.alpha, r.depth
+
+    assert torch.autograd.gradcheck(images, inputs, eps=1e-6, atol=1e-7, rtol=1e-5, nondet_tol=0.0)
+
+
+def test_moving_scene_and_camera_together_changes_nothing(device):
+    """The gradient of a translation of the world equals the opposite one of the camera."""
+    gaussians, cam = leaves(hand_placed(device=device)), camera(24, 20, cameras=1, device=device)
+    viewmat = cam.viewmat.clone().requires_grad_()
+    r = rasterize(gaussians, dataclasses.replace(cam, viewmat=viewmat), RasterizeOptions(rule=SMOOTH))
+    weights = torch.rand(r.rgb.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(device)
+    (r.rgb * weights).sum().backward()
+    # the identity rotation of the first camera makes world and camera axes the same
+    assert torch.allclose(gaussians.means.grad.sum(0), viewmat.grad[0, :3, 3], atol=1e-10)
+
+
+def test_gradients_of_projected_means_on_request(device):
+    """`projected.retain_grad()` gives the gradients that densification needs."""
+    gaussians, cam = leaves(cloud(50, device=device)), camera(20, 12, dtype=torch.float32, device=device)
+    r = rasterize(gaussians, cam)
+    r.projected.retain_grad()
+    r.rgb.sum().backward()
+    assert bool(r.projected.grad[..., :2].any()) and not bool(r.projected.grad[..., 10:].any())
+
+
+def test_contributions_only_on_request(device):
+    """Weights are None by default, and bounded by the covered pixels where asked for."""
+    gaussians, cam = cloud(50, device=device), camera(20, 12, dtype=torch.float32, device=device)
+    assert rasterize(gaussians, cam).weight_sums is None
+    r = rasterize(gaussians, cam, RasterizeOptions(contributions=True))
+    assert torch.allclose(r.weight_sums.sum(), r.alpha.sum(), rtol=1e-5)
+    assert bool((r.weight_maxima <= 0.99).all()) and bool((r.weight_maxima <= r.weight_sums + 1e-6).all())
+
+
+def test_sh_degree_limits_the_colour(device):
+    """A lower degree ignores the higher coefficients."""
+    gaussians, cam = hand_placed(torch.float32, device), camera(20, 12, dtype=torch.float32, device=device)
+    plain = dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])
+    assert torch.equal(rasterize(gaussians, cam, RasterizeOptions(sh_degree=0)).rgb, rasterize(plain, cam).rgb)
+    assert not torch.equal(rasterize(gaussians, cam).rgb, rasterize(plain, cam).rgb)
+
+
+def test_capacity_changes_nothing_but_says_when_it_is_too_small(device):
+    """A larger capacity gives the same bits of images and gradients; one too small sets overflow, and nothing else breaks."""
+    gaussians, cam = leaves(cloud(200, device=device)), camera(70, 50, dtype=torch.float32, device=device)
+    results = []
+    for capacity in (None, 5000):
+        r = rasterize(gaussians, cam, RasterizeOptions(capacity=capacity))
+        gradients = torch.autograd.grad(r.rgb.square().sum() + r.depth.sum(), list(gaussians.tensors().values()))
+        results.append((r.rgb, r.depth, *gradients))
+        assert (r.overflow is None) if capacity is None else int(r.overflow) == 0
+    assert all(torch.equal(a, b) for a, b in zip(*results))
+    cut = rasterize(gaussians, cam, RasterizeOptions(capacity=40))
+    assert int(cut.overflow) == 1
+    torch.autograd.grad(cut.rgb.sum(), list(gaussians.tensors().values()))
+
+
+def test_atomic_sums_agree_with_ordered_ones(device):
+    """Without a fixed order gradients differ by rounding only; on a CPU, where there are no atomics, not at all."""
+    gaussians, cam = leaves(cloud(300, device=device)), camera(70, 50, dtype=torch.float32, device=device)
+    gradients = []
+    for deterministic in (True, False):
+        r = rasterize(gaussians, cam, RasterizeOptions(deterministic=deterministic))
+        loss = r.rgb.square().sum() + r.depth.sum() + r.alpha.sum()
+        gradients.append(torch.autograd.grad(loss, list(gaussians.tensors().values())))
+    for a, b in zip(*gradients):
+        assert torch.equal(a, b) if device.type == "cpu" else float((a - b).norm()) <= 1e-5 * float(a.norm())
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("size", [(96, 80), (1100, 1000)], ids=["small chunks", "large chunks"])
+def test_native_kernels_agree_with_generic_ones(size):
+    """Float32 bodies in CUDA against the generic kernels in float64, which pass gradcheck: each gradient within 1e-5."""
+    device = torch.device("cuda", 0)
+    gaussians, cam = leaves(cloud(2000, device=device)), camera(*size, dtype=torch.float32, device=device)
+    weights = torch.rand(size[1], size[0], 5, generator=torch.Generator().manual_seed(1)).to(device)
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        tensors = {n: t.detach().to(dtype).requires_grad_() for n, t in gaussians.tensors().items()}
+        view = Camera(cam.viewmat.to(dtype), cam.K.to(dtype), *size)
+        r = rasterize(warpgs.Gaussians(**tensors), view, RasterizeOptions(rule=SMOOTH))
+        images = torch.cat([r.rgb, r.alpha[..., None], r.depth[..., None]], -1)
+        results.append((images.detach(), *torch.autograd.grad((images * weights).sum(), list(tensors.values()))))
+    for a, b in zip(*results):
+        assert float((a.double() - b).norm()) <= 1e-5 * float(b.norm())
+
+
+def test_errors_name_the_cause(device):
+    """Unknown rules and tile sizes, and a scene too large for its budget."""
+    gaussians, cam = cloud(50, device=device), camera(20, 12, dtype=torch.float32, device=device)
+    with pytest.raises(UsageError, match="unknown rule 'best': choose one of exact, balanced, fast, gsplat, inria"):
+        rasterize(gaussians, cam, RasterizeOptions(rule="best"))
+    with pytest.raises(UsageError, match="tile size 12 is not one of 8, 16"):
+        rasterize(gaussians, cam, RasterizeOptions(tile_size=12))
+    with pytest.raises(ResourceError, match="raise the memory budget"):
+        rasterize(gaussians, cam, RasterizeOptions(memory_budget=1))
+    with pytest.raises(ValueError, match="at least 1 x 1"):
+        rasterize(gaussians, Camera(cam.viewmat, cam.K, 0, 12))
+
+
+def test_opacity_factors_multiply_opacities_and_hide():
+    """Image and gradients are those of such opacities, also in chunks; 0 hides a Gaussian and leaves it no gradient."""
+    gaussians, camera = three_gaussians(), ring(3)[0]
+    factors = torch.tensor([0.5, 0.0, 1.0])
+    opacities = gaussians.logit_opacities.sigmoid() * factors
+    lower = dataclasses.replace(gaussians, logit_opacities=torch.logit(opacities))
+    leaves = [t.clone().requires_grad_() for t in gaussians.tensors().values()]
+    for most in (None, 4):
+        options = RasterizeOptions(opacity_factors=factors, max_instances=most)
+        render = rasterize(Gaussians(*leaves), camera, options)
+        assert torch.allclose(render.rgb, rasterize(lower, camera).rgb, atol=1e-6)
+        gradients = torch.autograd.grad(render.rgb.sum(), leaves)
+        assert all(bool(v[0].any()) and not bool(v[1].any()) for v in gradients if v.shape != (3, 4))
+    with pytest.raises(ValueError, match="opacity_factors"):
+        rasterize(gaussians, camera, RasterizeOptions(opacity_factors=torch.ones(2)))

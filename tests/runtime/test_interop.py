@@ -1,0 +1,209 @@
+"""Launches are cut into ranges that cover every item once; arguments are checked by name."""
+
+import os
+
+import pytest
+import torch
+import warp as wp
+
+from tests.gaussians import camera, cloud, leaves
+from warpgs.constants import RULES
+from warpgs.errors import ResourceError
+from warpgs.kernels.adam import adam_step
+from warpgs.kernels.blend import blend, contributions
+from warpgs.kernels.dropout import opacity_dropout
+from warpgs.kernels.knn import mean_square_distances
+from warpgs.kernels.project import project
+from warpgs.kernels.ssim import differences, ssim
+from warpgs.kernels.tiles import bin_tiles
+from warpgs.runtime import interop
+
+
+@wp.kernel(enable_backward=False)
+def mark(
+    begin: int,
+    # outputs
+    visits: wp.array(dtype=int), firsts: wp.array(dtype=int),
+):  # fmt: skip
+    """Count the visits of an item, and tell where its range begins."""
+    i = begin + wp.tid()
+    visits[i] = visits[i] + 1
+    firsts[i] = begin
+
+
+class Recorded:
+    """A pool of one thread that counts what is handed to it."""
+
+    def __init__(self):
+        self.handed = 0
+
+    def submit(self, work):
+        self.handed += 1
+        work()
+        return self
+
+    def result(self):
+        return None
+
+
+@pytest.mark.parametrize(
+    ("threads", "count", "cost", "ranges"),
+    [
+        (1, 30_000, 1, 1), (2, 30_000, 1, 16), (4, 30_001, 1, 32), (5, 30_000, 1, 20), (2, 1, 10**6, 1),
+        (2, 2, 10_000, 2), (2, 2, 9_999, 1), (2, 5, 4_000, 5), (2, 19_999, 1, 1), (2, 20_000, 1, 16), (2, 0, 1, 0),
+    ],
+)  # fmt: skip
+def test_ranges_cover_every_item_once(monkeypatch, threads, count, cost, ranges):
+    """There are as many ranges as there is work for, and at most one hand-over a thread; small launches stay on theirs."""
+    pool = Recorded()
+    monkeypatch.setattr(interop, "_pool", lambda _: pool)
+    torch.set_num_threads(threads)
+    visits, firsts = torch.zeros(2, count, dtype=torch.int32).unbind()
+    outputs = [interop.view(t, wp.int32) for t in (visits, firsts)]
+    interop.launch(mark, count, outputs, torch.device("cpu"), cost=cost)
+    assert bool((visits == 1).all())
+    assert sorted(set(firsts.tolist())) == [count * i // ranges for i in range(ranges)]
+    assert pool.handed == (min(threads, ranges) if ranges > 1 else 0)
+
+
+def everything():
+    """Return the results of every float32 kernel for a CPU, with gradients."""
+    g, cam = leaves(cloud(61)), camera(37, 30, cameras=2, dtype=torch.float32)
+    size, rule = {"width": 37, "height": 30}, RULES["exact"]
+    views, Ks = cam.viewmat.clone().requires_grad_(), cam.K.clone().requires_grad_()
+    projected, counts = project(*g.tensors().values(), views, Ks, **size, degree=1, rule=rule)
+    tiles = bin_tiles(projected, counts, **size, rule=rule)
+    capped = bin_tiles(projected, counts, **size, rule=rule, capacity=2000, overflow=torch.zeros(1, dtype=torch.int32))
+    images = blend(projected, tiles, torch.ones(2, 3), **size, rule=rule)
+    target = torch.rand(images[0].shape, generator=torch.Generator().manual_seed(0))
+    maps, sums = ssim(images[0], target), differences(images[0], target)
+    loss = sum((t * t).sum() for t in (*images, maps, sums))
+    gradients = torch.autograd.grad(loss, [*g.tensors().values(), views, Ks])
+    moved = torch.rand(3 * 4096, 3, generator=torch.Generator().manual_seed(1))
+    state = [moved, moved.flip(0).contiguous(), moved * 0, moved * 0]
+    adam_step(*state, lr=0.1, step=1)
+    factors = opacity_dropout(53, torch.tensor([0.3, 1.0]), 5)
+    lists = [t for tiled in (tiles, capped) for t in (tiled.ranges, tiled.counts, tiled.gaussian_ids[: len(tiles.slots)])]
+    weights = contributions(projected, tiles, **size, rule=rule)
+    near = mean_square_distances(moved[:91])
+    return [t.detach() for t in (projected, counts, *lists, *images, *gradients, *weights, *state, near, factors, maps, sums)]
+
+
+@pytest.fixture
+def poisoned_memory():
+    """Fill what torch allocates with NaN and with the largest numbers."""
+    torch.use_deterministic_algorithms(True)
+    assert bool(torch.empty(3).isnan().all())
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """The results of one thread, each launch in one piece."""
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield everything()
+    torch.set_num_threads(count)
+
+
+def test_every_op_gives_the_same_bits_in_ranges(monkeypatch, whole, poisoned_memory):
+    """However a launch is cut, items know their own number, share nothing, and none is left out.
+
+    Ranges of unequal length, none of which may cover for another: Warp counts a negative index from the end, and so a
+    kernel that goes backwards from the beginning of its range visits every item of equal ranges.
+    """
+    monkeypatch.setattr(interop, "SERIAL_WORK", 0)
+    monkeypatch.setattr(interop, "CHUNKS_PER_THREAD", 2)
+    torch.set_num_threads(4)
+    for i, (a, b) in enumerate(zip(whole, everything(), strict=True)):
+        assert torch.equal(a, b), i
+
+
+def test_items_run_in_any_order(monkeypatch, whole, poisoned_memory):
+    """One by one from the last to the first: the same bits, since none may rely on another having run."""
+
+    def backwards(kernel, count, inputs, device, **_):
+        arrays = [a.array() if isinstance(a, interop.View) else a for a in inputs]
+        for i in reversed(range(count)):
+            wp.launch(kernel, 1, inputs=[i, *arrays], device="cpu")
+
+    monkeypatch.setattr(interop, "launch", backwards)
+    for i, (a, b) in enumerate(zip(whole, everything(), strict=True)):
+        assert torch.equal(a, b), i
+
+
+def test_memory_that_nobody_wrote_is_not_read(whole, poisoned_memory):
+    """Workspace and outputs that were full of NaN and of the largest numbers give the same bits."""
+    for i, (a, b) in enumerate(zip(whole, everything(), strict=True)):
+        assert torch.equal(a, b), i
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_the_device_that_is_current_stays_so(monkeypatch, several):
+    """Warp leaves the one current that it worked on: where there are several, launches and its own work stand in a guard."""
+    events, device = [], torch.device("cuda", 1)
+
+    class Guard:
+        def __init__(self, where):
+            self.where = where
+
+        def __enter__(self):
+            events.append(("enter", self.where))
+
+        def __exit__(self, *_):
+            events.append("exit")
+
+    class Noted:
+        def launch(self, *_):
+            events.append("launch")
+
+        def set_stream(self, stream, sync):
+            events.append(stream)
+
+    Noted.stream = "before"
+    monkeypatch.setattr(interop, "_several_devices", lambda: several)
+    monkeypatch.setattr(torch.cuda, "device", Guard)
+    monkeypatch.setattr(interop, "_recorded", lambda *_: Noted())
+    monkeypatch.setattr(interop, "warp_stream", lambda _: "ours")
+    monkeypatch.setattr(interop, "warp_device", lambda _: Noted())
+    interop.launch(None, 1, [], device)
+    with interop.stream_of(device):
+        events.append("sort")
+    guarded = [[("enter", device), *body, "exit"] if several else body for body in (["launch"], ["ours", "sort", "before"])]
+    assert events == guarded[0] + guarded[1]
+
+
+def test_items_are_numbered_in_31_bits():
+    """2^31 - 1 of them can be, one more cannot."""
+    interop._check_size(2**31 - 1)
+    with pytest.raises(ResourceError, match=r"2,147,483,648 entries is beyond the 2,147,483,647"):
+        interop._check_size(2**31)
+
+
+def test_check_names_what_disagrees():
+    """Each rule of `check` alone, and the sizes where all hold."""
+    a, b = torch.zeros(2, 3), torch.zeros(4, 2)
+    assert interop.check(a=(a, "N 3"), b=(b, "K N")) == {"N": 2, "K": 4}
+    with pytest.raises(TypeError, match="a must be a torch tensor, not list"):
+        interop.check(a=([1.0], "N"))
+    with pytest.raises(TypeError, match=r"float32 or float64 tensors, not torch\.int32"):
+        interop.check(a=(a.int(), "N 3"))
+    with pytest.raises(TypeError, match=r"b is torch\.float64 but a is torch\.float32"):
+        interop.check(a=(a, "N 3"), b=(b.double(), "K N"))
+    with pytest.raises(ValueError, match="b is on meta but a is on cpu"):
+        interop.check(a=(a, "N 3"), b=(b.to("meta"), "K N"))
+    for pattern in ("N", "N 3 1", "N 4", "N N", "3 3"):
+        with pytest.raises(ValueError, match=r"a must have shape .* not \[2, 3\]"):
+            interop.check(a=(a, pattern))
+    with pytest.raises(ValueError, match=r"b must have shape \[N, 2\] \(N=2\), not \[4, 2\]"):
+        interop.check(a=(a, "N 3"), b=(b, "N 2"))
+
+
+def test_a_driver_that_is_missing_is_no_news(monkeypatch, capfd):
+    """Output of native code is dropped inside the context, not after it."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with interop._without_driver_notice():
+        os.write(2, b"no driver")
+    os.write(2, b"news")
+    assert capfd.readouterr().err == "news"

@@ -1,0 +1,214 @@
+"""The demo folder, read back by a parser of its own and checked against its own images."""
+
+import cv2
+import numpy as np
+import pytest
+
+from warpgs.errors import ResourceError, UsageError
+from warpgs.synthetic import demo, raycast
+
+SIZE = {"views": 9, "width": 128, "height": 96}
+
+
+def lines(path):
+    return [row for row in path.read_text().splitlines() if not row.startswith("#")]
+
+
+def matrix(w, x, y, z):
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+
+
+def parse(folder):
+    model = folder / "sparse" / "0"
+    (camera,) = lines(model / "cameras.txt")
+    number, kind, width, height, *params = camera.split()
+    assert (number, kind) == ("1", "PINHOLE")
+    rows, views = lines(model / "images.txt"), {}
+    for head, body in zip(rows[::2], rows[1::2]):
+        i, *pose, camera_id, name = head.split()
+        q, t = np.array(pose[:4], float), np.array(pose[4:], float)
+        assert camera_id == "1" and abs(np.linalg.norm(q) - 1) < 1e-9
+        observed = np.array(body.split(), float).reshape(-1, 3)
+        image = cv2.imread(str(folder / "images" / name))[..., ::-1] / 255
+        views[int(i)] = {"name": name, "R": matrix(*q), "t": t, "observed": observed, "image": image}
+    points = {}
+    for row in lines(model / "points3D.txt"):
+        i, x, y, z, r, g, b, error, *track = row.split()
+        pairs = [(int(a), int(c)) for a, c in zip(track[::2], track[1::2])]
+        assert float(error) == 0
+        points[int(i)] = (np.array([x, y, z], float), np.array([r, g, b], float) / 255, pairs)
+    return (int(width), int(height), *map(float, params)), views, points
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demo") / "new" / "scene"
+    spec = demo.write_demo(folder, **SIZE)
+    return folder, spec, *parse(folder)
+
+
+def project(camera, view, x):
+    _, _, fx, fy, cx, cy = camera
+    p = view["R"] @ x + view["t"]
+    return np.array([fx * p[0] / p[2] + cx, fy * p[1] / p[2] + cy]), p[2]
+
+
+def test_images_are_complete_and_fill_the_frame(made):
+    folder, _, camera, views, _ = made
+    assert sorted(p.name for p in (folder / "images").iterdir()) == [f"{i:03d}.png" for i in range(9)]
+    assert camera[:2] == (128, 96) and camera[4] != 64 and camera[5] != 48  # off-centre on purpose
+    for view in views.values():
+        assert view["image"].shape == (96, 128, 3)
+        assert (view["image"].max(axis=2) == 0).mean() < 0.002
+        assert view["image"].std() > 0.15
+
+
+def test_points_reproject_onto_their_observations(made):
+    _, _, camera, views, points = made
+    assert len(points) > 300
+    for number, (x, _, track) in points.items():
+        assert len(track) >= 2 and len({i for i, _ in track}) == len(track)
+        for i, k in track:
+            u, v, back = views[i]["observed"][k]
+            xy, depth = project(camera, views[i], x)
+            assert back == number and depth > 0
+            assert np.abs(xy - (u, v)).max() < 0.01
+            assert 0 < u < 128 and 0 < v < 96
+    assert sum(len(t) for _, _, t in points.values()) == sum(len(v["observed"]) for v in views.values())
+
+
+def test_point_colours_agree_with_the_images(made):
+    _, _, camera, views, points = made
+    errors = []
+    for x, rgb, track in points.values():
+        for i, _ in track:
+            (u, v), _ = project(camera, views[i], x)
+            patch = cv2.getRectSubPix(views[i]["image"].astype(np.float32), (1, 1), (u - 0.5, v - 0.5))
+            errors.append(np.abs(patch[0, 0] - rgb).max())
+    assert np.median(errors) < 0.03
+    assert np.quantile(errors, 0.95) < 0.15
+
+
+def test_tracks_respect_occlusion(made):
+    _, _, camera, views, points = made
+    hidden = 0
+    for shape in demo.still_life():
+        if not isinstance(shape, raycast.Sphere):
+            continue
+        for x, _, track in points.values():
+            seen = {i for i, _ in track}
+            for i, view in views.items():
+                eye = -view["R"].T @ view["t"]
+                s = np.clip(np.dot(shape.center - eye, x - eye) / np.dot(x - eye, x - eye), 0, 1)
+                inside = np.linalg.norm(eye + s * (x - eye) - shape.center) < 0.999 * shape.size
+                assert not (inside and i in seen)
+                (u, v), depth = project(camera, view, x)
+                hidden += inside and depth > 0 and 2 < u < 126 and 2 < v < 94
+    assert hidden > 20  # the scene does hide points from some views
+
+
+def test_split_is_a_partition_that_interpolates(made):
+    _, spec, _, views, _ = made
+    train, test = (part.split("=")[1].split(",") for part in spec.split(";"))
+    assert spec.startswith("train=") and ";test=" in spec
+    assert len(train) == 6 and sorted(train + test) == sorted(v["name"] for v in views.values())
+    centers = {v["name"]: -v["R"].T @ v["t"] for v in views.values()}
+    xs = np.array([centers[n][:2] for n in train])
+    for name in test:
+        assert (centers[name][:2] > xs.min(axis=0)).all() and (centers[name][:2] < xs.max(axis=0)).all()
+
+
+def test_images_are_poor_predictors_of_each_other(made):
+    _, spec, _, views, _ = made
+    image = {v["name"]: v["image"] for v in views.values()}
+    train, test = (part.split("=")[1].split(",") for part in spec.split(";"))
+
+    def psnr(a, b):
+        return -10 * np.log10(np.mean((a - b) ** 2))
+
+    mean = np.mean([image[n] for n in train], axis=0)
+    assert np.mean([psnr(mean, image[n]) for n in test]) < 16
+    assert np.mean([max(psnr(image[m], image[n]) for m in train) for n in test]) < 16
+
+
+def test_the_same_seed_gives_the_same_bytes(tmp_path):
+    size = {"views": 8, "width": 48, "height": 36}
+    specs = [demo.write_demo(tmp_path / n, **size, seed=s) for n, s in (("a", 3), ("b", 3), ("c", 4))]
+    a, b, c = ({p.relative_to(tmp_path / n): p.read_bytes() for p in (tmp_path / n).rglob("*.*")} for n in "abc")
+    assert len(a) == 11 and a == b and specs[0] == specs[1]
+    assert all(a[k] != c[k] for k in a if k.suffix == ".png")
+
+
+def test_an_empty_folder_is_fine_and_a_full_one_is_refused(tmp_path):
+    demo.write_demo(tmp_path, views=8, width=32, height=32)
+    before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*")}
+    with pytest.raises(UsageError, match="not empty"):
+        demo.write_demo(tmp_path, views=8, width=32, height=32)
+    assert before == {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*")}
+
+
+@pytest.mark.parametrize("change", [{"views": 7}, {"width": 31}, {"height": 8}])
+def test_sizes_too_small_are_refused(tmp_path, change):
+    with pytest.raises(UsageError, match="at least"):
+        demo.write_demo(tmp_path / "d", **(SIZE | change))
+    assert not (tmp_path / "d").exists()
+
+
+def test_a_file_in_the_way(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UsageError, match="is a file"):
+        demo.write_demo(tmp_path / "file", **SIZE)
+    with pytest.raises(ResourceError, match="cannot write"):
+        demo.write_demo(tmp_path / "file" / "below", **SIZE)
+
+
+def surface_equation(shape, p):
+    """Return a value that is zero on the surface of a shape, by textbook formulas, at local positions."""
+    x, y, z = p.T
+    if isinstance(shape, raycast.Plane):
+        return z
+    if isinstance(shape, raycast.Sphere):
+        return np.sqrt(x**2 + y**2 + z**2) - shape.size
+    if isinstance(shape, raycast.Box):
+        return np.max(np.abs(p) - shape.half, axis=1)
+    if isinstance(shape, raycast.Cylinder):
+        return np.maximum(np.hypot(x, z) - shape.size, np.abs(y) - shape.half_height)
+    return (x**2 + y**2 + z**2 + shape.ring**2 - shape.tube**2) ** 2 - 4 * shape.ring**2 * (x**2 + z**2)
+
+
+@pytest.mark.parametrize("number", range(10))
+def test_hits_lie_on_the_surface_and_nothing_lies_before_them(number):
+    shape = demo.still_life()[number]
+    rng = np.random.default_rng(number)
+    eye = np.array([0.1, -0.6, 0.0])
+    aim = np.array(shape.center) + rng.normal(size=(400, 3)) * min(shape.radius, 1.5) * 0.5
+    d = (aim - eye) / np.linalg.norm(aim - eye, axis=1, keepdims=True)
+    t, index = raycast.cast([shape], eye, d)
+    hit = index == 0
+    assert hit.sum() > 100 and np.isinf(t[~hit]).all()
+    p, d, t = shape.local(eye + t[hit, None] * d[hit]), d[hit] @ shape.rotation, t[hit]
+    assert np.abs(surface_equation(shape, p)).max() < 1e-6
+    normals = shape.normal(p)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-9)
+    outside = surface_equation(shape, p - 1e-4 * d)
+    start = surface_equation(shape, shape.local(eye[None]))[0]
+    facing = np.abs(np.einsum("ij,ij->i", normals, d)) > 0.05
+    assert (np.sign(outside[facing]) == np.sign(start)).all()
+    assert (np.einsum("ij,ij->i", normals, d)[facing] < 0).all()
+    for s in np.linspace(0.02, 0.98, 40):
+        along = surface_equation(shape, shape.local(eye[None]) + (s * t)[:, None] * d)
+        assert (np.sign(along) == np.sign(start)).all()
+
+
+def test_rays_that_miss_everything_are_black():
+    sphere = [s for s in demo.still_life() if isinstance(s, raycast.Sphere)][:1]
+    K = np.array([[20.0, 0, 16], [0, 20, 16], [0, 0, 1]])
+    view = np.eye(4)
+    view[:3, 3] = -np.array(sphere[0].center) + [0, 0, 3]
+    rgb = raycast.render(sphere, raycast.Light(), K, view, 32, 32)
+    assert rgb.dtype == np.float32 and rgb[16, 16].max() > 0.05
+    assert (rgb[0] == 0).all() and (rgb[:, 0] == 0).all()

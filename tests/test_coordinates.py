@@ -1,0 +1,93 @@
+"""Units: the similarity between scene and file coordinates, forth and back."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.gaussians import camera, cloud
+from warpgs import Normalization, load, rasterize, read_ply, save, write_ply
+from warpgs.coordinates import convert_camera, convert_gaussians
+from warpgs.errors import DataError, UsageError
+from warpgs.io.normalize import normalize_view
+from warpgs.scene import Camera, View
+
+N = Normalization(np.array([3.0, -2.0, 0.5]), 0.25)
+
+
+def as_double(g):
+    return type(g)(**{n: t.double() for n, t in g.tensors().items()})
+
+
+def test_gaussians_and_cameras_together_look_the_same_in_both_units():
+    """Converted alike, they give the same image; depth is longer by the scale, and only means and scales change."""
+    g, c = as_double(cloud(40, degree=2)), camera()
+    g_file, c_file = convert_gaussians(g, N, "scene", "file"), convert_camera(c, N, "scene", "file")
+    before, after = rasterize(g, c), rasterize(g_file, c_file)
+    assert float(before.alpha.max()) > 0.1
+    torch.testing.assert_close(after.rgb, before.rgb, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(after.depth, before.depth / N.scale, rtol=1e-9, atol=1e-9)
+    assert g_file.sh is g.sh and g_file.quats is g.quats and g_file.logit_opacities is g.logit_opacities
+    np.testing.assert_allclose(g_file.means, g.means.numpy() / 0.25 + N.offset, rtol=1e-12)
+    np.testing.assert_allclose(g_file.log_scales.exp(), g.log_scales.exp() / 0.25, rtol=1e-12)
+
+
+def test_conversions_are_inverse_and_those_of_the_reader():
+    """Scene to file to scene is the identity; file to scene is what `load_scene` does with cameras."""
+    g, c = as_double(cloud(5)), camera()
+    back = convert_gaussians(convert_gaussians(g, N, "scene", "file"), N, "file", "scene")
+    torch.testing.assert_close(back.means, g.means, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(back.log_scales, g.log_scales, rtol=1e-12, atol=1e-12)
+    numpy_camera = Camera(np.asarray(c.viewmat, np.float64), np.asarray(c.K, np.float64), c.width, c.height)
+    in_file = convert_camera(numpy_camera, N, "scene", "file")
+    read = normalize_view(View("a", in_file, np.zeros((c.height, c.width, 3), np.float32)), N).camera
+    np.testing.assert_allclose(read.viewmat, numpy_camera.viewmat, atol=1e-12)
+    again = convert_camera(in_file, N, "file", "scene")
+    np.testing.assert_array_equal(again.viewmat, read.viewmat)
+    batch = Camera(torch.as_tensor(in_file.viewmat)[None].repeat(2, 1, 1), torch.as_tensor(in_file.K)[None], c.width, c.height)
+    np.testing.assert_allclose(convert_camera(batch, N, "file", "scene").viewmat[1], read.viewmat, atol=1e-12)
+    assert convert_camera(c, N, "file", "file") is c and convert_gaussians(g, N, "scene", "scene") is g
+
+
+@pytest.mark.parametrize("units", ["scene", "file"])
+def test_model_and_ply_files_know_their_units(tmp_path, units):
+    """Whatever units they were written from, they come back the same in either."""
+    g = cloud(30, degree=1)
+    given = convert_gaussians(g, N, "scene", units)
+    save(tmp_path / "m.safetensors", given, N, units=units)
+    write_ply(tmp_path / "m.ply", given, N, units=units)
+    model = load(tmp_path / "m.safetensors")
+    for wanted in ("scene", "file"):
+        reference = convert_gaussians(g, N, "scene", wanted)
+        for found in (model.gaussians(wanted), read_ply(tmp_path / "m.ply", N, units=wanted)):
+            for name, t in reference.tensors().items():
+                torch.testing.assert_close(getattr(found, name), t, rtol=1e-5, atol=1e-5, msg=name)
+    assert model.normalization.scale == N.scale and np.array_equal(model.normalization.offset, N.offset)
+    torch.testing.assert_close(load(tmp_path / "m.safetensors").gaussians(units).means, given.means)
+
+
+def test_mistakes_are_named(tmp_path):
+    """Unknown units, scene units without a scene, no similarity, numbers that are not finite, and files of others."""
+    g = cloud(3)
+    with pytest.raises(UsageError, match="units 'metres' is not one of scene, file"):
+        convert_gaussians(g, N, "scene", "metres")
+    for call in (save, write_ply):
+        with pytest.raises(UsageError, match="scene units need the scene's normalization"):
+            call(tmp_path / "a", g)
+        with pytest.raises(DataError, match="is not a similarity"):
+            call(tmp_path / "a", g, Normalization(np.zeros(3), 0.0))
+    with pytest.raises(UsageError, match="scene units need"):
+        read_ply(tmp_path / "a", units="scene")
+    broken = type(g)(**{**g.tensors(), "means": g.means * float("nan")})
+    with pytest.raises(DataError, match="means holds numbers that are not finite"):
+        save(tmp_path / "a", broken, units="file")
+    assert not (tmp_path / "a").exists()
+    with pytest.raises(DataError, match="cannot be read"):
+        load(tmp_path / "a")
+    write_ply(tmp_path / "a", g, units="file")
+    with pytest.raises(DataError, match="damaged or no safetensors file"):
+        load(tmp_path / "a")
+    from safetensors.torch import save_file
+
+    save_file({"means": g.means}, tmp_path / "b")
+    with pytest.raises(DataError, match="is no model of format"):
+        load(tmp_path / "b")

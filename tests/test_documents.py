@@ -1,0 +1,43 @@
+"""Whatever the documents name is there: files, tests and flags. Links and formulas are checked by `make docs`."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+"""Decisions and the changelog are left out: they tell what was, too."""
+HOMES = [ROOT, ROOT / "tests", ROOT / "warpgs", ROOT / "warpgs/pipeline"]
+CODE = " ".join(
+    p.read_text("utf-8") for folder in ("warpgs", "bench", "tools", "tests", "examples") for p in (ROOT / folder).rglob("*.py")
+)
+
+
+def named_files(text: str) -> set[tuple[str, str]]:
+    """Return the paths of a text that end with .py, each with the test behind ``::``; placeholders such as X.py left out."""
+    found = re.findall(r"(?<![\w./-])((?:\w+/)+\w+\.py)(?:::(test_\w+))?", text)
+    return {(name, test) for name, test in found if not name.endswith(("/X.py", "_X.py"))}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_named_files_and_tests_are_there(page):
+    """Every path of code leads to a file, and every test named behind it is in that file."""
+    missing = []
+    for name, test in sorted(named_files(page.read_text("utf-8"))):
+        found = [home / name for home in HOMES if (home / name).is_file()]
+        if not found:
+            missing.append(name)
+        elif test and f"def {test}(" not in found[0].read_text("utf-8"):
+            missing.append(f"{name}::{test}")
+    assert not missing, f"{page.name} names what is not there: {', '.join(missing)}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_named_flags_are_there(page):
+    """Every flag in code font or in a command has a name that the code knows."""
+    known = set(re.findall(r"\w+", CODE))
+    flags = set(re.findall(r"(?<![\w-])--([a-z][a-z0-9.-]*[a-z0-9])", page.read_text("utf-8")))
+    parts = {flag: [part.replace("-", "_") for part in flag.split(".")] for flag in flags}
+    missing = sorted(f for f, names in parts.items() if not all(n in known or n.removeprefix("no_") in known for n in names))
+    assert not missing, f"{page.name} names flags that no command has: {', '.join(missing)}"

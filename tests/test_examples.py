@@ -1,0 +1,46 @@
+"""The examples run as printed, on small defaults, and show what they promise."""
+
+import re
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+SMALL = {
+    "01_fit_image": (["--steps", "40", "--count", "150", "--size", "40"], "fitted.png", lambda gain: gain > 3),
+    "02_fit_scene": (["--steps", "20", "--frames", "3", "--width", "48"], "orbit/0001.png", lambda gain: gain > -6),
+    "03_camera_pose": (["--steps", "100"], "pose.png", lambda left: left < 0.2),
+    "04_own_loss": (["--steps", "20", "--width", "48", "--weight", "5"], "smooth.png", lambda left: left < 0.9),
+    "05_own_strategy": (["--steps", "200", "--width", "48", "--start", "100"], "sprout.png", lambda gain: gain > 0.2),
+    "07_rasterizer_in_another_trainer": (["--steps", "40", "--width", "48"], "render.png", lambda gain: gain > 1),
+}
+"""Flags for a test, an image that is written, and what the returned figure must fulfil."""
+
+
+def run(name: str, arguments: list[str]) -> float:
+    """Run an example's main as a script of its own."""
+    return runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name=f"example_{name}")["main"](arguments)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_examples_show_what_they_promise(name, tmp_path, monkeypatch, capsys):
+    """A figure that shows it worked is printed, and an image is written that is not of one colour."""
+    flags, image, promised = SMALL[name]
+    monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "cache"))
+    out = tmp_path if "/" in image else tmp_path / image
+    figure = run(name, [*flags, "--out", str(out)])
+    printed = capsys.readouterr().out
+    assert promised(figure), printed
+    assert re.search(r"\d\.\d", printed)
+    assert np.asarray(Image.open(tmp_path / image)).std() > 5
+
+
+def test_every_example_says_how_it_is_run():
+    """Numbered files whose docstrings show their command, and which take --out, and --steps where they optimise."""
+    for path in sorted(EXAMPLES.glob("*.py")):
+        text = path.read_text("utf-8")
+        assert re.match(r"\d\d_\w+\.py$", path.name) and f"python examples/{path.name}" in text.split('"""')[1], path.name
+        assert '"--out"' in text and ('"--steps"' in text or "optim" not in text), path.name

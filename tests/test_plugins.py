@@ -1,0 +1,163 @@
+"""Parts that plug in: found by name, loaded when asked to, and never because a file names them."""
+
+import dataclasses
+import sys
+
+import pytest
+
+from warpgs.errors import UsageError
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
+from warpgs.pipeline.train.strategies.base import STRATEGIES, Strategy
+from warpgs.plugins import Registry
+
+OWN = """
+from pathlib import Path
+from warpgs.pipeline.train.strategies.base import Strategy
+Path(__file__).with_suffix(".ran").open("a").write("x")
+class Own(Strategy):
+    pass
+class Other:
+    pass
+number = 3
+"""
+
+
+@pytest.fixture
+def registry(monkeypatch) -> Registry:
+    """That of strategies, without what a test adds to it."""
+    STRATEGIES.names()
+    monkeypatch.setattr(STRATEGIES, "_classes", dict(STRATEGIES._classes))
+    return STRATEGIES
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """A user's file, importable as a module too; it leaves a mark each time that it runs."""
+    path = tmp_path / "own_strategy.py"
+    path.write_text(OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield path
+    for name in [n for n, m in sys.modules.items() if getattr(m, "__file__", None) == str(path)]:
+        del sys.modules[name]
+
+
+def test_registered_classes_are_found_by_name(registry):
+    """A decorator names a class; a class stands for itself; names are sorted."""
+
+    @registry.register("zeta")
+    class Zeta(Strategy):
+        pass
+
+    registry.register("alpha")(type("Alpha", (Strategy,), {}))
+    assert registry.find("zeta") is Zeta and Zeta.name == "zeta" and registry.find(Zeta) is Zeta
+    assert registry.names() == sorted(registry.names()) and {"alpha", "zeta"} <= set(registry.names())
+
+
+def test_ours_are_found_without_being_named_anywhere():
+    """Every module of the folder is imported; a name is the class's own."""
+    assert {"clone_split", "holdout", "importance_sampling"} <= set(STRATEGIES.names())
+    assert all(STRATEGIES.find(n).name == n for n in STRATEGIES.names())
+    assert {"photometric", "depth_correlation"} <= set(LOSS_TERMS.names())
+
+
+@pytest.mark.parametrize("as_file", [True, False])
+def test_a_class_of_ones_own_is_loaded_once(registry, own, as_file):
+    """By file or by module; found by the same name from then on, and not one of ours."""
+    spec = f"{own}:Own" if as_file else "own_strategy:Own"
+    cls = registry.load(spec)
+    assert issubclass(cls, Strategy) and cls.name == spec and cls.__name__ == "Own"
+    assert registry.load(spec) is cls is registry.find(spec) and own.with_suffix(".ran").read_text() == "x"
+    assert spec not in registry.names()
+
+
+def test_a_name_without_a_colon_is_loaded_as_it_is_found(registry):
+    assert registry.load("clone_split") is registry.find("clone_split")
+
+
+@pytest.mark.parametrize(
+    ("spec", "said"),
+    [
+        ("{own}:Other", "is no strategy: it must be a class that derives from warpgs.Strategy"),
+        ("{own}:number", "is no strategy"),
+        ("{own}:Missing", "has no class Missing"),
+        ("{own}x.py:Own", "cannot be imported .*there is no file"),
+        ("no_such_module_of_anyone:Own", "cannot be imported .*path/to/file.py:Class"),
+        ("{own.parent}/folder.py:Own", "cannot be imported"),
+        (":Own", "cannot be imported"),
+        (".relative:Own", "cannot be imported"),
+    ],
+)
+def test_what_is_not_there_or_of_another_kind_is_said(registry, own, spec, said):
+    (own.parent / "folder.py").mkdir()
+    with pytest.raises(UsageError, match=said):
+        registry.load(spec.format(own=own))
+    assert not [n for n in registry._classes if ":" in n]
+
+
+def test_a_file_that_fails_is_not_half_loaded(registry, own):
+    """Its error is the user's to see; once it is fixed, it loads."""
+    own.write_text("raise RuntimeError('mine')")
+    with pytest.raises(RuntimeError, match="mine"):
+        registry.load(f"{own}:Own")
+    own.write_text(OWN)
+    assert registry.load(f"{own}:Own").__name__ == "Own"
+
+
+def test_an_unknown_name_lists_those_there_are(registry):
+    with pytest.raises(UsageError, match=r"there is no strategy 'best'; choose one of .*clone_split.* or give module:Class"):
+        registry.find("best")
+    with pytest.raises(UsageError, match="int is no strategy"):
+        registry.find(int)
+
+
+def test_a_name_with_a_colon_is_never_imported_by_find(registry, own):
+    """Whatever it names, module or file."""
+    for spec in (f"{own}:Own", "own_strategy:Own"):
+        with pytest.raises(UsageError, match="never imported because a file names it"):
+            registry.find(spec)
+    assert not own.with_suffix(".ran").exists() and "own_strategy" not in sys.modules
+
+
+def test_a_stored_configuration_imports_nothing(own):
+    """A strategy or a loss term of the user's own that was not loaded in this process is an error that says so."""
+    plain = FitConfig().to_json()
+    for changes in (
+        {"strategy": f"{own}:Own"},
+        {"strategy": "own_strategy:Own"},
+        {"loss_terms": [{"name": f"{own}:Own"}]},
+        {"loss_terms": [{"name": "own_strategy:Own"}]},
+    ):
+        with pytest.raises(UsageError, match="a class of your own"):
+            FitConfig.from_json({**plain, **changes})
+    assert not own.with_suffix(".ran").exists() and "own_strategy" not in sys.modules
+
+
+def test_settings_of_ones_own_travel_through_json(registry, monkeypatch):
+    """A strategy's own settings, an empty one too, and those of a loss term come back as they were; defaults need no saying."""
+    monkeypatch.setattr(LOSS_TERMS, "_classes", dict(LOSS_TERMS._classes))
+
+    @dataclasses.dataclass(frozen=True)
+    class Settings:
+        speed: float = 2.0
+
+    @dataclasses.dataclass(frozen=True)
+    class NoSettings:
+        pass
+
+    @LOSS_TERMS.register("faint")
+    @dataclasses.dataclass(frozen=True)
+    class Faint(LossTerm):
+        weight: float = 0.5
+
+    registry.register("fast")(type("Fast", (Strategy,), {"Config": Settings}))
+    registry.register("bare")(type("Bare", (Strategy,), {"Config": NoSettings}))
+    for config in (
+        FitConfig(strategy="fast", strategy_config=Settings(3.0), loss_terms=(Faint(0.25), Faint())),
+        FitConfig(strategy="fast"),
+        FitConfig(strategy="bare"),
+    ):
+        assert FitConfig.from_json(config.to_json()) == config
+        assert FitConfig.from_json(config.to_json()).fingerprint() == config.fingerprint()
+    assert FitConfig(strategy="fast").strategy_config == Settings()
+    assert FitConfig(loss_terms=(Faint(),)).fingerprint() != FitConfig(loss_terms=(Faint(0.1),)).fingerprint()

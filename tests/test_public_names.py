@@ -1,0 +1,48 @@
+"""The package as `import warpgs` shows it."""
+
+import ast
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import warpgs
+
+ROOT = Path(warpgs.__file__).parent
+
+
+def test_dir_lists_the_public_names_and_nothing_else():
+    """Beside names with two underscores; sorted as written, none twice."""
+    assert {n for n in dir(warpgs) if not n.startswith("__")} == set(warpgs.__all__)
+    assert len(set(warpgs.__all__)) == len(warpgs.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'os_path'"):
+        warpgs.os_path  # noqa: B018
+
+
+@pytest.mark.parametrize("name", warpgs.__all__)
+def test_every_public_name_is_there_and_documented(name):
+    """It loads, and its own docstring says what it is."""
+    value = getattr(warpgs, name)
+    assert value is getattr(importlib.import_module(warpgs._HOMES[name]), name)
+    assert name.isupper() or value.__doc__
+
+
+def test_type_checkers_see_the_same_names():
+    """The imports under TYPE_CHECKING come from where the names load at run time; the marker of PEP 561 is there."""
+    tree = ast.parse((ROOT / "__init__.py").read_text("utf-8"))
+    (block,) = (n for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING")
+    seen = {a.name: n.module for n in block.body if isinstance(n, ast.ImportFrom) for a in n.names}
+    assert seen == warpgs._HOMES and set(seen) == set(warpgs.__all__)
+    assert (ROOT / "py.typed").is_file()
+
+
+def test_import_loads_neither_torch_nor_warp():
+    """A bare import is cheap; the first use of a name pays for it."""
+    code = (
+        "import sys, warpgs; heavy = {'torch', 'warp', 'numpy', 'cv2', 'tyro'}; print(sorted(heavy & set(sys.modules)));"
+        "dir(warpgs); warpgs.Camera; print('numpy' in sys.modules, 'torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split("\n")[:2] == ["[]", "True False"]

@@ -1,0 +1,1 @@
+"""Programs for those who work on warpgs; no part of the package."""

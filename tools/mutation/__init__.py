@@ -1,0 +1,1 @@
+"""Mutation check of the kernels: `python -m tools.mutation` (docs/mutation.md)."""

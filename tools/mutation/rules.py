@@ -1,0 +1,135 @@
+"""Rules: the code that is mutated, the device that runs it, and the tests that look at it."""
+
+import ast
+import re
+from pathlib import Path
+
+SPEED = {
+    "AHEAD", "SHORT", "CHUNKS_PER_THREAD", "FEW_THREADS", "SERIAL_WORK", "SEGMENT", "LANES", "BATCH", "BLOCK", "BOX", "SMALL",
+    "MANY", "WARPS", "STRIP", "ABREAST",
+}  # fmt: skip
+"""Sizes of portions of work; every value that divides as its comment says gives the same numbers."""
+
+HINTS = {
+    "cost", "enable_backward", "grid_stride", "record_tape", "sync", "requires_grad", "cuda_max_registers", "launch_bounds",
+    "max_unroll",
+}  # fmt: skip
+"""Keywords, and keys of options, that tell Warp or torch how to work, not what comes out."""
+
+SLACK = {"margin", "slack", "slack_x", "slack_y", "limit_of"}
+"""Widths by which bounds are safe: a hundredth more lists a tile in excess, which draws nothing. Their operators count."""
+
+MUTATED = (
+    "warpgs/kernels/*.py", "warpgs/kernels/cuda/*.cu", "warpgs/runtime/interop.py", "warpgs/runtime/allocator.py",
+)  # fmt: skip
+"""The files that are mutated."""
+
+CUDA_FILES = ("warpgs/kernels/blend_cuda.py", "warpgs/kernels/ssim_cuda.py", "warpgs/kernels/native.py")
+CUDA_FUNCTIONS = {
+    "warpgs/runtime/interop.py": ("_Recorded", "_recorded", "warp_stream", "_warp_stream", "stream_of", "warp_device"),
+    "warpgs/kernels/adam.py": ("make_scheduled_kernel", "scheduled_lrs", "adam_scheduled"),
+    "warpgs/kernels/ssim.py": ("make_kernels", "_Plan.padded", "_Plan.launch"),
+}
+"""Code that only a CUDA device runs, beside the branches that `sides` finds."""
+
+CUDA_ARGUMENTS = {"deterministic", "block_dim"}
+"""Arguments that mean something on CUDA alone: their defaults, and what is passed for them, are judged there."""
+
+LIMITS, LIMITS_PROJECT, LIMITS_BLEND = (f"kernels/test_limits{what}.py" for what in ("", "_project", "_blend"))
+SPANS, CUTS = "kernels/test_spans.py", "runtime/test_interop.py"
+RECORDS, BODIES, GUARDS = (f"kernels/test_{what}.py" for what in ("limits_gradients", "native", "guard_bytes"))
+EXTREMES, LAYERS = "numerics/test_extreme_projection.py", "numerics/test_extreme_compositing.py"
+OPS = {
+    "adam": ["kernels/test_adam.py", LIMITS],
+    "blend": ["kernels/test_blend.py", "render/test_rasterize.py", LIMITS_BLEND],
+    "blend_cpu": ["kernels/test_blend.py", LIMITS_BLEND, RECORDS, LAYERS, "render/test_window.py"],
+    "blend_cuda": ["kernels/test_blend.py", "render/test_rasterize.py", LIMITS_BLEND, RECORDS, LAYERS, "render/test_window.py"],
+    "step_buffers": ["kernels/test_step_buffers.py"],
+    "interop": [CUTS, "kernels/test_adam.py", "kernels/test_sh.py", "kernels/test_tiles.py"],
+    "compiler": ["kernels/test_blend.py"],
+    "dropout": ["kernels/test_dropout.py"],
+    "falloff": [SPANS, "kernels/test_blend.py", LIMITS_BLEND],
+    "functions": ["kernels/test_project.py", SPANS, LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "render/test_window.py"],
+    "knn": ["kernels/test_knn.py", LIMITS],
+    "allocator": ["runtime/test_allocator.py", "runtime/test_cuda_graph.py", "render/test_graphed.py"],
+    "native": [
+        "kernels/test_project.py", "kernels/test_tiles.py", "render/test_rasterize.py", LIMITS_PROJECT, LIMITS_BLEND, RECORDS,
+    ],
+    "project": ["kernels/test_project.py", LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "render/test_rasterize.py"],
+    "project_backward": ["kernels/test_project.py", LIMITS_PROJECT, RECORDS, EXTREMES, "render/test_rasterize.py"],
+    "scanlines": ["kernels/test_scanlines.py"],
+    "sh": ["kernels/test_sh.py", "kernels/test_project.py"],
+    "ssim": ["kernels/test_ssim.py", LIMITS],
+    "tiles": ["kernels/test_tiles.py", LIMITS_BLEND, RECORDS, "render/test_rasterize.py", "render/test_window.py"],
+}  # fmt: skip
+"""The tests of a file by the beginning of its name, the longest that fits; those that fail soonest come first."""
+
+CUDA_OPS = {
+    "adam": [GUARDS, "pipeline/test_step.py"], "blend_cuda": [BODIES, GUARDS],
+    "interop": [BODIES, "kernels/test_project.py", "pipeline/test_step.py"], "native": [BODIES, GUARDS], "project": [GUARDS],
+    "project_backward": [GUARDS], "ssim": [GUARDS],
+    "tiles": [BODIES, GUARDS, "pipeline/test_step.py"],
+}  # fmt: skip
+"""More tests for CUDA: bodies one by one, memory beside a tensor, steps that are recorded and replayed."""
+
+SKIPPED = ("tests/kernels/test_blend.py::test_gradcheck",)
+"""Tests that take most of a minute, and check what another in the list checks to the same digits by other means."""
+
+
+def tests_of(file: str, cuda: bool) -> list[str]:
+    """Return the test files for a file that is mutated, on CUDA or on the CPU."""
+    stem = Path(file).stem
+    op = max((name for name in OPS if stem.startswith(name)), key=len)
+    if file.endswith(".cu") and op == "blend":
+        op = "blend_cuda"
+    more = CUDA_OPS.get(op, []) if cuda else [CUTS]
+    return [f"tests/{name}" for name in dict.fromkeys([*OPS[op], *more])]
+
+
+def left_out(node: ast.AST) -> bool:
+    """Return whether a node is not mutated, with all below it.
+
+    Errors: their text, and what is computed for it, is no arithmetic. Formatted text: names of modules and messages.
+    Imports and `__all__` hold no operator. Hints and portions change the time, not the numbers. Slack: see `SLACK`.
+    """
+    match node:
+        case ast.Raise() | ast.JoinedStr() | ast.Import() | ast.ImportFrom():
+            return True
+        case ast.keyword(arg=name):
+            return name in HINTS
+        case ast.Assign(targets=[ast.Name(id=name)]):
+            return name in SPEED
+        case ast.AnnAssign(target=ast.Name(id=name)):
+            return name in SPEED
+    return False
+
+
+def is_hint(node: ast.AST) -> bool:
+    """Return whether a key of a dictionary is the name of a hint; its value is left out then."""
+    return isinstance(node, ast.Constant) and node.value in HINTS
+
+
+def number_left_out(statement: ast.stmt | None) -> bool:
+    """Return whether the numbers of a statement are left out, its operators not."""
+    return isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) in SLACK
+
+
+def native_number_left_out(line: str) -> bool:
+    """Return the same for a line of a CUDA body; sizes of portions of work count there, too."""
+    declared = re.match(r"\s*(?:const float|auto|constexpr int) (\w+) =", line)
+    return bool(declared) and declared[1] in SLACK | SPEED
+
+
+def is_native(node: ast.Constant) -> bool:
+    """Return whether a string is a CUDA body: it has a statement, or more, of its own."""
+    return isinstance(node.value, str) and ";" in node.value and ("return " in node.value or ";\n" in node.value)
+
+
+def sides(node: ast.AST) -> tuple[bool, bool]:
+    """Return whether only CUDA runs the body of an ``if`` (or conditional expression), and the same of its ``else``."""
+    if not isinstance(node, ast.If | ast.IfExp):
+        return False, False
+    test = ast.unparse(node.test)
+    if "== 'cuda'" in test or re.fullmatch(r"native|wp\.static\(native\)|_native\(\w+\)", test):
+        return True, False
+    return False, "== 'cpu'" in test or "blocked" in test

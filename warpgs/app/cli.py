@@ -1,0 +1,340 @@
+"""The command line: parses, calls, prints; no logic."""
+
+import contextlib
+import gc
+import os
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from warpgs import __version__
+from warpgs.errors import ResourceError, UsageError, WarpgsError
+
+COMMANDS = {
+    "fit": "fit Gaussians to a scene folder and fill a run folder",
+    "eval": "score a run again on its held-out views",
+    "render": "render a run: its views, an orbit or a spiral, as PNG and mp4",
+    "export": "write a run's Gaussians to a PLY file",
+    "prune": "shrink a finished model as far as its training views allow, into a new run folder",
+    "priors": "look at what is known before a fit (priors show), or write networks as ONNX (priors export)",
+    "compare": "fit presets to scenes with several seeds; tables, plot and figure of the differences",
+    "ablate": "fit a preset with its parts off one at a time; the same tables, plot and figure",
+    "convert-lpips": "join published LPIPS weights into the file that --lpips-weights takes",
+    "demo": "write a synthetic scene to try things with",
+    "doctor": "say what this machine has, what is missing, and how to get it",
+}
+
+
+def _help() -> str:
+    width = max(map(len, COMMANDS))
+    rows = "\n".join(f"  {name:<{width}}  {text}" for name, text in COMMANDS.items())
+    return (
+        f"warpgs {__version__}: from a handful of posed photographs to a 3D Gaussian scene\n\n"
+        f"usage: warpgs COMMAND [flags]\n\n{rows}\n\n"
+        "`warpgs COMMAND --help` lists a command's flags. First steps: warpgs demo scene && warpgs fit scene --out run\n"
+    )
+
+
+@contextlib.contextmanager
+def _importing():
+    """Import without looking for garbage meanwhile or later: modules leave none, and looking takes a fifth of the time."""
+    if "torch" in sys.modules or not gc.isenabled():
+        yield
+        return
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
+def _parse(kind: type, name: str, arguments: list[str], default: object = None):
+    import tyro
+
+    extra = {} if default is None else {"default": default}
+    return tyro.cli(kind, args=arguments, prog=f"warpgs {name}", description=COMMANDS[name.split(maxsplit=1)[0]], **extra)
+
+
+def _fit(arguments: list[str]) -> int:
+    with _importing():
+        from warpgs.app.cli_fit import fit
+
+        request = fit(arguments, COMMANDS["fit"])
+        from warpgs.pipeline.runs.fit import fit_request
+    fit_request(request)
+    return 0
+
+
+def _eval(arguments: list[str]) -> int:
+    import tyro
+
+    @dataclass(frozen=True)
+    class Eval:
+        run: tyro.conf.Positional[Path]
+        """Run folder of `warpgs fit`."""
+        device: str = "auto"
+        """auto, cpu or cuda."""
+        lpips_weights: Path | None = None
+        """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
+        reader: str | None = None
+        """Reader from outside warpgs, as `warpgs fit --reader` was given it."""
+
+    a = _parse(Eval, "eval", arguments)
+    from warpgs.pipeline.runs.commands import evaluate
+
+    for line in evaluate(a.run, a.device, a.lpips_weights, a.reader):
+        print(line)
+    return 0
+
+
+def _render(arguments: list[str]) -> int:
+    import tyro
+
+    @dataclass(frozen=True)
+    class Render:
+        run: tyro.conf.Positional[Path]
+        """Run folder of `warpgs fit`."""
+        path: str = "views"
+        """views (every view of the scene), orbit or spiral."""
+        out: Path | None = None
+        """Folder for the images and the film; RUN/path-PATH where not given."""
+        frames: int = 90
+        """Number of frames of an orbit or a spiral."""
+        fps: int = 30
+        """Frames per second of the film."""
+        device: str = "auto"
+        """auto, cpu or cuda."""
+
+    a = _parse(Render, "render", arguments)
+    from warpgs.pipeline.runs.commands import render
+
+    print(render(a.run, a.path, a.out, a.frames, a.fps, a.device))
+    return 0
+
+
+def _export(arguments: list[str]) -> int:
+    import tyro
+
+    @dataclass(frozen=True)
+    class Export:
+        run: tyro.conf.Positional[Path]
+        """Run folder of `warpgs fit`."""
+        to: Path
+        """File to write; its suffix says the format: .ply."""
+
+    a = _parse(Export, "export", arguments)
+    from warpgs.pipeline.runs.commands import export
+
+    print(export(a.run, a.to))
+    return 0
+
+
+def _prune(arguments: list[str]) -> int:
+    import tyro
+
+    @dataclass(frozen=True)
+    class Prune:
+        run: tyro.conf.Positional[Path]
+        """Run folder of `warpgs fit`; it stays as it is."""
+        keep_psnr: float = 0.1
+        """PSNR that the mean over the training views may fall by [dB]."""
+        out: Path | None = None
+        """Run folder to write; RUN-pruned where not given; must not exist yet."""
+        device: str = "auto"
+        """auto, cpu or cuda."""
+        reader: str | None = None
+        """Reader from outside warpgs, as `warpgs fit --reader` was given it."""
+
+    a = _parse(Prune, "prune", arguments)
+    from warpgs.pipeline.runs.prune import prune
+
+    for line in prune(a.run, a.keep_psnr, a.out, a.device, a.reader):
+        print(line)
+    return 0
+
+
+def _priors(arguments: list[str]) -> int:
+    kinds = {"show": _priors_show, "export": _priors_export}
+    if not arguments or arguments[0] not in kinds:
+        if arguments and arguments[0] in ("-h", "--help"):
+            print("usage: warpgs priors show SCENE --out DIR [flags]")
+            print("       warpgs priors export --model MODEL --out FILE.onnx [flags]")
+            return 0
+        raise UsageError("priors: say show or export; `warpgs priors show --help` lists flags")
+    return kinds[arguments[0]](arguments[1:])
+
+
+def _priors_show(arguments: list[str]) -> int:
+    import tyro
+
+    from warpgs.priors.view_prior import PriorConfig
+
+    @dataclass(frozen=True)
+    class Show:
+        scene: tyro.conf.Positional[Path]
+        """Scene folder."""
+        out: Path
+        """Folder for a PNG sheet per training view."""
+        split: str | None = None
+        """As for `warpgs fit`."""
+        downscale: int = 1
+        """Factor by which both image sides shrink."""
+        threads: int = 0
+        """CPU threads of the networks; 0 for as many as there are cores."""
+        source: str = "sweep"
+        """How depth is found in the other views where no depth network is named: sweep or flow, as --init.source of a fit."""
+        priors: tyro.conf.OmitArgPrefixes[PriorConfig] = field(default_factory=PriorConfig)
+
+    a = _parse(Show, "priors show", arguments)
+    from warpgs.pipeline.runs.preview import show_priors
+    from warpgs.pipeline.runs.request import SceneRequest
+
+    if a.threads < 0:
+        raise UsageError(f"--threads must be 0 or more, not {a.threads}")
+    for line in show_priors(SceneRequest(str(a.scene), a.split, a.downscale), a.priors, a.source, a.out, a.threads):
+        print(line)
+    return 0
+
+
+def _priors_export(arguments: list[str]) -> int:
+    import tyro
+
+    from warpgs.priors.export import ExportRequest
+
+    @dataclass(frozen=True)
+    class Export:
+        request: tyro.conf.OmitArgPrefixes[ExportRequest]
+        out: Path
+        """ONNX file to write; FILE.onnx.json beside it says how to feed it."""
+
+    a = _parse(Export, "priors export", arguments)
+    from warpgs.priors.export import export_network
+
+    for line in export_network(a.request, a.out):
+        print(line)
+    return 0
+
+
+def _demo(arguments: list[str]) -> int:
+    import tyro
+
+    @dataclass(frozen=True)
+    class Demo:
+        folder: tyro.conf.Positional[Path]
+        """Folder to write; must not exist yet."""
+        views: int = 24
+        """Number of photographs."""
+        width: int = 320
+        """Image width [px]."""
+        height: int = 240
+        """Image height [px]."""
+        seed: int = 0
+        """Decides the textures."""
+
+    a = _parse(Demo, "demo", arguments)
+    from warpgs.synthetic.demo import write_demo
+
+    split = write_demo(a.folder, views=a.views, width=a.width, height=a.height, seed=a.seed)
+    print(f"{a.folder}: {a.views} views of {a.width} x {a.height} px as a COLMAP folder")
+    print(f"next: warpgs fit {a.folder} --split '{split}' --out run")
+    return 0
+
+
+def _doctor(arguments: list[str]) -> int:
+    @dataclass(frozen=True)
+    class Doctor:
+        warm: bool = False
+        """Instead, compile all kernels that a fit uses on this machine's devices, so that none waits for it."""
+
+    a = _parse(Doctor, "doctor", arguments)
+    if a.warm:
+        with _importing():
+            from warpgs.app.precompile import print_warming
+        print_warming()
+        return 0
+    from warpgs.app.doctor import diagnose, print_report
+
+    return print_report(diagnose())
+
+
+def _study(name: str):
+    """The command of a name that `cli_studies` holds."""
+
+    def command(arguments: list[str]) -> int:
+        from warpgs.app import cli_study
+
+        return getattr(cli_study, name.replace("-", "_"))(arguments, COMMANDS[name])
+
+    return command
+
+
+RUN = {
+    "fit": _fit, "eval": _eval, "render": _render, "export": _export, "prune": _prune, "priors": _priors,
+    "demo": _demo, "doctor": _doctor,
+    **{name: _study(name) for name in ("compare", "ablate", "convert-lpips")},
+}  # fmt: skip
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; returns its exit code: 0 done, 2 usage, 3 data, 4 resources, 5 internal, 130 interrupted."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(_help(), end="")
+        return 0 if arguments else 2
+    if arguments[0] in ("--version", "-V"):
+        print(f"warpgs {__version__}")
+        return 0
+    name = arguments[0]
+    try:
+        if name not in RUN:
+            raise UsageError(f"there is no command {name!r}; choose one of {', '.join(RUN)}")
+        return RUN[name](arguments[1:])
+    except WarpgsError as e:
+        print(f"warpgs: {e}", file=sys.stderr)
+        return e.exit_code
+    except KeyboardInterrupt:
+        print("warpgs: interrupted; --resume continues from the last checkpoint", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader, `head` for one, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as e:
+        ran_out = isinstance(e, MemoryError) or "out of memory" in str(e).lower()
+        return _out_of_memory(e) if ran_out else _internal_error(e, arguments)
+
+
+def _out_of_memory(error: Exception) -> int:
+    """What torch, the driver or Python says when there is no room, in words that say what to do; returns the exit code."""
+    reason = (str(error).strip() or "MemoryError").splitlines()[0].partition(" GPU ")[0].rstrip(".")
+    print(
+        f"warpgs: no memory is left ({reason}). Give the fit less with --memory-limit, fit smaller images with "
+        "--downscale, or end other programs; --resume continues from the last checkpoint",
+        file=sys.stderr,
+    )
+    return ResourceError.exit_code
+
+
+def _internal_error(error: Exception, arguments: list[str]) -> int:
+    """Keep the traceback for a bug report; the user sees one line."""
+    import tempfile
+    import traceback
+
+    details = f"warpgs {__version__} {' '.join(arguments)}\n\n{''.join(traceback.format_exception(error))}"
+    try:
+        with tempfile.NamedTemporaryFile("w", prefix="warpgs-error-", suffix=".txt", delete=False, encoding="utf-8") as f:
+            f.write(details)
+        where = f"in {f.name}"
+    except OSError:  # no folder can be written
+        print(details, file=sys.stderr)
+        where = "above"
+    print(
+        f"warpgs: internal error, {type(error).__name__}: {error}. This is a defect of warpgs; the details are {where}, "
+        "please report them",
+        file=sys.stderr,
+    )
+    return 5
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,218 @@
+"""Flags of `warpgs fit`, derived from `FitConfig`: names, defaults and help texts are those of its fields.
+
+Defaults depend on the preset, and the preset on the device; a strategy and loss terms bring settings of their own. So the few
+flags that decide which others there are, are looked up first. This module parses and prints; it holds no logic of a fit.
+"""
+
+import dataclasses
+import re
+import traceback
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from warpgs.app.flags import flags_of, settings_of, word_after
+from warpgs.errors import UsageError, WarpgsError
+from warpgs.io.readers import READERS
+from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device
+from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESETS, FitConfig
+from warpgs.pipeline.train.loss import LOSS_TERMS
+from warpgs.pipeline.train.strategies.base import STRATEGIES
+from warpgs.pipeline.train.time_budget import check_budget
+from warpgs.plugins import Registry
+from warpgs.render.rule_costs import select_rule
+from warpgs.runtime.byte_units import parse_bytes
+from warpgs.runtime.interop import set_threads
+
+
+def _request_type() -> type:
+    """Return the dataclass of the flags that are no settings of a fit: its input, output and machine."""
+    import tyro
+
+    @dataclass(frozen=True, kw_only=True)
+    class Request:
+        scene: tyro.conf.Positional[Path]
+        """Scene folder: COLMAP, transforms.json, LLFF, DTU or Middlebury."""
+        out: Path
+        """Run folder to fill; must not exist yet."""
+        split: str | None = None
+        """llff:K, mip360:K, dtu:3|6|9, blender:8, every:N, all, or train=NAMES;test=NAMES."""
+        downscale: int = 1
+        """Factor by which both image sides shrink."""
+        reader: str | None = None
+        """Name of the scene's format, or a reader of your own: module:Class or path/to/file.py:Class."""
+        device: str = "auto"
+        """auto, cpu or cuda."""
+        threads: int = 0
+        """CPU threads; 0 for as many as there are cores."""
+        resume: bool = False
+        """Continue the run in --out from its last checkpoint."""
+        strict: bool = False
+        """A frame without an image file is an error."""
+        allow_outside: bool = False
+        """Let transforms.json name files outside the scene folder."""
+        invert_masks: bool = False
+        """White in a mask removes a pixel."""
+        score_masks: Path | None = None
+        """Folder of object masks for scoring, matched by image id; the scene's idrmasks where not given."""
+        lpips_weights: Path | None = None
+        """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
+        max_error: float | None = None
+        """Choose the fastest rule whose images are off exact by at most this on average, in [0, 1]; not with --rule."""
+        time_budget: float | None = None
+        """Choose the number of steps so that the fit is done in this time [s]; not with --steps or --max-error."""
+
+    return Request
+
+
+def _load(registry: Registry[Any], name: str) -> type[Any]:
+    """Return the class of a plug-in, importing code of the user's own where it is named by module or file.
+
+    Raises:
+        UsageError: There is no such class, or its code does not run; the message names the line.
+    """
+    try:
+        return registry.load(name)
+    except WarpgsError:
+        raise
+    except Exception as e:  # whatever a user's module raises
+        last = traceback.extract_tb(e.__traceback__)[-1]
+        where = f"{e.filename}, line {e.lineno}" if isinstance(e, SyntaxError) else f"{last.filename}, line {last.lineno}"
+        raise UsageError(
+            f"the {registry.kind} {name!r} cannot be loaded: {type(e).__name__}: {e} ({where}); fix that code, or leave it out"
+        ) from e
+
+
+def _group(name: str) -> str:
+    """Return the name of the flags of a plug-in's own settings: ``my.module:MyStrategy`` has the group ``my_strategy``."""
+    word = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name.rpartition(":")[2])
+    return re.sub(r"\W", "_", word).lower()
+
+
+def _terms(arguments: list[str], base: FitConfig) -> dict[str, Any]:
+    """Return the loss terms that a command line names, with default settings, by the name of their flags."""
+    given = word_after(arguments, "--loss-terms")
+    if given is None:
+        return {_group(t.name): t for t in base.loss_terms}
+    terms = {}
+    for name in filter(None, (n.strip() for n in given.split(","))):
+        if _group(name) in terms:
+            raise UsageError(f"--loss-terms {given}: two terms have the flags --{_group(name)}; leave one out")
+        kind = _load(LOSS_TERMS, name)
+        try:
+            terms[_group(name)] = kind()
+        except TypeError as e:
+            raise UsageError(f"the loss term {name!r} has a setting without a default ({e}); give every field one") from e
+    return terms
+
+
+def _preset(arguments: list[str]) -> tuple[FitConfig, str]:
+    """Return the settings that the flags start from, and the kind of device that they go with."""
+    named, device = word_after(arguments, "--preset"), word_after(arguments, "--device") or "auto"
+    kind = "cpu" if {"-h", "--help"} & set(arguments) and device == "auto" else choose_device(device)[0].type
+    name = named or DEFAULT_PRESET[kind]
+    if name not in PRESETS:
+        raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
+    base = PRESETS[name]
+    strategy = word_after(arguments, "--strategy")
+    if strategy is None or strategy == base.strategy:
+        return base, kind
+    own = _load(STRATEGIES, strategy).Config
+    return dataclasses.replace(base, strategy=strategy, strategy_config=None if own is None else own()), kind
+
+
+def _size() -> Any:
+    """Return the specification of a flag for a size in bytes, such as 2GiB."""
+    import tyro
+
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1, metavar="SIZE", instance_from_str=lambda words: parse_bytes(words[0]),
+        is_instance=lambda value: value is None or isinstance(value, int),
+        str_from_instance=lambda value: ["none" if value is None else f"{value}B"],
+    )  # fmt: skip
+
+
+def _names(terms: dict[str, Any]) -> Any:
+    """Return the specification of the flag that names loss terms; their settings are flags of their own."""
+    import tyro
+
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1, metavar="NAME,...", instance_from_str=lambda words: tuple(terms.values()),
+        is_instance=lambda value: isinstance(value, tuple),
+        str_from_instance=lambda value: [",".join(t.name for t in value) or "none"],
+    )  # fmt: skip
+
+
+def _flags(base: FitConfig, terms: dict[str, Any]) -> type:
+    """Return the dataclass of all flags: the request, the settings ``base``, and those of the strategy and of loss terms."""
+    import tyro
+
+    special = {
+        "memory_limit": (_size(),), "loss_terms": (_names(terms),), "priors": (tyro.conf.OmitArgPrefixes,),
+        "strategy_config": (tyro.conf.Fixed, tyro.conf.Suppress),
+    }  # fmt: skip
+    kind, default = flags_of(FitConfig, dataclasses.replace(base, loss_terms=tuple(terms.values())), special)
+    fields: list[tuple[str, Any, Any]] = [("config", Annotated[kind, tyro.conf.arg(name="")], field(default=default))]
+    own = {} if base.strategy_config is None else {_group(base.strategy): base.strategy_config}
+    taken = {f.name for f in dataclasses.fields(FitConfig)}
+    for name, settings in [*own.items(), *terms.items()]:
+        if name in taken:
+            raise UsageError(f"a plug-in has the name {name}, whose flags --{name} there are already; call it something else")
+        taken.add(name)
+        group, default = flags_of(type(settings), settings)
+        fields.append((name, group, field(default=default)))
+    return dataclasses.make_dataclass("Fit", fields, bases=(_request_type(),), frozen=True, kw_only=True)
+
+
+def _config(a: Any, base: FitConfig, terms: dict[str, Any]) -> FitConfig:
+    """Return the settings that parsed flags stand for."""
+    config, own = settings_of(FitConfig, a.config), base.strategy_config
+    if own is not None:
+        config = dataclasses.replace(config, strategy_config=settings_of(type(own), getattr(a, _group(base.strategy))))
+    return dataclasses.replace(config, loss_terms=tuple(settings_of(type(t), getattr(a, n)) for n, t in terms.items()))
+
+
+def _chosen(a: Any, arguments: list[str], config: FitConfig) -> tuple[FitConfig, tuple[str, ...]]:
+    """Let measured costs choose settings where the user asked for it; returns the settings and notes on the choice."""
+    if a.max_error is not None and a.time_budget is not None:
+        raise UsageError("--max-error and --time-budget choose settings by different costs: give one of them")
+    if a.time_budget is not None:
+        if a.resume or word_after(arguments, "--steps"):
+            raise UsageError(
+                "--time-budget chooses the number of steps: leave out --steps, and to continue such a run give --resume with "
+                "the --steps that it chose instead of --time-budget"
+            )
+        check_budget(a.time_budget)
+    if a.max_error is None:
+        return config, ()
+    if word_after(arguments, "--rule"):
+        raise UsageError("--max-error chooses the rule: leave out --rule")
+    rule, note = select_rule(max_error=a.max_error)
+    return dataclasses.replace(config, rule=rule), (note,)
+
+
+def fit(arguments: list[str], description: str) -> FitRequest:
+    """Return the request that the words of a command line make.
+
+    Raises:
+        ResourceError: The device is not there.
+        UsageError: A flag is wrong, or a plug-in cannot be loaded.
+    """
+    import tyro
+
+    base, kind = _preset(arguments)
+    terms = _terms(arguments, base)
+    a: Any = tyro.cli(_flags(base, terms), args=arguments, prog="warpgs fit", description=description)
+    if a.reader is not None:
+        _load(READERS, a.reader)
+    if a.threads < 0:
+        raise UsageError(f"--threads must be 0 or more, not {a.threads}")
+    if a.threads:
+        set_threads(a.threads)
+    config, notes = _chosen(a, arguments, _config(a, base, terms))
+    if word_after(arguments, "--preset") is None:
+        steps = "as many steps as the time allows" if a.time_budget else f"{config.steps} steps"
+        print(f"preset {base.preset}, as usual on {kind}, {steps}; the time left stands in the line of progress")
+    masks = None if a.score_masks is None else str(a.score_masks.resolve())
+    scene = SceneRequest(str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.invert_masks, masks, a.reader)
+    return FitRequest(scene, a.out, config, a.device, a.resume, a.lpips_weights, a.time_budget, notes)

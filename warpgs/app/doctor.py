@@ -1,0 +1,348 @@
+"""Report on this machine: parts that a fit needs, those that are missing, and how to get them."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import os
+import platform
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from warpgs.errors import ResourceError
+from warpgs.runtime.byte_units import format_bytes
+from warpgs.runtime.device_memory import ASSUMED_BYTES, machine_memory
+from warpgs.runtime.kernel_cache import prepare_kernel_cache
+from warpgs.runtime.processor import processor_name, usable_cores
+
+OK, MISSING, NOTE = "ok", "missing", "note"
+PYTHON = ((3, 11), (3, 14))  # from, and below
+LOW_DISK = 2 * 2**30  # [bytes]; a run folder with checkpoints and a video fits well into this
+LOW_MEMORY = 4 * 2**30  # [bytes]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at."""
+
+    topic: str
+    """Subject in a word or two, unique within a report."""
+    status: Literal["ok", "missing", "note"]
+    """``missing`` where something does not work; ``note`` where all works, only slower or with less."""
+    detail: str
+    """Observation, in words."""
+    remedy: str = ""
+    """Way to get it; never empty where the status is ``missing``."""
+    required: bool = False
+    """True where a fit needs it."""
+
+
+@dataclass(frozen=True)
+class Package:
+    """A package that warpgs uses."""
+
+    distribution: str
+    """Name in the package index."""
+    module: str
+    """Module to import."""
+    required: bool
+    """True where a fit needs it."""
+    use: str
+    """Part that is lost without it."""
+
+
+PACKAGES = (
+    Package("torch", "torch", True, "tensors and gradients"),
+    Package("warp-lang", "warp", True, "the rasterizer's kernels"),
+    Package("numpy", "numpy", True, "reading scenes"),
+    Package("scipy", "scipy", True, "rotations and neighbours"),
+    Package("scikit-image", "skimage", True, "metrics"),
+    Package("opencv-contrib-python-headless", "cv2", True, "images, matches, video"),
+    Package("psutil", "psutil", False, "free memory"),
+    Package("safetensors", "safetensors", True, "checkpoints"),
+    Package("onnxruntime", "onnxruntime", False, "depth and feature networks"),
+    Package("pyvista", "pyvista", False, "3D overviews in reports"),
+    Package("vtk", "vtk", False, "3D overviews in reports"),
+)
+
+
+def _reason(error: BaseException) -> str:
+    """The first line of an error, short enough for a table."""
+    text = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {text[0][:160]}" if text else type(error).__name__
+
+
+def _python() -> Iterable[Finding]:
+    version = platform.python_version()
+    detail = f"{version} at {sys.executable}"
+    low, high = PYTHON
+    if low <= sys.version_info[:2] < high:
+        yield Finding("Python", OK, detail, required=True)
+    else:
+        span = f"from {low[0]}.{low[1]} on, below {high[0]}.{high[1]}"
+        yield Finding("Python", MISSING, detail, f"make an environment with a Python {span}", True)
+    yield Finding("System", OK, f"{platform.system()} {platform.release()} on {platform.machine()}")
+
+
+def _package(package: Package) -> Finding:
+    """Import a package: an installed one may still lack a system library."""
+    try:
+        module = importlib.import_module(package.module)
+    except Exception as e:
+        status = MISSING if package.required else NOTE
+        wanted = package.distribution
+        remedy = f"pip install {wanted}"
+        if not isinstance(e, ModuleNotFoundError):
+            remedy = f"pip install --force-reinstall {wanted}, or install the system library that the message names"
+        without = "a fit needs it" if package.required else "a fit runs without it"
+        return Finding(wanted, status, f"{_reason(e)} ({package.use}; {without})", remedy, package.required)
+    try:
+        version = importlib.metadata.version(package.distribution)
+    except importlib.metadata.PackageNotFoundError:  # built from source, or another build of the same module
+        version = str(getattr(module, "__version__", "of unknown version"))
+    detail = version
+    if package.module == "onnxruntime":
+        names = [n.removesuffix("ExecutionProvider") for n in module.get_available_providers()]
+        detail += f", providers: {', '.join(names)}"
+    return Finding(package.distribution, OK, detail, required=package.required)
+
+
+def _packages() -> Iterable[Finding]:
+    return map(_package, PACKAGES)
+
+
+def _processor() -> Iterable[Finding]:
+    yield Finding("CPU", OK, f"{processor_name()}, {usable_cores()} of {os.cpu_count()} cores usable")
+    memory = machine_memory()
+    if memory is None:
+        assumed = f"the system does not say how much there is; {format_bytes(ASSUMED_BYTES)} are assumed"
+        yield Finding("Memory", NOTE, assumed)
+        return
+    total, free = memory
+    detail = f"{format_bytes(total)}, {format_bytes(free)} available"
+    if free < LOW_MEMORY:
+        yield Finding("Memory", NOTE, detail, "close other programs, or fit at a smaller image size")
+    else:
+        yield Finding("Memory", OK, detail)
+
+
+def _cuda() -> Iterable[Finding]:
+    """CUDA devices as torch and Warp see them; both must."""
+    slower = "a fit runs on the CPU, slower"
+    try:
+        import torch
+    except Exception as e:
+        yield Finding("CUDA", NOTE, f"cannot look: {_reason(e)}", "install torch first")
+        return
+    if torch.version.cuda is None:
+        yield Finding(
+            "CUDA", NOTE, f"none: this torch ({torch.__version__}) is built without CUDA; {slower}",
+            "with an NVIDIA GPU: install a CUDA build of torch, see pytorch.org/get-started",
+        )  # fmt: skip
+        return
+    if not torch.cuda.is_available():
+        driver = "no NVIDIA driver was found" if shutil.which("nvidia-smi") is None else "torch cannot use the driver"
+        if os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1"):
+            driver = "CUDA_VISIBLE_DEVICES hides every device"
+        yield Finding(
+            "CUDA", NOTE, f"none: {driver}; {slower}",
+            f"with an NVIDIA GPU: unset CUDA_VISIBLE_DEVICES, or update the driver for CUDA {torch.version.cuda}",
+        )  # fmt: skip
+        return
+    for i in range(torch.cuda.device_count()):
+        p = torch.cuda.get_device_properties(i)
+        detail = f"{p.name}, {format_bytes(p.total_memory)}, compute {p.major}.{p.minor}, torch for CUDA {torch.version.cuda}"
+        yield Finding(f"CUDA {i}", OK, detail)
+    yield _warp_cuda()
+
+
+def _quiet_warp():
+    """Warp, initialised without its banner and warnings: what they say is said by the report."""
+    import warp
+
+    prepare_kernel_cache()
+    before = warp.config.log_level
+    warp.config.log_level = warp.LOG_ERROR
+    try:
+        warp.init()
+    finally:
+        warp.config.log_level = before
+    return warp
+
+
+def _warp_cuda() -> Finding:
+    """Whether Warp sees the devices that torch sees, and through which driver."""
+    try:
+        warp = _quiet_warp()
+        if warp.is_cuda_available():
+            driver = ".".join(map(str, warp.get_cuda_driver_version() or ("unknown",)))
+            return Finding("Warp on CUDA", OK, f"{warp.get_cuda_device_count()} devices, driver for CUDA {driver}")
+        why = "Warp sees no CUDA device though torch does"
+    except Exception as e:
+        why = _reason(e)
+    return Finding("Warp on CUDA", MISSING, why, "update the NVIDIA driver and warp-lang, or fit with --device cpu")
+
+
+def _size(folder: Path) -> int:
+    """Size of all files below a folder [bytes]."""
+    size = 0
+    for path in folder.rglob("*"):
+        try:
+            size += path.stat().st_size if path.is_file() else 0
+        except OSError:  # another process tidies up
+            continue
+    return size
+
+
+def _prior_cache() -> Iterable[Finding]:
+    """Where maps of networks are kept; a fit works without."""
+    from warpgs.priors.cache import cache_folder
+
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as e:
+        remedy = "set WARPGS_CACHE to a folder that you may write to"
+        yield Finding("Prior cache", NOTE, f"{folder} is not writable ({e.strerror}); networks run anew each time", remedy)
+        return
+    yield Finding("Prior cache", OK, f"{folder}, {format_bytes(_size(folder))}, writable")
+
+
+def _kernel_cache() -> Iterable[Finding]:
+    """Where Warp keeps compiled kernels: without a writable place no kernel runs."""
+    topic = "Kernel cache"
+    try:
+        folder = Path(_quiet_warp().config.kernel_cache_dir)
+        refused = prepare_kernel_cache().refused
+    except ResourceError as e:
+        yield Finding(topic, MISSING, str(e), "set WARP_CACHE_PATH or TMPDIR to a folder that you may write to", True)
+        return
+    except Exception as e:
+        yield Finding(topic, MISSING, _reason(e), "fix warp-lang first", True)
+        return
+    if refused:
+        remedy = "set WARP_CACHE_PATH to a folder that you, and nobody else, may write to"
+        yield Finding(topic, NOTE, f"{refused}; every run compiles its kernels for a minute or two", remedy, True)
+        return
+    size = _size(folder)
+    first = "" if size else "; empty: the first fit compiles for a minute or two"
+    yield Finding(topic, OK, f"{folder}, {format_bytes(size)}, writable{first}", required=True)
+
+
+def _rendering() -> Iterable[Finding]:
+    topic = "3D overview"
+    try:
+        overview = importlib.import_module("warpgs.report.overview")
+        ok, detail = overview.probe_rendering()
+    except Exception as e:
+        ok, detail = False, _reason(e)
+    if ok:
+        yield Finding(topic, OK, detail)
+    else:
+        remedy = "pip install pyvista vtk; where no screen is, also the system's libEGL or libOSMesa (libosmesa6)"
+        yield Finding(topic, NOTE, f"{detail}; reports come without the 3D overview", remedy)
+
+
+def _video() -> Iterable[Finding]:
+    """Encode a few frames for real: a build of OpenCV may accept the codec and still write nothing."""
+    topic = "MP4 encoder"
+    try:
+        import cv2
+        import numpy as np
+
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "probe.mp4"
+            writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 10, (64, 64))
+            if writer.isOpened():
+                for level in (0, 128, 255):
+                    writer.write(np.full((64, 64, 3), level, np.uint8))
+            writer.release()
+            if path.is_file() and path.stat().st_size > 100:
+                yield Finding(topic, OK, "mp4v through OpenCV")
+                return
+        why = "OpenCV opens no mp4v writer"
+    except Exception as e:
+        why = _reason(e)
+    remedy = "pip install --force-reinstall opencv-contrib-python-headless (its wheels bring the encoder)"
+    yield Finding(topic, NOTE, f"{why}; fly-throughs are written as single frames", remedy)
+
+
+def _disk() -> Iterable[Finding]:
+    here = Path.cwd()
+    free = shutil.disk_usage(here).free
+    detail = f"{format_bytes(free)} free at {here}"
+    if free < LOW_DISK:
+        yield Finding("Disk", NOTE, detail, "free some, or work in a folder on another disk")
+    else:
+        yield Finding("Disk", OK, detail)
+
+
+CHECKS: tuple[Callable[[], Iterable[Finding]], ...] = (
+    _python, _packages, _processor, _cuda, _kernel_cache, _prior_cache, _rendering, _video, _disk,
+)  # fmt: skip
+
+
+def diagnose() -> list[Finding]:
+    """Look at everything a fit and its report need.
+
+    Returns:
+        The findings in the order of the report. Nothing is raised: a check that fails is itself a finding.
+    """
+    findings: list[Finding] = []
+    for check in CHECKS:
+        try:
+            findings.extend(check())
+        except Exception as e:
+            topic = check.__name__.strip("_").replace("_", " ").capitalize()
+            findings.append(Finding(topic, NOTE, f"the check itself failed: {_reason(e)}", "report this as a bug"))
+    return findings
+
+
+def print_report(findings: list[Finding], console=None) -> int:
+    """Print the findings as a table, and below it what to do about them.
+
+    Args:
+        findings: what `diagnose` returned.
+        console: a `rich.console.Console`; the standard output where None.
+
+    Returns:
+        The exit code: 0 if a fit can run, else 4.
+    """
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = console or Console()
+    styles = {OK: "green", NOTE: "yellow", MISSING: "bold red"}
+    names = {"opencv-contrib-python-headless": "opencv-contrib"}  # the long name would take a third of 80 columns
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, header_style="bold")
+    table.add_column("Topic", no_wrap=True)
+    table.add_column("Status", no_wrap=True)
+    table.add_column("Detail", overflow="fold")
+    for f in findings:
+        table.add_row(escape(names.get(f.topic, f.topic)), f"[{styles[f.status]}]{f.status}[/]", escape(f.detail))
+    console.print(table)
+    open_ends = [f for f in findings if f.status != OK and f.remedy]
+    if open_ends:
+        remedies = Table.grid(padding=(0, 2))
+        remedies.add_column(no_wrap=True)
+        remedies.add_column(overflow="fold")
+        for f in open_ends:
+            remedies.add_row(f"[{styles[f.status]}]{escape(names.get(f.topic, f.topic))}[/]", escape(f.remedy))
+        console.print("[bold]What to do[/]")
+        console.print(remedies)
+        console.print()
+    stops = [names.get(f.topic, f.topic) for f in findings if f.status == MISSING and f.required]
+    if stops:
+        console.print(f"[bold red]A fit cannot run yet[/]: {escape(', '.join(stops))}.")
+        return ResourceError.exit_code
+    console.print("[bold green]A fit can run here.[/]")
+    return 0

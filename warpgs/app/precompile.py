@@ -1,0 +1,131 @@
+"""Compile the kernels that a fit uses before it needs them, several modules at a time, into Warp's cache."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import warp as wp
+
+from warpgs.kernels import (
+    adam,
+    blend,
+    blend_cpu,
+    blend_cuda,
+    dropout,
+    knn,
+    project,
+    scanlines,
+    ssim_cpu,
+    ssim_cuda,
+    step_buffers,
+    tiles,
+)
+from warpgs.kernels.native import BLOCK
+from warpgs.runtime import interop
+from warpgs.runtime.byte_units import format_bytes
+
+TILE = 16
+"""Side of a tile in a fit [px]."""
+THREADS = 256
+"""Threads of a block where a launch does not say otherwise."""
+CAMERA_MODEL = "pinhole"
+"""Model of the cameras of a fit: readers give no other."""
+
+
+def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
+    """Return a kernel of each module that a fit on such a device launches, with the size of the blocks of its launches.
+
+    On CUDA a module is compiled once for each size. Scores are computed on the CPU wherever the fit ran.
+    """
+    real = wp.float32
+    common = [
+        (project.make_forward(real, cuda, CAMERA_MODEL), THREADS), (project.make_backward(real, cuda, CAMERA_MODEL), BLOCK),
+        (tiles.make_kernels(real, cuda).pack_counts, THREADS), (tiles.make_kernels(real, cuda).find_ranges, THREADS),
+        (tiles.make_emit(real, cuda), THREADS), (knn.make_kernels(real).search, THREADS), (dropout.make_kernel(), THREADS),
+        (step_buffers.make_kernels().end_step, THREADS),
+    ]  # fmt: skip
+    if not cuda:
+        blending, scoring = (
+            blend_cpu.make_kernels(real, TILE),
+            [ssim_cpu.make_kernels(real, summed) for summed in (True, False)],
+        )
+        updates = [adam.make_kernel(real, split, adam.LANES) for split in (True, False)]
+        own = [
+            blending.forward, blending.backward, blending.contributions, blend.make_segments(real).sum_gradients,
+            *(k for s in scoring for k in (s.forward, s.backward)), *updates,
+        ]  # fmt: skip
+        return [(kernel, 1) for kernel in [*(k for k, _ in common), *own]]
+    blending, warps = blend_cuda.make_kernels(TILE), 32 * blend_cuda.WARPS
+    own = [(blending.forward, warps), (blending.order_tiles, 1024), (blending.contributions, TILE * TILE)]
+    own += [(blend.make_segments(real).gather_weights, THREADS), (scanlines.make_kernel(), scanlines.BLOCK)]
+    for depth, chunk in itertools.product((False, True), blend_cuda.CHUNKS):  # with a depth term, and without
+        passes = blend_cuda.make_backward(TILE, depth, chunk, False)
+        own += [(passes.backward, warps), (passes.gather, THREADS)]
+    own += [(ssim_cuda.make_kernels().forward, ssim_cuda.THREADS), (adam.make_scheduled_kernel(), THREADS)]
+    return common + own
+
+
+@dataclass(frozen=True)
+class Precompiled:
+    """One module on one device."""
+
+    device: str
+    """cpu, or the name of the CUDA device."""
+    kernel: str
+    """File and name of one of its kernels."""
+    block: int
+    """Threads of a block that it was compiled for."""
+    compiled: bool
+    """False where the cache had it already."""
+    seconds: float
+    """Time to compile and load it [s]."""
+
+
+def _load(device: torch.device, kernel: wp.Kernel, block: int) -> Precompiled:
+    began, name = time.time(), f"{kernel.func.__module__.rpartition('.')[2]}.{kernel.func.__name__}"
+    path = Path(kernel.module.load(interop.warp_device(device), block_dim=block).binary_path)
+    return Precompiled(str(device), name, block, path.stat().st_mtime >= began, time.time() - began)
+
+
+def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[Precompiled]:
+    """Compile what is not in the cache yet, and yield each module as it is done.
+
+    Args:
+        devices: Where; None for the CPU and every CUDA device that torch sees.
+
+    Raises:
+        RuntimeError: A kernel does not compile.
+    """
+    if devices is None:
+        devices = [torch.device("cpu"), *(torch.device("cuda", i) for i in range(torch.cuda.device_count()))]
+    jobs = {}
+    for device in devices:
+        for kernel, block in fit_kernels(device.type == "cuda"):
+            jobs[device, kernel.module, block] = device, kernel, block
+    # Warp's own force_load loads modules from threads too; it would not say how long each took
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        for done in as_completed([pool.submit(_load, *job) for job in jobs.values()]):
+            yield done.result()
+
+
+def print_warming(devices: list[torch.device] | None = None) -> None:
+    """Warm the cache, with a line for each module that was compiled and a sum at the end."""
+    began, results = time.perf_counter(), []
+    for w in precompile_kernels(devices):
+        results.append(w)
+        if w.compiled:
+            blocks = "" if w.device == "cpu" else f" in blocks of {w.block}"
+            print(f"{w.device}: {w.kernel}{blocks}, {w.seconds:.1f} s", flush=True)
+    compiled, folder = [w for w in results if w.compiled], Path(wp.config.kernel_cache_dir)
+    size = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
+    print(
+        f"{len(results)} modules: {len(compiled)} compiled, {len(results) - len(compiled)} were there, "
+        f"{time.perf_counter() - began:.1f} s; {folder} holds {format_bytes(size)}"
+    )

@@ -1,0 +1,112 @@
+"""The two systems of units that Gaussians and cameras come in, and the similarity between them.
+
+``scene`` units [u] are those of a `Scene` that `load_scene` returned: recentred and rescaled, as the fit sees it. ``file``
+units are those of the scene's own files, which PLY files of a run keep. `Normalization` holds the similarity that leads from
+the second to the first: ``x_scene = scale * (x_file - offset)``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+
+from warpgs.errors import DataError, UsageError
+from warpgs.scene import Camera, Gaussians, Normalization
+
+UNITS = ("scene", "file")
+
+
+def check_units(units: str) -> None:
+    """Check that ``units`` names one of the two systems.
+
+    Raises:
+        UsageError: It does not.
+    """
+    if units not in UNITS:
+        raise UsageError(f"units {units!r} is not one of {', '.join(UNITS)}")
+
+
+def checked_normalization(normalization: Normalization | None, units: str, where: str) -> Normalization:
+    """Return the normalization that goes with Gaussians in ``units``: for file units without one, the identity.
+
+    Args:
+        normalization: Similarity from file to scene units, or None.
+        units: Units of the Gaussians: scene or file.
+        where: Opening of messages, such as the path of a file.
+
+    Raises:
+        DataError: The normalization is not finite, or its scale is not above 0.
+        UsageError: The units are unknown, or scene units come without a normalization.
+    """
+    check_units(units)
+    if normalization is None:
+        if units == "scene":
+            raise UsageError(
+                f"{where}: scene units need the scene's normalization, without which nobody finds back to file units; give "
+                "normalization=scene.normalization, or units='file' for Gaussians that belong to no scene"
+            )
+        return Normalization()
+    scale, offset = normalization.scale, np.asarray(normalization.offset)
+    if not (math.isfinite(scale) and scale > 0 and offset.shape == (3,) and np.isfinite(offset).all()):
+        raise DataError(f"{where}: the scene's normalization is not a similarity: {normalization}. Read the scene again")
+    return normalization
+
+
+def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source: str, target: str) -> Gaussians:
+    """Return Gaussians in other units; the tensors are shared where nothing changes.
+
+    Means and log scales change; quaternions, opacities and spherical harmonics do not, because the similarity has no rotation.
+    Sums are taken in float64: georeferenced offsets of 10^6 m would eat the millimetres of a float32.
+
+    Args:
+        gaussians: N Gaussians in the units ``source``, on any device.
+        normalization: Similarity from file to scene units.
+        source: Units of the input: scene or file.
+        target: Units of the result: scene or file.
+
+    Raises:
+        UsageError: A name of units is unknown.
+    """
+    check_units(source)
+    check_units(target)
+    if source == target:
+        return gaussians
+    means, log_scales = gaussians.means.double(), gaussians.log_scales.double()
+    offset = means.new_tensor(np.asarray(normalization.offset, np.float64))
+    if target == "file":
+        means, log_scales = means / normalization.scale + offset, log_scales - math.log(normalization.scale)
+    else:
+        means, log_scales = normalization.scale * (means - offset), log_scales + math.log(normalization.scale)
+    kind = gaussians.means.dtype
+    return dataclasses.replace(gaussians, means=means.to(kind), log_scales=log_scales.to(kind))
+
+
+def convert_camera(camera: Camera, normalization: Normalization, source: str, target: str) -> Camera:
+    """Return a camera, or a batch of them, in other units: its translation changes, rotation and intrinsics do not.
+
+    Args:
+        camera: Numpy arrays or torch tensors.
+        normalization: Similarity from file to scene units.
+        source: Units of the input: scene or file.
+        target: Units of the result: scene or file.
+
+    Raises:
+        UsageError: A name of units is unknown.
+    """
+    check_units(source)
+    check_units(target)
+    if source == target:
+        return camera
+    viewmat: Any = camera.viewmat.copy() if isinstance(camera.viewmat, np.ndarray) else camera.viewmat.clone()
+    offset: Any = np.asarray(normalization.offset, np.float64)
+    if not isinstance(viewmat, np.ndarray):
+        offset = viewmat.new_tensor(offset)
+    rotation, translation = viewmat[..., :3, :3], viewmat[..., :3, 3]
+    if target == "file":
+        viewmat[..., :3, 3] = translation / normalization.scale - rotation @ offset
+    else:
+        viewmat[..., :3, 3] = normalization.scale * (rotation @ offset + translation)
+    return dataclasses.replace(camera, viewmat=viewmat)

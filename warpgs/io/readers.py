@@ -1,0 +1,116 @@
+"""Readers of scene formats: the base class, the registry, and the choice of a reader by name, class or object.
+
+One module of `warpgs.io` holds one format and registers its reader. Adding a format means adding one such module; a user's
+own reader is passed to `warpgs.load_scene`, or named as ``module:Class`` or ``file.py:Class`` (examples/06_own_format.py).
+"""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from warpgs.errors import UsageError
+from warpgs.plugins import Registry
+from warpgs.scene import Scene, View
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """The user's wishes on how a scene folder is read."""
+
+    downscale: int = 1
+    """Factor, at least 1, by which both image sides shrink."""
+    strict: bool = False
+    """A frame without an image file is an error instead of a note."""
+    allow_outside: bool = False
+    """The scene may name image files outside its folder."""
+    invert_masks: bool = False
+    """White in a mask file removes a pixel instead of keeping it."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.downscale, bool) or not isinstance(self.downscale, int) or self.downscale < 1:
+            raise UsageError(f"--downscale must be a whole number of at least 1, not {self.downscale!r}")
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Traces of a format in a folder."""
+
+    found: str
+    """Files of the format that are there, as the subject of a sentence, such as ``poses_bounds.npy``."""
+    missing: str = ""
+    """Parts that the format needs and the folder lacks; empty where it is complete."""
+
+
+class Reader(abc.ABC):
+    """Base class of the readers of scene formats."""
+
+    name: ClassVar[str] = ""
+    """Name of the format: set by `register`, else declared by the class, else the name of the class."""
+    description: ClassVar[str] = ""
+    """Files that make the format, then its name in brackets, on one line: for the message on an unknown folder."""
+    priority: ClassVar[int] = 100
+    """Order in which complete formats of one folder are preferred, lowest first; the built-in ones have 10 to 50."""
+
+    _declared_name: ClassVar[str] = ""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        cls.name = cls._declared_name = cls.__dict__.get("name", cls.__name__)
+
+    @abc.abstractmethod
+    def probe(self, folder: Path) -> Probe | None:
+        """Look for the format in a folder, by file names alone.
+
+        Returns:
+            What was found and what is missing; None where nothing points to the format.
+        """
+
+    @abc.abstractmethod
+    def read(self, folder: Path, options: ReadOptions) -> Scene:
+        """Read a scene folder in which `probe` found everything.
+
+        Returns:
+            The scene in file coordinates: cameras as camera_from_world with OpenCV axes, images at their final size, notes on
+            every choice made for the user. `warpgs.io.load.load_scene` sorts the views, normalises the coordinates, adds
+            score masks and the fingerprint.
+
+        Raises:
+            warpgs.errors.DataError: A file is missing or malformed; the message names file, reason and remedy.
+        """
+
+    def scene(self, folder: Path, views: list[View], notes: list[str], **fields: Any) -> Scene:
+        """Return a `Scene` of this format with further ``fields`` (points, background, pixels) as given."""
+        return Scene(str(folder), self.name, tuple(views), notes=tuple(notes), **fields)
+
+
+READERS: Registry[Reader] = Registry("reader", Reader, __package__)  # type: ignore[type-abstract]
+
+register = READERS.register
+"""Class decorator ``@register("name")`` that adds a reader to the built-in ones."""
+
+
+def all_readers() -> list[Reader]:
+    """Return a reader of every registered format, by ascending ``priority``, then by name."""
+    return sorted((READERS.find(name)() for name in READERS.names()), key=lambda r: (r.priority, r.name))
+
+
+def find_reader(choice: str | type[Reader] | Reader) -> Reader:
+    """Return the reader that a name, ``module:Class``, ``path/to/file.py:Class``, a class or a reader itself stands for.
+
+    A string with a colon imports the module or file, which runs its code: never pass one that a file of others names.
+
+    Raises:
+        UsageError: There is no such reader, or it does not derive from `Reader`.
+    """
+    if isinstance(choice, Reader):
+        return choice
+    if not isinstance(choice, (str, type)):
+        raise UsageError(f"{choice!r} is no reader; give a name, module:Class, or a class or object derived from Reader")
+    if isinstance(choice, type) or ":" not in choice:
+        return READERS.find(choice)()
+    cls = READERS.load(choice)
+    cls.name = cls._declared_name  # a scene's format is named by its reader, not by the place of the code
+    return cls()

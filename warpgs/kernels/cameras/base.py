@@ -1,0 +1,46 @@
+"""The interface of a camera model, and the models by name."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+from warpgs.plugins import Registry
+
+
+class CameraModel:
+    """A camera model: the Warp functions that take a point in camera coordinates to a pixel, and their gradients."""
+
+    name: str
+    """Name that `Camera.model` selects the model by."""
+
+    @staticmethod
+    def make_functions(real: type) -> SimpleNamespace:
+        """Make the functions for one scalar type, wp.float32 or wp.float64.
+
+        Below, ``position`` is a mean in camera coordinates [u] (+x right, +y down, +z forward), ``K`` the intrinsics [3, 3],
+        ``pixel`` the result of ``pixel_of`` and J the Jacobian of ``pixel_of`` by the position, 2 x 3. The namespace has:
+
+        ``in_range(position, near) -> bool``: True where the model can project this position. A NaN must give False.
+
+        ``pixel_of(position, K) -> vec2``: The projected position [px].
+
+        ``expansion_point(pixel, width, height) -> vec2``: The pixel at which J is taken [px]: ``pixel`` itself, clamped
+        to somewhat more than the image, since far outside of it a first-order expansion errs too much.
+
+        ``project_axes(position, K, point, axes) -> Rows``: J times ``axes`` [3, 3], with J at the expansion point
+        ``point``. ``Rows`` is a struct with two vec3, ``first`` and ``second``.
+
+        ``axes_backward(position, K, point, v_first, v_second) -> mat33``: The gradient of ``axes`` from that of the two
+        rows.
+
+        ``position_backward(position, K, pixel, point, axes, v_first, v_second, v_pixel, v_depth) -> Gradients``: The
+        gradients of position and intrinsics from those of the two rows, of the pixel and of ``position[2]``.
+        ``Gradients`` is a struct with ``v_position`` (vec3) and ``v_K`` (mat33). Where ``point`` equals ``pixel``, J
+        moves with the position; else it does not.
+        """
+        raise NotImplementedError
+
+
+CAMERA_MODELS = Registry("camera model", CameraModel, "warpgs.kernels.cameras")
+"""Camera models by name."""
+register = CAMERA_MODELS.register

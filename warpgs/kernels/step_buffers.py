@@ -1,0 +1,115 @@
+"""Bookkeeping of a captured step: it reads its settings at the start, and stores its loss at the end.
+
+In torch these are some twenty kernels on a handful of numbers each, a tenth of a step's time.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import torch
+import warp as wp
+
+from warpgs.runtime import interop
+
+NOT_FINITE = 2
+"""Value of the stop flag after a loss that is not finite; 1 after more instances than the capacity."""
+
+
+@functools.cache
+def make_kernels():
+    """Make the two kernels."""
+
+    @wp.kernel(enable_backward=False, module="warpgs.kernels.step_buffers")
+    def begin_step(
+        begin: int, counter: wp.array(dtype=wp.int64), view_rows: wp.array(dtype=wp.int64),
+        lr_rows: wp.array2d(dtype=float), setting_rows: wp.array2d(dtype=float),
+        viewmats: wp.array2d(dtype=float), Ks: wp.array2d(dtype=float), targets: wp.array2d(dtype=float),
+        # outputs
+        lrs: wp.array(dtype=float), settings: wp.array(dtype=float),
+        viewmat: wp.array(dtype=float), K: wp.array(dtype=float), target: wp.array(dtype=float),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        step = int(counter[0])
+        view = int(view_rows[step])
+        if i < target.shape[0]:
+            target[i] = targets[view, i]
+        if i < lrs.shape[0]:
+            lrs[i] = lr_rows[step, i]
+        if i < settings.shape[0]:
+            settings[i] = setting_rows[step, i]
+        if i < 16:
+            viewmat[i] = viewmats[view, i]
+        if i < 9:
+            K[i] = Ks[view, i]
+
+    @wp.kernel(enable_backward=False, module="warpgs.kernels.step_buffers")
+    def end_step(
+        begin: int, loss: wp.array(dtype=float), mse: wp.array(dtype=float),
+        # outputs; all but the last are read, too
+        counter: wp.array(dtype=wp.int64), stop: wp.array(dtype=int), history: wp.array2d(dtype=float),
+        going: wp.array(dtype=wp.bool),
+    ):  # fmt: skip
+        step = int(counter[begin])
+        history[step, 0] = loss[0]
+        history[step, 1] = mse[0]
+        if not wp.isfinite(loss[0]):
+            stop[0] = wp.static(NOT_FINITE)
+        going[0] = stop[0] == 0
+        if stop[0] == 0:
+            counter[0] = wp.int64(step + 1)
+
+    return SimpleNamespace(begin_step=begin_step, end_step=end_step)
+
+
+def begin_step(
+    counter: torch.Tensor, view_rows: torch.Tensor, lr_rows: torch.Tensor, setting_rows: torch.Tensor,
+    viewmats: torch.Tensor, Ks: torch.Tensor, targets: torch.Tensor,
+) -> tuple[torch.Tensor, ...]:  # fmt: skip
+    """Return the inputs of the step whose number is in device memory. Tensors are float32 where nothing else is said.
+
+    Args:
+        counter: The step's number in its batch, int64, shape [1].
+        view_rows: Number of each step's view, int64, shape [B].
+        lr_rows: Learning rates of each step, shape [B, R].
+        setting_rows: Settings of each step, shape [B, S].
+        viewmats: camera_from_world of each view, shape [V, 4, 4].
+        Ks: Intrinsics [px], shape [V, 3, 3].
+        targets: Images, shape [V, H, W, 3].
+
+    Returns:
+        ``lrs`` [R], ``settings`` [S], ``viewmat`` [1, 4, 4], ``K`` [1, 3, 3] and ``target`` [H, W, 3].
+    """
+    found = (
+        lr_rows.new_empty(lr_rows.shape[1]), setting_rows.new_empty(setting_rows.shape[1]),
+        viewmats.new_empty(1, 4, 4), Ks.new_empty(1, 3, 3), targets.new_empty(targets.shape[1:]),
+    )  # fmt: skip
+    rows = [interop.view(t.view(len(t), -1), wp.float32) for t in (lr_rows, setting_rows, viewmats, Ks, targets)]
+    numbers = [interop.view(t, wp.int64) for t in (counter, view_rows)]
+    outputs = [interop.view(t.view(-1), wp.float32) for t in found]
+    count = max(16, *(t.numel() for t in found))
+    interop.launch(make_kernels().begin_step, count, [*numbers, *rows, *outputs], counter.device)
+    return found
+
+
+def end_step(
+    loss: torch.Tensor, mse: torch.Tensor, counter: torch.Tensor, stop: torch.Tensor, history: torch.Tensor
+) -> torch.Tensor:
+    """Store a step's result, and count the step unless something stops the batch: then it will be taken again.
+
+    Args:
+        loss: Float32, shape []. Where it is not finite, ``stop`` becomes NOT_FINITE.
+        mse: Mean squared error, float32, shape [].
+        counter: Number of the step, int64, shape [1]; one more where the batch goes on.
+        stop: 0, or the reason to stop, int32, shape [1].
+        history: Loss and mean squared error of each step, float32, shape [B, 2].
+
+    Returns:
+        True where the batch goes on, bool, shape [1].
+    """
+    going = torch.empty(1, dtype=torch.bool, device=loss.device)
+    inputs = [
+        *(interop.view(t.detach().view(1), wp.float32) for t in (loss, mse)), interop.view(counter, wp.int64),
+        interop.view(stop, wp.int32), interop.view(history, wp.float32), interop.view(going, wp.bool),
+    ]  # fmt: skip
+    interop.launch(make_kernels().end_step, 1, inputs, loss.device)
+    return going

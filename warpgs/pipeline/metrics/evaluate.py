@@ -1,0 +1,149 @@
+"""Scores of a model on images it has not seen: PSNR, SSIM in two variants, LPIPS, and baselines without a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from warpgs.kernels.ssim import ssim
+from warpgs.pipeline.metrics.lpips import Lpips
+from warpgs.pipeline.metrics.psnr import psnr
+from warpgs.pipeline.metrics.region import scored_region
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.scene import Gaussians, View
+
+VARIANTS = {
+    "psnr": "of images rounded to 8 bits, over the scored pixels alone; mean over images",
+    "ssim": "as the 3DGS line has it: 11 x 11 Gaussian window, sigma 1.5, zero padding, all pixels and channels",
+    "ssim_skimage": "of scikit-image, as NeRF papers have it: the same window, border left out; about 0.005 lower",
+}
+"""Definition of each score, for result files and reports. Every paper's table depends on these words."""
+MASKED = "where a view has a mask, SSIM and LPIPS compare both images with white outside of it"
+NO_LPIPS = "not measured: no --lpips-weights were given"
+SSIM_WINDOW = 11
+"""Side of the window of SSIM [px]."""
+
+
+@dataclass(frozen=True)
+class ViewMetrics:
+    """Scores of one view."""
+
+    name: str
+    """Name of the view."""
+    psnr: float
+    """Peak signal-to-noise ratio [dB] after rounding to 8 bits, over the pixels that count."""
+    ssim: float
+    """Mean structural similarity, 3DGS variant (zero padding, every pixel)."""
+    ssim_skimage: float
+    """Mean structural similarity, scikit-image variant (Gaussian weights, border cropped)."""
+    region: str
+    """Pixels that count: all, mask, score mask, or foreground (the object on a black background)."""
+    lpips: dict[str, float] = field(default_factory=dict)
+    """LPIPS by variant (`lpips_vgg_legacy`); empty where no weights were given, NaN where the image is too small."""
+
+    def row(self) -> dict[str, Any]:
+        """Return every score by name, flat, as result files have it."""
+        plain: dict[str, Any] = asdict(self)
+        return {k: v for k, v in plain.items() if k != "lpips"} | self.lpips
+
+
+def to_8_bit(image: np.ndarray) -> np.ndarray:
+    """Round an image in [0, 1] to the values that an 8-bit file can hold, float32."""
+    levels: np.ndarray = np.round(np.clip(image, 0, 1) * 255).astype(np.float32)
+    return levels / 255
+
+
+def over_white(image: np.ndarray, region: np.ndarray) -> np.ndarray:
+    """Return the image [H, W, 3] with white where ``region`` [H, W] is False."""
+    return np.where(region[..., None], image, np.float32(1))
+
+
+def score(view: View, image: np.ndarray, lpips: Lpips | None = None) -> ViewMetrics:
+    """Compare a rendered image [H, W, 3] with the image of its view.
+
+    With a mask the recipe is that of DTU's protocol (Niemeyer et al. 2022 and all since): PSNR over the mask's pixels alone,
+    SSIM and LPIPS on both images with white outside of it.
+    """
+    from skimage.metrics import structural_similarity
+
+    region, name = scored_region(view)
+    image, target = to_8_bit(image), to_8_bit(view.image)
+    decibels = psnr(image, target, region)
+    if region is not None and name != "foreground":
+        image, target = over_white(image, region), over_white(target, region)
+    similarity = float(ssim(torch.from_numpy(image), torch.from_numpy(target)).mean())
+    if min(image.shape[:2]) >= SSIM_WINDOW:
+        cropped = structural_similarity(  # type: ignore[no-untyped-call]
+            image, target, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1, channel_axis=-1
+        )
+    else:
+        cropped = float("nan")  # the window does not fit
+    distances = {} if lpips is None else lpips.measure(image, target)
+    return ViewMetrics(view.name, decibels, similarity, float(cropped), name, distances)
+
+
+def options_for(
+    rule: str, background: tuple[float, float, float], gaussians: Gaussians, max_instances: int | None = None
+) -> RasterizeOptions:
+    """Return the rasterizer's options for a model: its cut-offs, its background, and a bound on instances, if any."""
+    return RasterizeOptions(rule=rule, background=gaussians.means.new_tensor(background), max_instances=max_instances)
+
+
+@torch.no_grad()
+def render_view(gaussians: Gaussians, view: View, options: RasterizeOptions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Render a view; returns colours [H, W, 3], depth [u] [H, W] and alpha [H, W] as numpy arrays."""
+    r = rasterize(gaussians, view.camera, options)
+    return r.rgb.cpu().numpy(), r.depth.cpu().numpy(), r.alpha.cpu().numpy()
+
+
+def evaluate(
+    gaussians: Gaussians, views: Sequence[View], options: RasterizeOptions | None = None, lpips: Lpips | None = None
+) -> list[ViewMetrics]:
+    """Render views and score each against its image, as every fit is scored.
+
+    Args:
+        gaussians: N Gaussians in the units of the views' cameras: scene units for the views of a `Scene`.
+        views: Views with images, held-out ones where the score is to mean something.
+        options: Options of the rasterizer, as `FitResult.options` gives them; None for the defaults.
+        lpips: Network for LPIPS (`load_lpips`), or None to leave it out.
+
+    Returns:
+        The scores of each view, in order; `summarize` gives their means.
+    """
+    options = RasterizeOptions() if options is None else options
+    return [score(v, render_view(gaussians, v, options)[0], lpips) for v in views]
+
+
+def baselines(train: list[View], test: list[View]) -> dict[str, float]:
+    """Return the mean PSNR [dB] over the test views of two predictions without 3D, which any useful fit beats.
+
+    ``mean_photo``: the mean of the training images; ``nearest_photo``: the training image taken from nearest by. Images of
+    another size than the test view's are left out; a baseline that no view allows is left out too.
+    """
+    scores: dict[str, list[float]] = {"mean_photo": [], "nearest_photo": []}
+    for view in test:
+        same = [v for v in train if v.image.shape == view.image.shape]
+        if not same:
+            continue
+        region, _ = scored_region(view)
+        nearest = min(same, key=lambda v: float(np.linalg.norm(v.camera.center - view.camera.center)))
+        scores["mean_photo"].append(psnr(to_8_bit(np.mean([v.image for v in same], axis=0)), view.image, region))
+        scores["nearest_photo"].append(psnr(nearest.image, view.image, region))
+    return {name: float(np.mean(values)) for name, values in scores.items() if values}
+
+
+def summarize(metrics: list[ViewMetrics]) -> dict[str, float]:
+    """Return the means over views of every score that is a number; empty where there are no views."""
+    if not metrics:
+        return {}
+    rows = [m.row() for m in metrics]
+    return {key: float(np.mean([r[key] for r in rows])) for key in ("psnr", "ssim", "ssim_skimage", *metrics[0].lpips)}
+
+
+def variants(lpips: Lpips | None) -> dict[str, str]:
+    """Return the definition of each score, LPIPS included; where there are no weights it says that it was not measured."""
+    return VARIANTS | {"masks": MASKED} | ({"lpips": NO_LPIPS} if lpips is None else lpips.variants())

@@ -1,0 +1,198 @@
+"""Weights of LPIPS: the two networks, the one-time conversion of published files, and reading the result."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from warpgs.errors import DataError, UsageError
+from warpgs.files import write_bytes
+
+FORMAT = "warpgs-lpips-1"
+
+
+@dataclass(frozen=True)
+class Net:
+    """The convolutional half of a classifier, as torchvision numbers its layers (`features.N`)."""
+
+    name: str
+    """vgg or alex."""
+    title: str
+    """Name as papers write it."""
+    layers: tuple[tuple[Any, ...], ...]
+    """Layers in order: ("conv", number, inputs, outputs, kernel, stride, padding), ("tap",) after a rectified convolution that
+    is compared, or ("pool", kernel, stride)."""
+    smallest: int
+    """Shortest image side that leaves the last compared layer a pixel [px]."""
+    published: str
+    """First digits of the SHA-256 of torchvision's file, which its name carries."""
+
+    @property
+    def channels(self) -> tuple[int, ...]:
+        """Channels of the five compared layers."""
+        pairs = zip(self.layers, self.layers[1:])
+        return tuple(layer[3] for layer, after in pairs if after == ("tap",))
+
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Return the names of all tensors of a converted file with their shapes."""
+        found: dict[str, tuple[int, ...]] = {}
+        for layer in self.layers:
+            if layer[0] == "conv":
+                _, number, inputs, outputs, kernel, _, _ = layer
+                found[f"features.{number}.weight"] = (outputs, inputs, kernel, kernel)
+                found[f"features.{number}.bias"] = (outputs,)
+        return found | {f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(self.channels)}
+
+
+def _conv(number: int, inputs: int, outputs: int, kernel: int = 3, stride: int = 1, padding: int = 1) -> tuple[Any, ...]:
+    return ("conv", number, inputs, outputs, kernel, stride, padding)
+
+
+TAP = ("tap",)
+NETS = {
+    # Simonyan and Zisserman 2015, network D; compared after the last rectification of each block
+    "vgg": Net(
+        "vgg", "VGG16",
+        (
+            _conv(0, 3, 64), _conv(2, 64, 64), TAP, ("pool", 2, 2),
+            _conv(5, 64, 128), _conv(7, 128, 128), TAP, ("pool", 2, 2),
+            _conv(10, 128, 256), _conv(12, 256, 256), _conv(14, 256, 256), TAP, ("pool", 2, 2),
+            _conv(17, 256, 512), _conv(19, 512, 512), _conv(21, 512, 512), TAP, ("pool", 2, 2),
+            _conv(24, 512, 512), _conv(26, 512, 512), _conv(28, 512, 512), TAP,
+        ),
+        16, "397923af",
+    ),
+    # Krizhevsky 2014, one tower; compared after every rectification
+    "alex": Net(
+        "alex", "AlexNet",
+        (
+            _conv(0, 3, 64, 11, 4, 2), TAP, ("pool", 3, 2), _conv(3, 64, 192, 5, 1, 2), TAP, ("pool", 3, 2),
+            _conv(6, 192, 384), TAP, _conv(8, 384, 256), TAP, _conv(10, 256, 256), TAP,
+        ),
+        31, "7be5be79",
+    ),
+}  # fmt: skip
+"""Zhang et al. 2018, section 3; layer numbers of torchvision's vgg16 and alexnet."""
+
+HEADS = {
+    "b9e4236260c3dd988fc79d2a48d645d885afcbb21f9fd595e6744cf7419b582c": "0.0",
+    "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868": "0.1",
+    "18720f55913d0af89042f13faa7e536a6ce1444a0914e6db9461355ece1e8cd5": "0.0",
+    "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0": "0.1",
+}
+"""SHA-256 of the heads vgg.pth and alex.pth that github.com/richzhang/PerceptualSimilarity publishes, and their version."""
+
+
+def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
+    """The tensors of a .pth file by name, and the file's SHA-256."""
+    if not path.is_file():
+        raise DataError(f"{path}: there is no such file; give a .pth file with a state dict")
+    try:
+        # weights_only: tensors and plain containers, nothing that could run
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as e:  # torch, pickle and zipfile raise a dozen types on foreign bytes
+        reason = str(e).splitlines()[0][:120] if str(e) else ""
+        raise DataError(
+            f"{path}: cannot be read as a torch state dict ({type(e).__name__}: {reason}); download it again from its source"
+        ) from e
+    if not isinstance(state, dict):
+        raise DataError(f"{path}: holds a {type(state).__name__}, not a state dict of named tensors; give the weights alone")
+    with path.open("rb") as f:
+        return state, hashlib.file_digest(f, "sha256").hexdigest()
+
+
+def _net_of(heads: dict[str, torch.Tensor], path: Path) -> Net:
+    shapes = {k: tuple(v.shape) for k, v in heads.items() if isinstance(v, torch.Tensor)}
+    for net in NETS.values():
+        if shapes == {k: v for k, v in net.shapes().items() if k.startswith("lin")}:
+            return net
+    raise DataError(
+        f"{path}: these are heads of no network known here; warpgs measures LPIPS with VGG16 (vgg.pth) and AlexNet (alex.pth) "
+        "from the folder lpips/weights of PerceptualSimilarity"
+    )
+
+
+def convert_lpips(backbone: Path, heads: Path, out: Path) -> list[str]:
+    """Join a backbone and LPIPS heads, once, into a file without pickles that `--lpips-weights` takes.
+
+    Args:
+        backbone: State dict of torchvision's vgg16 or alexnet, trained on ImageNet.
+        heads: The five linear heads of PerceptualSimilarity for the same network.
+        out: The safetensors file to write; its header names net, version and the SHA-256 of both sources.
+
+    Returns:
+        Lines for the user: what was written, and whether a source is not the published one.
+
+    Raises:
+        DataError: A source is missing, no state dict, of another network, or not finite.
+        ResourceError: The file cannot be written.
+        UsageError: ``out`` exists.
+    """
+    from safetensors.torch import save
+
+    if out.exists():
+        raise UsageError(f"{out} exists already; choose another --out")
+    head_state, head_hash = _read_state(heads)
+    net = _net_of(head_state, heads)
+    state, backbone_hash = _read_state(backbone)
+    tensors = {}
+    for name, shape in net.shapes().items():
+        source, path = (head_state, heads) if name.startswith("lin") else (state, backbone)
+        value = source.get(name)
+        if not isinstance(value, torch.Tensor) or tuple(value.shape) != shape:
+            found = f"is {list(value.shape)}" if isinstance(value, torch.Tensor) else "is missing"
+            raise DataError(
+                f"{path}: {name} {found}, {net.title} has {list(shape)} there; the heads are those of {net.title}, so give "
+                f"torchvision's weights of the same network"
+            )
+        if not bool(torch.isfinite(value).all()):
+            raise DataError(f"{path}: {name} is not finite; download it again from its source")
+        tensors[name] = value.float().contiguous()
+    version = HEADS.get(head_hash, "unknown")
+    metadata = {
+        "format": FORMAT, "net": net.name, "version": version, "backbone_sha256": backbone_hash, "heads_sha256": head_hash,
+    }  # fmt: skip
+    write_bytes(out, save(tensors, metadata))
+    notes = [f"{out}: LPIPS with {net.title}, heads of version {version}"]
+    if not backbone_hash.startswith(net.published):
+        notes.append(
+            f"{backbone} is not the file that torchvision publishes (SHA-256 {net.published}...): figures will not compare"
+        )
+    if version == "unknown":
+        notes.append(f"{heads} is neither v0.0 nor v0.1 of the published heads: figures will not compare")
+    return notes
+
+
+def read_lpips(path: Path) -> tuple[Net, dict[str, torch.Tensor], dict[str, str]]:
+    """Read a converted file.
+
+    Returns:
+        The network, its tensors by name (float32, CPU, shapes [...] as in `Net.shapes`), and the header with the file's own
+        SHA-256 as "sha256".
+
+    Raises:
+        DataError: The file is missing, damaged, or was not written by `convert_lpips`.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    if not path.is_file():
+        raise DataError(f"{path}: there is no such file; `warpgs convert-lpips` makes one from published weights")
+    data = path.read_bytes()
+    try:
+        tensors = load(data)
+        metadata = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__", {})
+    except (SafetensorError, ValueError) as e:
+        raise DataError(f"{path}: is damaged or no safetensors file ({e}); make it anew with `warpgs convert-lpips`") from e
+    if metadata.get("format") != FORMAT or metadata.get("net") not in NETS:
+        raise DataError(f"{path}: holds no LPIPS weights; `warpgs convert-lpips` makes such a file from published weights")
+    net = NETS[metadata["net"]]
+    for name, shape in net.shapes().items():
+        if name not in tensors or tuple(tensors[name].shape) != shape:
+            raise DataError(f"{path}: lacks {name} of shape {list(shape)}; make it anew with `warpgs convert-lpips`")
+    return net, tensors, {**metadata, "sha256": hashlib.sha256(data).hexdigest()}

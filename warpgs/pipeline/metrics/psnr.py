@@ -1,0 +1,37 @@
+"""Mean squared error and PSNR of images."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+
+def masked_mse(rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+    """Return the mean squared error of a rendered image clamped to [0, 1], over the pixels that count.
+
+    Args:
+        rgb: Rendered colours, shape [H, W, 3].
+        target: Colours in [0, 1], shape [H, W, 3].
+        mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count.
+    """
+    rgb = rgb.clamp(0, 1)
+    if mask is None:
+        return torch.nn.functional.mse_loss(rgb, target)
+    return ((rgb - target) ** 2 * mask[..., None]).sum() / (3 * mask.sum().clamp_min(1))
+
+
+def psnr_of(mse: float) -> float:
+    """Return the PSNR [dB] of a mean squared error of images in [0, 1]; infinite for 0."""
+    return float("inf") if mse == 0 else -10 * math.log10(mse)
+
+
+def psnr(image: np.ndarray, target: np.ndarray, region: np.ndarray | None = None) -> float:
+    """Return the PSNR [dB] of two images in [0, 1], over all channels of the pixels in ``region`` [H, W]; infinite if equal."""
+    difference = image.astype(np.float64) - target
+    if region is not None:
+        difference = difference[region]
+    mse = float((difference**2).mean())
+    # numpy's logarithm, which rounds apart from math.log10 now and then: figures that were published stay the same
+    return float("inf") if mse == 0 else -10 * float(np.log10(mse))

@@ -1,0 +1,19 @@
+"""Quantiles of as many numbers as an image has pixels."""
+
+from __future__ import annotations
+
+import torch
+
+
+def quantiles(values: torch.Tensor, *fractions: float) -> list[torch.Tensor]:
+    """Return quantiles of numbers [N], N at least 1, for fractions in [0, 1]: linear between neighbours; a NaN is the largest.
+
+    torch.quantile refuses more than 2^24 numbers, and cameras have more pixels.
+    """
+    ordered = values.sort().values
+    found = []
+    for fraction in fractions:
+        rank = fraction * (len(ordered) - 1)
+        below = int(rank)
+        found.append(torch.lerp(ordered[below], ordered[min(below + 1, len(ordered) - 1)], rank - below))
+    return found

@@ -1,0 +1,1 @@
+"""The Gaussians of a fit and what is known of each."""

@@ -1,0 +1,218 @@
+"""Less model for the same pictures: merge neighbours, remove what is not needed, lower degrees, as far as a judge allows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+from warpgs.pipeline.model.coverage import Coverage, coverage, fisher
+from warpgs.pipeline.model.merge import Merges, merges
+from warpgs.pipeline.model.parameter_bounds import truncated
+from warpgs.pipeline.model.table import DensityUpdate
+from warpgs.render.rasterize import RasterizeOptions
+from warpgs.scene import Camera, Gaussians
+
+ROUNDS = 5
+"""Halvings of the interval in which the largest share is looked for."""
+PASSES = 8
+"""Most rounds of merging: 2^8 neighbours become one."""
+DEGREES_FRACTION, MERGE_FRACTION = 1 / 3, 2 / 3
+"""Parts of the allowed loss of a finished model that may be spent after lower degrees, and after merging; removing takes it
+whole."""
+RAMP = 3
+"""Rounds of merging over which the loss that they may spend grows to the whole."""
+WORTHWHILE = 0.02
+"""A round of merging that takes a smaller part of the Gaussians than this is the last."""
+
+
+def largest_fraction(accepted: Callable[[float], bool], rounds: int = ROUNDS) -> float:
+    """The largest share in [0, 1] that is accepted, by bisection; 1 is tried first, 0 is taken without asking.
+
+    What is returned was itself asked for and accepted, or is 0: no promise rests on acceptance being monotone.
+    """
+    if accepted(1.0):
+        return 1.0
+    low, high = 0.0, 1.0
+    for _ in range(rounds):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if accepted(middle) else (low, middle)
+    return low
+
+
+def _ranks(values: torch.Tensor) -> torch.Tensor:
+    """Place of each value [N] in ascending order, equal values by number, int64."""
+    places = torch.empty(len(values), dtype=torch.int64, device=values.device)
+    places[torch.argsort(values, stable=True)] = torch.arange(len(values), device=values.device)
+    return places
+
+
+def prune_order(maxima: torch.Tensor, sensitivity: torch.Tensor) -> torch.Tensor:
+    """Numbers of the Gaussians, the one to remove first first, int64 [N].
+
+    A Gaussian's place is the later of its places by largest contribution and by Fisher sensitivity: one goes only where both
+    call it dispensable, so neither the thin nor the faint but wide is lost to one score alone.
+    """
+    return torch.argsort(torch.maximum(_ranks(maxima), _ranks(sensitivity)), stable=True)
+
+
+def keep_last(order: torch.Tensor, fraction: float) -> torch.Tensor:
+    """Numbers in ascending order of what stays when the first ``fraction`` of an order goes; at least one stays."""
+    return order[min(len(order) - 1, int(fraction * len(order))) :].sort().values
+
+
+def rows_of(gaussians: Gaussians, keep: torch.Tensor) -> Gaussians:
+    """The Gaussians with these numbers."""
+    return Gaussians(**{n: t[keep] for n, t in gaussians.tensors().items()})
+
+
+def changed(gaussians: Gaussians, change: DensityUpdate) -> Gaussians:
+    """The set after a change."""
+    return Gaussians(**{n: torch.cat([t[change.keep], change.added[n]]) for n, t in gaussians.tensors().items()})
+
+
+def with_degrees(gaussians: Gaussians, degrees: torch.Tensor) -> Gaussians:
+    """The same Gaussians without coefficients above their degrees [N]."""
+    return Gaussians(**(gaussians.tensors() | {"sh": truncated(gaussians.sh, degrees)}))
+
+
+def degree_order(gaussians: Gaussians, seen: Coverage) -> torch.Tensor:
+    """Numbers of the Gaussians, the one that needs its harmonics least first, int64 [N].
+
+    By energy above degree 0 times the largest contribution: in an orthonormal basis the sum of squares is, up to a constant,
+    the variance of the colour over directions.
+    """
+    return torch.argsort(gaussians.sh[:, 1:].square().sum((1, 2)).sqrt() * seen.maxima, stable=True)
+
+
+def stored_degrees(sh: torch.Tensor) -> torch.Tensor:
+    """Highest degree of each Gaussian's coefficients [N, K, 3] that is not all zero, int32 [N]."""
+    bands = torch.arange(sh.shape[1], device=sh.device).add(0.5).sqrt().to(torch.int32)
+    return torch.where((sh != 0).any(2), bands, 0).amax(1)
+
+
+def drop_unused_sh(gaussians: Gaussians) -> Gaussians:
+    """The same Gaussians without the bands that none of them uses; a file has one number of coefficients for all."""
+    degrees = stored_degrees(gaussians.sh)
+    highest = int(degrees.max()) if len(degrees) else 0
+    return Gaussians(**(gaussians.tensors() | {"sh": gaussians.sh[:, : (highest + 1) ** 2].contiguous()}))
+
+
+@dataclass(frozen=True)
+class ViewSet:
+    """How the training views look at a model."""
+
+    cameras: list[Camera]
+    options: RasterizeOptions
+    seed: int
+
+    def coverage(self, gaussians: Gaussians) -> Coverage:
+        """See `coverage`."""
+        return coverage(gaussians, self.cameras, self.options)
+
+    def fisher(self, gaussians: Gaussians) -> torch.Tensor:
+        """See `fisher`."""
+        return fisher(gaussians, self.cameras, self.options, self.seed)
+
+
+def cheapest(gaussians: Gaussians, pairs: Merges, accepted: Callable[[Gaussians], bool]) -> int:
+    """How many of the pairs, the cheapest first, may become one."""
+    count, total = len(gaussians), len(pairs.first)
+    return int(total * largest_fraction(lambda s: accepted(changed(gaussians, pairs.change(count, int(s * total))))))
+
+
+def merge_neighbours(
+    gaussians: Gaussians, kinds: torch.Tensor, view_set: ViewSet, accepted: Callable[[Gaussians, float], bool]
+) -> tuple[Gaussians, torch.Tensor]:
+    """Merge pairs, cheapest first, in rounds: again and again while it is worthwhile.
+
+    Args:
+        gaussians: The set.
+        kinds: Only Gaussians of the same number are paired, int, shape [N].
+        view_set: Training views.
+        accepted: Whether a model is good enough when that part [0, 1] of the allowed loss may be spent. It grows over the first
+            `RAMP` rounds, for the cheapest pairs of the second are cheaper than the dearest of the first.
+
+    Returns:
+        The smaller set, and the row of it that each Gaussian went into, int64 [N].
+    """
+    idle, into = 0, torch.arange(len(gaussians), device=gaussians.means.device)
+    for number in range(PASSES):
+        part = min(1.0, (number + 1) / RAMP)
+        pairs = merges(gaussians, view_set.coverage(gaussians).maxima, kinds, odd=bool(number % 2), shift=number / PASSES)
+        taken = cheapest(gaussians, pairs, lambda g, part=part: accepted(g, part))
+        if taken:
+            change = pairs.change(len(gaussians), taken)
+            place = torch.empty_like(kinds, dtype=torch.int64)
+            place[change.keep] = torch.arange(len(change.keep), device=place.device)
+            for half in (pairs.first, pairs.second):
+                place[half[:taken]] = len(change.keep) + torch.arange(taken, device=place.device)
+            into = place[into]
+            gaussians, kinds = changed(gaussians, change), torch.cat([kinds[change.keep], kinds[change.parents]])
+        idle = 0 if taken > WORTHWHILE * len(gaussians) else idle + 1
+        if (idle >= 2 and part == 1) or len(gaussians) < 2:
+            break
+    return gaussians, into
+
+
+def dispensable(gaussians: Gaussians, view_set: ViewSet, accepted: Callable[[Gaussians], bool]) -> torch.Tensor:
+    """Numbers of the Gaussians that stay, ascending, when as many of the others go as the judge accepts."""
+    order = prune_order(view_set.coverage(gaussians).maxima, view_set.fisher(gaussians))
+    return keep_last(order, largest_fraction(lambda s: accepted(rows_of(gaussians, keep_last(order, s)))))
+
+
+def needed_degrees(
+    gaussians: Gaussians, highest: torch.Tensor, view_set: ViewSet, accepted: Callable[[Gaussians], bool]
+) -> torch.Tensor:
+    """Degree of each Gaussian, int32 [N]: 0 for as many as the judge accepts, the others keep up to ``highest`` [N]."""
+    order = degree_order(gaussians, view_set.coverage(gaussians))
+    degrees = torch.minimum(stored_degrees(gaussians.sh), highest.to(torch.int32))
+
+    def lowered(fraction: float) -> torch.Tensor:
+        result = degrees.clone()
+        result[order[: int(fraction * len(order))]] = 0
+        return result
+
+    return lowered(largest_fraction(lambda s: accepted(with_degrees(gaussians, lowered(s)))))
+
+
+@dataclass(frozen=True)
+class Pruned:
+    """A smaller model."""
+
+    gaussians: Gaussians
+    """Sorted by degree, ascending."""
+    degrees: torch.Tensor
+    """Degree of each, int32, shape [N], ascending."""
+    into: torch.Tensor
+    """Row that each Gaussian of the larger model went into, -1 where it was removed, int64."""
+
+
+def prune_model(
+    gaussians: Gaussians, kinds: torch.Tensor, view_set: ViewSet, accepted: Callable[[Gaussians, float], bool]
+) -> Pruned:
+    """Lower degrees, merge neighbours, then remove Gaussians, as far as is accepted.
+
+    Args:
+        gaussians: N Gaussians.
+        kinds: Only Gaussians of the same number are merged, int, shape [N].
+        view_set: The training views.
+        accepted: Whether a model is good enough when that share [0, 1] of the allowed loss may be spent.
+
+    Returns:
+        The smaller model, which was accepted with a share of 1; the model itself where nothing may go.
+    """
+    degrees, model = stored_degrees(gaussians.sh), gaussians
+    if bool((degrees > 0).any()):
+        model = with_degrees(model, needed_degrees(model, degrees, view_set, lambda g: accepted(g, DEGREES_FRACTION)))
+
+    begin = DEGREES_FRACTION
+    model, into = merge_neighbours(model, kinds, view_set, lambda g, part: accepted(g, begin + part * (MERGE_FRACTION - begin)))
+    keep = dispensable(model, view_set, lambda g: accepted(g, 1.0))
+    degrees = stored_degrees(model.sh[keep])
+    order = torch.argsort(degrees, stable=True)
+    keep, degrees = keep[order], degrees[order]
+    place = torch.full((len(model),), -1, dtype=torch.int64, device=keep.device)
+    place[keep] = torch.arange(len(keep), device=keep.device)
+    return Pruned(rows_of(model, keep), degrees, place[into])

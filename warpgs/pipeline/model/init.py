@@ -1,0 +1,324 @@
+"""The first Gaussians: from depths that views confirm, the reconstruction's points, or at random where cameras look."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from warpgs import geometry
+from warpgs.errors import DataError, UsageError
+from warpgs.kernels.knn import mean_square_distances
+from warpgs.kernels.sh import C0, MAX_DEGREE, coefficient_count
+from warpgs.pipeline.metrics.region import counted_region
+from warpgs.pipeline.model.depth_points import coarse_points, depth_bounds
+from warpgs.priors.epipolar import EpipolarConfig, flow_depth
+from warpgs.priors.flow import RANGES, flow_between
+from warpgs.priors.matches import triangulate_matches
+from warpgs.priors.sweep import CPU, SweepConfig, sweep_depths
+from warpgs.scene import Camera, Gaussians, PointCloud, View, ViewDepth
+
+SOURCES = ("auto", "sweep", "flow", "points", "random")
+MIN_POINTS = 100
+"""With fewer sparse points a random start is better: they leave most of the picture empty."""
+MIN_MATCHES = 10
+"""Matched points that a view must hold to guide its random points."""
+NEIGHBORS = 5
+"""Matched points that a random pixel takes its depth from."""
+PAIRS = 2**20
+"""Distances that are held at a time while neighbours are looked for."""
+DEPTH_SPREAD = 0.1
+"""Standard deviation of the logarithm of depth around a matched point."""
+
+
+@dataclass(frozen=True)
+class InitConfig:
+    """Where the first Gaussians come from."""
+
+    source: str = "auto"
+    """sweep or flow (a point per pixel whose depth other views confirm), points (the reconstruction's), random, or auto: sweep
+    for few views, else points where the scene has at least 100 that training views saw, else random."""
+    sweep_up_to: int = 0
+    """auto: most views that are swept, which takes a second a view on two cores."""
+    random_count: int = 20_000
+    """Number of random points."""
+    opacity: float = 0.1
+    """First opacity, in (0, 1)."""
+    scale_factor: float = 1.0
+    """First width of a Gaussian, as a multiple of the distance to its neighbours, in (0, 10]."""
+    max_sh_degree: int = 3
+    """Spherical-harmonics degree stored, 0 to 3."""
+    near_views: int = 4
+    """sweep, flow: nearest other views that each view is matched with."""
+    merge_px: float = 4.0
+    """sweep, flow: width of the cells in which confirmed points become one [px]; 0 keeps one for every pixel."""
+    fill_px: float = 16.0
+    """sweep, flow: width of the cells of points where no depth is confirmed [px]; 0 leaves those places empty."""
+    flow: str = "dis"
+    """flow: dis, deepflow, sparse, a folder of .flo files or an ONNX file (images in, flow out)."""
+    flow_range: str = "255"
+    """flow: colours that an ONNX file takes: 255 (0 to 255), unit (0 to 1) or signed (-1 to 1)."""
+    max_residual: float = 1.0
+    """flow: largest distance of a match from its epipolar line [px]."""
+    blend: str = "least_sensitive"
+    """flow: which source view decides: least_sensitive, nearest_first, mean_valid or inverse_sensitivity."""
+
+    def __post_init__(self):
+        if self.source not in SOURCES:
+            raise UsageError(f"init source {self.source!r} is not one of {', '.join(SOURCES)}")
+        for name in ("merge_px", "fill_px"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise UsageError(f"init {name.replace('_', '-')} must be 0 or more, not {getattr(self, name)}")
+        if self.flow_range not in RANGES:
+            raise UsageError(f"init flow-range {self.flow_range!r} is not one of {', '.join(RANGES)}")
+        self.epipolar()  # its own checks
+        if not 0 < self.scale_factor <= 10:
+            raise UsageError(f"init scale-factor {self.scale_factor} must lie above 0 and be at most 10")
+        if not 0 < self.opacity < 1:
+            raise UsageError(f"init opacity {self.opacity} must lie between 0 and 1")
+        if not 0 <= self.max_sh_degree <= MAX_DEGREE:
+            raise UsageError(f"init max sh degree {self.max_sh_degree} must lie between 0 and {MAX_DEGREE}")
+        if self.random_count < 1:
+            raise UsageError(f"init random count {self.random_count} must be at least 1")
+
+    def epipolar(self) -> EpipolarConfig:
+        """The part that decides about flow."""
+        return EpipolarConfig(max_residual=self.max_residual, near_count=self.near_views, blend=self.blend)
+
+
+class Start(NamedTuple):
+    """What a fit starts from."""
+
+    cloud: PointCloud
+    how: str
+    """Where it comes from, for the user."""
+    depths: list[ViewDepth] | None = None
+    """Depth of each view that the others confirm, where it was looked for."""
+
+
+def camera_depths(views: list[View]) -> tuple[float, float]:
+    """Near and far depth [u] where nothing else is known: 0.1 and 10 times the distance to the cameras' focus point.
+
+    Cameras in one place with one direction have no such point; then it is one unit, which the scene's scale was chosen for.
+    """
+    focus = geometry.focus_point([v.camera for v in views])
+    distance = float(np.median([np.linalg.norm(v.camera.center - focus) for v in views]))
+    distance = distance if distance > 1e-3 else 1.0
+    return 0.1 * distance, 10 * distance
+
+
+def nearest(points: np.ndarray, queries: np.ndarray, count: int) -> np.ndarray:
+    """Numbers of the ``count`` points [P, 2] nearest to each query [Q, 2], the nearest first, int64 [Q, count]."""
+    known, asked = torch.from_numpy(points), torch.from_numpy(queries)
+    found = []
+    # every pair, some rows at a time: a few hundred points take less time than importing a library of search trees
+    for rows in asked.split(max(1, PAIRS // max(1, len(known)))):
+        squares = sum((rows[:, i, None] - known[None, :, i]) ** 2 for i in range(2))
+        found.append(squares.topk(count, largest=False).indices)
+    return torch.cat(found).numpy()
+
+
+class _Depths:
+    """Draws depths for pixels of one view: near those of matched points around the pixel, else anywhere the cameras allow."""
+
+    def __init__(self, view: View, matched: PointCloud, bounds: tuple[float, float]):
+        seen = geometry.in_image(view.camera, matched.points)
+        pixels, self.known = geometry.project_points(view.camera, matched.points)
+        self.pixels, self.known, self.bounds = pixels[seen], self.known[seen], bounds
+        self.depth_supervised = len(self.known) >= MIN_MATCHES
+
+    def draw(self, pixels: np.ndarray, wanted: int, generator: np.random.Generator) -> np.ndarray:
+        """Depths [u] of the first ``wanted`` pixels. Random numbers are drawn for all, so one does not depend on how many."""
+        count = len(pixels)
+        if not self.depth_supervised:
+            near, far = self.bounds
+            return 1 / generator.uniform(1 / far, 1 / near, size=count)[:wanted]
+        which, spread = generator.integers(NEIGHBORS, size=count), generator.normal(0, DEPTH_SPREAD, count)
+        ids = nearest(self.pixels, pixels[:wanted], NEIGHBORS)
+        return self.known[ids[np.arange(wanted), which[:wanted]]] * np.exp(spread[:wanted])
+
+
+def empty_votes(views: list[View], regions: list[tuple[np.ndarray | None, str]], points: np.ndarray) -> np.ndarray:
+    """How many views see each point [N, 3] before the black around an object, int [N]: the visual hull has none."""
+    votes = np.zeros(len(points), int)
+    for view, (region, name) in zip(views, regions):
+        if name != "foreground":
+            continue
+        seen = np.nonzero(geometry.in_image(view.camera, points))[0]
+        pixels, _ = geometry.project_points(view.camera, points[seen])
+        columns, rows = np.floor(pixels).astype(int).T
+        votes[seen] += ~region[rows, columns]
+    return votes
+
+
+def random_points(views: list[View], count: int, generator: np.random.Generator) -> tuple[PointCloud, str]:
+    """Points behind random pixels of the training views, with those pixels' colours.
+
+    A view in which at least 10 triangulated SIFT matches lie takes each depth from one of the 5 matches nearest to the pixel,
+    spread by a tenth (docs/decisions/003-random-start.md); any other view draws inverse depths uniformly, and keeps points
+    that a second view sees where there are any. Where views show an object on black, points start on the object, and those
+    that fewest views see before black come first: nothing stands in empty space. Returns the cloud and a sentence on how it
+    was made.
+    """
+    regions = [counted_region(v) for v in views]
+    matched = triangulate_matches(views)
+    bounds = camera_depths(views)
+    sources = [_Depths(v, matched, bounds) for v in views]
+    points, colors = [], []
+    for i, (view, source) in enumerate(zip(views, sources)):
+        wanted = (i + 1) * count // len(views) - i * count // len(views)
+        free = np.ones(view.image.shape[:2], bool) if regions[i][0] is None else regions[i][0]
+        rows, columns = np.nonzero(free)
+        if len(rows) == 0:
+            continue
+        chosen = generator.integers(len(rows), size=8 * wanted)
+        rows, columns = rows[chosen], columns[chosen]
+        pixels = np.stack([columns, rows], 1) + 0.5
+        elsewhere = not source.depth_supervised and len(views) > 1
+        # where none is better than another, the first are taken, and the others need no depth
+        useful = len(pixels) if elsewhere or any(name == "foreground" for _, name in regions) else wanted
+        candidates = geometry.back_project(view.camera, pixels[:useful], source.draw(pixels, useful, generator))
+        worse = empty_votes(views, regions, candidates)
+        if elsewhere:
+            worse += sum(geometry.in_image(v.camera, candidates).astype(int) for v in views) < 2
+        order = np.argsort(worse, kind="stable")
+        candidates, rows, columns = candidates[order], rows[order], columns[order]
+        points.append(candidates[:wanted])
+        colors.append(view.image[rows[:wanted], columns[:wanted]])
+    if not points:
+        raise DataError("no random start: every pixel of the training views is masked out; check the masks' polarity")
+    depth_supervised = sum(s.depth_supervised for s in sources)
+    how = f"{count:,} random points, {depth_supervised} of {len(views)} views guided by {len(matched):,} matched points"
+    objects = sum(name == "foreground" for _, name in regions)
+    if objects:
+        how += f", on the object that {objects} views show on black"
+    return PointCloud(np.concatenate(points), np.concatenate(colors)), how
+
+
+def consistent_depths(
+    views: list[View], known: PointCloud, config: InitConfig, device: Callable[[], torch.device] = lambda: CPU
+) -> list[ViewDepth]:
+    """Depth of each of at least two views that the others confirm, by flow or by sweeping planes between ``known`` points.
+
+    ``device`` gives where to sweep, once that may be used.
+    """
+    if config.source == "flow":
+        between = flow_between(views, config.flow, config.flow_range)
+        return [flow_depth(views, i, between, config.epipolar()) for i in range(len(views))]
+    points = np.concatenate([known.points, triangulate_matches(views).points])
+    bounds = [depth_bounds(v, points, camera_depths(views)) for v in views]
+    return sweep_depths(views, bounds, SweepConfig(near_count=config.near_views), device())
+
+
+def consistent_points(
+    views: list[View], points: PointCloud, config: InitConfig, generator: np.random.Generator,
+    device: Callable[[], torch.device],
+) -> Start:  # fmt: skip
+    """Points behind pixels whose depth other views confirm, and what was found in which view, a line each.
+
+    Where a random start has more points than that, it is taken instead, and the reason said.
+    """
+    reason, depths = "a single view has no other to compare with", None
+    if len(views) > 1:
+        depths = consistent_depths(views, points, config, device)
+        cloud, notes = coarse_points(views, depths, merge_px=config.merge_px, fill_px=config.fill_px, source=config.source)
+        if len(cloud) >= MIN_POINTS:
+            return Start(cloud, "\n    ".join((notes[-1], *notes[:-1])), depths)
+        reason = f"only {len(cloud)} points survived the checks ({' | '.join(notes[:-1])}); do the views overlap?"
+    cloud, how = random_points(views, config.random_count, generator)
+    return Start(cloud, f"{how}, instead of --init.source {config.source}: {reason}", depths)
+
+
+def seen_points(views: list[View], points: PointCloud | None) -> PointCloud:
+    """The reconstruction's points that the views saw; none where there is no reconstruction."""
+    nothing = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+    return nothing if points is None else points.seen_by({v.name for v in views})
+
+
+def sweeps(config: InitConfig, views: int) -> bool:
+    """Whether a fit of that many views starts from a sweep."""
+    return config.source == "sweep" or (config.source == "auto" and 2 <= views <= config.sweep_up_to)
+
+
+def check_points(views: list[View], points: PointCloud | None, config: InitConfig) -> None:
+    """Raise DataError where points are asked for and the scene has none that the training views saw."""
+    if config.source == "points" and len(seen_points(views, points)) == 0:
+        raise DataError(
+            "the scene holds no 3D points that the training views saw, and --init.source points asks for them; "
+            "use --init.source random, or give a reconstruction with points"
+        )
+
+
+def initial_points(
+    views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator,
+    device: Callable[[], torch.device] = lambda: CPU,
+) -> Start:  # fmt: skip
+    """The points to start from; ``device`` gives where to sweep, once that may be used.
+
+    Raises:
+        DataError: Points were asked for and the scene has none that the training views saw.
+    """
+    check_points(views, points, config)
+    usable = seen_points(views, points)
+    if config.source == "auto" and sweeps(config, len(views)):
+        return consistent_points(views, usable, dataclasses.replace(config, source="sweep"), generator, device)
+    if config.source in ("sweep", "flow"):
+        return consistent_points(views, usable, config, generator, device)
+    if config.source == "points" or (config.source == "auto" and len(usable) >= MIN_POINTS):
+        return Start(usable, f"{len(usable):,} points of the reconstruction that the training views saw")
+    cloud, how = random_points(views, config.random_count, generator)
+    if config.source == "auto" and points is not None:
+        how += f" (the reconstruction has only {len(usable)} points that the training views saw)"
+    return Start(cloud, how)
+
+
+def subsample(start: Start, most: int, generator: np.random.Generator) -> Start:
+    """The start with no more points than that, drawn at random; their Gaussians are wider as they lie farther apart."""
+    count = len(start.cloud)
+    if count <= most:
+        return start
+    keep = np.sort(generator.permutation(count)[:most])
+    how = f"{start.how}\n{most:,} of these {count:,} points, drawn at random: --max-gaussians is {most:,}"
+    return start._replace(cloud=PointCloud(start.cloud.points[keep], start.cloud.colors[keep]), how=how)
+
+
+def scene_extent(cameras: list[Camera], cloud: PointCloud) -> float:
+    """Size of the scene [u]: that of the camera set; where all cameras stand together, a tenth of the cloud's."""
+    extent = geometry.camera_extent(cameras)
+    spread = float(np.linalg.norm(np.std(cloud.points, axis=0)))
+    return max(extent, 0.1 * spread if extent < 1e-3 * spread else 0.0, 1e-6)
+
+
+def initial_gaussians(cloud: PointCloud, config: InitConfig, extent: float, device: torch.device) -> Gaussians:
+    """Return one isotropic Gaussian per point, as wide as the root mean square distance to its three neighbours.
+
+    Args:
+        cloud: At least one point.
+        config: Opacity and degree.
+        extent: Size of the scene [u]; widths are kept between 1e-6 and 0.1 of it, so coincident or lone points get one too.
+        device: Where the tensors go, float32.
+
+    Returns:
+        The Gaussians.
+    """
+    points = torch.as_tensor(cloud.points, dtype=torch.float32, device=device)
+    colors = torch.as_tensor(cloud.colors, dtype=torch.float32, device=device)
+    count = len(points)
+    # in float64: float32's roots and logarithms have other last digits on other processors (MKL)
+    distances = mean_square_distances(points).double().sqrt()
+    scales = config.scale_factor * distances.clamp(1e-6 * extent, 0.1 * extent)
+    sh = points.new_zeros(count, coefficient_count(config.max_sh_degree), 3)
+    sh[:, 0] = (colors - 0.5) / C0
+    quats = points.new_zeros(count, 4)
+    quats[:, 0] = 1
+    return Gaussians(
+        means=points,
+        quats=quats,
+        log_scales=scales.log().to(points.dtype)[:, None].repeat(1, 3),
+        logit_opacities=points.new_full((count,), geometry.logit(config.opacity)),
+        sh=sh,
+    )

@@ -1,0 +1,206 @@
+"""One table of what training learns: parameters, their Adam moments and named columns, one row each.
+
+A fit has a table of Gaussians. A second one, of its training views, has a row a view; it is empty unless a loss term asks for
+parameters of each view.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+
+from warpgs.kernels.adam import adam_scheduled, scheduled_lrs
+from warpgs.kernels.knn import morton_codes
+from warpgs.scene import Gaussians
+
+
+@dataclass(frozen=True)
+class Column:
+    """What is known of each row beside its parameters."""
+
+    fill: float
+    """Value of rows of which nothing is known."""
+    dtype: torch.dtype = torch.float32
+    """Type of the values."""
+    inherited: bool = True
+    """A row that grew from another takes its value; else it starts from ``fill``."""
+
+
+@dataclass(frozen=True)
+class DensityUpdate:
+    """A change of the set of Gaussians: rows that stay, rows that are overwritten, rows that are appended."""
+
+    keep: torch.Tensor
+    """Numbers of the surviving rows in ascending order, int64, shape [S]."""
+    added: Mapping[str, torch.Tensor]
+    """New rows of each parameter, shape [A, ...]; their moments start at zero."""
+    parents: torch.Tensor
+    """For each new row the number of the row it grew from, -1 for none, int64, shape [A]."""
+    columns: Mapping[str, float] = field(default_factory=dict)
+    """Values of columns for new rows without a parent, and of columns that are not inherited; the column's ``fill`` where
+    nothing is said."""
+    overwritten: torch.Tensor | None = None
+    """Numbers of rows, before the change, whose parameters are replaced and whose moments start again at zero, int64, shape
+    [R]; None for none."""
+    values: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    """Parameters of the overwritten rows, shape [R, ...]; a parameter that is not named stays as it is."""
+
+
+class Table:
+    """Parameters with Adam moments and columns, kept row by row in step."""
+
+    def __init__(self, params: Mapping[str, torch.Tensor], columns: Mapping[str, Column], device: torch.device, count: int):
+        """Begin with zero moments and filled columns.
+
+        Args:
+            params: Parameters by name, float32, shape [N, ...]; copied.
+            columns: Columns by name.
+            device: Where the table lives.
+            count: Number of rows N.
+        """
+        self.device = device
+        self.params = {n: t.detach().clone().contiguous().requires_grad_() for n, t in params.items()}
+        self.exp_avg = {n: torch.zeros_like(t) for n, t in self.params.items()}
+        self.exp_avg_sq = {n: torch.zeros_like(t) for n, t in self.params.items()}
+        self.kinds = dict(columns)
+        self.columns = {n: torch.full((count,), c.fill, dtype=c.dtype, device=device) for n, c in columns.items()}
+        self.count = count
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return self.count
+
+    @staticmethod
+    def of_gaussians(gaussians: Gaussians, columns: Mapping[str, Column]) -> Table:
+        """Return the table of a set of Gaussians."""
+        return Table(gaussians.tensors(), columns, gaussians.means.device, len(gaussians))
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The current parameters as Gaussians; they require gradients."""
+        return Gaussians(**self.params)
+
+    def lr_row(self, lrs: Mapping[str, float], step: int, head_lrs: Mapping[str, float]) -> list[float]:
+        """Return what `adam_step` reads from memory at a step, 3 numbers a parameter, in order.
+
+        Args:
+            lrs: Learning rate of each parameter.
+            step: Number of the step, from 1.
+            head_lrs: Learning rate of the first 3 numbers of each row, for parameters where it differs.
+        """
+        row = []
+        for name in self.params:
+            row += scheduled_lrs(lrs[name], step, head_lr=head_lrs.get(name))
+        return row
+
+    @torch.no_grad()
+    def adam_step(
+        self, gradients: Mapping[str, torch.Tensor], lrs: torch.Tensor, skip: torch.Tensor, factors: torch.Tensor | None = None
+    ) -> None:
+        """Update all parameters; nothing changes where ``skip`` [1] is not 0.
+
+        Args:
+            gradients: Gradient of each parameter, in the order of the table.
+            lrs: A row of `lr_row`, float32, shape [3 P].
+            skip: 0, or why the step is not taken, int32, shape [1].
+            factors: Part of its step that each mean takes, shape [N]; None for all of it. Adam makes the size of a step
+                independent of the gradient's, so the part is taken of the step.
+        """
+        before = None if factors is None else self.params["means"].detach().clone()
+        for i, (name, gradient) in enumerate(gradients.items()):
+            state = (self.params[name].detach(), gradient, self.exp_avg[name], self.exp_avg_sq[name])
+            adam_scheduled(*state, lrs[3 * i : 3 * i + 3], skip, head=3 if name == "sh" else 0)
+        if factors is not None:
+            means = self.params["means"].detach()
+            means.copy_(torch.where(factors[:, None] == 1, means, before + factors[:, None] * (means - before)))
+
+    @torch.no_grad()
+    def apply(self, update: DensityUpdate) -> None:
+        """Follow a change of the set: kept rows keep everything, new rows start with zero moments."""
+        if update.overwritten is not None:
+            self._overwrite(update.overwritten, update.values)
+        keep, parents = update.keep, update.parents
+        for name in self.params:  # each old tensor is given up before the next is made
+            added = update.added[name].to(self.params[name].dtype)
+            self.params[name] = torch.cat([self.params[name].detach()[keep], added]).requires_grad_()
+            for moments in (self.exp_avg, self.exp_avg_sq):
+                moments[name] = torch.cat([moments[name][keep], torch.zeros_like(added)])
+        for name, kind in self.kinds.items():
+            old = self.columns[name]
+            new = old.new_full((len(parents),), update.columns.get(name, kind.fill))
+            if kind.inherited and len(parents):
+                new = torch.where(parents >= 0, old[parents.clamp_min(0)], new)
+            self.columns[name] = torch.cat([old[keep], new])
+        self.count = len(keep) + len(parents)
+
+    def _overwrite(self, rows: torch.Tensor, values: Mapping[str, torch.Tensor]) -> None:
+        for name, value in values.items():
+            self.params[name].detach()[rows] = value.to(self.params[name].dtype)
+        for moments in (self.exp_avg, self.exp_avg_sq):
+            for t in moments.values():
+                t[rows] = 0
+
+    @torch.no_grad()
+    def reorder(self, order: torch.Tensor) -> None:
+        """Make row i what row ``order[i]`` was; ``order`` is int64, shape [N]."""
+        for group in (self.params, self.exp_avg, self.exp_avg_sq, self.columns):
+            for name in group:
+                group[name] = group[name].detach()[order]
+        for param in self.params.values():
+            param.requires_grad_()
+
+    def sort_along_curve(self) -> None:
+        """Put the Gaussians in Morton order, so that neighbours in space are neighbours in memory."""
+        self.reorder(torch.argsort(morton_codes(self.params["means"].detach()), stable=True))
+
+    @torch.no_grad()
+    def merge(self, rows: Gaussians, into: torch.Tensor) -> None:
+        """Replace the set by one whose Gaussians each stand for some of the old.
+
+        First moments add up as the gradients do, second ones as if the gradients had all had one sign: a step is then rather
+        too short than too long. Summed in float64 on the CPU, where the order is the same every time. Columns are those of the
+        first of the old rows.
+
+        Args:
+            rows: The new set, M rows.
+            into: Row of the new set that each old one went into, -1 for none, int64, shape [N].
+        """
+        went, old = into >= 0, torch.arange(self.count, device=into.device)
+        first = old.new_full((len(rows),), self.count).scatter_reduce(0, into[went], old[went], "amin")
+        for name in self.columns:
+            self.columns[name] = self.columns[name][first]
+        into = into.cpu()
+        sources = torch.nonzero(into >= 0).squeeze(1)
+        for name, new in rows.tensors().items():
+            for moments, power in ((self.exp_avg, 1.0), (self.exp_avg_sq, 0.5)):
+                each = moments[name].double().cpu()[sources] ** power
+                total = each.new_zeros(new.shape).index_add_(0, into[sources], each)
+                moments[name] = (total ** (1 / power)).to(moments[name])
+            self.params[name] = new.detach().to(self.params[name].dtype).contiguous().requires_grad_()
+        self.count = len(rows)
+
+    def reset_opacities(self, opacity: float) -> None:
+        """Lower every opacity to at most this, in (0, 1), and forget the moments of all opacities (the classic reset)."""
+        limit = math.log(opacity / (1 - opacity))  # in float64: the smallest float32 opacity would be 0
+        self.params["logit_opacities"] = self.params["logit_opacities"].detach().clamp(max=limit).requires_grad_()
+        self.exp_avg["logit_opacities"].zero_()
+        self.exp_avg_sq["logit_opacities"].zero_()
+
+    def _groups(self) -> dict[str, dict[str, torch.Tensor]]:
+        return {"params": self.params, "exp_avg": self.exp_avg, "exp_avg_sq": self.exp_avg_sq, "columns": self.columns}
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Return everything by flat names, ``params.means`` for one, as a checkpoint stores it."""
+        return {f"{group}.{n}": t.detach() for group, tensors in self._groups().items() for n, t in tensors.items()}
+
+    def load(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Take over what `state` gave."""
+        for group, tensors in self._groups().items():
+            for name in tensors:
+                tensors[name] = state[f"{group}.{name}"].to(self.device).contiguous()
+        for t in self.params.values():
+            t.requires_grad_()
+        self.count = len(next(iter(self.params.values()))) if self.params else self.count

@@ -1,0 +1,1 @@
+"""Run folders: written by a fit, read by the other commands."""

@@ -1,0 +1,104 @@
+"""Checkpoints: safetensors for numbers, JSON for the rest, replaced atomically and verified; never a pickle."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from warpgs import __version__
+from warpgs.errors import DataError, NotFiniteError
+from warpgs.files import write_bytes
+
+TENSORS = "checkpoint.safetensors"
+FORMAT = 2
+"""Number of the format of run folders: config.json and the checkpoint. 1 was that of warpgs 0.1.0."""
+DTYPES = {torch.float64: "F64", torch.float32: "F32", torch.int64: "I64", torch.int32: "I32", torch.uint8: "U8"}
+"""Names of scalar types in the format."""
+
+
+def _chunks(tensors: dict[str, torch.Tensor], metadata: dict[str, str]) -> list[memoryview | bytes]:
+    """Return a safetensors file in pieces; those of tensors on the CPU are their own memory, so nothing is held twice."""
+    ordered = sorted(tensors.items(), key=lambda item: (-item[1].element_size(), item[0]))  # aligned for every reader
+    parts = [t.detach().cpu().contiguous().reshape(-1).view(torch.uint8) for _, t in ordered]
+    header: dict[str, Any] = {"__metadata__": metadata}
+    end = 0
+    for (name, t), part in zip(ordered, parts):
+        begin, end = end, end + len(part)
+        header[name] = {"dtype": DTYPES[t.dtype], "shape": list(t.shape), "data_offsets": [begin, end]}
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)
+    return [len(text).to_bytes(8, "little"), text, *(p.numpy().data for p in parts)]
+
+
+def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> Path:
+    """Write one checkpoint, replacing the last one only once the new one is complete on disk.
+
+    ``state`` travels in the header of the same file, so tensors and state can never be of two different steps.
+
+    Args:
+        folder: The run folder.
+        tensors: Of the types in `DTYPES`, on any device.
+        state: Values that JSON can hold.
+
+    Returns:
+        The file's path.
+
+    Raises:
+        NotFiniteError: A tensor holds a NaN or an infinity; the last checkpoint is untouched.
+        ResourceError: The disk is full or not writable; the last checkpoint is untouched.
+    """
+    path = folder / TENSORS
+    for name, t in tensors.items():
+        # the extremes tell without a copy, since torch lets a NaN win
+        if t.is_floating_point() and t.numel() and not all(math.isfinite(float(v)) for v in t.aminmax()):
+            raise NotFiniteError(
+                f"{path} was not written: {name} holds numbers that are not finite, so nothing after the last checkpoint, if "
+                "there is one, can be trusted. A fit repeats exactly: continued with --resume, it comes to the same place; "
+                "other settings, lower learning rates above all, lead elsewhere"
+            )
+    metadata = {"format": str(FORMAT), "version": __version__, "state": json.dumps(state)}
+    chunks = _chunks(tensors, metadata)
+    digest = hashlib.sha256()
+    for chunk in chunks:
+        digest.update(chunk)
+    write_bytes(path, *chunks, digest.digest())
+    return path
+
+
+def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Read a checkpoint back.
+
+    Returns:
+        Tensors by name on the CPU, shapes [...] as they were saved, and the state.
+
+    Raises:
+        DataError: There is none, or it is not whole: truncated, altered, or of another format.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    path = folder / TENSORS
+    if not path.is_file():
+        raise DataError(f"{folder} holds no {TENSORS}: there is nothing to continue or to render from; run `warpgs fit` first")
+    data = path.read_bytes()
+    body, digest = data[:-32], data[-32:]
+    if hashlib.sha256(body).digest() != digest:
+        raise DataError(f"{path}: the checksum does not match, so the file was truncated or altered; fit again, or restore it")
+    try:
+        tensors = load(body)
+        length = int.from_bytes(body[:8], "little")
+        metadata = json.loads(body[8 : 8 + length])["__metadata__"]
+    except (SafetensorError, KeyError, ValueError) as e:
+        raise DataError(f"{path} is not a warpgs checkpoint ({e})") from e
+    if metadata.get("format") != str(FORMAT):
+        version = metadata.get("version", "0.1.0")
+        raise DataError(
+            f"{path}: this checkpoint is of warpgs {version}, in a format that warpgs {__version__} does not read. Open it "
+            f"with warpgs {version}, or fit the scene again into a new --out"
+        )
+    return tensors, json.loads(metadata["state"])

@@ -1,0 +1,101 @@
+"""Commands on a run that is there: score it again, render it, export it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from warpgs.errors import DataError, UsageError
+from warpgs.export.ply import write_ply
+from warpgs.files import write_json
+from warpgs.io.splits import Split
+from warpgs.pipeline.metrics.lpips import load_lpips
+from warpgs.pipeline.model.compress import drop_unused_sh
+from warpgs.pipeline.runs.camera_paths import PATHS
+from warpgs.pipeline.runs.folder import StoredRun, open_run
+from warpgs.pipeline.runs.paths import FILM, render_path
+from warpgs.pipeline.runs.request import choose_device, read_scene
+from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line
+from warpgs.pipeline.train.trainer import train_views
+from warpgs.scene import Scene, View
+
+
+def scene_of(stored: StoredRun, reader: str | None = None) -> tuple[Scene, list[View], list[View]]:
+    """Read the scene that a run was fitted to; returns it with its training and its held-out views.
+
+    Args:
+        stored: The run.
+        reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
+
+    Raises:
+        DataError: The scene is gone, or its images or cameras have changed since the fit.
+    """
+    scene, _, _ = read_scene(stored.scene_request(reader))
+    if scene.fingerprint != stored.record["fingerprint"]:
+        raise DataError(f"{scene.path}: its images or cameras are not those that {stored.folder} was fitted to; restore them")
+    split = Split(stored.train, stored.test)
+    return scene, train_views(scene, split.train), train_views(scene, split.test)
+
+
+def evaluate(folder: Path, device_name: str, lpips_weights: Path | None = None, reader: str | None = None) -> list[str]:
+    """Score a run on its held-out views and render them again; returns lines for the user.
+
+    The scores go to eval.json beside metrics.json, which stays as the fit wrote it.
+
+    Args:
+        folder: The run folder.
+        device_name: auto, cpu or cuda.
+        lpips_weights: File of `warpgs convert-lpips`; without one LPIPS is not measured.
+        reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
+
+    Raises:
+        DataError: The folder is no run, its scene is gone, the scene's data have changed since the fit, or the weights are
+            no weights.
+    """
+    device, _ = choose_device(device_name)
+    lpips = None if lpips_weights is None else load_lpips(lpips_weights, device)
+    stored = open_run(folder, device)
+    scene, train, test = scene_of(stored, reader)
+    request = stored.scene_request(reader)
+    metrics = evaluate_run(folder, stored.gaussians(), train, test, stored.rule, stored.background, lpips)
+    metrics |= {
+        "protocol": protocol_of(scene, request.split, request.downscale, train, test),
+        "config_hash": stored.record["config_hash"], "steps": stored.step,
+    }  # fmt: skip
+    write_json(folder / "eval.json", metrics)
+    if not test:
+        return [f"no view is held out; training PSNR {metrics['train']['psnr']:.2f} dB"]
+    lines = [f"{r['name']}: PSNR {r['psnr']:.2f} dB, SSIM {r['ssim']:.4f} ({r['region']})" for r in metrics["views"]]
+    return [*lines, f"mean of {len(test)}: {score_line(metrics['test'])}"]
+
+
+def render(folder: Path, kind: str, out: Path | None, frames: int, fps: int, device_name: str) -> str:
+    """Render a run along a path to PNG files and a film; returns a line for the user.
+
+    Raises:
+        DataError: The folder is no run.
+        ResourceError: A file cannot be written.
+        UsageError: The path is unknown.
+    """
+    if kind not in PATHS:
+        raise UsageError(f"path {kind!r} is not one of {', '.join(PATHS)}")
+    out = folder / f"path-{kind}" if out is None else out
+    *files, last = render_path(open_run(folder, device_name), kind, out=out, frames=frames, fps=fps)
+    if last.name == FILM:
+        return f"{len(files)} images and {FILM} in {out}"
+    return f"{len(files) + 1} images in {out}; no film, since the views differ in size"
+
+
+def export(folder: Path, target: Path) -> str:
+    """Write a run's Gaussians to a file, in the units of the scene's files; returns a line for the user.
+
+    Raises:
+        DataError: The folder is no run.
+        UsageError: The suffix is not supported.
+    """
+    if target.suffix.lower() != ".ply":
+        raise UsageError(f"{target}: format {target.suffix or '(none)'} is not supported; use .ply")
+    stored = open_run(folder, torch.device("cpu"))
+    write_ply(target, drop_unused_sh(stored.gaussians()), stored.normalization)
+    return f"{len(stored.gaussians()):,} Gaussians in {target}"

@@ -1,0 +1,330 @@
+"""One fit from scene to result: `warpgs.fit`, which the command line calls, too."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from warpgs.errors import UsageError, WarpgsError
+from warpgs.export.ply import write_ply
+from warpgs.files import write_json
+from warpgs.io.splits import Split
+from warpgs.pipeline.metrics.lpips import Lpips, load_lpips
+from warpgs.pipeline.model.compress import drop_unused_sh
+from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
+from warpgs.pipeline.runs.folder import CONFIG, check_same, prepare_folder, read_record, record_of
+from warpgs.pipeline.runs.model_file import FittedModel
+from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device, choose_split, read_scene
+from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line, write_report
+from warpgs.pipeline.runs.rule_report import rule_report_of
+from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, sampling_report_of
+from warpgs.pipeline.train.complexity import complexity_figures, complexity_summary
+from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESETS, FitConfig
+from warpgs.pipeline.train.time_budget import within_budget
+from warpgs.pipeline.train.trainer import StepReport, Trainer, run, train_views
+from warpgs.pipeline.train.warmup import rehearsal
+from warpgs.report.events import EventLog
+from warpgs.report.progress import Progress
+from warpgs.scene import Scene, View
+
+State = tuple[dict[str, torch.Tensor], dict[str, Any]]
+"""Tensors and plain values of a checkpoint."""
+
+
+@dataclass(frozen=True)
+class FitResult(FittedModel):
+    """A finished fit."""
+
+    config: FitConfig
+    """All settings, those chosen by the time budget included."""
+    metrics: dict[str, Any]
+    """Scores, sizes and times, as metrics.json holds them."""
+    notes: tuple[str, ...]
+    """Choices made for the user, assumptions, and anything missing."""
+    folder: Path | None
+    """The run folder; None where none was asked for."""
+
+
+@dataclass
+class _Job:
+    """One fit in progress: its inputs, and what is known of it so far."""
+
+    scene: Scene
+    request: SceneRequest
+    split: Split
+    config: FitConfig
+    device: torch.device
+    where: str
+    out: Path | None
+    lpips: Lpips | None
+    notes: list[str]
+    verbose: bool
+    on_step: Callable[[StepReport], object] | None
+    began: float
+
+    @property
+    def train(self) -> list[View]:
+        """Views to fit."""
+        return train_views(self.scene, self.split.train)
+
+    @property
+    def test(self) -> list[View]:
+        """Views held out."""
+        return train_views(self.scene, self.split.test)
+
+    def say(self, line: str) -> None:
+        """Print a line for the user, unless the fit is to be silent."""
+        if self.verbose:
+            print(line)
+
+
+def preset_config(config: FitConfig | str | None, device: torch.device) -> FitConfig:
+    """Return the settings for a preset's name, for settings themselves, or for None: the usual preset of the device's kind.
+
+    Raises:
+        UsageError: There is no such preset.
+    """
+    if isinstance(config, FitConfig):
+        return config
+    name = DEFAULT_PRESET[device.type] if config is None else config
+    if name not in PRESETS:
+        raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
+    return PRESETS[name]
+
+
+def fit(
+    scene: Scene | SceneRequest | str | Path,
+    config: FitConfig | str | None = None,
+    *,
+    split: str | None = None,
+    out: str | Path | None = None,
+    device: str | torch.device = "auto",
+    on_step: Callable[[StepReport], object] | None = None,
+    resume: bool = False,
+    lpips_weights: str | Path | None = None,
+    time_budget: float | None = None,
+    notes: tuple[str, ...] = (),
+    verbose: bool = True,
+) -> FitResult:
+    """Fit Gaussians to a scene: the same code as `warpgs fit`.
+
+    Prints every choice made for the user, progress, and where the results are, unless ``verbose`` is False.
+
+    Args:
+        scene: A scene, its folder, or a folder with the options it is read with.
+        config: Settings, the name of a preset, or None for the usual preset of the device's kind.
+        split: Views to fit and to hold out, as in `warpgs fit --split`; None for the default of the scene's format.
+        out: Run folder to fill with configuration, log, checkpoints, PLY, images, scores and report; None to write nothing.
+        device: auto, cpu, cuda, or one of torch's.
+        on_step: Called after every step with its number, loss, PSNR, number of Gaussians and time.
+        resume: Continue the run in ``out`` from its last checkpoint.
+        lpips_weights: File of `warpgs convert-lpips`; None to leave LPIPS out.
+        time_budget: Time that the fit may take [s], by which its steps are chosen; None for those of ``config``.
+        notes: Choices made before, to be printed and recorded with the fit's own.
+        verbose: Whether to print.
+
+    Raises:
+        UsageError: Settings, a preset or a split cannot be, ``out`` holds something already, or ``resume`` comes without it.
+        WarpgsError: Anything else that a user can fix; before the first step wherever it can be known by then.
+    """
+    out = None if out is None else Path(out)
+    if resume and out is None:
+        raise UsageError("resume needs the run folder that it continues: give out")
+    if out is not None:
+        prepare_folder(out, resume)
+        if resume:
+            read_record(out)  # a run of another version is refused before anything takes time
+    try:
+        where = choose_device(device)
+        began = time.perf_counter()
+        lpips = None if lpips_weights is None else load_lpips(Path(lpips_weights), where[0])
+        request, read, parts, found = _scene_of(scene, split)
+        job = _Job(
+            read, request, parts, preset_config(config, where[0]), *where, out, lpips, [*notes, *found], verbose, on_step, began
+        )
+        if time_budget is not None:
+            job.config, note = within_budget(job.config, time_budget, job.train, job.device)
+            job.notes.append(note)
+        trainer, state, record = _prepare(job, out if resume else None)
+    except WarpgsError:
+        if out is not None and not resume:
+            out.rmdir()  # nothing is in it yet
+        raise
+    return _finish(job, trainer, state, record, resume)
+
+
+def fit_request(request: FitRequest) -> FitResult:
+    """Run `fit` as the command line or a study asks for it."""
+    r = request
+    return fit(
+        r.scene, r.config, out=r.out, device=r.device, resume=r.resume, lpips_weights=r.lpips_weights,
+        time_budget=r.time_budget, notes=r.notes,
+    )  # fmt: skip
+
+
+def _scene_of(scene: Scene | SceneRequest | str | Path, spec: str | None) -> tuple[SceneRequest, Scene, Split, list[str]]:
+    """Read and split a scene that is given in one of four ways; its notes come last."""
+    if isinstance(scene, Scene):
+        split, notes = choose_split(scene, spec)
+        return SceneRequest("", spec), scene, split, [*scene.notes, *notes]
+    request = scene if isinstance(scene, SceneRequest) else SceneRequest(str(scene))
+    if spec is not None:
+        request = replace(request, split=spec)
+    return request, *read_scene(request)
+
+
+def _prepare(job: _Job, resumed: Path | None) -> tuple[Trainer, State | None, dict[str, Any]]:
+    """Set up the trainer; returns it, the state to continue the run ``resumed`` from, if any, and the record of the run."""
+    record, state = record_of(job.request, job.config, job.scene, job.split, job.notes, job.device), None
+    if resumed is not None:
+        check_same(record, read_record(resumed), resumed)
+        if (resumed / TENSORS).is_file():
+            state = load_checkpoint(resumed)
+    c = job.config
+    with rehearsal(c, job.device) as ready:
+        trainer = Trainer(job.train, job.scene.points, c, job.device, job.scene.background, ready=ready)
+    if job.device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(job.device)  # the steps' need is told, not the start's or an earlier fit's
+    return trainer, state, record
+
+
+def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, Any], resume: bool) -> FitResult:
+    """Take the steps, score the model, and write the run folder where there is one."""
+    if job.out is not None and not resume:
+        write_json(job.out / CONFIG, record)
+    if state is not None:
+        trainer.load(*state)
+        job.notes.append(f"continued from step {trainer.step}")
+    _announce(job, trainer)
+    setup = time.perf_counter() - job.began
+    with contextlib.nullcontext() if job.out is None else images_kept(trainer, list(job.split.train), job.out):
+        _train(job, trainer)
+    training = time.perf_counter() - job.began - setup
+    if job.out is not None:
+        write_ply(job.out / "point_cloud.ply", drop_unused_sh(trainer.gaussians), job.scene.normalization)
+    metrics = _score(job, trainer, {"setup": setup, "training": training})
+    if job.out is not None:
+        write_json(job.out / "metrics.json", metrics)
+        record["notes"] = job.notes
+        report = sampling_report_of(trainer, job.out)
+        note = write_report(job.out, job.scene, job.split, trainer.gaussians, metrics, record, report)
+        if note:
+            job.say(f"  {note}")
+    _print_result(job, metrics)
+    cameras = {v.name: v.camera for v in job.scene.views}
+    return FitResult(
+        trainer.gaussians, job.scene.normalization, cameras, job.split.train, job.split.test, job.config.rule,
+        job.scene.background, trainer.step, job.config, metrics, tuple(job.notes), job.out,
+    )  # fmt: skip
+
+
+def _announce(job: _Job, trainer: Trainer) -> None:
+    """Print what is fitted and every choice made for the user."""
+    job.notes += [*trainer.notes, trainer.memory.sentence()]
+    train, test = job.train, job.test
+    size = f"{train[0].camera.width} x {train[0].camera.height} px"
+    job.say(f"{job.scene.path}: {job.scene.format}, {len(train)} views to fit, {len(test)} held out, {size}, {job.where}")
+    for note in job.notes:
+        job.say(f"  {note}")
+
+
+def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, Any]:
+    """Score the finished fit; returns the contents of metrics.json."""
+    c, scene, train, test, gaussians = job.config, job.scene, job.train, job.test, trainer.gaussians
+    on_cuda = job.device.type == "cuda"
+    peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(job.device)} if on_cuda else {}
+    metrics = evaluate_run(job.out, gaussians, train, test, c.rule, scene.background, job.lpips, trainer.max_instances)
+    rule = rule_report_of(
+        gaussians,
+        train,
+        c.rule,
+        scene.background,
+        seed=c.seed,
+        half_resolution=c.half_resolution,
+        max_instances=trainer.max_instances,
+    )
+    job.notes.append(rule["summary"])
+    job.say(f"  {rule['summary']}")
+    return metrics | {
+        "protocol": protocol_of(scene, job.request.split, job.request.downscale, train, test),
+        "steps": trainer.step, "gaussians": len(gaussians), "preset": c.preset, "seed": c.seed,
+        "config_hash": c.fingerprint(), "fingerprint": scene.fingerprint, "device": job.where.removeprefix("on "),
+        "seconds": {**seconds, "total": time.perf_counter() - job.began}, **peak,
+        "memory": trainer.memory.to_json(), "rule": rule, **event_figures(trainer), **complexity_figures(trainer),
+    }  # fmt: skip
+
+
+@contextlib.contextmanager
+def _stop_signals() -> Iterator[Callable[[], bool]]:
+    """Let Ctrl-C and SIGTERM end the fit after the step in progress; a second one ends it at once.
+
+    Gives a function that says whether one came. Elsewhere than in the main thread signals cannot be caught and act as ever.
+    """
+    came = False
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: came
+        return
+
+    def note(*_: object) -> None:
+        nonlocal came
+        came = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: came
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _train(job: _Job, trainer: Trainer) -> None:
+    """Take all remaining steps, with a log and checkpoints where there is a run folder."""
+    out = job.out
+    log = None if out is None else EventLog(out / "metrics.jsonl", trainer.step)
+
+    def save(current: Trainer) -> None:
+        if out is not None and log is not None:
+            log.flush()
+            save_checkpoint(out, *current.state())
+
+    with Progress(trainer.config.steps, trainer.step) if job.verbose else contextlib.nullcontext() as progress:
+
+        def on_step(r: StepReport) -> None:
+            if progress is not None:
+                progress.update(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count)
+            if log is not None:
+                log.write(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=round(r.seconds, 6))
+            while trainer.messages:
+                job.notes.append(trainer.messages.pop(0))
+                job.say(f"  {job.notes[-1]}")
+            if job.on_step is not None:
+                job.on_step(r)
+
+        try:
+            with _stop_signals() as stopped:
+                run(trainer, on_step, save, stopped)
+        finally:
+            if log is not None:
+                log.close()
+
+
+def _print_result(job: _Job, metrics: dict[str, Any]) -> None:
+    """Print scores, sizes and where the results are."""
+    if metrics["test"]:
+        job.say(f"held-out {score_line(metrics['test'])} over {len(metrics['views'])} views")
+        for name, value in metrics["baselines"].items():
+            job.say(f"  without a fit, the {name.replace('_', ' ')} scores {value:.2f} dB")
+    job.say(complexity_summary(metrics))
+    if job.out is None:
+        job.say(f"{metrics['gaussians']:,} Gaussians; no folder was asked for, so nothing is written")
+    else:
+        job.say(f"{metrics['gaussians']:,} Gaussians; report: {job.out / 'report.html'}  images: {job.out / 'renders'}")

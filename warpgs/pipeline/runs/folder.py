@@ -1,0 +1,204 @@
+"""Run folders: what config.json records, the format it is in, and reading a run back."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import platform
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from warpgs import __version__
+from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.io.splits import Split
+from warpgs.pipeline.model.parameter_bounds import unpack
+from warpgs.pipeline.runs.checkpoint import FORMAT, load_checkpoint
+from warpgs.pipeline.runs.model_file import FittedModel
+from warpgs.pipeline.runs.request import SceneRequest, choose_device
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.scene import Camera, Gaussians, Normalization, Scene
+
+CONFIG = "config.json"
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of everything that a result depends on, by name."""
+    names = ("torch", "warp-lang", "numpy", "opencv-contrib-python-headless", "scikit-image", "safetensors")
+    found = {"warpgs": __version__, "python": platform.python_version(), "system": platform.platform(terse=True)}
+    for name in names:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed as a package"
+    return found
+
+
+def prepare_folder(out: Path, resume: bool) -> None:
+    """Make a run folder, or check that one holds a run to continue.
+
+    Raises:
+        ResourceError: The folder cannot be written.
+        UsageError: The folder exists already, or holds no run to continue.
+    """
+    if resume:
+        if not (out / CONFIG).is_file():
+            raise UsageError(f"--resume: {out} holds no {CONFIG}, so there is no run to continue; leave out --resume")
+        return
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UsageError(f"{out} exists already; choose another --out, or continue that run with --resume")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as e:
+        raise ResourceError(f"{out}: cannot be written ({e.strerror}); choose another --out") from e
+
+
+def _camera_values(camera: Camera) -> dict[str, Any]:
+    return {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in vars(camera).items()}
+
+
+def record_of(
+    request: SceneRequest, config: FitConfig, scene: Scene, split: Split, notes: list[str], device: torch.device
+) -> dict[str, Any]:
+    """Return the contents of config.json: format, scene, views, settings, device, versions and cameras."""
+    return {
+        "format": FORMAT, "scene": {**asdict(request), "path": str(Path(request.path).resolve()) if request.path else None},
+        "scene_format": scene.format, "fingerprint": scene.fingerprint,
+        "train": split.train, "test": split.test, "notes": notes,
+        "normalization": {"offset": scene.normalization.offset.tolist(), "scale": scene.normalization.scale},
+        "background": scene.background, "config": config.to_json(), "config_hash": config.fingerprint(),
+        "device": device.type, "versions": versions(),
+        "cameras": {v.name: _camera_values(v.camera) for v in scene.views},
+    }  # fmt: skip
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """Read config.json of a run folder, its format first.
+
+    Raises:
+        DataError: The folder is no run, or another version of warpgs wrote it in a format that this one does not read; the
+            message names that version and the way out.
+    """
+    path = folder / CONFIG
+    try:
+        record = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as e:
+        raise DataError(f"{path}: cannot be read ({e}); give a folder that `warpgs fit --out` filled") from e
+    if not isinstance(record, dict) or "config" not in record:
+        raise DataError(f"{path}: is no record of a fit; give a folder that `warpgs fit --out` filled")
+    if record.get("format") != FORMAT:  # version 0.1.0 stored no number
+        stored = record.get("versions")
+        version = stored.get("warpgs", "unknown") if isinstance(stored, dict) else "unknown"
+        raise DataError(
+            f"{path}: this run is of warpgs {version}, in a format that warpgs {__version__} does not read. Open it with "
+            f"warpgs {version}, or fit the scene again into a new --out; its point_cloud.ply stays readable"
+        )
+    return record
+
+
+def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
+    """Check that a continued run is the same run: same data, views, settings and kind of device.
+
+    Raises:
+        UsageError: It is another, or code of the user's own is not named again.
+    """
+    if "pruned" in stored:
+        raise UsageError(
+            f"--resume: {out} is a pruned model without the state of its fit; continue the run it came from, "
+            f"{stored['pruned']['source']}"
+        )
+    _check_named_again(record["config"], stored["config"], out)
+    for key in ("fingerprint", "train", "test", "config", "device"):
+        now, then = json.loads(json.dumps(record[key])), stored.get(key)
+        if now != then:
+            if isinstance(now, dict) and isinstance(then, dict):
+                changed = [k for k in now if now[k] != then.get(k)]
+                key = f"{key} ({', '.join(changed)})"
+            raise UsageError(
+                f"--resume: {key} differs from the run in {out}; give the flags it was started with, or a new --out"
+            )
+
+
+def _check_named_again(now: dict[str, Any], then: dict[str, Any], out: Path) -> None:
+    """Raise a UsageError where a run used code from outside warpgs that is not named again."""
+
+    def outside(config: dict[str, Any]) -> dict[str, list[str]]:
+        names = {"--strategy": [config.get("strategy")], "--loss-terms": [t["name"] for t in config.get("loss_terms", [])]}
+        return {flag: [n for n in found if isinstance(n, str) and ":" in n] for flag, found in names.items()}
+
+    for flag, names in outside(then).items():
+        if set(names) - set(outside(now)[flag]):
+            raise UsageError(
+                f"--resume: the run in {out} was fitted with {', '.join(names)}, code from outside warpgs. A run folder never "
+                f"decides which code is loaded: name it again with {flag} {','.join(names)}"
+            )
+
+
+@dataclass(frozen=True)
+class StoredRun(FittedModel):
+    """A finished or interrupted run, read from its folder."""
+
+    folder: Path
+    """The run folder."""
+    record: dict[str, Any]
+    """Contents of its config.json."""
+
+    def scene_request(self, reader: str | None = None) -> SceneRequest:
+        """Return the scene that was fitted, as it was read.
+
+        Args:
+            reader: A reader from outside warpgs, which must be named again: a run folder never decides which code is loaded.
+
+        Raises:
+            DataError: The scene was passed from Python and lies in no folder.
+            UsageError: The scene was read with another reader from outside warpgs.
+        """
+        if self.record["scene"]["path"] is None:
+            raise DataError(
+                f"{self.folder}: its scene was passed from Python, so there is no folder to read it from; score the model "
+                "there with warpgs.evaluate"
+            )
+        request = SceneRequest(**self.record["scene"])
+        if request.reader is not None and ":" in request.reader and reader != request.reader:
+            raise UsageError(
+                f"{self.folder}: its scene was read with {request.reader}, code from outside warpgs. A run folder never "
+                f"decides which code is loaded: name it again with --reader {request.reader}"
+            )
+        return request
+
+
+def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredRun:
+    """Read a finished or interrupted run.
+
+    Args:
+        folder: The run folder.
+        device: Device of the tensors: auto, cpu, cuda, or one of torch's.
+
+    Raises:
+        DataError: The folder is no run folder, another version of warpgs wrote it, or its checkpoint is not whole.
+        ResourceError: The device is not there.
+    """
+    folder = Path(folder)
+    where, _ = choose_device(device)
+    record = read_record(folder)
+    try:
+        cameras = {n: Camera(**(c | {k: np.array(c[k]) for k in ("viewmat", "K")})) for n, c in record["cameras"].items()}
+        n = record["normalization"]
+        normalization = Normalization(np.array(n["offset"]), n["scale"])
+        train, test = tuple(record["train"]), tuple(record["test"])
+        red, green, blue = record["background"]
+        rule = record["config"]["rule"]
+    except (KeyError, TypeError, ValueError) as e:
+        raise DataError(f"{folder / CONFIG}: is not whole ({e!r} is missing or malformed); fit again, or restore it") from e
+    tensors, state = load_checkpoint(folder)
+    if "params.sh_packed" in tensors:
+        tensors["params.sh"] = unpack(tensors["params.sh_packed"], tensors["degrees"])
+    gaussians = Gaussians(**{n: tensors[f"params.{n}"].to(where) for n in Gaussians.__dataclass_fields__})
+    background = (red, green, blue)
+    return StoredRun(gaussians, normalization, cameras, train, test, rule, background, state["step"], folder, record)

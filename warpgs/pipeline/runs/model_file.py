@@ -1,0 +1,126 @@
+"""Models: Gaussians with the similarity to the coordinates of their scene's files, in memory and as one safetensors file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from warpgs import __version__
+from warpgs.coordinates import checked_normalization, convert_camera, convert_gaussians
+from warpgs.errors import DataError, UsageError
+from warpgs.files import write_bytes
+from warpgs.pipeline.metrics.evaluate import options_for
+from warpgs.render.rasterize import RasterizeOptions
+from warpgs.scene import Camera, Gaussians, Normalization
+
+FORMAT = "warpgs-model-1"
+
+
+@dataclass(frozen=True)
+class Model:
+    """A set of Gaussians that knows both systems of units."""
+
+    scene_gaussians: Gaussians
+    """The Gaussians in scene units [u]."""
+    normalization: Normalization
+    """Similarity from file to scene units."""
+
+    def gaussians(self, units: str = "scene") -> Gaussians:
+        """Return the Gaussians in ``scene`` units, as cameras of a `Scene` are, or in those of the scene's ``file``."""
+        return convert_gaussians(self.scene_gaussians, self.normalization, "scene", units)
+
+
+@dataclass(frozen=True)
+class FittedModel(Model):
+    """A model with the cameras it was fitted to and the settings it is rendered with."""
+
+    scene_cameras: dict[str, Camera]
+    """Cameras of all views of the scene by name, in scene units [u]."""
+    train: tuple[str, ...]
+    """Names of the views that were fitted."""
+    test: tuple[str, ...]
+    """Names of the views held out."""
+    rule: str
+    """Cut-offs of the rasterizer that the fit used."""
+    background: tuple[float, float, float]
+    """Colour behind the scene."""
+    step: int
+    """Steps done."""
+
+    def cameras(self, units: str = "scene") -> dict[str, Camera]:
+        """Return the cameras of all views by name, in ``scene`` or ``file`` units."""
+        return {n: convert_camera(c, self.normalization, "scene", units) for n, c in self.scene_cameras.items()}
+
+    def options(self) -> RasterizeOptions:
+        """Return the rasterizer's options of the fit: rule and background."""
+        return options_for(self.rule, self.background, self.scene_gaussians)
+
+
+def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | None = None, units: str = "scene") -> None:
+    """Write a model to a safetensors file, which appears whole or not at all.
+
+    Tensors are stored as they are; the header names their units and holds the normalization.
+
+    Args:
+        path: File to write; an existing one is replaced.
+        gaussians: N Gaussians, on any device.
+        normalization: Similarity from file to scene units; None for Gaussians in file units that belong to no scene.
+        units: Units that ``gaussians`` are in: scene or file.
+
+    Raises:
+        DataError: A number is not finite, or the normalization is no similarity.
+        ResourceError: The file cannot be written.
+        UsageError: The units are unknown, or scene units come without a normalization.
+    """
+    from safetensors.torch import save as to_bytes
+
+    normalization = checked_normalization(normalization, units, f"{path}: not written")
+    tensors = {n: t.detach().cpu().contiguous() for n, t in gaussians.tensors().items()}
+    for name, t in tensors.items():
+        if not bool(torch.isfinite(t).all()):
+            raise DataError(
+                f"{path}: not written, {name} holds numbers that are not finite; save an earlier state of the model"
+            )
+    header = {
+        "format": FORMAT, "version": __version__, "units": units, "scale": repr(float(normalization.scale)),
+        "offset": json.dumps([float(v) for v in normalization.offset]),
+    }  # fmt: skip
+    write_bytes(Path(path), to_bytes(tensors, header))
+
+
+def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
+    """Read a model that `save` wrote; `Model.gaussians` gives its Gaussians in either system of units.
+
+    Args:
+        path: The file.
+        device: Device of the tensors.
+
+    Raises:
+        DataError: The file is missing, damaged, or no model.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load as from_bytes
+
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+        tensors = from_bytes(data)
+        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__", {})
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({e.strerror or e}); check the path and its permissions") from e
+    except (SafetensorError, ValueError) as e:
+        raise DataError(f"{path}: is damaged or no safetensors file ({e}); write it again with warpgs.save") from e
+    names = Gaussians.__dataclass_fields__
+    if header.get("format") != FORMAT or tensors.keys() != names.keys():
+        raise DataError(f"{path}: is no model of format {FORMAT}; write it with warpgs.save, or read PLY with warpgs.read_ply")
+    try:
+        found = Normalization(np.array(json.loads(header["offset"]), np.float64), float(header["scale"]))
+        normalization = checked_normalization(found, units := header["units"], str(path))
+    except (KeyError, ValueError, UsageError) as e:
+        raise DataError(f"{path}: its header is damaged ({e}); write it again with warpgs.save") from e
+    gaussians = Gaussians(**{n: tensors[n].to(device) for n in names})
+    return Model(convert_gaussians(gaussians, normalization, units, "scene"), normalization)

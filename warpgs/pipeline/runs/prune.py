@@ -1,0 +1,136 @@
+"""Pruning of a finished model: Gaussians and harmonics that its training views do not miss go (docs/complexity.md)."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import secrets
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.export.ply import write_ply
+from warpgs.files import write_json
+from warpgs.pipeline.metrics.evaluate import render_view, to_8_bit
+from warpgs.pipeline.metrics.psnr import psnr
+from warpgs.pipeline.metrics.region import scored_region
+from warpgs.pipeline.model import compress
+from warpgs.pipeline.model.parameter_bounds import model_bytes, pack
+from warpgs.pipeline.runs.checkpoint import save_checkpoint
+from warpgs.pipeline.runs.commands import scene_of
+from warpgs.pipeline.runs.folder import CONFIG, StoredRun, open_run
+from warpgs.pipeline.runs.request import choose_device
+from warpgs.pipeline.train.views import TrainingView
+from warpgs.render.rasterize import RasterizeOptions
+from warpgs.runtime.byte_units import format_bytes
+from warpgs.scene import Gaussians, Normalization, View
+
+
+def mean_psnr(gaussians: Gaussians, views: list[View], options: RasterizeOptions) -> float:
+    """Return the mean PSNR [dB] over views as in `warpgs eval`: rounded to 8 bits, over scored pixels; NaN without views."""
+    if not views:
+        return math.nan
+    scores = []
+    for v in views:
+        image = to_8_bit(render_view(gaussians, v, options)[0])
+        scores.append(psnr(image, to_8_bit(v.image), scored_region(v)[0]))
+    return float(np.mean(scores))
+
+
+def _new_folder(folder: Path, out: Path | None) -> Path:
+    """Return the folder to write; UsageError where it exists already, or cannot be made."""
+    out = folder.with_name(f"{folder.resolve().name}-pruned") if out is None else out
+    if out.exists():
+        raise UsageError(f"{out} exists already; choose another --out")
+    if not out.parent.is_dir():
+        raise UsageError(f"{out.parent} is no folder; make it first, or choose another --out")
+    return out
+
+
+def _write(out: Path, record: dict[str, Any], made: compress.Pruned, step: int, normalization: Normalization) -> None:
+    """Write the new run folder, whole or not at all."""
+    temporary = out.with_name(f".{out.name}.{secrets.token_hex(4)}.tmp")
+    tensors = {f"params.{n}": t for n, t in made.gaussians.tensors().items() if n != "sh"}
+    tensors |= {"params.sh_packed": pack(made.gaussians.sh, made.degrees), "degrees": made.degrees}
+    try:
+        temporary.mkdir()
+        write_json(temporary / CONFIG, record)
+        save_checkpoint(temporary, tensors, {"step": step})
+        write_ply(temporary / "point_cloud.ply", made.gaussians, normalization)
+        os.rename(temporary, out)
+    except OSError as e:
+        raise ResourceError(f"{out}: cannot be written ({e.strerror or e}); choose another --out") from e
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str, reader: str | None = None) -> list[str]:
+    """Shrink a run's model so that the mean PSNR over its training views falls by no more than ``keep_psnr`` [dB].
+
+    The new folder holds config.json, a checkpoint that stores each Gaussian's real degree, and the PLY file; `warpgs eval`,
+    `render` and `export` take it as they take the run.
+
+    Args:
+        folder: The run folder, which stays as it is.
+        keep_psnr: Allowed loss, above 0.
+        out: Folder to write; None for the run's name with ``-pruned``.
+        device_name: auto, cpu or cuda.
+        reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
+
+    Returns:
+        Lines for the user.
+
+    Raises:
+        DataError: The folder is no run, its scene is gone, or the scene's data have changed since the fit.
+        ResourceError: The new folder cannot be written, or the device is not there.
+        UsageError: ``keep_psnr`` is not above 0, or the new folder exists.
+    """
+    if not 0 < keep_psnr < math.inf:
+        raise UsageError(f"--keep-psnr must be above 0 dB, not {keep_psnr}; 0.1 is a loss that nobody sees")
+    device, _ = choose_device(device_name)
+    stored = open_run(folder, device)
+    out = _new_folder(folder, out)
+    _, train, test = scene_of(stored, reader)
+    before, options = stored.gaussians(), stored.options()
+    made = _pruned(stored, train, options, keep_psnr)
+
+    degrees = compress.stored_degrees(before.sh)
+    sizes = [model_bytes(d) for d in (degrees, made.degrees)]
+    scores = [(mean_psnr(before, v, options), mean_psnr(made.gaussians, v, options)) for v in (train, test)]
+    figures: dict[str, Any] = {
+        "source": str(folder.resolve()), "keep_psnr": keep_psnr, "count": [len(before), len(made.degrees)], "bytes": sizes,
+        "mean_degree": [float(d.double().mean()) for d in (degrees, made.degrees)],
+        "train_psnr": scores[0], "test_psnr": scores[1] if test else None,
+    }  # fmt: skip
+    _write(out, stored.record | {"pruned": figures}, made, stored.step, stored.normalization)
+    lines = [
+        f"{len(before):,} -> {len(made.degrees):,} Gaussians, mean SH degree {figures['mean_degree'][0]:.2f} -> "
+        f"{figures['mean_degree'][1]:.2f}",
+        f"{format_bytes(sizes[0])} -> {format_bytes(sizes[1])} uncompressed, {sizes[0] / sizes[1]:.2f} times smaller",
+        f"training PSNR {scores[0][0]:.2f} -> {scores[0][1]:.2f} dB over {len(train)} views",
+    ]
+    if test:
+        lines.append(f"held-out PSNR {scores[1][0]:.2f} -> {scores[1][1]:.2f} dB over {len(test)} views")
+    return [*lines, f"in {out}: checkpoint, PLY; `warpgs eval {out}` scores it, `warpgs render {out}` renders it"]
+
+
+def _pruned(stored: StoredRun, train: list[View], options: RasterizeOptions, keep_psnr: float) -> compress.Pruned:
+    """Prune the model of a run; DataError where its PSNR on the training views is not finite."""
+    before = stored.gaussians()
+    device = before.means.device
+    whole = mean_psnr(before, train, options)
+    if not math.isfinite(whole):
+        raise DataError(
+            f"{stored.folder}: its PSNR on the training views is {whole} dB, so no loss of it can be kept small; fit again"
+        )
+    kinds = torch.zeros(len(before), dtype=torch.int64, device=device)
+    view_set = compress.ViewSet([TrainingView.of(v, device).camera for v in train], options, stored.record["config"]["seed"])
+    made = compress.prune_model(
+        before, kinds, view_set, lambda g, fraction: mean_psnr(g, train, options) >= whole - fraction * keep_psnr
+    )
+    return dataclasses.replace(made, gaussians=compress.drop_unused_sh(made.gaussians))

@@ -1,0 +1,118 @@
+"""Requests for a fit, and the scene and the device that they name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from warpgs.errors import ResourceError, UsageError
+from warpgs.io.load import load_scene
+from warpgs.io.splits import Split, coincident_views, default_split, split_views
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.scene import Scene
+
+
+@dataclass(frozen=True)
+class SceneRequest:
+    """A scene folder and the options it is read with."""
+
+    path: str
+    """Folder of the scene; empty where it was passed from Python."""
+    split: str | None = None
+    """Views to fit and to hold out, as in `warpgs fit --split`; None for the format's default."""
+    downscale: int = 1
+    """Factor by which both image sides shrink."""
+    strict: bool = False
+    """A frame without an image file is an error."""
+    allow_outside: bool = False
+    """The scene may name image files outside its folder."""
+    invert_masks: bool = False
+    """White in a mask removes a pixel."""
+    score_masks: str | None = None
+    """Folder of object masks for scoring, matched by image id; None for the scene's own `idrmasks`, if any."""
+    reader: str | None = None
+    """Name of the reader, ``module:Class`` or ``path/to/file.py:Class``; None to ask every built-in reader."""
+
+
+@dataclass(frozen=True)
+class FitRequest:
+    """A fit as the command line and studies ask for it."""
+
+    scene: SceneRequest
+    out: Path
+    """Run folder to fill."""
+    config: FitConfig
+    device: str
+    """auto, cpu or cuda."""
+    resume: bool = False
+    """Continue the run in ``out`` from its last checkpoint."""
+    lpips_weights: Path | None = None
+    """File of `warpgs convert-lpips`; without one LPIPS is not measured."""
+    time_budget: float | None = None
+    """Time that the fit may take [s], by which its steps are chosen; None for those of ``config``. Not with ``resume``."""
+    notes: tuple[str, ...] = ()
+    """Choices made for the user while the request was read."""
+
+
+def choose_device(name: str | torch.device) -> tuple[torch.device, str]:
+    """Return the device for auto, cpu or cuda, or a device itself, and a phrase that names it.
+
+    Raises:
+        ResourceError: CUDA was asked for and is not there.
+        UsageError: The name is none of the three.
+    """
+    if isinstance(name, torch.device):
+        device = name
+    elif name not in ("auto", "cpu", "cuda"):
+        raise UsageError(f"device {name!r} is not one of auto, cpu, cuda")
+    else:
+        device = torch.device("cuda" if name == "auto" and torch.cuda.is_available() else name.replace("auto", "cpu"))
+    if device.type == "cpu":
+        return device, f"on the CPU, {torch.get_num_threads()} threads"
+    if not torch.cuda.is_available():
+        raise ResourceError("--device cuda: torch sees no CUDA device here; `warpgs doctor` says why. Use --device cpu")
+    if device.index is None:
+        device = torch.device("cuda", torch.cuda.current_device())
+    return device, f"on {torch.cuda.get_device_name(device)}"
+
+
+def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
+    """Split the views of a scene into those to fit and those to hold out.
+
+    Args:
+        scene: The scene.
+        spec: As in `warpgs fit --split`; None for the default of the scene's format.
+
+    Returns:
+        The split, and notes for the user: the choice made, masks and held-out views that make scores mean less.
+
+    Raises:
+        DataError: A view that is named is not there.
+        UsageError: The split is not understood.
+    """
+    notes = []
+    if spec is None:
+        split, note = default_split(scene)
+        notes.append(note)
+    else:
+        split = split_views(scene, spec)
+    if (spec or "").startswith("dtu:") and any(v.mask is not None for v in scene.views):
+        notes.append(
+            "masks hide pixels from the fit, which the published DTU protocol does not do: object masks that only scores "
+            "should see belong into a folder idrmasks, or behind --score-masks"
+        )
+    for test, train in coincident_views(scene, split):
+        notes.append(f"{test} is held out, but {train} was taken from the same place: its score says nothing of new views")
+    return split, notes
+
+
+def read_scene(request: SceneRequest) -> tuple[Scene, Split, list[str]]:
+    """Load a scene and split its views; returns both with the notes for the user."""
+    scene = load_scene(
+        request.path, reader=request.reader, downscale=request.downscale, strict=request.strict,
+        allow_outside=request.allow_outside, invert_masks=request.invert_masks, score_masks=request.score_masks,
+    )  # fmt: skip
+    split, notes = choose_split(scene, request.split)
+    return scene, split, [*scene.notes, *notes]

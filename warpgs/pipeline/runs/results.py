@@ -1,0 +1,221 @@
+"""Results of a fit for people: images of held-out views, scores, the report page."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from warpgs.files import write_bytes
+from warpgs.io.splits import Split
+from warpgs.kernels.sh import C0
+from warpgs.pipeline.metrics.evaluate import ViewMetrics, baselines, options_for, render_view, score, summarize, variants
+from warpgs.pipeline.metrics.lpips import Lpips
+from warpgs.render.rasterize import RasterizeOptions
+from warpgs.report.curve import curve
+from warpgs.report.events import read_events
+from warpgs.report.images import depth_map, error_map, png, side_by_side
+from warpgs.report.overview import render_overview
+from warpgs.report.page import SamplingReport, ViewImages, write_page
+from warpgs.runtime.byte_units import format_bytes
+from warpgs.scene import Gaussians, Scene, View
+
+LABELS = {
+    "psnr": "PSNR [dB]", "ssim": "SSIM", "ssim_skimage": "SSIM (scikit-image)",
+    "lpips_vgg_legacy": "LPIPS-VGG [0, 1]", "lpips_vgg_standard": "LPIPS-VGG [-1, 1]",
+    "lpips_alex_legacy": "LPIPS-Alex [0, 1]", "lpips_alex_standard": "LPIPS-Alex [-1, 1]", "lpips": "LPIPS",
+}  # fmt: skip
+"""Names of scores for people."""
+SHOWN_VIEWS = 6
+"""Held-out views with images in the report; all have files in the run folder."""
+RENDER_WORKERS = 4
+"""Threads that score and encode images while others are rendered."""
+OVERVIEW_POINTS = 60_000
+"""Gaussians shown in the 3D overview, sampled at random."""
+
+
+def score_keys(metrics: dict[str, Any]) -> list[str]:
+    """Return the names of the scores that result files hold for held-out views, in the order to show them."""
+    return [k for k in LABELS if k in metrics["test"]]
+
+
+def score_line(scores: dict[str, float]) -> str:
+    """Return mean scores as one line for people."""
+    distances = [f", {LABELS[k]} {v:.3f}" for k, v in scores.items() if k.startswith("lpips")]
+    return f"PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f}{''.join(distances) or ', LPIPS not measured'}"
+
+
+def file_stem(name: str) -> str:
+    """Return a view's name as one file name without suffix."""
+    return str(PurePosixPath(name).with_suffix("")).replace("/", "_")
+
+
+def protocol_of(scene: Scene, spec: str | None, downscale: int, train: list[View], test: list[View]) -> dict[str, Any]:
+    """Return the conditions in which scores must agree before they may be compared, for result files and the page."""
+    sizes = sorted({(v.camera.width, v.camera.height) for v in test or train})
+    return {
+        "split": spec or "default (no --split given)", "training_views": len(train), "held_out_views": len(test),
+        "ground_truth": scene.pixels, "downscale": downscale, "resolution": [f"{w} x {h}" for w, h in sizes],
+        "score_masks": sum(v.score_mask is not None for v in test),
+    }  # fmt: skip
+
+
+def evaluate_run(
+    out: Path | None,
+    gaussians: Gaussians,
+    train: list[View],
+    test: list[View],
+    rule: str,
+    background: tuple[float, float, float],
+    lpips: Lpips | None = None,
+    max_instances: int | None = None,
+) -> dict[str, Any]:
+    """Score held-out and training views, and save a render and a depth map of each held-out view.
+
+    Where no view is held out, the images are of the training views. LPIPS is measured on held-out views alone.
+
+    Args:
+        out: The run folder; None to write nothing.
+        gaussians: N Gaussians in scene units [u].
+        train: Training views.
+        test: Held-out views.
+        rule: Cut-offs of the rasterizer.
+        background: Colour behind the scene.
+        lpips: Network for LPIPS, or None.
+        max_instances: As in RasterizeOptions.
+
+    Returns:
+        Means over held-out and over training views, a row per held-out view, scores of baselines, and what each score is.
+    """
+    options = options_for(rule, background, gaussians, max_instances)
+    if out is not None:
+        (out / "renders").mkdir(exist_ok=True)
+        (out / "depth").mkdir(exist_ok=True)
+
+    def finish(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:
+        if out is not None:
+            stem = file_stem(view.name)
+            row = side_by_side([np.clip(image, 0, 1), view.image, error_map(image, view.image)])
+            write_bytes(out / "renders" / f"{stem}.png", png(row))
+            write_bytes(out / "depth" / f"{stem}.png", png(depth_map(depth, alpha)))
+        return score(view, image, lpips if test else None)
+
+    def compare(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:
+        return score(view, image)
+
+    tasks, jobs = [(finish, v) for v in test or train] + [(compare, v) for v in train if test], []
+    with ThreadPoolExecutor(RENDER_WORKERS if lpips is None else 1) as render_workers:  # LPIPS takes much memory a view
+        for work, view in tasks:
+            jobs.append(render_workers.submit(work, view, *render_view(gaussians, view, options)))
+            if len(jobs) > RENDER_WORKERS:
+                jobs[-RENDER_WORKERS].result()  # not all images at once
+        found = [j.result() for j in jobs]
+    rows, train_rows = found[: len(test)], found[-len(train) :]
+    return {
+        "test": summarize(rows), "train": summarize(train_rows),
+        "views": [r.row() for r in rows],
+        "baselines": baselines(train, test) if test else {},
+        "variants": variants(lpips),
+    }  # fmt: skip
+
+
+def _images(views: list[View], gaussians: Gaussians, options: RasterizeOptions, rows: dict[str, Any]) -> list[ViewImages]:
+    """Render up to `SHOWN_VIEWS` of the views, evenly spaced, and encode what the page shows of them."""
+    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(SHOWN_VIEWS, len(views))).round().astype(int))]
+    result = []
+    with ThreadPoolExecutor(RENDER_WORKERS) as render_workers:
+        for view in chosen:
+            image, depth, alpha = render_view(gaussians, view, options)
+            row = rows.get(view.name)
+            region = f", over {row['region']}" if row and row["region"] != "all" else ""
+            caption = f"PSNR {row['psnr']:.2f} dB{region}, SSIM {row['ssim']:.3f}" if row else "training view"
+            parts = (image, view.image, error_map(image, view.image), depth_map(depth, alpha))
+            result.append((view.name, caption, render_workers.map(png, parts)))
+    return [ViewImages(name, caption, *parts) for name, caption, parts in result]
+
+
+def _overview(gaussians: Gaussians, train: list[View], test: list[View]) -> tuple[bytes | None, str]:
+    """Return the PNG of the 3D overview, or None and the reason."""
+    means = gaussians.means.cpu().numpy()
+    colors = np.clip(C0 * gaussians.sh[:, 0].cpu().numpy() + 0.5, 0, 1)
+    sample = np.random.default_rng(0).permutation(len(means))[:OVERVIEW_POINTS]
+    cameras = ([v.camera for v in train], [v.camera for v in test])
+    return render_overview(*cameras, means[sample].astype(np.float64), colors[sample])
+
+
+def _figures(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the headline figures of the page as pairs of label and value."""
+    held_out = []
+    if metrics["test"]:
+        best = max(metrics["baselines"].values(), default=float("nan"))
+        held_out = [
+            ("held-out PSNR", f"{metrics['test']['psnr']:.2f} dB"), ("held-out SSIM", f"{metrics['test']['ssim']:.3f}"),
+            ("best baseline without a fit", f"{best:.2f} dB"),
+        ]  # fmt: skip
+    return [
+        *held_out,
+        ("training PSNR", f"{metrics['train']['psnr']:.2f} dB"), ("Gaussians", f"{metrics['gaussians']:,}"),
+        ("mean SH degree", f"{metrics['complexity']['mean_degree']:.2f}"),
+        ("model", format_bytes(metrics["complexity"]["bytes"])),
+        ("steps", f"{metrics['steps']:,}"), ("time", f"{metrics['seconds']['total']:.0f} s"),
+    ]  # fmt: skip
+
+
+def _protocol(metrics: dict[str, Any]) -> dict[str, str]:
+    """Return the conditions of the scores, and what each score is, as the page words them."""
+    words = {k.replace("_", " "): ", ".join(v) if isinstance(v, list) else str(v) for k, v in metrics["protocol"].items()}
+    words["configuration"] = f"{metrics['config_hash']}, step {metrics['steps']:,}"
+    return words | {LABELS.get(k, k): v for k, v in metrics["variants"].items()}
+
+
+def write_report(
+    out: Path,
+    scene: Scene,
+    split: Split,
+    gaussians: Gaussians,
+    metrics: dict[str, Any],
+    record: dict[str, Any],
+    sampling: SamplingReport | None,
+) -> str:
+    """Write report.html for a run whose scores are known.
+
+    Args:
+        out: The run folder, whose metrics.jsonl gives the curves.
+        scene: The scene.
+        split: Its views to fit and those held out.
+        gaussians: The fitted model, in scene units [u].
+        metrics: Contents of metrics.json.
+        record: Contents of config.json.
+        sampling: The part on sampling events, or None.
+
+    Returns:
+        The reason why the page has no 3D overview; empty where it has one.
+    """
+    train, test = [scene.view(n) for n in split.train], [scene.view(n) for n in split.test]
+    overview, why = _overview(gaussians, train, test)
+    notes = [*record["notes"], *([why] if why else [])]
+    events = read_events(out / "metrics.jsonl")
+    steps = [e["step"] for e in events]
+    curves = [
+        curve("Training loss", steps, [e["loss"] for e in events]),
+        curve("Training PSNR", steps, [e["psnr"] for e in events], "dB"),
+        curve("Gaussians", steps, [e["count"] for e in events]),
+    ]
+    keys = score_keys(metrics)
+    table = [["view", *(LABELS.get(k, k) for k in keys), "pixels"]] + [
+        [r["name"], *(f"{r[k]:.{2 if k == 'psnr' else 4}f}" for k in keys), r["region"]] for r in metrics["views"]
+    ]
+    options = options_for(record["config"]["rule"], tuple(record["background"]), gaussians)
+    images = _images(test or train, gaussians, options, {r["name"]: r for r in metrics["views"]})
+    camera = train[0].camera
+    write_page(
+        out / "report.html",
+        title=Path(scene.path).resolve().name,
+        subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
+        f"{camera.width} x {camera.height} px, {metrics['device']}",
+        figures=_figures(metrics), notes=notes, table=table, views=images, curves=curves, sampling=sampling,
+        overview=overview, details={k: v for k, v in record.items() if k != "cameras"}, protocol=_protocol(metrics),
+    )  # fmt: skip
+    return why

@@ -1,0 +1,127 @@
+"""Cost of a fit's cut-offs on its own scene: error of training views against ``exact`` in float64, and time saved."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import torch
+
+from warpgs.pipeline.metrics.psnr import psnr_of
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.reference import reference_image
+from warpgs.scene import Camera, Gaussians, View
+
+VIEWS = 3
+"""Number of training views that are compared, sampled at random."""
+SIDE = 64
+"""Side of the part of each that is compared [px], a multiple of the tile's."""
+TILE = 16
+"""Side of a tile [px]."""
+
+
+def _window(camera: Camera, generator: np.random.Generator) -> tuple[int, int, int, int]:
+    """Sample a part of an image, [left, top, width, height], whose edges are tile edges or the image's."""
+    sides = []
+    for length in (camera.width, camera.height):
+        first = TILE * int(generator.integers(max(0, length - SIDE) // TILE + 1))
+        sides.append((first, min(SIDE, length - first)))
+    (x, width), (y, height) = sides
+    return x, y, width, height
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Compute on one thread: on many small tensors, threads wait for each other longer than they compute."""
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(count)
+
+
+def _seconds(render: Callable[[], object], device: torch.device) -> float:
+    """Return the wall time of the second of two calls [s]: the first loads kernels and allocates."""
+    for _ in range(2):
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        began = time.perf_counter()
+        render()
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+    return time.perf_counter() - began
+
+
+@torch.no_grad()
+def rule_report_of(
+    gaussians: Gaussians, views: list[View], rule: str, background: tuple[float, float, float], *, seed: int,
+    half_resolution: float = 0.0, max_instances: int | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Measure error and gain of a rule on a scene; takes some tenths of a second.
+
+    Three random views are rendered with the rule, as in the fit, and 64 x 64 px of each are compared with the image that
+    rule `exact` defines, computed in float64 by other means than the kernels (`warpgs.render.reference`).
+
+    Args:
+        gaussians: Of the finished fit, float32.
+        views: Training views, at least one.
+        rule: Name of the fit's cut-offs.
+        background: Colour behind the scene.
+        seed: Seed of the choice of views and parts.
+        half_resolution: Fraction of the steps that saw views at half their size.
+        max_instances: As in RasterizeOptions.
+
+    Returns:
+        ``max``, ``mean`` and ``psnr`` [dB] (None where infinite) of the error of colours in [0, 1] over all parts; ``views``
+        by name with their windows; ``render_ms`` and, where the rule is another, ``exact_ms`` of one whole view; ``rule``;
+        and ``summary``, all of it in words.
+    """
+    generator = np.random.default_rng(seed)
+    chosen = [views[i] for i in sorted(generator.permutation(len(views))[:VIEWS])]
+    device = gaussians.means.device
+    behind = gaussians.means.new_tensor(background)
+    exact = RasterizeOptions(rule="exact", background=behind, max_instances=max_instances)
+    options = dataclasses.replace(exact, rule=rule)
+    errors, windows = [], {}
+    for view in chosen:
+        window = windows[view.name] = _window(view.camera, generator)
+        found = rasterize(gaussians, view.camera, dataclasses.replace(options, window=window)).rgb
+        # what reaches the part under `exact`; tiles are listed with a margin
+        near = rasterize(gaussians, view.camera, dataclasses.replace(exact, window=window)).visible[0]
+        part = Gaussians(**{n: t[near] for n, t in gaussians.tensors().items()})
+        with _one_thread():
+            wanted = reference_image(part, view.camera, window, behind, gaussians.sh_degree)
+        errors.append((found.double() - wanted).abs().flatten())
+    error = torch.cat(errors)
+    whole = chosen[0].camera
+    result = {
+        "rule": rule, "max": float(error.max()), "mean": float(error.mean()), "psnr": psnr_of(float((error**2).mean())),
+        "views": {n: list(w) for n, w in windows.items()}, "half_resolution": half_resolution,
+        "render_ms": 1000 * _seconds(lambda: rasterize(gaussians, whole, options), device),
+    }  # fmt: skip
+    if rule != "exact":
+        result["exact_ms"] = 1000 * _seconds(lambda: rasterize(gaussians, whole, exact), device)
+    return result | {"summary": _summary(result)}
+
+
+def _summary(r: dict[str, Any]) -> str:
+    """Return the figures as one sentence for people."""
+    sizes = {f"{w} x {h} px" for _, _, w, h in r["views"].values()}
+    where = f"on {' or '.join(sorted(sizes))} of {len(r['views'])} random training view{'s' if len(r['views']) > 1 else ''}"
+    error = f"{r['mean']:.1e} on average and {r['max']:.1e} at most, {r['psnr']:.0f} dB, {where}"
+    if r["rule"] == "exact":
+        words = f"no cut-off changes the images (rule exact); float32 is off float64 by {error}"
+    else:
+        ratio = r["render_ms"] / r["exact_ms"]
+        words = (
+            f"rule {r['rule']} is off exact, in float64, by {error}; a view took {r['render_ms']:.1f} ms instead of "
+            f"{r['exact_ms']:.1f}, {abs(1 - ratio):.0%} {'less' if ratio <= 1 else 'more'}"
+        )
+    if r["half_resolution"] > 0:
+        words += f"; {r['half_resolution']:.0%} of the steps used views at half their size, a quarter of the pixels"
+    return words

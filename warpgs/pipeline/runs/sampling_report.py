@@ -1,0 +1,200 @@
+"""Reasons for the places of sampled Gaussians: images of sampling events, and the report's part on all of a fit's events."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpgs.errors import ResourceError
+from warpgs.files import write_bytes
+from warpgs.pipeline.train.schedule import Phases
+from warpgs.pipeline.train.strategies.importance_sampling import Event, ImportanceSampling, MethodConfig, SampledView
+from warpgs.pipeline.train.strategies.sampler import SUPPORT
+from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.train.views import TrainingView
+from warpgs.report.contact_sheet import Tile, contact_sheet
+from warpgs.report.images import png
+from warpgs.report.page import SamplingReport
+
+FOLDER = "sampling"
+"""Subfolder of a run with the images, ``STEP.png``."""
+SHOWN = 3
+"""Number of views in an image."""
+OPEN, CLOSED = (0.97, 0.97, 0.95), (0.17, 0.19, 0.22)
+"""Colours of the gate."""
+FADED = 0.45
+"""Contrast of the view's image under the dots."""
+
+
+def shown_steps(phases: Phases) -> set[int]:
+    """Return the steps of the events that get an image: the first, and the first of the second half of phase 2."""
+    middle = 0.5 * (phases.refine + phases.stable_start)
+    late = [e for e in phases.events if e >= middle]
+    return {*phases.events[:1], *late[:1]}
+
+
+def _open_pixels(consistent: bool, quantile: float) -> str:
+    """Describe the pixels that a gate leaves open."""
+    parts = ["whose depth other views confirm"] * consistent
+    parts += [f"whose S_geometry is above its {quantile:g} quantile"] * (quantile > 0)
+    return f"pixels {' and '.join(parts)}" if parts else "all pixels that Gaussians cover"
+
+
+def _asked(method: MethodConfig) -> float:
+    """Return the quantile of S_geometry that the gate of a fit starts from."""
+    return method.sampler.gate_quantile if method.ra else 0.0
+
+
+def view_sheet(
+    name: str, step: int, view: TrainingView, disparity: np.ndarray, sampled: SampledView, config: MethodConfig
+) -> np.ndarray:
+    """Return a sheet of one view at one event, colours [rows, columns, 3] in [0, 1]: images, scores, gate, sampled pixels.
+
+    Args:
+        name: Name of the view.
+        step: Steps done.
+        view: The view.
+        disparity: Its relative inverse depth, shape [H, W].
+        sampled: Maps of the event and the pixels it took.
+        config: Switches and settings of the fit.
+    """
+    image, rendered, score = (t.cpu().numpy() for t in (view.image, sampled.rendered, sampled.score))
+    render, semantic, geometry = (t.cpu().numpy() for t in sampled.scores)
+    at, gate = sampled.at.cpu().numpy(), sampled.gate.cpu().numpy()
+    weights = config.weights(view.semantic is not None)
+    # each score stands below what it comes from
+    tiles = [
+        Tile("render before", rendered),
+        Tile("image", image),
+        Tile("disparity, near is 1", disparity, "TURBO"),
+        Tile("gate", np.where(gate[..., None], OPEN, CLOSED).astype(np.float32)),
+        Tile("sampled pixels", 1 - FADED * (1 - image.mean(-1, keepdims=True).repeat(3, -1)), dots=at),
+        Tile(f"{weights[0]:.2f} S_render", render),
+        Tile(f"{weights[1]:.2f} S_semantic", semantic),
+        Tile(f"{weights[2]:.2f} S_geometry", geometry),
+        Tile("S_importance", score),
+    ]
+    consistent = config.ra and config.sampler.depth == "consistent" and view.consistent is not None
+    widened = f"; too few passed at the {_asked(config):g} quantile" if sampled.quantile < _asked(config) else ""
+    lines = [
+        f"{len(at):,} pixels sampled of the {gate.sum():,} that the gate leaves open, {gate.mean():.0%} of the view.",
+        f"Gate: {_open_pixels(consistent, sampled.quantile)}{widened}.",
+        f"Their mean importance is {score[at[:, 0], at[:, 1]].mean() if len(at) else 0:.2f}, the view's {score.mean():.2f}.",
+    ]
+    return contact_sheet(f"{name}, step {step:,}", lines, tiles, columns=5, tile_width=320, text=1.25)
+
+
+def _shown(event: Event) -> list[SampledView]:
+    """Return up to three of an event's views, evenly spaced."""
+    count = len(event.views)
+    return [event.views[i] for i in np.unique(np.linspace(0, count - 1, min(SHOWN, count)).round().astype(int))]
+
+
+def _on_host(sampled: SampledView) -> SampledView:
+    """Return a copy whose maps lie in host memory."""
+    maps = {n: getattr(sampled, n).cpu() for n in ("rendered", "score", "gate", "at")}
+    render, semantic, geometry = (s.cpu() for s in sampled.scores)
+    return dataclasses.replace(sampled, scores=(render, semantic, geometry), **maps)
+
+
+@contextlib.contextmanager
+def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[None]:
+    """Have a fit write images of some of its events into its run folder, ``sampling/STEP.png``, while it goes on.
+
+    A thread of its own makes them; the end of the block waits for it.
+
+    Args:
+        fit: The fit, before its first step.
+        names: Names of its training views.
+        out: Run folder.
+
+    Raises:
+        ResourceError: The folder cannot be made; or an image could not be written, at the next event or the end of the block.
+    """
+    config, steps, strategy = fit.config.method, shown_steps(fit.phases), fit.strategy
+    if not isinstance(strategy, ImportanceSampling) or not config.events:
+        yield
+        return
+    try:
+        (out / FOLDER).mkdir(exist_ok=True)
+    except OSError as e:
+        raise ResourceError(
+            f"{out / FOLDER}: cannot be made ({e.strerror}); free some disk space, or choose another --out"
+        ) from e
+
+    def write(step: int, views: list[TrainingView], kept: list[SampledView]) -> None:
+        sheets = [view_sheet(names[d.view], step, v, fit.disparities[d.view], d, config) for v, d in zip(views, kept)]
+        write_bytes(out / FOLDER / f"{step:06d}.png", png(np.concatenate(sheets)))
+
+    with ThreadPoolExecutor(1) as thread:
+        writing: list[Future[None]] = []
+
+        def on_event(step: int, event: Event) -> None:
+            for sheet in writing:
+                if sheet.done():
+                    sheet.result()  # or what went wrong
+            if step in steps:
+                # the thread must not ask the device for anything: steps may be being recorded then
+                kept = [_on_host(d) for d in _shown(event)]
+                views = [dataclasses.replace(fit.views[d.view], image=fit.views[d.view].image.cpu()) for d in kept]
+                writing.append(thread.submit(write, step, views, kept))
+
+        strategy.on_event = on_event
+        try:
+            yield
+        finally:
+            strategy.on_event = None
+    for sheet in writing:
+        sheet.result()
+
+
+def event_figures(fit: Trainer) -> dict[str, Any]:
+    """Return the sums over the events of a fit, and the sizes of its two layers, for metrics.json.
+
+    Returns:
+        ``events``: their number, the Gaussians added and evicted, the samplings (views over all events) and those for which the
+        gate was widened; ``layers``: Gaussians in the coarse and the fine one.
+    """
+    asked = _asked(fit.config.method)
+    layered = isinstance(fit.strategy, ImportanceSampling)
+    events, fine = (fit.strategy.events, int(fit.strategy.fine.sum())) if layered else ([], 0)
+    quantiles = [q for e in events for q in e["quantiles"]]
+    return {
+        "events": {
+            "count": len(events), **{k: sum(e[k] for e in events) for k in ("added", "evicted")},
+            "samplings": len(quantiles), "widened": sum(q < asked for q in quantiles),
+        },
+        "layers": {"coarse": len(fit.gaussians) - fine, "fine": fine},
+    }  # fmt: skip
+
+
+def sampling_report_of(fit: Trainer, out: Path) -> SamplingReport | None:
+    """Return the report's part on the sampling events of a finished fit; None where there were none."""
+    method, figures = fit.config.method, event_figures(fit)
+    events, layers = figures["events"], figures["layers"]
+    if not events["count"]:
+        return None
+    how = "sampled at random, the likelier the higher their S_importance," if method.agp else "the highest in S_importance"
+    consistent = method.sampler.depth == "consistent"
+    words = (
+        f"Each dot is a pixel behind which a fine Gaussian was put at the {method.sampler.depth} depth, as far as the layer "
+        f"had capacity. These pixels are {how} among {_open_pixels(consistent and method.ra, _asked(method))} (the gate); "
+        "S_importance is the weighted sum of the three scores, and each score stands below what it comes from."
+    )
+    if events["widened"]:
+        words += (
+            f" In {events['widened']:,} of {events['samplings']:,} samplings the gate was widened: fewer than {SUPPORT} times "
+            f"as many pixels as are sampled passed at the {_asked(method):g} quantile."
+        )
+    table = [
+        ["sampling events", "Gaussians added", "evicted", "coarse at the end", "fine at the end"],
+        [f"{n:,}" for n in (events["count"], events["added"], events["evicted"], layers["coarse"], layers["fine"])],
+    ]
+    images = [(f"sampling after step {int(p.stem):,}", p.read_bytes()) for p in sorted((out / FOLDER).glob("*.png"))]
+    return SamplingReport(words, images, table)

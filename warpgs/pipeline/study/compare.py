@@ -1,0 +1,118 @@
+"""Studies: several settings on the same scenes with the same seeds, their scores, and the certainty of the differences."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+
+import torch
+
+from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.pipeline.metrics.lpips import load_lpips
+from warpgs.pipeline.runs.request import FitRequest, choose_device, read_scene
+from warpgs.pipeline.study.ensure_run import ensure_run
+from warpgs.pipeline.study.study import FILES, SWITCHES, Place, Runs, StudyRequest, run_folder, scene_name, write_study
+from warpgs.pipeline.train.config import PRESETS, FitConfig
+from warpgs.pipeline.train.trainer import train_views
+
+ABLATION_ROWS: dict[str, dict[str, bool]] = {"full": {}, **{f"no {name}": {name: False} for name in SWITCHES}}
+"""Switches of each row of the ablation: all on, then each part off alone, last the whole sampling (not in the paper's)."""
+
+
+def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]:
+    """Return presets as the variants of a study, in the order named; ``steps`` replaces the steps of all.
+
+    Raises:
+        UsageError: A preset is unknown or named twice.
+    """
+    for name in names:
+        if name not in PRESETS:
+            raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
+        if names.count(name) > 1:
+            raise UsageError(f"preset {name!r} is named twice")
+    return {n: PRESETS[n] if steps is None else dataclasses.replace(PRESETS[n], steps=steps) for n in names}
+
+
+def ablation_variants(base: FitConfig) -> tuple[dict[str, FitConfig], dict[str, tuple[bool, ...]]]:
+    """Return the rows of the ablation of a configuration, and their check marks in the order of `SWITCHES`.
+
+    Raises:
+        UsageError: The configuration has the sampling off already, so there is nothing to ablate.
+    """
+    method = base.method
+    off = [name for name in SWITCHES if not getattr(method, name)]
+    if off:
+        raise UsageError(
+            f"preset {base.preset!r} has {', '.join(off)} switched off already; ablate a preset of the full method"
+        )
+    variants: dict[str, FitConfig] = {}
+    marks: dict[str, tuple[bool, ...]] = {}
+    for row, switches in ABLATION_ROWS.items():
+        changed = dataclasses.replace(method, **switches)  # type: ignore[arg-type]  # names of bool fields alone
+        variants[row] = dataclasses.replace(base, method=changed)
+        marks[row] = tuple(getattr(changed, name) for name in SWITCHES)
+    return variants, marks
+
+
+def _places(request: StudyRequest) -> list[Place]:
+    """Read the scenes of a study; DataError where one holds out no view."""
+    places = []
+    for wanted in request.scenes:
+        scene, split, _ = read_scene(wanted)
+        if not split.test:
+            raise DataError(f"{wanted.path}: no view is held out, so there is nothing to compare; choose another --split")
+        places.append(Place(scene_name(wanted), wanted, scene.fingerprint, split, train_views(scene, split.test)))
+    return places
+
+
+def _run_all(request: StudyRequest, places: list[Place], device: torch.device, lpips: dict[str, str]) -> Runs:
+    """Make all runs, seed by seed, so that an interrupted study holds whole pairs."""
+    runs: Runs = {}
+    total = len(places) * request.seeds * len(request.variants)
+    for seed in range(request.seeds):
+        for place in places:
+            for name, config in request.variants.items():
+                print(f"[{len(runs) + 1}/{total}] {place.name}, {name}, seed {seed}")
+                fit = FitRequest(
+                    place.request, run_folder(request, place.name, name, seed), dataclasses.replace(config, seed=seed),
+                    request.device, lpips_weights=request.lpips_weights,
+                )  # fmt: skip
+                outcome = ensure_run(fit, place.fingerprint, place.split, device.type, lpips)
+                if outcome.state != "fitted":
+                    print(f"  {outcome.state}{': ' if outcome.note else ''}{outcome.note}")
+                runs[place.name, name, seed] = outcome
+                gc.collect()  # a fit and its recorded steps refer to each other: without this their device memory piles up
+    return runs
+
+
+def run_study(request: StudyRequest) -> list[str]:
+    """Fit every variant to every scene with every seed, and write the results into the study's folder.
+
+    Scenes and weights are read before the first fit. A run that fails is named in the notes and left out of its pairs.
+
+    Returns:
+        Lines for the user: the table and the notes.
+
+    Raises:
+        DataError: A scene cannot be read or holds out no view; the LPIPS weights are none; or every run of a variant failed.
+        ResourceError: The folder cannot be written, or the device is not there.
+    """
+    device, where = choose_device(request.device)
+    lpips = {} if request.lpips_weights is None else load_lpips(request.lpips_weights, device).variants()
+    places = _places(request)
+    try:
+        request.out.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise ResourceError(f"{request.out}: cannot be written ({e.strerror}); choose another --out") from e
+    print(f"{len(places)} scenes, {len(request.variants)} settings, {request.seeds} seeds, {where}")
+    try:
+        runs = _run_all(request, places, device, lpips)
+    except KeyboardInterrupt:
+        print("the same command goes on from here: finished runs are kept, the half-finished one is continued")
+        raise
+    for name in request.variants:
+        failed = [o.note for (_, v, _), o in runs.items() if v == name and o.metrics is None]
+        if len(failed) == len(places) * request.seeds:
+            raise DataError(f"every run of {name} failed, so nothing can be compared; the first: {failed[0]}")
+    lines = write_study(request, runs, places, device, where.removeprefix("on "))
+    return [*lines, f"in {request.out}: {', '.join(FILES)}"]

@@ -1,0 +1,121 @@
+"""Runs of a study: each is kept where it is finished and the same, continued where it is half done, else fitted."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from warpgs import __version__
+from warpgs.errors import DataError, UsageError, WarpgsError
+from warpgs.io.splits import Split
+from warpgs.pipeline.runs.commands import evaluate
+from warpgs.pipeline.runs.fit import fit_request
+from warpgs.pipeline.runs.folder import CONFIG
+from warpgs.pipeline.runs.request import FitRequest
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Outcome of one run."""
+
+    state: str
+    """kept, continued, fitted, redone or failed."""
+    metrics: dict[str, Any] | None
+    """Contents of metrics.json, or of eval.json where LPIPS was measured later; None where it failed."""
+    note: str = ""
+    """Note on this run for readers of the study; empty where nothing is special."""
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    """Read a JSON object; None where there is none or it is not whole."""
+    try:
+        value = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError):
+        return None
+    return value if isinstance(value, dict) else None
+
+
+def _difference(record: dict[str, Any], request: FitRequest, fingerprint: str, split: Split, device: str) -> str:
+    """Name the properties in which a stored run differs from the one that is wanted; empty where in none."""
+    wanted = {
+        "configuration": (record.get("config_hash"), request.config.fingerprint()),
+        "data": (record.get("fingerprint"), fingerprint),
+        "training views": (record.get("train"), list(split.train)),
+        "held-out views": (record.get("test"), list(split.test)),
+        "device": (record.get("device"), device),
+        "version of warpgs": ((record.get("versions") or {}).get("warpgs"), __version__),
+    }
+    return ", ".join(name for name, (then, now) in wanted.items() if then != now)
+
+
+def _set_aside(folder: Path) -> Path:
+    """Move a run that cannot be used out of the way; nothing is deleted."""
+    number = 1
+    while (target := folder.with_name(f"{folder.name}.old{number}")).exists():
+        number += 1
+    folder.rename(target)
+    return target
+
+
+def _with_lpips(metrics: dict[str, Any], folder: Path, request: FitRequest, variants: dict[str, str]) -> dict[str, Any]:
+    """Return the scores of a finished run with LPIPS of the weights asked for, measured now where they are not there yet."""
+    for found in (metrics, _read(folder / "eval.json")):
+        if found and found.get("config_hash") == metrics["config_hash"] and variants.items() <= found["variants"].items():
+            return metrics | {k: found[k] for k in ("test", "views", "variants")}
+    evaluate(folder, request.device, request.lpips_weights)
+    found = json.loads((folder / "eval.json").read_text("utf-8"))
+    return metrics | {k: found[k] for k in ("test", "views", "variants")}
+
+
+def ensure_run(request: FitRequest, fingerprint: str, split: Split, device: str, variants: dict[str, str]) -> Outcome:
+    """Ensure that a run folder holds the finished run that is asked for.
+
+    A finished run of the same configuration, data, views, kind of device and version is kept. A half-finished one is
+    continued from its checkpoint. What is there and is neither is moved aside, and the run is done anew.
+
+    Args:
+        request: The fit; ``out`` is its folder, ``resume`` is decided here.
+        fingerprint: Fingerprint of the scene's data.
+        split: The views that train and those held out.
+        device: cpu or cuda.
+        variants: Names of the LPIPS scores that must be there, with their definitions; empty for none.
+
+    Returns:
+        The outcome. It holds the error of this one run, if any, so that the others can go on.
+    """
+    folder, note, state = request.out, "", "fitted"
+    record = _read(folder / CONFIG)
+    resume = False
+    if record is not None:
+        gap = _difference(record, request, fingerprint, split, device)
+        metrics = _read(folder / "metrics.json")
+        if gap:
+            note = f"the run that was there had another {gap}; moved to {_set_aside(folder).name} and done anew"
+            state = "redone"
+        elif metrics is not None:
+            try:
+                scores = _with_lpips(metrics, folder, request, variants) if variants else metrics
+            except WarpgsError as e:
+                return Outcome("failed", None, f"scoring it again: {e}")
+            return Outcome("kept", scores)
+        else:
+            resume, state, note = True, "continued", "was half done and has been continued from its last checkpoint"
+    elif folder.exists() and any(folder.iterdir()):
+        note = f"what was there is no run; moved to {_set_aside(folder).name} and done anew"
+        state = "redone"
+
+    def fit(go_on: bool) -> dict[str, Any]:
+        return fit_request(replace(request, resume=go_on)).metrics
+
+    try:
+        try:
+            return Outcome(state, fit(resume), note)
+        except (DataError, UsageError) as e:
+            if not resume:
+                raise
+            note = f"was half done and could not be continued ({e}); moved to {_set_aside(folder).name} and done anew"
+            return Outcome("redone", fit(False), note)
+    except WarpgsError as e:
+        return Outcome("failed", None, f"{note + '; ' if note else ''}failed: {e}")

@@ -1,0 +1,71 @@
+"""Statistics of a handful of repeated runs: mean, deviation, and the interval of a paired difference."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+CONFIDENCE = 0.95
+"""Probability that an interval holds the true mean."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Mean and spread of repeated measurements."""
+
+    mean: float
+    """Arithmetic mean; NaN of none."""
+    sd: float
+    """Standard deviation with n - 1 in the denominator; NaN of fewer than two."""
+    count: int
+    """Number of measurements."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Mean of paired differences and the interval that holds its true value, were the differences normal."""
+
+    mean: float
+    """Mean difference; NaN of no pair."""
+    low: float
+    """Lower end of the interval; NaN of fewer than two pairs."""
+    high: float
+    """Upper end of the interval; NaN of fewer than two pairs."""
+    count: int
+    """Number of pairs."""
+
+    @property
+    def excludes_zero(self) -> bool:
+        """True where the interval lies on one side of 0; never with fewer than two pairs."""
+        return self.low > 0 or self.high < 0
+
+
+def sample(values: Sequence[float]) -> Sample:
+    """Return mean and standard deviation (Bessel's correction) of measurements."""
+    n = len(values)
+    mean = math.fsum(values) / n if n else math.nan
+    sd = math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (n - 1)) if n > 1 else math.nan
+    return Sample(mean, sd, n)
+
+
+def paired_difference(ours: Sequence[float], base: Sequence[float], confidence: float = CONFIDENCE) -> Difference:
+    """Return Student's interval of the mean of ``ours - base`` over pairs (Student 1908): mean ± t s / sqrt(n), n - 1 degrees.
+
+    Pairing takes out what both have in common (the same seed, the same scene), which is most of the spread between runs.
+
+    Args:
+        ours: Measurements.
+        base: Measurements of the base, in the same order.
+        confidence: Probability that the interval holds the true mean, in (0, 1).
+
+    Raises:
+        ValueError: The two differ in length.
+    """
+    from scipy.special import stdtrit
+
+    d = sample([a - b for a, b in zip(ours, base, strict=True)])
+    if d.count < 2:
+        return Difference(d.mean, math.nan, math.nan, d.count)
+    half = float(stdtrit(d.count - 1, 0.5 + confidence / 2)) * d.sd / math.sqrt(d.count)
+    return Difference(d.mean, d.mean - half, d.mean + half, d.count)

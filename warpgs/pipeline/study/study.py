@@ -1,0 +1,258 @@
+"""Results of a study: tables, plot, figure, notes."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+
+from warpgs.errors import UsageError
+from warpgs.files import write_bytes, write_json, write_text
+from warpgs.io.splits import Split
+from warpgs.pipeline.runs.request import SceneRequest
+from warpgs.pipeline.runs.results import LABELS
+from warpgs.pipeline.study.ensure_run import Outcome
+from warpgs.pipeline.study.plots import Line, Panel, forest
+from warpgs.pipeline.study.qualitative import strips
+from warpgs.pipeline.study.statistics import paired_difference, sample
+from warpgs.pipeline.study.table import Metric, Row, Table, csv_text, latex, markdown
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.report.sheet import sheet
+from warpgs.scene import View
+
+SWITCHES = {
+    "hier": "Hier", "s_render": "S_{rend}", "s_semantic": "S_{sem}", "s_geometry": "S_{geo}", "ra": "RA", "agp": "AGP",
+    "pm": "PM", "events": "Events",
+}  # fmt: skip
+"""Parts of the method that can be switched off, with the headings of the paper's ablation table."""
+FIGURE_ROWS = 3
+"""Rows of the figure for a single scene; two scenes get two rows each, more scenes one each."""
+FILES = ("table.md", "table.csv", "table.tex", "runs.csv", "plot.svg", "figure.png", "study.json")
+"""Files of a study, beside its runs."""
+
+
+@dataclass(frozen=True)
+class StudyRequest:
+    """A comparison: settings, scenes and seeds."""
+
+    scenes: tuple[SceneRequest, ...]
+    """Scenes that every variant is fitted to."""
+    variants: dict[str, FitConfig]
+    """Settings by name; the others are compared with the first. The seed is set by the study."""
+    seeds: int
+    """Number of runs of each variant on each scene, with seeds from 0 on."""
+    out: Path
+    """Folder of the study; each run lies in SCENE/VARIANT/SEED below it."""
+    device: str = "auto"
+    """auto, cpu or cuda."""
+    lpips_weights: Path | None = None
+    """File of `warpgs convert-lpips`; without one LPIPS is not measured."""
+    marks: dict[str, tuple[bool, ...]] = field(default_factory=dict)
+    """Check marks of each variant in the order of `SWITCHES`; empty for a comparison of presets."""
+
+    def __post_init__(self) -> None:
+        if not self.seeds >= 1:
+            raise UsageError(f"--seeds must be at least 1, not {self.seeds}")
+        if len(self.variants) < 2:
+            raise UsageError(f"a comparison needs at least two settings, not {', '.join(self.variants) or 'none'}")
+        names = [scene_name(s) for s in self.scenes]
+        if not names:
+            raise UsageError("name at least one scene folder")
+        if len(set(names)) < len(names):
+            raise UsageError(f"two scene folders have one name ({', '.join(names)}); results lie below it, so rename one")
+
+
+def scene_name(request: SceneRequest) -> str:
+    """Return the name of a scene in tables and folders: that of its folder."""
+    return Path(request.path).resolve().name
+
+
+@dataclass(frozen=True)
+class Place:
+    """One scene of a study, read once."""
+
+    name: str
+    """Name of its folder."""
+    request: SceneRequest
+    """Folder and options it is read with."""
+    fingerprint: str
+    """Fingerprint of its data."""
+    split: Split
+    """Views to fit and those held out."""
+    test: list[View]
+    """Held-out views."""
+
+
+Runs = dict[tuple[str, str, int], Outcome]
+"""Outcome by scene, variant and seed."""
+
+
+def run_folder(request: StudyRequest, scene: str, variant: str, seed: int) -> Path:
+    """Return the folder of a run of a study."""
+    return request.out / scene / variant.replace(" ", "-") / str(seed)
+
+
+def _value(outcome: Outcome, key: str) -> float:
+    """Return a mean score of a run; NaN where it was not measured."""
+    value = (outcome.metrics or {}).get("test", {}).get(key)
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def _by_seed(runs: Runs, scenes: list[str], variant: str, key: str, seeds: int) -> dict[int, float]:
+    """Return the mean over scenes by seed; seeds that lack a scene are left out."""
+    means = {s: math.fsum(_value(runs[p, variant, s], key) for p in scenes) / len(scenes) for s in range(seeds)}
+    return {s: v for s, v in means.items() if math.isfinite(v)}
+
+
+def _metrics(runs: Runs) -> tuple[Metric, ...]:
+    """Return PSNR, SSIM, and the LPIPS variant that papers print where one was measured."""
+    keys = {k for o in runs.values() for k in (o.metrics or {}).get("test", {})}
+    order = ("lpips_vgg_legacy", "lpips_alex_legacy")
+    found = next((k for k in order if k in keys), "lpips")
+    return (
+        Metric("psnr", "PSNR", True, 2), Metric("ssim", "SSIM", True, 3),
+        Metric(found, LABELS[found].split(" ")[0], False, 3),
+    )  # fmt: skip
+
+
+def _table(request: StudyRequest, runs: Runs, scenes: list[str], metrics: tuple[Metric, ...], caption: str) -> Table:
+    """Return the means of all variants over scenes and seeds, and their differences to the first."""
+    base = next(iter(request.variants))
+    rows = []
+    for name in request.variants:
+        samples, differences = {}, {}
+        for m in metrics:
+            ours = _by_seed(runs, scenes, name, m.key, request.seeds)
+            theirs = _by_seed(runs, scenes, base, m.key, request.seeds)
+            if ours:
+                samples[m.key] = sample(list(ours.values()))
+            common = sorted(ours.keys() & theirs.keys())
+            if name != base:
+                differences[m.key] = paired_difference([ours[s] for s in common], [theirs[s] for s in common])
+        rows.append(Row(name, samples, differences, request.marks.get(name, ())))
+    return Table(caption, base, metrics, tuple(rows), tuple(SWITCHES.values()) if request.marks else ())
+
+
+def _plot(request: StudyRequest, runs: Runs, scenes: list[str], table: Table) -> str:
+    """Return the SVG of the paired differences of a table."""
+    panels = []
+    for m in table.metrics:
+        theirs = _by_seed(runs, scenes, table.base, m.key, request.seeds)
+        lines = []
+        for row in table.rows:
+            ours = _by_seed(runs, scenes, row.name, m.key, request.seeds)
+            pairs = () if row.name == table.base else tuple(ours[s] - theirs[s] for s in sorted(ours.keys() & theirs.keys()))
+            lines.append(Line(row.name, pairs, row.differences.get(m.key)))
+        panels.append(Panel(m.label + (" [dB]" if m.key == "psnr" else ""), m.upwards, m.digits, tuple(lines)))
+    return forest(table.caption, table.base, panels)
+
+
+def _figure(request: StudyRequest, runs: Runs, places: list[Place], device: torch.device) -> tuple[bytes | None, str]:
+    """Return the figure (PNG) of the first seed for which every run is there, and a note; None where there is no such seed."""
+    whole = [s for s in range(request.seeds) if all(runs[p.name, v, s].metrics for p in places for v in request.variants)]
+    if not whole:
+        return None, "no figure: there is no seed for which every run succeeded"
+    seed, rows, each = whole[0], [], {1: FIGURE_ROWS, 2: 2}.get(len(places), 1)
+    for place in places:
+        folders = {v: run_folder(request, place.name, v, seed) for v in request.variants}
+        found = {v: runs[place.name, v, seed].metrics or {} for v in request.variants}
+        scores = {v: {r["name"]: r["psnr"] for r in metrics["views"]} for v, metrics in found.items()}
+        rows += strips(place.name, place.test, folders, scores, each, device)
+    return sheet([*request.variants, "image"], rows), f"the figure shows seed {seed}"
+
+
+def _notes(request: StudyRequest, runs: Runs, metrics: tuple[Metric, ...]) -> list[str]:
+    """Return the caveats that a reader of the tables needs."""
+    notes = [f"{p}, {v}, seed {s}: {o.note}" for (p, v, s), o in runs.items() if o.note]
+    for v in request.variants:
+        lost = [f"{p} seed {s}" for (p, name, s), o in runs.items() if name == v and o.metrics is None]
+        if lost:
+            notes.append(f"{v} lacks {', '.join(lost)}: these seeds are left out of its means and of its pairs")
+    if request.seeds < 2:
+        notes.append("one seed: there is no deviation and no interval, so no difference here is worth a claim")
+    last = metrics[-1].key
+    lacking = sum(math.isnan(_value(o, last)) for o in runs.values() if o.metrics)
+    if last == "lpips":
+        notes.append("LPIPS was not measured: no --lpips-weights were given")
+    elif lacking:
+        notes.append(f"{lacking} runs lack {metrics[-1].label}: they are left out of its column")
+    if len(request.scenes) > 1:
+        notes.append("deviations and intervals are over seeds, of the mean over these scenes: they say nothing of other scenes")
+    return notes
+
+
+def _protocols(runs: Runs) -> list[str]:
+    """Return how each scene was scored, and the definition of each score, as Markdown lines."""
+    lines, seen = [], set()
+    variants: dict[str, str] = {}
+    for (scene, _, _), outcome in runs.items():
+        if outcome.metrics and scene not in seen:
+            seen.add(scene)
+            p = outcome.metrics["protocol"]
+            words = [f"split {p['split']}", f"{p['training_views']} training and {p['held_out_views']} held-out views"]
+            words += [f"{', '.join(p['resolution'])} px from {p['ground_truth']}"]
+            if p["score_masks"]:
+                words.append(f"{p['score_masks']} views scored within object masks")
+            lines.append(f"- {scene}: {'; '.join(words)}")
+            variants |= outcome.metrics["variants"]
+    return [*lines, *(f"- {LABELS.get(k, k)}: {v}" for k, v in variants.items())]
+
+
+def _runs_csv(request: StudyRequest, runs: Runs) -> str:
+    """Return CSV with a line per run."""
+    keys = [k for k in LABELS if any(k in (o.metrics or {}).get("test", {}) for o in runs.values())]
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(["scene", "variant", "seed", "state", *keys, "gaussians", "steps", "seconds", "config_hash", "folder"])
+    for (scene, variant, seed), o in runs.items():
+        values = [v if math.isfinite(v := _value(o, k)) else "" for k in keys]
+        m = o.metrics or {}
+        rest = [
+            m.get("gaussians", ""),
+            m.get("steps", ""),
+            round(m["seconds"]["total"], 3) if m else "",
+            m.get("config_hash", ""),
+        ]
+        place = run_folder(request, scene, variant, seed).relative_to(request.out).as_posix()
+        writer.writerow([scene, variant, seed, o.state, *values, *rest, place])
+    return out.getvalue()
+
+
+def write_study(request: StudyRequest, runs: Runs, places: list[Place], device: torch.device, device_name: str) -> list[str]:
+    """Write tables, plot, figure and the record of a study into its folder.
+
+    Returns:
+        Lines for the user: the table and the notes.
+
+    Raises:
+        ResourceError: A file cannot be written.
+    """
+    metrics, scenes = _metrics(runs), [p.name for p in places]
+    title = "Ablation" if request.marks else "Comparison"
+    what = scenes[0] if len(scenes) == 1 else f"the mean over {len(scenes)} scenes"
+    table = _table(request, runs, scenes, metrics, f"{title} on {what}, {request.seeds} seeds")
+    image, about = _figure(request, runs, places, device)
+    notes = [*_notes(request, runs, metrics), about]
+    parts = [f"# {table.caption}", markdown(table)]
+    if len(scenes) > 1:
+        parts += [f"## {s}\n\n{markdown(_table(request, runs, [s], metrics, s))}" for s in scenes]
+    parts += ["## How it was scored\n\n" + "\n".join(_protocols(runs)), "## Notes\n\n" + "\n".join(f"- {n}" for n in notes)]
+    write_text(request.out / "table.md", "\n\n".join(p.strip() for p in parts) + "\n")
+    write_text(request.out / "table.csv", csv_text(table))
+    write_text(request.out / "table.tex", latex(table))
+    write_text(request.out / "runs.csv", _runs_csv(request, runs))
+    write_text(request.out / "plot.svg", _plot(request, runs, scenes, table))
+    if image is not None:
+        write_bytes(request.out / "figure.png", image)
+    hashes = {n: dataclasses.replace(c, seed=0).fingerprint() for n, c in request.variants.items()}
+    write_json(request.out / "study.json", {
+        "variants": {n: {"config_hash_of_seed_0": hashes[n], "config": c.to_json()} for n, c in request.variants.items()},
+        "seeds": request.seeds, "device": device_name, "notes": notes,
+        "scenes": {p.name: {**dataclasses.asdict(p.request), "fingerprint": p.fingerprint} for p in places},
+    })  # fmt: skip
+    return [f"{table.caption}:", "", *markdown(table).splitlines(), "", *(f"  {n}" for n in notes)]

@@ -1,0 +1,192 @@
+"""Tables of a study as Markdown, CSV and LaTeX, laid out as papers print them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+
+from warpgs.pipeline.study.statistics import Difference, Sample
+
+NONE = "-"
+"""Sign for a figure that was not measured."""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A column of figures."""
+
+    key: str
+    """Name in result files."""
+    label: str
+    """Name in tables."""
+    upwards: bool
+    """True where more is better."""
+    digits: int
+    """Digits after the point."""
+
+    @property
+    def arrow(self) -> str:
+        """Arrow in the direction that is better."""
+        return "↑" if self.upwards else "↓"
+
+
+@dataclass(frozen=True)
+class Row:
+    """Measurements of one variant."""
+
+    name: str
+    """Name of the variant."""
+    samples: dict[str, Sample]
+    """Mean and deviation by metric; a metric that is not there was not measured."""
+    differences: dict[str, Difference]
+    """Paired difference to the table's base by metric; empty for the base itself."""
+    marks: tuple[bool, ...] = ()
+    """Check marks, one for each of the table's switches."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of a study, ready to print."""
+
+    caption: str
+    """Title."""
+    base: str
+    """Name of the row that the others are compared with."""
+    metrics: tuple[Metric, ...]
+    """Columns of figures."""
+    rows: tuple[Row, ...]
+    """Variants, the base among them."""
+    switches: tuple[str, ...] = ()
+    """Headings of the columns of check marks, in LaTeX without dollar signs; empty for a table of methods."""
+
+    def __post_init__(self) -> None:
+        if any(len(r.marks) != len(self.switches) for r in self.rows):
+            raise ValueError("every row needs a check mark for each switch, and none where there are no switches")
+
+    def best(self, metric: Metric) -> float:
+        """Return the best mean of a column as printed; NaN where nothing was measured."""
+        means = [round(r.samples[metric.key].mean, metric.digits) for r in self.rows if metric.key in r.samples]
+        means = [m for m in means if math.isfinite(m)]
+        return (max if metric.upwards else min)(means, default=math.nan)
+
+
+def figure(sample: Sample | None, digits: int, plus_minus: str = " ± ") -> str:
+    """Return mean and deviation as text; a dash where nothing was measured, the mean alone where there is no deviation."""
+    if sample is None or not math.isfinite(sample.mean):
+        return NONE
+    spread = f"{plus_minus}{sample.sd:.{digits}f}" if math.isfinite(sample.sd) else ""
+    return f"{sample.mean:.{digits}f}{spread}"
+
+
+def interval(d: Difference | None, digits: int) -> str:
+    """Return a paired difference with its interval as text, signed; a dash for none."""
+    if d is None or not math.isfinite(d.mean):
+        return NONE
+    ends = f" [{d.low:+.{digits}f}, {d.high:+.{digits}f}]" if math.isfinite(d.low) else ""
+    return f"{d.mean:+.{digits}f}{ends}"
+
+
+def _grid(head: list[str], body: list[list[str]], left: int) -> list[str]:
+    """Return the lines of a Markdown table whose first ``left`` columns are words, the rest figures."""
+    rows = [[c.replace("|", "\\|") for c in r] for r in [head, *body]]
+    widths = [max(len(r[i]) for r in rows) for i in range(len(head))]
+    lines = [
+        "| " + " | ".join(c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(r, widths))) + " |"
+        for r in rows
+    ]
+    rule = "|" + "|".join("-" * (w + 2) if i < left else "-" * (w + 1) + ":" for i, w in enumerate(widths)) + "|"
+    return [lines[0], rule, *lines[1:]]
+
+
+def _plain(heading: str) -> str:
+    """Return a LaTeX heading for readers without LaTeX: S_{render} becomes S_render."""
+    return heading.replace("\\mathit", "").replace("{", "").replace("}", "")
+
+
+def markdown(table: Table) -> str:
+    """Return two tables: means ± deviations over seeds, the best in bold; and differences to the base with intervals."""
+
+    def cell(row: Row, m: Metric) -> str:
+        s = row.samples.get(m.key)
+        text = figure(s, m.digits)
+        return f"**{text}**" if s is not None and round(s.mean, m.digits) == table.best(m) else text
+
+    marks = [_plain(s) for s in table.switches]
+    head = ["row" if marks else "method", *marks, *(f"{m.label} {m.arrow}" for m in table.metrics), "seeds"]
+    body = [
+        [r.name, *("✓" if m else "✗" for m in r.marks), *(cell(r, m) for m in table.metrics),
+         str(max((s.count for s in r.samples.values()), default=0))]
+        for r in table.rows
+    ]  # fmt: skip
+    lines = [*_grid(head, body, 1 + len(marks)), ""]
+    lines += [
+        f"Difference to {table.base}, paired by seed, with its 95 % t interval (an interval without 0 is marked \\*):",
+        "",
+    ]
+    rows = [r for r in table.rows if r.differences]
+
+    def gap(row: Row, m: Metric) -> str:
+        d = row.differences.get(m.key)
+        return interval(d, m.digits) + (" \\*" if d is not None and d.excludes_zero else "")
+
+    body = [[r.name, *(gap(r, m) for m in table.metrics), str(max(d.count for d in r.differences.values()))] for r in rows]
+    return "\n".join([*lines, *_grid([head[0], *(f"Δ {m.label}" for m in table.metrics), "pairs"], body, 1)]) + "\n"
+
+
+def csv_text(table: Table) -> str:
+    """Return CSV: a line per row and metric, every digit, empty where there is no number."""
+    out = io.StringIO()
+    names = [_plain(s) for s in table.switches]
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(["row", *names, "metric", "mean", "sd", "seeds", "difference", "low95", "high95", "pairs"])
+
+    def number(value: float) -> str:
+        return repr(value) if math.isfinite(value) else ""
+
+    for row in table.rows:
+        for m in table.metrics:
+            s, d = row.samples.get(m.key), row.differences.get(m.key)
+            measured = ["", "", 0] if s is None else [number(s.mean), number(s.sd), s.count]
+            paired = ["", "", "", ""] if d is None else [number(d.mean), number(d.low), number(d.high), d.count]
+            writer.writerow([row.name, *(int(x) for x in row.marks), m.key, *measured, *paired])
+    return out.getvalue()
+
+
+def _escape(text: str) -> str:
+    """Escape the signs that mean something to LaTeX."""
+    for sign in "\\&%$#_{}":
+        text = text.replace(sign, "\\textbackslash " if sign == "\\" else f"\\{sign}")
+    return text
+
+
+def latex(table: Table) -> str:
+    """Return a booktabs table: check marks or methods, means ± deviations, and the paired difference of the first metric."""
+    first, space = table.metrics[0], "\\,["
+
+    def cell(row: Row, m: Metric) -> str:
+        s = row.samples.get(m.key)
+        text = figure(s, m.digits, " \\pm ")
+        if text == NONE:
+            return "--"
+        return f"$\\mathbf{{{text}}}$" if s is not None and round(s.mean, m.digits) == table.best(m) else f"${text}$"
+
+    def gap(row: Row) -> str:
+        text = interval(row.differences.get(first.key), first.digits)
+        return "--" if text == NONE else f"${text.replace(' [', space)}$"
+
+    head = [f"${s}$" for s in table.switches] or ["Method"]
+    arrows = {"↑": "$\\uparrow$", "↓": "$\\downarrow$"}
+    head += [f"{m.label}{arrows[m.arrow]}" for m in table.metrics] + [f"$\\Delta$ {first.label} [95\\,\\%]"]
+    lines = [
+        "% needs \\usepackage{booktabs, amssymb}",
+        "\\begin{table}[htbp]", "  \\centering", f"  \\caption{{{_escape(table.caption)}}}",
+        f"  \\begin{{tabular}}{{{'c' * len(table.switches) or 'l'}{'c' * len(table.metrics)}r}}", "    \\toprule",
+        f"    {' & '.join(head)} \\\\", "    \\midrule",
+    ]  # fmt: skip
+    for row in table.rows:
+        words = ["$\\checkmark$" if m else "$\\times$" for m in row.marks] or [_escape(row.name)]
+        note = f"  % {row.name}" if row.marks else ""
+        lines.append(f"    {' & '.join([*words, *(cell(row, m) for m in table.metrics), gap(row)])} \\\\{note}")
+    return "\n".join([*lines, "    \\bottomrule", "  \\end{tabular}", "\\end{table}"]) + "\n"

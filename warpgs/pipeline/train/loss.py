@@ -1,0 +1,226 @@
+"""The loss: 0.8 L1 + 0.2 (1 - SSIM), as in the paper's preliminaries and Kerbl et al. 2023, eq. 7; on request a depth term."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+
+from warpgs.errors import UsageError
+from warpgs.kernels.ssim import differences, ssim
+from warpgs.pipeline.train.views import TrainingView
+from warpgs.plugins import Registry
+from warpgs.scene import Gaussians, Prior, Render
+
+MIN_ALPHA = 0.5
+"""Depth counts where the picture is more opaque than this: elsewhere the background has the larger share."""
+FLAT = 1e-3
+"""Standard deviation at or below which a map is constant: of a disparity in [0, 1], and of mean depth over depth, whose values
+lie around 1. The gradient of a correlation grows with the inverse of it."""
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the loss."""
+
+    ssim_weight: float = 0.2
+    """Share lambda of the structural term, in [0, 1]."""
+    depth_weight: float = 0.0
+    """Weight of the depth term, 1 minus the correlation of rendered inverse depth with the view's prior, in [0, 1000]; 0 for
+    none, 0.05 in FSGS (Zhu et al. 2024)."""
+    depth_until: float = 0.95
+    """Share of the steps, from the first, that have the depth term."""
+
+    def __post_init__(self) -> None:
+        for name, most in (("depth_weight", 1000), ("depth_until", 1)):
+            if not 0 <= getattr(self, name) <= most:
+                raise UsageError(f"loss {name.replace('_', ' ')} {getattr(self, name)} must lie between 0 and {most}")
+        if not 0 <= self.ssim_weight <= 1:
+            raise UsageError(f"loss ssim weight {self.ssim_weight} must lie between 0 and 1")
+
+
+@functools.cache
+def _weights(fraction: float, count: int, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    """Of the sums of 1 - SSIM and of absolute differences over ``count`` numbers; kept for good, as graphs refer to it."""
+    with torch.inference_mode(False):  # whoever asks first: what is made in that mode cannot be trained with
+        return torch.tensor([fraction / count, (1 - fraction) / count], dtype=dtype, device=device)
+
+
+def _total(values: torch.Tensor) -> torch.Tensor:
+    """Return the sum of values [H, ...], on a CPU row by row: that of a whole tensor depends on the number of threads."""
+    return values.sum() if values.is_cuda else values.flatten(1).sum(1).sum()
+
+
+def _centred(values: torch.Tensor, fraction: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+    """Return values [H, W] less their mean over the pixels that count, and 0 at others."""
+    mean = _total(values * fraction) / pixels
+    # one number for each row: the gradient of a number for all is the sum of a whole tensor (see `_total`)
+    return (values - (mean if values.is_cuda else mean.expand(len(values), 1))) * fraction
+
+
+def photometric_loss(
+    rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None, ssim_weight: float = 0.2
+) -> torch.Tensor:
+    """Return the loss of a rendered image: (1 - lambda) L1 + lambda (1 - SSIM).
+
+    Args:
+        rgb: Rendered colours, shape [H, W, 3].
+        target: Photographed colours in [0, 1], shape [H, W, 3].
+        mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count. Masked pixels are black to the window.
+        ssim_weight: lambda, in [0, 1].
+
+    Returns:
+        The loss, shape []; 0 where no pixel counts.
+    """
+    fraction = ssim_weight
+    if mask is None and fraction > 0:
+        sums = differences(rgb, target)
+        # a product and a sum, where terms one by one would be a dozen kernels on a GPU
+        return (sums * _weights(fraction, target.numel(), sums.dtype, sums.device)).sum()
+    if mask is not None:
+        rgb, target = rgb * mask[..., None], target * mask[..., None]
+    pixels = target.shape[0] * target.shape[1] if mask is None else mask.sum().clamp_min(1)
+    l1 = _total((rgb - target).abs()) / (3 * pixels)
+    if mask is None or fraction == 0:
+        return l1
+    structural = _total((1 - ssim(rgb, target)) * mask[..., None]) / (3 * pixels)
+    return (1 - fraction) * l1 + fraction * structural
+
+
+def depth_disagreement(
+    depth: torch.Tensor, alpha: torch.Tensor, disparity: torch.Tensor, mask: torch.Tensor | None
+) -> torch.Tensor:
+    """1 minus Pearson's correlation of rendered inverse depth with a disparity, which may have any scale and offset.
+
+    Over the pixels that count: alpha above `MIN_ALPHA`, and kept by the mask. Differentiable in ``depth`` alone. Where either
+    map is constant over them (`FLAT`), and where none counts, no correlation is known: then it is 0 and has no gradient. The
+    unit of depth does not matter from 1e-30 to 1e30 u: maps are brought to values around 1 and centred before squaring.
+
+    Args:
+        depth: Expected z-depth [u], positive where alpha is, shape [H, W].
+        alpha: Accumulated opacity, shape [H, W].
+        disparity: Relative inverse depth in [0, 1], shape [H, W].
+        mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count.
+
+    Returns:
+        A number in [0, 2], shape []; NaN where a pixel that counts has one.
+    """
+    counts = ~(alpha <= MIN_ALPHA)  # of a NaN too: it must not vanish
+    counts = counts if mask is None else counts & (mask > 0)
+    fraction = counts.to(depth.dtype)
+    pixels = fraction.sum().clamp_min(1)
+    depth = torch.where(counts, depth, 1)
+    mean = _total(depth.detach() * fraction) / pixels
+    a, b = (_centred(m, fraction, pixels) for m in (mean / depth, disparity))
+    of_a, of_b = _total(a * a) / pixels, _total(b * b) / pixels
+    flat = (of_a <= FLAT**2) | (of_b <= FLAT**2)
+    # roots in float64: float32's have other last digits on other processors (MKL)
+    spread = torch.where(flat, 1, of_a).double().sqrt() * torch.where(flat, 1, of_b).double().sqrt()
+    return torch.where(flat, 0, 1 - _total(a * b) / pixels / spread.to(a.dtype))
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a step compares its render with."""
+
+    image: torch.Tensor
+    """Colours in [0, 1], shape [H, W, 3]."""
+    mask: torch.Tensor | None
+    """1 where a pixel counts, else 0, shape [H, W]; None where all count."""
+    maps: Mapping[str, torch.Tensor]
+    """What loss terms asked for (`LossTerm.needs`), by name."""
+    params: Mapping[str, torch.Tensor]
+    """The view's own parameters (`LossTerm.view_parameters`), by name, shape [...]; differentiable."""
+
+
+@dataclass(frozen=True)
+class ViewParameter:
+    """A parameter that each training view has for itself, such as an exposure."""
+
+    initial: tuple[float, ...]
+    """Its first value, the same for all views."""
+    lr: float
+    """Learning rate."""
+
+
+@dataclass(frozen=True)
+class LossTerm:
+    """One term of the loss. A term of your own is a frozen dataclass that derives from this; its fields are its settings."""
+
+    name: ClassVar[str] = ""
+    needs_priors: ClassVar[bool] = False
+    """Whether `needs` reads the priors of the views, which then are found before the fit."""
+
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+        """Return the maps of a view that the term compares with, by name, each of shape [H, W] or [H, W, C]."""
+        return {}
+
+    def view_parameters(self) -> dict[str, ViewParameter]:
+        """Return the parameters that the term has each view learn, by name."""
+        return {}
+
+    def active(self, step: int, steps: int) -> bool:
+        """Return whether a step, from 1 to ``steps``, has the term."""
+        return True
+
+    def __call__(self, render: Render, target: Target, gaussians: Gaussians) -> torch.Tensor:
+        """Return the term's value, shape [], differentiable; it must not read back from the device.
+
+        Args:
+            render: The render of the step's view: ``rgb`` [H, W, 3], ``alpha`` and ``depth`` [H, W].
+            target: What to compare it with.
+            gaussians: The Gaussians, parameters as stored.
+        """
+        raise TypeError(f"{type(self).__name__} must define __call__(render, target, gaussians)")
+
+
+LOSS_TERMS = Registry("loss term", LossTerm, __name__)
+"""Loss terms by name."""
+register = LOSS_TERMS.register
+
+
+@register("photometric")
+@dataclass(frozen=True)
+class Photometric(LossTerm):
+    """The photometric loss; every fit has it."""
+
+    ssim_weight: float = 0.2
+    """Fraction lambda of the structural term, in [0, 1]."""
+
+    def __call__(self, render: Render, target: Target, gaussians: Gaussians) -> torch.Tensor:
+        """See `photometric_loss`."""
+        return photometric_loss(render.rgb, target.image, target.mask, self.ssim_weight)
+
+
+@register("depth_correlation")
+@dataclass(frozen=True)
+class DepthCorrelation(LossTerm):
+    """The weighted depth term of `LossConfig`."""
+
+    needs_priors: ClassVar[bool] = True
+    weight: float = 0.05
+    """Weight of the term."""
+    until: float = 0.95
+    """Fraction of the steps, from the first, that have the term."""
+
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+        """Return the disparity of the view's prior."""
+        assert prior is not None  # `needs_priors`
+        return {"disparity": torch.as_tensor(prior.disparity, dtype=torch.float32, device=view.image.device)}
+
+    def active(self, step: int, steps: int) -> bool:
+        """Return whether the step is one of the first ``until`` of all."""
+        return step <= self.until * steps
+
+    def __call__(self, render: Render, target: Target, gaussians: Gaussians) -> torch.Tensor:
+        """See `depth_disagreement`."""
+        return self.weight * depth_disagreement(render.depth, render.alpha, target.maps["disparity"], target.mask)
+
+
+def built_in_terms(config: LossConfig) -> tuple[LossTerm, ...]:
+    """Return the terms that the settings ask for."""
+    depth = (DepthCorrelation(config.depth_weight, config.depth_until),) if config.depth_weight > 0 else ()
+    return (Photometric(config.ssim_weight), *depth)

@@ -1,0 +1,121 @@
+"""Learning rates, spherical-harmonics degree and phases over a fit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from warpgs.errors import UsageError
+
+
+def log_linear(start: float, end: float, progress: float) -> float:
+    """Value between ``start`` and ``end`` (both positive) on a straight line in the logarithm; progress in [0, 1]."""
+    progress = min(max(progress, 0.0), 1.0)
+    return math.exp((1 - progress) * math.log(start) + progress * math.log(end))
+
+
+def sh_degree(step: int, every: int, highest: int) -> int:
+    """Degree in use at a step counted from 1: one more after every ``every`` steps, up to ``highest``."""
+    return min(highest, (step - 1) // every)
+
+
+MAX_LR = 1e6
+"""Largest learning rate: far above what trains, far below what overflows within a fit."""
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """Learning rates of the reference implementation of Kerbl et al. 2023, but for the scales."""
+
+    means_lr: float = 1.6e-4
+    """Learning rate of the means, times the scene's extent, at the start."""
+    means_lr_final: float = 1.6e-6
+    """The same at the last step; log-linear between."""
+    quats_lr: float = 1e-3
+    """Learning rate of the rotations."""
+    scales_lr: float = 0.01
+    """Learning rate of the log scales; 0.005 in the reference (docs/decisions/004-scale-rate.md)."""
+    scales_decay: float = 1.0
+    """Fraction of that learning rate which is left at the last step; log-linear from the beginning of phase 3, or of a fit
+    without phases. 1 keeps it as it is."""
+    opacities_lr: float = 0.05
+    """Learning rate of the opacity logits."""
+    sh_lr: float = 2.5e-3
+    """Learning rate of the constant colour coefficient."""
+    sh_rest_factor: float = 0.05
+    """Fraction of that for the other coefficients."""
+
+    def __post_init__(self):
+        for name, value in vars(self).items():
+            if not 0 < value <= MAX_LR:
+                raise UsageError(f"optimizer {name} must be positive and at most {MAX_LR:g}, not {value}")
+
+    def lrs(self, progress: float, extent: float, stable_start: float = 0.0) -> dict[str, float]:
+        """Return the learning rate of each parameter.
+
+        Args:
+            progress: Fraction of the fit, in [0, 1].
+            extent: Size of the scene [u], which the rate of the means is multiplied by.
+            stable_start: Fraction of the fit, in [0, 1), after which the rate of the scales falls.
+        """
+        stable = (progress - stable_start) / (1 - stable_start)
+        return {
+            "means": extent * log_linear(self.means_lr, self.means_lr_final, progress),
+            "quats": self.quats_lr,
+            "log_scales": log_linear(self.scales_lr, self.scales_lr * self.scales_decay, stable),
+            "logit_opacities": self.opacities_lr,
+            "sh": self.sh_lr * self.sh_rest_factor,
+        }
+
+    @property
+    def head_lrs(self) -> dict[str, float]:
+        """Learning rate of the first 3 numbers of a row, where it differs from the others'."""
+        return {"sh": self.sh_lr}
+
+
+@dataclass(frozen=True)
+class PhaseConfig:
+    """The paper's three phases (section "Training Strategy"), and when fine Gaussians are sampled in the second.
+
+    A fit shorter than twice phases 1 and 3 together has all of them, and the interval, shortened in proportion.
+    """
+
+    coarse: int = 0
+    """Steps of phase 1, in which there is the coarse layer alone; 2000 in the paper. 0 with ``stable`` 0: no phases."""
+    stable: int = 0
+    """Steps of phase 3, in which the set stays as it is; 3000 in the paper."""
+    every: float = 100.0
+    """Steps from the first sampling event to the second (T_base, which the paper leaves open)."""
+    growth: float = 4.0
+    """Growth of that interval over phase 2 (gamma, with the time t from 0 to 1): T_sample(t) = T_base (1 + gamma t)."""
+
+    def __post_init__(self):
+        if self.coarse < 0 or self.stable < 0 or not 1 <= self.every < math.inf or not 0 <= self.growth < math.inf:
+            raise UsageError("phases: coarse, stable and growth must be at least 0, every at least 1, and all finite")
+
+
+@dataclass(frozen=True)
+class Phases:
+    """Phases of one fit: the first ``refine`` steps are phase 1, those from ``stable_start`` on phase 3."""
+
+    refine: int
+    """Steps done when phase 2 begins."""
+    stable_start: int
+    """Steps done when phase 3 begins."""
+    events: tuple[int, ...]
+    """Steps done when fine Gaussians are sampled, ascending; the first is ``refine``, or 1 where that is 0."""
+
+
+def plan_phases(config: PhaseConfig, steps: int) -> Phases:
+    """The phases of a fit of that many steps.
+
+    With the paper's numbers there are 102 events in 25,000 steps of phase 2 and 21 in 5000.
+    """
+    outer = config.coarse + config.stable
+    shrink = min(1.0, 0.5 * steps / outer) if outer else 1.0
+    refine, stable_start = round(shrink * config.coarse), steps - round(shrink * config.stable)
+    length, at, events = stable_start - refine, 0.0, []
+    while at < length:
+        events.append(max(1, refine + int(at)))
+        at += max(1.0, shrink * config.every) * (1 + config.growth * at / length)
+    return Phases(refine, stable_start, tuple(events))

@@ -1,0 +1,105 @@
+"""Preparation of a fit: its first points, priors of its views, and the views on the device."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from warpgs.pipeline.metrics.region import counted_region
+from warpgs.pipeline.model.init import Start, check_points, initial_points, subsample
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loss import LossTerm, built_in_terms
+from warpgs.pipeline.train.strategies.base import find_strategy
+from warpgs.pipeline.train.strategies.importance_sampling import scored
+from warpgs.pipeline.train.views import TrainingView
+from warpgs.priors.cache import cache_folder
+from warpgs.priors.view_prior import view_priors
+from warpgs.scene import PointCloud, Prior, View
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """Found before the first step."""
+
+    start: Start
+    """The first points, and the depths that views confirm."""
+    priors: list[Prior] | None
+    """One a view; None where nothing asks for them."""
+    notes: list[str]
+    """What was chosen, assumed and missing."""
+
+
+def prepare(
+    train: list[View], points: PointCloud | None, config: FitConfig, generator: np.random.Generator, device: torch.device,
+    priors: list[Prior] | None, ready: Callable[[], object],
+) -> Preparation:  # fmt: skip
+    """Find the first points, and priors where they are not given and sampling or the depth term asks for them.
+
+    Args:
+        train: The views to fit.
+        points: The reconstruction's points, or None.
+        config: Settings.
+        generator: For random points.
+        device: Where to sweep, unless there is a memory limit: depths take more than a step may.
+        priors: What is believed of each view, where that is known.
+        ready: Called before the device is used, and in any case before the end.
+
+    Raises:
+        DataError: There is nothing to start from.
+    """
+    check_points(train, points, config.init)  # before anything takes time
+    where = device if config.memory_limit is None else torch.device("cpu")
+
+    def usable() -> torch.device:
+        ready()
+        return where
+
+    @functools.cache
+    def start() -> Start:
+        found = initial_points(train, points, config.init, generator, usable)
+        return subsample(found, config.max_gaussians, generator)
+
+    notes = []
+    if priors is None and needs_priors(config):
+        regions, cache = [counted_region(v)[0] for v in train], cache_folder()
+        # semantics come first: they are found while the device is made ready
+        priors, notes = view_priors(train, config.priors, depths=lambda: start().depths, regions=regions, cache=cache)
+    found = start()
+    ready()
+    return Preparation(found, priors, [*(line.strip() for line in f"start: {found.how}".splitlines()), *notes])
+
+
+def needs_priors(config: FitConfig) -> bool:
+    """Return whether sampling or a loss term asks for what is believed of the views."""
+    terms = (*built_in_terms(config.loss), *config.loss_terms)
+    return find_strategy(config.strategy).samples(config) or any(t.needs_priors for t in terms)
+
+
+def prepared_views(
+    train: list[View], made: Preparation, config: FitConfig, terms: tuple[LossTerm, ...], device: torch.device
+) -> tuple[list[TrainingView], list[np.ndarray]]:
+    """Return the training views on the device, with their scores and the maps of loss terms.
+
+    Also returns each view's disparity, relative inverse depth in [0, 1], shape [H, W], where views are scored: only images of
+    events show it. A note on the depth term is appended to the preparation's.
+    """
+    views, disparities = [TrainingView.of(v, device) for v in train], []
+    priors = made.priors or [None] * len(train)
+    if find_strategy(config.strategy).samples(config):
+        disparities = [p.disparity for p in priors]
+        depths = made.start.depths or [None] * len(train)
+        views = [scored(v, p, d, config.method) for v, p, d in zip(views, priors, depths, strict=True)]
+    found = []
+    for view, prior in zip(views, priors, strict=True):
+        maps = {n: m for term in terms for n, m in term.needs(view, prior).items()}
+        found.append(dataclasses.replace(view, maps=maps))
+    if config.loss.depth_weight > 0:
+        known = sum(bool(p.disparity.any()) for p in priors)
+        more = "" if known else "; --depth-model, or a start by --init.source sweep or flow, makes priors"
+        made.notes.append(f"depth term: in {known} of {len(views)} views, those whose prior knows a depth{more}")
+    return found, disparities

@@ -1,0 +1,281 @@
+"""One training step, called eagerly on a CPU and captured as a CUDA graph on a GPU.
+
+At sparse-view sizes a step keeps a GPU busy for less time than Python needs to launch it. There one step is captured, from the
+choice of the view to Adam, and replayed; learning rates and views of several steps are uploaded at once, losses read at their
+end. On a CPU the same function is called for each step.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from warpgs.constants import RULES
+from warpgs.errors import ResourceError
+from warpgs.kernels.blend import blend
+from warpgs.kernels.dropout import opacity_dropout
+from warpgs.kernels.project import project
+from warpgs.kernels.step_buffers import NOT_FINITE, begin_step, end_step
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, bin_tiles
+from warpgs.pipeline.metrics.psnr import masked_mse
+from warpgs.pipeline.model.table import Table
+from warpgs.pipeline.train.loss import LossTerm, Target
+from warpgs.pipeline.train.strategies.base import Strategy
+from warpgs.pipeline.train.views import ViewStack
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.runtime.cuda_graph import CapturedGraph, GraphMemory
+from warpgs.runtime.device_memory import available_bytes
+from warpgs.scene import Camera, Gaussians, Render
+
+MAX_BATCH = 100
+"""Most steps between two looks at the device."""
+CAPACITY_FACTOR = 1.3
+"""Instances that a captured step has capacity for, as a multiple of the most that any view has when it is captured."""
+DEAD_BYTES = 2**30
+"""Memory of graphs no longer used that may pile up. To give it back takes milliseconds, in which the device waits."""
+
+
+@dataclass(frozen=True)
+class StepPlan:
+    """What a step does; steps of equal plans share a CUDA graph."""
+
+    degree: int
+    """Spherical-harmonics degree in use."""
+    half_size: bool
+    """Views are half their size."""
+    terms: tuple[LossTerm, ...]
+    """Loss terms, in the order in which they are summed."""
+    phase: Hashable
+    """What the strategy does (`Strategy.phase`)."""
+
+
+class StepBuffers:
+    """What steps read and write between two looks at the device: views, learning rates, losses, and the stop flag."""
+
+    def __init__(self, device: torch.device, lrs: int):
+        """Allocate for `MAX_BATCH` steps on CUDA, elsewhere for the one of a batch, with ``lrs`` learning rates each."""
+        self.device = device
+        rows = MAX_BATCH if device.type == "cuda" else 1
+        self.view_rows = torch.zeros(rows, dtype=torch.int64, device=device)
+        """Row of each step's view in its stack."""
+        self.lr_rows = torch.ones(rows, lrs, device=device)
+        """Learning rates of each step (`Table.lr_row` of all tables)."""
+        self.setting_rows = torch.zeros(rows, 3, device=device)
+        """Dropout probability, number, and learning rate of the means [u] of each step."""
+        self.counter = torch.zeros(1, dtype=torch.int64, device=device)
+        """Number of the step at hand. It stays once a step stops, and so do all Gaussians."""
+        self.stop = torch.zeros(1, dtype=torch.int32, device=device)
+        """0 while all is well, else why the steps stopped."""
+        self.history = torch.zeros(rows, 2, device=device)
+        """Loss and mean squared error of each step."""
+        self.one = torch.ones((), device=device)
+        """Gradient of the loss."""
+
+    def load(self, rows: list[int], lrs: list[list[float]], settings: list[tuple[float, float, float]]) -> None:
+        """Upload view rows, learning rates and settings of the next steps, at most `MAX_BATCH`."""
+        self.counter.zero_()
+        self.stop.zero_()
+        self.view_rows[: len(rows)] = torch.tensor(rows).to(self.device)
+        self.lr_rows[: len(lrs)] = torch.tensor(lrs, dtype=torch.float32).to(self.device)
+        self.setting_rows[: len(settings)] = torch.tensor(settings, dtype=torch.float32).to(self.device)
+
+    def result(self) -> tuple[int, int, list[list[float]]]:
+        """Return steps taken, the stop flag, and loss and squared error of each step taken and of one that was not finite."""
+        done, stop = int(self.counter), int(self.stop)
+        return done, stop, self.history[: done + 1].tolist()
+
+    def begin(self, views: ViewStack) -> tuple[torch.Tensor, ...]:
+        """Return learning rates, settings [3], viewmat [1, 4, 4], K [1, 3, 3] and image [H, W, 3] of the step at hand."""
+        if self.device.type == "cpu":  # no copies
+            step, row = int(self.counter), int(self.view_rows[int(self.counter)])
+            view = views.viewmats[row : row + 1], views.Ks[row : row + 1], views.images[row]
+            return self.lr_rows[step], self.setting_rows[step], *view
+        rows = (self.view_rows, self.lr_rows, self.setting_rows, views.viewmats, views.Ks, views.images)
+        return begin_step(self.counter, *rows)
+
+    def of_view(self, maps: torch.Tensor) -> torch.Tensor:
+        """Return the entry of the step's view in maps [V, ...]; before the step is counted."""
+        if self.device.type == "cpu":
+            return maps[int(self.view_rows[int(self.counter)])]
+        return maps.index_select(0, self.view_rows.index_select(0, self.counter))[0]
+
+
+Renderer = Callable[[Gaussians, Camera, int, "torch.Tensor | None"], Render]
+"""Renders Gaussians for a camera with tensors of one view, a degree, and factors of the opacities."""
+
+
+def eager_renderer(rule: str, background: torch.Tensor, max_instances: int | None) -> Renderer:
+    """Return a renderer that makes room for as many instances as there are, in chunks of at most ``max_instances``."""
+
+    def render(gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None) -> Render:
+        options = RasterizeOptions(
+            rule=rule, sh_degree=degree, background=background, opacity_factors=factors, max_instances=max_instances,
+            record=False,  # it would make room for more than was planned
+        )  # fmt: skip
+        camera = Camera(camera.viewmat[0], camera.K[0], camera.width, camera.height)
+        return rasterize(gaussians, camera, options)
+
+    return render
+
+
+def captured_renderer(rule: str, background: torch.Tensor, capacity: int, overflow: torch.Tensor) -> Renderer:
+    """Return a renderer with a fixed capacity of instances, which sets ``overflow`` [1] where they do not fit."""
+    cut, backgrounds = RULES[rule], background[None]
+
+    def render(gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None) -> Render:
+        size = {"width": camera.width, "height": camera.height}
+        of = (*gaussians.tensors().values(), camera.viewmat, camera.K)
+        projected, counts = project(*of, **size, degree=degree, rule=cut, opacity_factors=factors)
+        tiles = bin_tiles(projected, counts, **size, rule=cut, capacity=capacity, overflow=overflow)
+        # not p[0], whose gradient would be a copy among zeros
+        images = (p.squeeze(0) for p in blend(projected, tiles, backgrounds, **size, rule=cut))
+        return Render(*images, projected, counts)
+
+    return render
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What steps change."""
+
+    table: Table
+    """The Gaussians."""
+    views: Table
+    """Parameters of each training view, one row each; often none."""
+    strategy: Strategy
+    """What gathers gradients and follows updates."""
+    dropout_seed: int | None
+    """Seed of the opacity dropout; None for none."""
+
+
+def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer) -> None:
+    """Take one training step: render the next view, compare it, update all parameters.
+
+    Nothing changes where the render overflows or the loss is not finite: ``buffers.stop`` then says so.
+
+    Args:
+        learned: What the step changes.
+        views: What it may look at.
+        buffers: Where it finds its settings and leaves its results.
+        plan: What it does.
+        render: How it renders.
+    """
+    table, strategy = learned.table, learned.strategy
+    lrs, settings, viewmat, K, image = buffers.begin(views)
+    mask = None if views.masks is None else buffers.of_view(views.masks)
+    own = {n: t[buffers.of_view(views.numbers)] for n, t in learned.views.params.items()}
+    target = Target(image, mask, {n: buffers.of_view(t) for n, t in views.maps.items()}, own)
+    factors = None
+    if learned.dropout_seed is not None:
+        factors = opacity_dropout(len(table), settings[:2], learned.dropout_seed)
+    rendered = render(table.gaussians, Camera(viewmat, K, **views.size), plan.degree, factors)
+    loss = total_loss(plan.terms, rendered, target, table.gaussians, strategy)
+
+    projected, split = rendered.projected, 3 * len(table.params)
+    params = [*table.params.values(), *learned.views.params.values()]
+    *gradients, v_projected = torch.autograd.grad(loss, [*params, projected], buffers.one, materialize_grads=True)
+    with torch.no_grad():
+        going = end_step(loss, masked_mse(rendered.rgb, image, mask), buffers.counter, buffers.stop, buffers.history)
+        table.adam_step(dict(zip(table.params, gradients)), lrs[:split], buffers.stop, strategy.lr_factors(plan.phase))
+        learned.views.adam_step(dict(zip(learned.views.params, gradients[len(table.params) :])), lrs[split:], buffers.stop)
+        strategy.after_step(plan.phase, settings, going)
+        size = (views.size["width"], views.size["height"])
+        strategy.after_backward(plan.phase, v_projected, rendered.visible, size, going)
+
+
+def total_loss(
+    terms: Sequence[LossTerm], rendered: Render, target: Target, gaussians: Gaussians, strategy: Strategy
+) -> torch.Tensor:
+    """Return the sum of the terms and of what the strategy adds, shape []."""
+    values = [term(rendered, target, gaussians) for term in terms]
+    extra = strategy.regularisation(gaussians)
+    total = values[0]
+    for value in values[1:] if extra is None else [*values[1:], extra]:
+        total = total + value
+    return total
+
+
+class OverLimitError(ResourceError):
+    """A captured step would not keep to the fit's memory limit."""
+
+
+class StepGraphs:
+    """Captured steps, one for each plan and kind of view; made when they are first asked for."""
+
+    def __init__(self, device: torch.device):
+        """Capture nothing yet."""
+        self.device = device
+        self.stream = torch.cuda.Stream(device)
+        """Where steps are captured: always the same one, since torch keeps freed memory for the stream that it was used on."""
+        self.memory = GraphMemory(device)
+        """Account of the memory that torch keeps for graphs that are gone."""
+        self._graphs: dict[tuple, CapturedGraph] = {}
+
+    def clear(self) -> None:
+        """Forget all graphs: what they refer to has changed."""
+        self._graphs.clear()
+
+    def capture_all(
+        self, kinds: Sequence[Hashable], stacks: Mapping[Hashable, ViewStack], learned: Learned, buffers: StepBuffers,
+        plan: StepPlan, rule: str, background: torch.Tensor, max_instances: int | None,
+    ) -> list[CapturedGraph]:  # fmt: skip
+        """Return the graph of each of several steps of one plan, by the kind of their views; captured where there is none.
+
+        Raises:
+            OverLimitError: The capacity of one would be above ``max_instances``.
+            ResourceError: The instances would not fit into memory.
+        """
+        self._graphs = {k: g for k, g in self._graphs.items() if k[1] == plan}
+        for kind in dict.fromkeys(kinds):
+            if (kind, plan) in self._graphs:
+                continue
+            views = stacks[kind]
+            capacity = instance_capacity(learned.table.gaussians, views, plan.degree, rule)
+            if max_instances is not None and capacity > max_instances:
+                raise OverLimitError(
+                    f"a captured step would need capacity for {capacity:,} instances, the limit allows {max_instances:,}"
+                )
+            self.memory.give_back(0 if max_instances is not None else DEAD_BYTES)
+            render = captured_renderer(rule, background, capacity, buffers.stop)
+            work = functools.partial(step, learned, views, buffers, plan, render)
+            self._graphs[kind, plan] = self._capture(work, buffers)
+        return [self._graphs[kind, plan] for kind in kinds]
+
+    def _capture(self, work: Callable[[], None], buffers: StepBuffers) -> CapturedGraph:
+        """Return the graph of a step."""
+        here, loaded = torch.cuda.current_stream(), buffers.view_rows.clone()
+        self.stream.wait_stream(here)
+        with torch.cuda.stream(self.stream):
+            # a first run loads kernels and makes room in caches, which may not happen while capturing; it changes nothing
+            buffers.stop.fill_(NOT_FINITE)
+            buffers.view_rows.zero_()
+            work()
+            buffers.stop.zero_()
+            buffers.view_rows.copy_(loaded)
+            self.stream.synchronize()
+            captured = CapturedGraph(work, self.stream)
+        here.wait_stream(self.stream)
+        return captured
+
+
+@torch.no_grad()
+def instance_capacity(gaussians: Gaussians, views: ViewStack, degree: int, rule: str) -> int:
+    """Return the (Gaussian, tile) instances that a captured step makes room for, over all views of a stack.
+
+    Raises:
+        ResourceError: They would not fit into memory.
+    """
+    how = {**views.size, "degree": degree, "rule": RULES[rule]}
+    of = gaussians.tensors().values()
+    counts = [project(*of, m[None], K[None], **how)[1].sum() for m, K in zip(views.viewmats, views.Ks)]
+    wanted = int(CAPACITY_FACTOR * int(torch.stack(counts).max())) + 1024
+    budget = available_bytes(gaussians.means.device) * 4 // 5
+    if wanted > MAX_INSTANCES or wanted * BYTES_PER_INSTANCE > budget:
+        raise ResourceError(
+            f"a step would touch {wanted:,} tiles, which needs {wanted * BYTES_PER_INSTANCE / 2**30:.2f} GiB; "
+            f"{budget / 2**30:.2f} GiB may be used. Fit smaller images with --downscale, or limit --max-gaussians."
+        )
+    return wanted

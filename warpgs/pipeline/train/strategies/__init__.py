@@ -1,0 +1,1 @@
+"""Strategies: where Gaussians are added and removed during training."""

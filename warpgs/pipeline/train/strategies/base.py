@@ -1,0 +1,123 @@
+"""What a density strategy is: the one part of training that adds, moves and removes Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import torch
+
+from warpgs.pipeline.model.table import Column, DensityUpdate
+from warpgs.pipeline.train.schedule import sh_degree
+from warpgs.plugins import Registry
+
+if TYPE_CHECKING:
+    from warpgs.pipeline.train.config import FitConfig
+    from warpgs.pipeline.train.trainer import Trainer
+
+
+class Strategy:
+    """Decides where Gaussians are added, moved and removed.
+
+    A strategy of your own is a class that derives from this one and overrides what it needs; nothing else has to change. The
+    trainer calls, for each step: `phase` on the host; then, as part of the step, `lr_factors`, `after_step` and
+    `after_backward`; then `due` and, where that is true, `update` on the host.
+
+    What is part of a step is recorded once as a CUDA graph and replayed, so it must not read back from the device, must write
+    its results into tensors that are there already, and may depend on the host only by `phase`.
+    """
+
+    name: ClassVar[str] = ""
+    """Name that it is registered by."""
+    Config: ClassVar[type | None] = None
+    """Frozen dataclass of its own settings, None for none. They become flags, grouped under the strategy's name."""
+
+    def __init__(self, trainer: Trainer):
+        """Keep the trainer, whose table, views and settings the strategy works with; nothing is trained yet.
+
+        Args:
+            trainer: The trainer. Its table exists, its views do not: see `setup`.
+        """
+        self.trainer = trainer
+        own = trainer.config.strategy_config
+        self.config: Any = self.Config() if own is None and self.Config is not None else own
+        """The strategy's own settings."""
+
+    @classmethod
+    def samples(cls, config: FitConfig) -> bool:
+        """Return whether it samples by importance, for which views need priors and scores."""
+        return False
+
+    def columns(self) -> Mapping[str, Column]:
+        """Return what the strategy keeps of each Gaussian, by name; it is saved with every checkpoint."""
+        return {}
+
+    def setup(self) -> None:
+        """Begin: the table, the training views and the plan of memory are there."""
+
+    def phase(self, step: int) -> Hashable:
+        """Return what the strategy does in a step; steps of equal phases share a CUDA graph."""
+        return None
+
+    def sh_degree(self, step: int) -> int:
+        """Return the spherical-harmonics degree in use at a step."""
+        return sh_degree(step, self.trainer.config.sh_every, self.trainer.config.init.max_sh_degree)
+
+    def dropout(self, step: int) -> float:
+        """Return the probability that a Gaussian is hidden in a step, in [0, 1)."""
+        return self.trainer.dropout * self.trainer.progress(step)
+
+    def regularisation(self, gaussians: Any) -> torch.Tensor | None:
+        """Return what is added to the loss of every step, shape []; None for nothing."""
+        return None
+
+    def lr_factors(self, phase: Hashable) -> torch.Tensor | None:
+        """Return the part of its step that each mean takes, shape [N]; None for all of it."""
+        return None
+
+    def after_step(self, phase: Hashable, settings: torch.Tensor, going: torch.Tensor) -> None:
+        """Follow the update of the parameters within a step.
+
+        Args:
+            phase: What `phase` returned.
+            settings: Dropout probability, number of the step, and learning rate of the means [u], float32, shape [3].
+            going: Whether the step is taken, bool, shape [1]; where it is not, nothing may change.
+        """
+
+    def after_backward(
+        self, phase: Hashable, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int], going: torch.Tensor
+    ) -> None:
+        """Take in the gradients of a step.
+
+        Args:
+            phase: What `phase` returned.
+            v_projected: Gradient of the projected Gaussians, shape [1, N, 12]; the first two are of the mean [1/px].
+            visible: Gaussians that touch a tile, bool, shape [1, N].
+            size: Width and height of the view [px].
+            going: Whether the step is taken, bool, shape [1]; where it is not, nothing may change.
+        """
+
+    def due(self, step: int) -> bool:
+        """Return whether `update` has anything to do after a step."""
+        return False
+
+    def update(self, step: int) -> Iterator[DensityUpdate]:
+        """Yield changes of the set of Gaussians after a step; each has been applied to the table when the next is asked for."""
+        return iter(())
+
+    def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+        """Return tensors and plain values beside the table from which the strategy goes on as if it had never stopped."""
+        return {}, {}
+
+    def load(self, tensors: Mapping[str, torch.Tensor], plain: dict[str, Any]) -> None:
+        """Take over what `state` gave."""
+
+    def figures(self) -> dict[str, Any]:
+        """Return what the report says of it, plain values for metrics.json."""
+        return {}
+
+
+STRATEGIES: Registry[Strategy] = Registry("strategy", Strategy, __package__)
+"""Strategies by name; the modules of this folder are ours."""
+register = STRATEGIES.register
+find_strategy = STRATEGIES.find

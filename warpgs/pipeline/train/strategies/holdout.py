@@ -1,0 +1,342 @@
+"""A strategy that finds its own size: growth is measured on held-out blocks, what the evidence does not ask for goes.
+
+docs/complexity.md. On top of importance sampling, it decides when growth ends and what is left of the model.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+
+import torch
+
+from warpgs.pipeline.metrics.psnr import masked_mse
+from warpgs.pipeline.model import compress
+from warpgs.pipeline.model.parameter_bounds import bound_columns, enforce_bounds, min_log_scale
+from warpgs.pipeline.model.table import Column, DensityUpdate
+from warpgs.pipeline.train.schedule import sh_degree
+from warpgs.pipeline.train.strategies.base import register
+from warpgs.pipeline.train.strategies.holdout_blocks import (
+    FLOOR,
+    MIN_BLOCKS,
+    Gain,
+    block_errors,
+    decibels,
+    gain,
+    hide,
+    only,
+    sample_blocks,
+)
+from warpgs.pipeline.train.strategies.importance_sampling import MAX_VIEWS, ImportanceSampling
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.scene import Gaussians
+
+RECOVERED_AGAIN = 0.5
+"""Fraction of what training recovered of one trim that it is expected to recover of the next: a smaller model recovers less.
+With all of it smooth walls ended up to 1.1 dB below enough, with half of it at enough (docs/complexity.md)."""
+
+NEAR = 4.0
+"""Below enough by less than this a trim may take the less the farther [dB]. With an edge there a tenth of a decibel decided
+whether a smooth wall kept 167 or 696 Gaussians (docs/complexity.md)."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level of growth and what it gained; plain values as metrics.json has them."""
+
+    step: int
+    """Steps done when it was measured."""
+    count: int
+    """Gaussians then."""
+    held_out_psnr: float
+    """PSNR of the held-out blocks, the error floor included [dB]."""
+    fall: float
+    """Fall of the held-out error since the level before, by growth and training together [dB]."""
+    own: float
+    """Loss when the Gaussians that came with the level are hidden [dB]."""
+    gain: float
+    """The smaller of the two, which are both upper bounds of the gain by growth [dB]."""
+    noise: float
+    """Standard error of ``gain`` over the blocks [dB]."""
+
+
+@register("holdout")
+class Holdout(ImportanceSampling):
+    """Importance sampling, or with ``method.events`` off clone and split, that ends growth where held-out evidence says so.
+
+    Until growth ends, blocks of every view are held out of the loss and of sampling. The start sees whole images: its colours
+    and depths come from them, and the evidence is about growth, merging and pruning.
+    """
+
+    def __init__(self, trainer):
+        """See `Strategy`."""
+        super().__init__(trainer)
+        self.closed: int | None = None
+        """Steps done when growth ended; None before."""
+        self.why = ""
+        """Why growth ended, for the user."""
+        self.levels: list[Level] = []
+        self.trims: list[dict] = []
+        """Step of each trim, and the Gaussians and the training PSNR [dB] before and after it."""
+        self.growing = 0
+        """Level of growth that new Gaussians come with."""
+        self.before: torch.Tensor | None = None
+        """Errors of the blocks when they were measured last, shape [B]."""
+
+    def columns(self):
+        """See `Strategy`."""
+        bounds = bound_columns(self.trainer.config.init.max_sh_degree)
+        return {**super().columns(), **bounds, "growth_level": Column(0, torch.int32, inherited=False)}
+
+    def setup(self) -> None:
+        """Hold blocks out, where there are enough of them to tell a gain from noise."""
+        t, c = self.trainer, self.trainer.config
+        begins = t.phases.refine if c.method.events else c.density.times(c.steps)[0]
+        ends = self._growth_ends
+        levels = c.holdout.levels
+        self.marks = sorted({max(1, begins + round(k * (ends - begins) / levels)) for k in range(levels + 1)})
+        """Steps done when the blocks are measured: before growth, and after each level."""
+        self.whole = t.views
+        self.blocks = sample_blocks(t.views, c.holdout.fraction, c.seed)
+        held = sum(map(len, self.blocks))
+        self.measuring = held >= MIN_BLOCKS and ends < c.steps
+        """Whether there is evidence at all."""
+        if self.measuring:
+            t.set_views([hide(v, b) for v, b in zip(self.whole, self.blocks)])
+            pixels = sum(len(b) * b.side**2 for b in self.blocks) / sum(v.camera.width * v.camera.height for v in t.views)
+            t.notes.append(
+                f"holdout: {held} blocks, {pixels:.1%} of the pixels, are held out until growth ends, by step {ends}"
+            )
+        else:
+            few = f"the images hold only {held} blocks" if held < MIN_BLOCKS else "growth lasts to the end of the fit"
+            t.notes.append(f"holdout: nothing is held out, since {few}; the fit is as without this strategy")
+
+    @property
+    def _growth_ends(self) -> int:
+        """Steps done when growth ends by schedule."""
+        return super().densify_until
+
+    @property
+    def densify_until(self) -> int:
+        """Last step after which the set may be refined."""
+        ends = self._growth_ends
+        return ends if self.closed is None else min(ends, self.closed - 1)
+
+    def sh_degree(self, step: int) -> int:
+        """Return the degree in use; the highest comes when growth begins: else nothing would speak for it."""
+        c = self.trainer.config
+        highest = c.init.max_sh_degree
+        if not self.measuring or highest == 0:
+            return super().sh_degree(step)
+        return sh_degree(step, max(1, min(c.sh_every, self.marks[0] // highest)), highest)
+
+    def dropout(self, step: int) -> float:
+        """Return the dropout probability, such that a trimmed model shows no fewer Gaussians than the whole one would have.
+
+        Hiding some teaches the others to stand in for them, and what was redundant that way has gone.
+        """
+        kept = math.prod(t["after"] / t["before"] for t in self.trims)
+        return max(0.0, 1 - (1 - super().dropout(step)) / kept)
+
+    def samples_after(self, step: int) -> bool:
+        """Return whether fine Gaussians are sampled after a step."""
+        return super().samples_after(step) and (self.closed is None or step < self.closed)
+
+    def _measures_after(self, step: int) -> bool:
+        return self.measuring and self.closed is None and step in self.marks
+
+    def _trims_after(self, step: int) -> bool:
+        c = self.trainer.config.holdout
+        if self.closed is None or not c.trim_db > 0:
+            return False
+        rest = self.trainer.config.steps - self.closed
+        return step in {self.closed + round(k * rest / c.trims) for k in range(1, c.trims + 1)}
+
+    def due(self, step: int) -> bool:
+        """Return whether anything is measured, added or trimmed after a step."""
+        return super().due(step) or self._measures_after(step) or self._trims_after(step)
+
+    def update(self, step: int) -> Iterator[DensityUpdate]:
+        """Measure, then grow, then trim, where it is time for each."""
+        if self._measures_after(step):
+            yield from self._measure(step)
+        yield from map(self._of_level, super().update(step))
+        if self._trims_after(step):
+            self._trim(step)
+
+    def _of_level(self, change: DensityUpdate) -> DensityUpdate:
+        return dataclasses.replace(change, columns={**change.columns, "growth_level": self.growing})
+
+    def refine(self, step, growing=None, protected=None):
+        """Refine, but never what one view alone sees, nor what is as fine as a pixel."""
+        if self.measuring:
+            self._observe()
+        yield from super().refine(step, growing, protected)
+
+    def after_step(self, phase, settings, going):
+        """Keep the bounds of each Gaussian, and what `ImportanceSampling` protects."""
+        enforce_bounds(self.trainer.table)
+        super().after_step(phase, settings, going)
+
+    @property
+    def _view_set(self) -> compress.ViewSet:
+        return compress.ViewSet([v.camera for v in self.whole], self._options(), self.trainer.config.seed)
+
+    def _options(self) -> RasterizeOptions:
+        t = self.trainer
+        degree = self.sh_degree(t.step)
+        return RasterizeOptions(
+            rule=t.config.rule, sh_degree=degree, background=t.background, max_instances=t.max_instances
+        )  # fmt: skip
+
+    def _errors(self, gaussians: Gaussians) -> torch.Tensor:
+        return block_errors(gaussians, self.whole, self.blocks, self._options())
+
+    def _observe(self) -> None:
+        """Bound every Gaussian by what the views can tell of it, and take growth from what one view alone sees."""
+        t, columns, seen = self.trainer, self.trainer.table.columns, self._view_set.coverage(self.trainer.gaussians)
+        columns["min_log_scale"] = min_log_scale(seen.footprint)
+        columns["max_degree"] = torch.minimum(columns["max_degree"], seen.supported_degree().to(torch.int32))
+        enforce_bounds(t.table)
+        if len(t.views) > 1:
+            columns["grad_sum"] = torch.where(seen.views > 1, columns["grad_sum"], 0)
+        finest = t.gaussians.log_scales.amax(1) <= columns["min_log_scale"]
+        columns["grad_sum"] = torch.where(finest, 0, columns["grad_sum"])
+
+    def _measure(self, step: int) -> Iterator[DensityUpdate]:
+        """Measure the held-out blocks; end growth where the last level gained less than its noise, or where its time is up."""
+        c, model = self.trainer.config.holdout, self.trainer.gaussians
+        last = max((m for m in self.marks if m < step), default=step)
+        if last < step < self.marks[-1] and not any(super(Holdout, self).due(s) for s in range(last, step)):
+            return  # nothing could have grown
+        errors = self._errors(model)
+        if self.before is not None:
+            old = self.trainer.table.columns["growth_level"] < self.growing
+            hidden = self._errors(compress.rows_of(model, old)) if bool(old.any()) and not bool(old.all()) else errors
+            fall, own = gain(self.before, errors), gain(hidden, errors)
+            least: Gain = min(fall, own, key=lambda g: g.mean)
+            self.levels.append(Level(step, len(model), decibels(errors), fall.mean, own.mean, least.mean, least.noise))
+            if least.upper_bound_below(c.least_db, c.noise):
+                self.why = (
+                    f"level {len(self.levels)} gained {least.mean:+.3f} dB on the held-out blocks, which with {c.noise:g} x "
+                    f"its noise of {least.noise:.3f} dB is less than {c.least_db:g} dB"
+                )
+                if bool(old.all()):
+                    self.why = f"no Gaussian came with level {len(self.levels)}: the capacity is used up, or nothing is to add"
+                yield from self._close(step)
+                return
+            if step == self.marks[-1]:
+                self.why = f"its time was up: level {len(self.levels)} still gained {least.mean:+.3f} dB"
+                yield from self._close(step)
+                return
+        self.before = errors
+        self.growing += 1
+
+    def _close(self, step: int) -> Iterator[DensityUpdate]:
+        """End growth: no harmonics but those that held-out evidence asks for, and all pixels are trained on from here on."""
+        t, c = self.trainer, self.trainer.config.holdout
+        self.closed = step
+        yield from map(self._of_level, self._catch_up(step))
+        self._observe()
+        if c.degrees:
+            base = self._errors(t.gaussians)
+            t.table.columns["max_degree"] = compress.needed_degrees(
+                t.gaussians, t.table.columns["max_degree"], self._view_set,
+                lambda model: gain(base, self._errors(model)).cost_below(c.keep_db, c.noise),
+            )  # fmt: skip
+        enforce_bounds(t.table)
+        self.forget()
+        t.set_views(self.whole)
+        t.messages.append(
+            f"holdout: growth ended at step {step} with {len(t.table):,} Gaussians, because {self.why}; all pixels are trained "
+            "on from here"
+        )
+
+    @torch.no_grad()
+    def view_psnr(self, gaussians: Gaussians) -> float:
+        """Return the mean over the training views of the PSNR over the pixels that count, the error floor included [dB]."""
+        options = self._options()
+        errors = [masked_mse(rasterize(gaussians, v.camera, options).rgb, v.image, v.mask).double() for v in self.whole]
+        return float((-10 * torch.log10(torch.stack(errors) + FLOOR)).mean())
+
+    def psnr_budget(self, psnr: float, step: int) -> float:
+        """Return what a trim may take of that PSNR on the training views [dB]; 0 before the last step of a fit far from enough.
+
+        That is ``holdout.trim_db``, less below enough; what the fit has beyond enough; and before the last step what training
+        is expected to recover.
+        """
+        c = self.trainer.config.holdout
+        over = psnr - c.enough_db
+        if step == self.trainer.config.steps:
+            return c.trim_db + max(over, 0.0)
+        fraction = 1 + over / NEAR
+        if not fraction > 0:
+            return 0.0
+        recovered = psnr - self.trims[-1]["psnr"][1] if self.trims else 0.0
+        return min(fraction, 1.0) * c.trim_db + max(over, 0.0) + RECOVERED_AGAIN * max(recovered, 0.0)
+
+    def _trim(self, step: int) -> None:
+        """Make the model smaller, within its PSNR budget on the training views."""
+        t = self.trainer
+        whole, before = self.view_psnr(t.gaussians), len(t.table)
+        budget = self.psnr_budget(whole, step)
+        if budget == 0:
+            return
+        made = compress.prune_model(
+            t.gaussians, t.table.columns["level"], self._view_set,
+            lambda g, fraction: self.view_psnr(g) >= whole - fraction * budget,
+        )  # fmt: skip
+        t.table.merge(made.gaussians, made.into)
+        t.count_changed()
+        t.table.columns["max_degree"] = made.degrees
+        self._observe()
+        after = self.view_psnr(t.gaussians)
+        self.trims.append({"step": step, "before": before, "after": len(made.degrees), "psnr": [whole, after]})
+        t.messages.append(
+            f"holdout: trimmed at step {step} from {before:,} to {len(made.degrees):,} Gaussians for {whole - after:.3f} dB on "
+            "the training views"
+        )
+
+    def _catch_up(self, step: int) -> Iterator[DensityUpdate]:
+        """Give the blocks, where nothing was sampled so far, as many fine Gaussians a pixel as there are elsewhere."""
+        method, pixels = self.method, sum(v.image[..., 0].numel() for v in self.whole)
+        held = sum(len(b) * b.side**2 for b in self.blocks)
+        fraction = int(self.fine.sum()) / (pixels - held) * held / pixels
+        if not method.events or not fraction * pixels >= 1:
+            return
+        sampler = dataclasses.replace(method.sampler, fraction=min(1.0, fraction), max_fraction=1e6)
+        blocks = [only(v, b) for v, b in zip(self.whole, self.blocks)]
+        for first in range(0, len(blocks), MAX_VIEWS):
+            views = blocks[first : first + MAX_VIEWS]
+            yield self.sample(step, views, dataclasses.replace(method, sampler=sampler)).change
+
+    def state(self):
+        """Return what was measured so far."""
+        tensors, plain = super().state()
+        if self.before is not None:
+            tensors["holdout.before"] = self.before
+        return tensors, plain | {
+            "closed": self.closed, "why": self.why, "levels": [asdict(x) for x in self.levels], "trims": self.trims,
+            "growing": self.growing,
+        }  # fmt: skip
+
+    def load(self, tensors, plain):
+        """Take over what `state` gave."""
+        super().load(tensors, plain)
+        self.closed, self.why, self.trims, self.growing = (plain[k] for k in ("closed", "why", "trims", "growing"))
+        self.levels = [Level(**x) for x in plain["levels"]]
+        self.before = tensors.get("holdout.before")
+        if self.closed is not None:
+            self.trainer.views = self.whole
+
+    def figures(self) -> dict:
+        """Return why growth ended, its levels and the trims."""
+        if not self.measuring:
+            return {}
+        last = self.levels[-1] if self.levels else None
+        return {
+            "adaptive": True, "why": self.why, "marginal_db": last and last.gain, "closed": self.closed,
+            "levels": [asdict(x) for x in self.levels], "trims": self.trims,
+        }  # fmt: skip

@@ -1,0 +1,349 @@
+"""Importance sampling: score the training views, sample pixels, put fine Gaussians behind them, protect them for a while.
+
+Paper, sections "Hierarchical Gaussian Representation", "Geometric-Aware Sampling" and "Training Strategy".
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from warpgs.errors import UsageError
+from warpgs.pipeline.model.table import Column, DensityUpdate
+from warpgs.pipeline.train.strategies import importance as scoring
+from warpgs.pipeline.train.strategies.base import register
+from warpgs.pipeline.train.strategies.clone_split import CloneSplit
+from warpgs.pipeline.train.strategies.importance import ImportanceConfig
+from warpgs.pipeline.train.strategies.sampler import (
+    SamplerConfig,
+    fine_gaussians,
+    geometry_gate,
+    sample_pixels,
+    valid_pixels,
+)
+from warpgs.pipeline.train.views import TrainingView
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.scene import Gaussians, Prior, ViewDepth
+
+COARSE, FINE = 0, 1
+"""Layers."""
+NOT_SAMPLED = -(2**30)
+"""``created_step`` of what was never sampled: the coarse layer."""
+MAX_VIEWS = 8
+"""Views that one event looks at; drawn at random where there are more."""
+
+
+@dataclass(frozen=True)
+class ProtectConfig:
+    """How long and how well new Gaussians are protected."""
+
+    steps: int = 500
+    """Age [steps] up to which a sampled Gaussian is protected (T_protect, which the paper leaves open): five refinements."""
+    opacity: float = 0.05
+    """Its opacity does not fall below this meanwhile (alpha_minimum): ten times what is pruned."""
+
+    def __post_init__(self):
+        if self.steps < 0 or not 0 < self.opacity < 1:
+            raise UsageError("protect: steps must be at least 0 and opacity lie in (0, 1)")
+
+    @property
+    def logit(self) -> float:
+        """The least opacity as it is stored."""
+        return math.log(self.opacity / (1 - self.opacity))
+
+
+@dataclass(frozen=True)
+class MethodConfig:
+    """The paper's parts, each by itself (its Table 2), and what they are made of. All off is plain 3D Gaussian splatting."""
+
+    events: bool = False
+    """Sampling events: fine Gaussians are added in phase 2."""
+    hier: bool = False
+    """Two layers: from phase 2 on the coarse one is neither cloned nor split, and moves slowly."""
+    s_render: bool = True
+    """The rendering residual has its weight in the importance."""
+    s_semantic: bool = True
+    """The semantic score has its weight in the importance."""
+    s_geometry: bool = True
+    """The geometric score has its weight in the importance; the gate uses it in any case."""
+    ra: bool = True
+    """Reliability assessment: only pixels of high geometric score are drawn, and with ``sampler.depth`` confirmed only those
+    whose depth other views confirm."""
+    agp: bool = True
+    """Adaptive Gaussian placement: pixels are drawn at random by importance, not the highest ones."""
+    pm: bool = True
+    """Protection mechanism: young fine Gaussians keep a least opacity and are not pruned."""
+    coarse_lr_factor: float = 0.1
+    """Share of the position rate that the coarse layer moves with from phase 2 on."""
+    importance: ImportanceConfig = field(default_factory=ImportanceConfig)
+    sampler: SamplerConfig = field(default_factory=SamplerConfig)
+    protect: ProtectConfig = field(default_factory=ProtectConfig)
+
+    def __post_init__(self):
+        if not 0 <= self.coarse_lr_factor <= 1:
+            raise UsageError(f"method coarse rate {self.coarse_lr_factor} must lie between 0 and 1")
+
+    def weights(self, semantics: bool = True) -> tuple[float, float, float]:
+        """Weights of the render, semantic and geometric score that are switched on, summing to 1.
+
+        ``semantics`` is False where nothing is known of a view's.
+        """
+        semantic = self.s_semantic and semantics
+        return scoring.weights(self.importance, render=self.s_render, semantic=semantic, geometry=self.s_geometry)
+
+
+def scored(view: TrainingView, prior: Prior, depth: ViewDepth | None, config: MethodConfig) -> TrainingView:
+    """Return the view with the scores of its prior and the depth that other views confirm."""
+    maps = {n: torch.as_tensor(getattr(prior, n), dtype=torch.float32, device=view.image.device)
+            for n in ("disparity", "confidence", "boundary", "foreground")}  # fmt: skip
+    valid = None if view.mask is None else view.mask > 0
+    geometry = scoring.geometry_score(maps.pop("disparity"), config.importance.curvature, valid)
+    semantic = scoring.semantic_score(**maps)
+    consistent = None
+    if depth is not None and depth.valid.any():
+        consistent = torch.as_tensor(np.where(depth.valid, depth.depth, 0), dtype=torch.float32, device=view.image.device)
+    known = semantic if bool(semantic.any()) else None
+    return dataclasses.replace(view, semantic=known, geometry=geometry, consistent=consistent)
+
+
+@dataclass(frozen=True)
+class SampledView:
+    """What an event saw and did in one view; maps on the device of the fit."""
+
+    view: int
+    """Number of the training view."""
+    rendered: torch.Tensor
+    """Colours before the event, shape [H, W, 3]."""
+    scores: tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+    """Render, semantic and geometric score, each [H, W] in [0, 1]."""
+    score: torch.Tensor
+    """Their weighted sum, shape [H, W]."""
+    gate: torch.Tensor
+    """Pixels that could be drawn, shape [H, W]."""
+    quantile: float
+    """Quantile of the geometric score that the gate used; lower than asked for where too few pixels passed."""
+    at: torch.Tensor
+    """Rows and columns of the pixels drawn, shape [S, 2]."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """One sampling event."""
+
+    change: DensityUpdate
+    """Rows that stay and rows that are new."""
+    evicted: int
+    """Fine Gaussians removed to make room."""
+    views: tuple[SampledView, ...]
+    """What happened in each view."""
+
+
+def sample_view(
+    gaussians: Gaussians, view: TrainingView, number: int, config: MethodConfig, options: RasterizeOptions,
+    generator: torch.Generator,
+) -> tuple[SampledView, dict[str, torch.Tensor]]:  # fmt: skip
+    """Score one view, draw its pixels, and make the fine Gaussians behind them."""
+    c = config.sampler
+    render = rasterize(gaussians, view.camera, options)
+    depth, alpha = render.depth, render.alpha
+    if c.depth == "consistent" and view.consistent is not None:
+        known = view.consistent > 0
+        depth = torch.where(known, view.consistent, depth)
+        alpha = torch.where(known, 1.0, 0.0 if config.ra else alpha)
+    valid = valid_pixels(alpha, depth, view.mask, c)
+    known = view.semantic is not None
+    semantic = view.semantic if known else torch.zeros_like(view.geometry)
+    scores = (scoring.render_score(render.rgb, view.image, valid), semantic, view.geometry)
+    score = scoring.importance(scores, config.weights(known))
+    wanted = max(1, round(c.fraction * valid.numel()))
+    gate, quantile = geometry_gate(view.geometry, valid, c.gate_quantile if config.ra else 0.0, wanted)
+    at = sample_pixels(score, gate, wanted, generator, random=config.agp)
+    rows = fine_gaussians(view.camera, view.image, depth, at, c, gaussians.sh.shape[1])
+    return SampledView(number, render.rgb, scores, score, gate, quantile, at), rows
+
+
+def least_contributing(
+    gaussians: Gaussians, candidates: torch.Tensor, count: int, views: list[TrainingView], options: RasterizeOptions
+) -> torch.Tensor:
+    """Numbers of the ``count`` candidates (bool [N]) whose blending weights over all views sum to least, int64."""
+    total = torch.zeros(len(gaussians), device=gaussians.means.device)
+    for view in views:
+        total += rasterize(gaussians, view.camera, options).weight_sums[0]
+    total = torch.where(candidates, total, torch.inf)
+    return torch.topk(total, min(count, int(candidates.sum())), largest=False).indices
+
+
+@torch.no_grad()
+def sampling_event(
+    gaussians: Gaussians,
+    fine: torch.Tensor,
+    protected: torch.Tensor,
+    views: list[TrainingView],
+    config: MethodConfig,
+    *,
+    step: int,
+    capacity: int,
+    options: RasterizeOptions,
+    generator: torch.Generator,
+) -> Event:
+    """Add fine Gaussians where the importance of the training views says.
+
+    Where the fine layer is as large as it may be (``sampler.max_fraction`` of the coarse one), those of its Gaussians that
+    contribute least to the training views are evicted, the protected ones excepted; what still has no room is not added.
+
+    Args:
+        gaussians: The current set, N rows.
+        fine: Gaussians of the fine layer, bool, shape [N].
+        protected: Gaussians that are not evicted, bool, shape [N].
+        views: Training views with their scores.
+        config: Switches and settings.
+        step: Steps done.
+        capacity: Gaussians that may be added before the whole set is full.
+        options: How to render.
+        generator: CPU generator; the same numbers on every device.
+
+    Returns:
+        The change and what led to it.
+    """
+    numbers = list(range(len(views)))
+    if len(views) > MAX_VIEWS:
+        numbers = sorted(torch.randperm(len(views), generator=generator)[:MAX_VIEWS].tolist())
+    sampled, rows = zip(*(sample_view(gaussians, views[i], i, config, options, generator) for i in numbers))
+    added = {name: torch.cat([r[name] for r in rows]) for name in rows[0]}
+    count = len(added["means"])
+
+    coarse_count, fine_count = int((~fine).sum()), int(fine.sum())
+    over = max(fine_count + count - int(config.sampler.max_fraction * coarse_count), count - capacity)
+    keep = torch.ones(len(gaussians), dtype=torch.bool, device=fine.device)
+    evicted = 0
+    if over > 0:
+        weigh = dataclasses.replace(options, contributions=True)
+        ids = least_contributing(gaussians, fine & ~protected, over, views, weigh)
+        keep[ids] = False
+        evicted = len(ids)
+        if over > evicted:  # spread over the views, as they were sampled
+            left = torch.randperm(count, generator=generator)[: max(0, count - (over - evicted))].sort().values.to(fine.device)
+            added = {name: t[left] for name, t in added.items()}
+            count = len(left)
+    parents = torch.full((count,), -1, dtype=torch.int64, device=fine.device)
+    columns = {"level": FINE, "created_step": step}
+    return Event(DensityUpdate(torch.nonzero(keep).squeeze(1), added, parents, columns), evicted, sampled)
+
+
+@register("importance_sampling")
+class ImportanceSampling(CloneSplit):
+    """The method: a coarse layer, fine Gaussians sampled by importance, protection, three phases.
+
+    Its settings are `FitConfig.method` and `FitConfig.phases`; with ``method.events`` off it is `CloneSplit`.
+    """
+
+    def __init__(self, trainer):
+        """See `Strategy`."""
+        super().__init__(trainer)
+        self.events: list[dict] = []
+        """Step of each sampling event, Gaussians added and evicted, and the quantile of the gate in each view."""
+        self.on_event: Callable[[int, Event], None] | None = None
+
+    def columns(self) -> Mapping[str, Column]:
+        """See `Strategy`."""
+        own = {"level": Column(COARSE, torch.int32), "created_step": Column(NOT_SAMPLED, torch.int32)}
+        return {**super().columns(), **own}
+
+    @classmethod
+    def samples(cls, config) -> bool:
+        """Return whether ``method.events`` is on."""
+        return config.method.events
+
+    @property
+    def method(self) -> MethodConfig:
+        """Switches and settings."""
+        return self.trainer.config.method
+
+    @property
+    def fine(self) -> torch.Tensor:
+        """Gaussians of the fine layer, bool, shape [N]."""
+        return self.trainer.table.columns["level"] == FINE
+
+    @property
+    def protects(self) -> bool:
+        """Whether fine Gaussians are protected at all."""
+        return self.method.events and self.method.pm
+
+    def is_protected(self, step: int | torch.Tensor) -> torch.Tensor:
+        """Return the Gaussians that are protected at a step, bool, shape [N]."""
+        return step - self.trainer.table.columns["created_step"] <= self.method.protect.steps
+
+    def phase(self, step: int) -> Hashable:
+        """Return whether gradients are gathered, and whether the coarse layer is held."""
+        layered = self.method.hier and self.method.events and step > self.trainer.phases.refine
+        return super().phase(step), layered
+
+    def lr_factors(self, phase):
+        """Return ``method.coarse_lr_factor`` for the coarse layer, 1 for the fine one, from phase 2 on."""
+        if not phase[1]:
+            return None
+        return torch.where(self.fine, 1.0, self.method.coarse_lr_factor)
+
+    def after_step(self, phase, settings, going):
+        """Raise the opacities of the protected to the least value: alpha = max(alpha, alpha_minimum)."""
+        if self.protects:
+            logits = self.trainer.table.params["logit_opacities"].detach()
+            held = self.is_protected(settings[1]) & going
+            logits.copy_(torch.where(held, logits.clamp_min(self.method.protect.logit), logits))
+
+    def after_backward(self, phase, v_projected, visible, size, going):
+        """See `CloneSplit`."""
+        super().after_backward(phase[0], v_projected, visible, size, going)
+
+    def samples_after(self, step: int) -> bool:
+        """Return whether fine Gaussians are sampled after a step."""
+        return self.method.events and step in self.trainer.phases.events
+
+    def due(self, step: int) -> bool:
+        """Return whether the set changes after a step."""
+        return super().due(step) or self.samples_after(step)
+
+    def update(self, step: int) -> Iterator[DensityUpdate]:
+        """Refine the fine layer, then sample, where it is time for either."""
+        yield from super().update(step)
+        if self.samples_after(step):
+            event = self.sample(step, self.trainer.views, self.method)
+            yield event.change
+            self.events.append({
+                "step": step, "added": len(event.change.parents), "evicted": event.evicted,
+                "quantiles": [v.quantile for v in event.views],
+            })  # fmt: skip
+            if self.on_event is not None:
+                self.on_event(step, event)
+
+    def refine(self, step, growing=None, protected=None):
+        """See `CloneSplit`; from phase 2 on only the fine layer grows."""
+        growing = self.fine if self.phase(step)[1] else growing
+        protected = self.is_protected(step) if self.protects else protected
+        yield from super().refine(step, growing, protected)
+
+    def sample(self, step: int, views: list[TrainingView], method: MethodConfig) -> Event:
+        """Return a sampling event on some views (docs/decisions/008-method.md)."""
+        t = self.trainer
+        options = RasterizeOptions(rule=t.config.rule, background=t.background, max_instances=t.max_instances)
+        protected = self.is_protected(step) if method.pm else torch.zeros_like(self.fine)
+        capacity = t.capacity - len(t.table)
+        return sampling_event(
+            t.gaussians, self.fine, protected, views, method,
+            step=step, capacity=capacity, options=options, generator=t.generator,
+        )  # fmt: skip
+
+    def state(self):
+        """Return the events so far."""
+        tensors, plain = super().state()
+        return tensors, plain | {"events": self.events}
+
+    def load(self, tensors, plain):
+        """Take over what `state` gave."""
+        super().load(tensors, plain)
+        self.events = plain["events"]

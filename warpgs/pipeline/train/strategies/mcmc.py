@@ -1,0 +1,188 @@
+"""Gaussians as samples: dead ones are relocated to where opacity is, and all are perturbed (Kheradmand et al. 2024).
+
+"3D Gaussian Splatting as Markov Chain Monte Carlo", arXiv 2404.09591. Equation numbers are that paper's.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+
+from warpgs.errors import UsageError
+from warpgs.pipeline.model.table import DensityUpdate
+from warpgs.pipeline.train.strategies.base import Strategy, register
+from warpgs.runtime import interop
+from warpgs.scene import Gaussians
+
+MAX_COPIES = 51
+"""Largest number of Gaussians that one may become at a time, as in the authors' program."""
+MAX_OPACITY = 1 - 2**-24
+"""Opacities are taken for at most this: below 1 their logit is finite."""
+GATE_SLOPE, GATE_OPACITY = 100.0, 0.005
+"""Perturbation fades above this opacity: sigmoid(-slope (opacity - this)), eq. 8 with k = 100 and t = 0.995 of 1 - opacity."""
+
+
+@dataclass(frozen=True)
+class MCMCConfig:
+    """Settings of the strategy; the defaults are the paper's."""
+
+    start: int = 500
+    """First step after which Gaussians are relocated and added."""
+    every: int = 100
+    """Steps between two such events."""
+    stop_fraction: float = 0.83
+    """Fraction of the fit after which the set is left alone; 25,000 of 30,000 steps in the paper."""
+    growth: float = 0.05
+    """Gaussians added at an event, as a fraction of those there are, up to --max-gaussians."""
+    min_opacity: float = 0.005
+    """A Gaussian of at most this opacity is dead."""
+    noise_lr: float = 5e5
+    """Size of the perturbation, times the learning rate of the means."""
+    opacity_weight: float = 0.01
+    """Weight of the mean opacity in the loss."""
+    scale_weight: float = 0.01
+    """Weight of the mean axis length [1/u] in the loss."""
+
+    def __post_init__(self):
+        if self.start < 0 or self.every < 1:
+            raise UsageError("mcmc: start must be at least 0 and every at least 1")
+        for name, top in (("stop_fraction", 1), ("growth", 1), ("min_opacity", 0.5)):
+            if not 0 <= getattr(self, name) <= top:
+                raise UsageError(f"mcmc {name.replace('_', '-')} {getattr(self, name)} must lie between 0 and {top}")
+        for name in ("noise_lr", "opacity_weight", "scale_weight"):
+            if not 0 <= getattr(self, name) <= 1e9:
+                raise UsageError(f"mcmc {name.replace('_', '-')} {getattr(self, name)} must lie between 0 and 1e9")
+
+
+@torch.no_grad()
+def relocated(opacities: torch.Tensor, copies: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return opacity and scale factor of each of N Gaussians that stand in one place for one Gaussian (eq. 9).
+
+    The new opacity is 1 - (1 - o)^(1/N), so that together they are as opaque at the centre; the scales shrink such that the
+    integral over a line through the centre stays. In float64, since the sum alternates.
+
+    Args:
+        opacities: o of the one Gaussian, in (0, 1), shape [M].
+        copies: N, whole numbers from 1 to `MAX_COPIES`, shape [M].
+
+    Returns:
+        New opacities and factors of the scales, shape [M] each, of the type of ``opacities``.
+    """
+    o, N = opacities.double(), copies.double()
+    new = -torch.expm1(torch.log1p(-o) / N)
+    integral = torch.zeros_like(o)
+    for i in range(1, int(copies.max()) + 1 if len(copies) else 0):
+        # the i-th of N is seen through i - 1 others: new (1 - new)^(i - 1), integrated power by power
+        terms = [math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1) * new ** (k + 1) for k in range(i)]
+        integral += torch.where(copies >= i, sum(terms), 0)
+    return new.to(opacities), (o / integral).to(opacities)
+
+
+@functools.cache
+def _perturb_kernel():
+    @wp.kernel(enable_backward=False, module="warpgs.pipeline.train.strategies.mcmc")
+    def perturb(
+        begin: int, settings: wp.array(dtype=float), seed: int, noise_lr: float, going: wp.array(dtype=wp.bool),
+        quats: wp.array(dtype=wp.vec4), log_scales: wp.array(dtype=wp.vec3), logits: wp.array(dtype=float),
+        # outputs
+        means: wp.array(dtype=wp.vec3),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        if not going[0]:
+            return
+        # one stream of numbers for each seed and step, one part of it for each Gaussian
+        state = wp.rand_init(wp.randi(wp.rand_init(seed, int(settings[1]))), i)
+        noise = wp.vec3(wp.randn(state), wp.randn(state), wp.randn(state))
+        q = quats[i]
+        rotation = wp.quat_to_matrix(wp.normalize(wp.quat(q[1], q[2], q[3], q[0])))
+        s = log_scales[i]
+        variances = wp.vec3(wp.exp(2.0 * s[0]), wp.exp(2.0 * s[1]), wp.exp(2.0 * s[2]))
+        opacity = 1.0 / (1.0 + wp.exp(-logits[i]))
+        gate = 1.0 / (1.0 + wp.exp(wp.static(GATE_SLOPE) * (opacity - wp.static(GATE_OPACITY))))
+        moved = rotation * wp.cw_mul(variances, wp.transpose(rotation) * noise)
+        means[i] = means[i] + moved * (gate * noise_lr * settings[2])
+
+    return perturb
+
+
+def perturb(
+    gaussians: Gaussians, settings: torch.Tensor, going: torch.Tensor, *, seed: int, noise_lr: float
+) -> None:  # fmt: skip
+    """Add noise of each Gaussian's own covariance to its mean, in place; the less the more opaque it is (eq. 8).
+
+    The noise depends on seed, step and row alone: the same on every device, and again after a fit is continued.
+
+    Args:
+        gaussians: N Gaussians, float32.
+        settings: Anything, number of the step, learning rate of the means [u], float32, shape [3].
+        going: Nothing changes where this is False, bool, shape [1].
+        seed: Any 32-bit integer.
+        noise_lr: Factor of the learning rate.
+    """
+    g = {n: t.detach() for n, t in gaussians.tensors().items()}
+    inputs = [
+        interop.view(settings, wp.float32), seed, noise_lr, interop.view(going, wp.bool), interop.view(g["quats"], wp.vec4),
+        interop.view(g["log_scales"], wp.vec3), interop.view(g["logit_opacities"], wp.float32),
+        interop.view(g["means"], wp.vec3),
+    ]  # fmt: skip
+    interop.launch(_perturb_kernel(), len(gaussians), inputs, settings.device)
+
+
+@register("mcmc")
+class MCMC(Strategy):
+    """Relocates dead Gaussians, adds new ones up to ``max_gaussians``, and perturbs all."""
+
+    Config = MCMCConfig
+
+    def regularisation(self, gaussians):
+        """Return the weighted mean opacity and mean axis length, which let the unneeded die."""
+        c = self.config
+        opacity, scale = gaussians.logit_opacities.sigmoid().mean(), gaussians.log_scales.exp().mean()
+        return c.opacity_weight * opacity + c.scale_weight * scale
+
+    def after_step(self, phase, settings, going):
+        """Perturb the means."""
+        t = self.trainer
+        perturb(t.table.gaussians, settings, going, seed=t.config.seed, noise_lr=self.config.noise_lr)
+
+    def due(self, step: int) -> bool:
+        """Return whether Gaussians are relocated and added after a step."""
+        c, steps = self.config, self.trainer.config.steps
+        return min(c.start, steps // 4) < step <= c.stop_fraction * steps and step % c.every == 0
+
+    def update(self, step: int) -> Iterator[DensityUpdate]:
+        """Relocate the dead, then add."""
+        t = self.trainer
+        opacities = t.gaussians.logit_opacities.sigmoid()
+        dead = torch.nonzero(opacities <= self.config.min_opacity).squeeze(1)
+        if 0 < len(dead) < len(t.table):
+            yield self._copied(torch.where(opacities <= self.config.min_opacity, 0, opacities), len(dead), onto=dead)
+        count = min(t.capacity, int((1 + self.config.growth) * len(t.table))) - len(t.table)
+        if count > 0:
+            yield self._copied(t.gaussians.logit_opacities.sigmoid(), count, onto=None)
+
+    def _copied(self, weights: torch.Tensor, count: int, onto: torch.Tensor | None) -> DensityUpdate:
+        """Return the change that samples ``count`` Gaussians by weight [N] and copies each, onto rows or as new rows."""
+        t = self.trainer
+        # on the CPU, where the numbers are the same for every device
+        sampled = torch.multinomial(weights.cpu().double(), count, replacement=True, generator=t.generator).to(t.device)
+        sources, place, times = torch.unique(sampled, return_inverse=True, return_counts=True)
+        g = t.gaussians
+        opacities = g.logit_opacities[sources].sigmoid().clamp(self.config.min_opacity, MAX_OPACITY)
+        new, factor = relocated(opacities, (times + 1).clamp_max(MAX_COPIES))
+        values = {n: v[sources] for n, v in g.tensors().items()}
+        values["logit_opacities"] = torch.logit(new.clamp(self.config.min_opacity, MAX_OPACITY))
+        values["log_scales"] = values["log_scales"] + factor.log()[:, None]
+        copies = {n: v[place] for n, v in values.items()}
+        everything = torch.arange(len(t.table), device=t.device)
+        if onto is None:
+            return DensityUpdate(everything, copies, sampled, overwritten=sources, values=values)
+        nothing = {n: v[:0] for n, v in values.items()}
+        both = {n: torch.cat([v, copies[n]]) for n, v in values.items()}
+        rows = torch.cat([sources, onto])
+        return DensityUpdate(everything, nothing, sampled[:0], overwritten=rows, values=both)

@@ -1,0 +1,97 @@
+"""A fit that is done in a given time: as many steps as this machine is foretold to take in it, by its own measured speed."""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+import time
+
+import torch
+
+from warpgs.errors import UsageError
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loss import LossConfig, photometric_loss
+from warpgs.render.rasterize import rasterize
+from warpgs.scene import Camera, Gaussians, View
+
+PIXELS_PER_GAUSSIAN = 4
+"""Of the probe's pictures: about what fits of preset `quick` have over their steps."""
+REPEATS = 5
+
+
+STEP, SETUP = 1.6, 11.0
+"""Mean time of a step of a fit, and time before the first step for each training view, in probes (`probe_seconds`). Measured on
+a CPU on fern with preset `quick`: 1.54 and 11.2 at 126 x 94 px, 1.56 and 10.8 at 168 x 126 px (docs/trade.md). On CUDA, where
+steps are recorded and probes are not, a step takes less: what is foretold there is an upper limit."""
+MIN_STEPS, MAX_STEPS = 100, 3000
+"""Steps that a budget may lead to: with fewer nothing is seen, with more held-out views gain nothing (docs/results.md)."""
+
+
+def probe_seconds(width: int, height: int, device: torch.device) -> float:
+    """Time of a step's picture, loss and gradients on this machine for a cloud that is always the same [s].
+
+    Median of a few after a first that compiles and loads kernels; takes some hundred milliseconds.
+    """
+    count = max(1, width * height // PIXELS_PER_GAUSSIAN)
+    g = torch.Generator().manual_seed(0)
+    depth = 2 + 4 * torch.rand(count, 1, generator=g)
+    across = torch.rand(count, 2, generator=g) - 0.5
+    means = torch.cat([across * depth * torch.tensor([1.0, height / width]), depth], 1)
+    tensors = {
+        "means": means, "quats": torch.randn(count, 4, generator=g),
+        "log_scales": torch.log(depth / width * (1 + 2 * torch.rand(count, 3, generator=g))),
+        "logit_opacities": torch.randn(count, generator=g), "sh": 0.3 * torch.randn(count, 4, 3, generator=g),
+    }  # fmt: skip
+    gaussians = Gaussians(**{n: t.to(device).requires_grad_() for n, t in tensors.items()})
+    K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]], device=device)
+    camera, target = Camera(torch.eye(4, device=device), K, width, height), torch.rand(height, width, 3, generator=g).to(device)
+    seconds = []
+    for _ in range(REPEATS + 1):
+        began = time.perf_counter()
+        loss = photometric_loss(rasterize(gaussians, camera).rgb, target, None, LossConfig().ssim_weight)
+        torch.autograd.grad(loss, list(gaussians.tensors().values()))
+        loss.item()
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        seconds.append(time.perf_counter() - began)
+    return statistics.median(seconds[1:])
+
+
+def within_budget(config: FitConfig, seconds: float, views: list[View], device: torch.device) -> tuple[FitConfig, str]:
+    """As many steps as are foretold to take at most so long, set-up included.
+
+    Args:
+        config: Everything but the steps.
+        seconds: The budget [s].
+        views: Training views.
+        device: Where the fit works.
+
+    Returns:
+        The configuration with its steps, and a sentence that says what was chosen and why.
+
+    Raises:
+        UsageError: The budget is no positive number, or too short for the shortest fit.
+    """
+    check_budget(seconds)
+    largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
+    probe = probe_seconds(largest.width, largest.height, device)
+    setup, step = probe * SETUP * len(views), probe * STEP
+    steps = min(int((seconds - setup) / step), MAX_STEPS)
+    if steps < MIN_STEPS:
+        raise UsageError(
+            f"time-budget {seconds:g} s is too short: {MIN_STEPS} steps would take {setup + MIN_STEPS * step:.0f} s here, "
+            f"where a picture with gradients takes {1000 * probe:.0f} ms; give more time, or smaller images with --downscale"
+        )
+    needed = setup + steps * step
+    return dataclasses.replace(config, steps=steps), (
+        f"time-budget {seconds:g} s: chose --steps {steps} of preset {config.preset}, foretold to take {needed:.0f} s "
+        f"here, where a picture with gradients takes {1000 * probe:.0f} ms"
+        + (f"; more than {MAX_STEPS} steps gain nothing" if steps == MAX_STEPS else "")
+        + "; scores and report come on top"
+    )
+
+
+def check_budget(seconds: float) -> None:
+    """UsageError where a time budget is no positive number."""
+    if not 0 < seconds < float("inf"):
+        raise UsageError(f"time-budget must be a positive number of seconds, not {seconds}")

@@ -1,0 +1,299 @@
+"""The training loop: from views and points to Gaussians, one view a step."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from warpgs.errors import DataError, NotFiniteError
+from warpgs.kernels.step_buffers import NOT_FINITE
+from warpgs.pipeline.model.init import initial_gaussians, scene_extent
+from warpgs.pipeline.model.table import Table
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loss import built_in_terms
+from warpgs.pipeline.train.memory_plan import layout_of, most_instances, plan
+from warpgs.pipeline.train.schedule import plan_phases
+from warpgs.pipeline.train.setup import prepare, prepared_views
+from warpgs.pipeline.train.step import (
+    CAPACITY_FACTOR,
+    MAX_BATCH,
+    Learned,
+    OverLimitError,
+    StepBuffers,
+    StepGraphs,
+    StepPlan,
+    eager_renderer,
+    step,
+)
+from warpgs.pipeline.train.strategies.base import find_strategy
+from warpgs.pipeline.train.views import TrainingView, half_size, stack_views
+from warpgs.runtime.device_memory import available_bytes
+from warpgs.scene import Gaussians, PointCloud, Prior, Scene, View
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What one step has to tell."""
+
+    step: int
+    """Steps done, from 1."""
+    loss: float
+    """Loss on the step's view."""
+    psnr: float
+    """PSNR on the step's view before the update [dB]."""
+    count: int
+    """Number of Gaussians after the step."""
+    seconds: float
+    """Wall time of the step [s]."""
+
+
+class Trainer:
+    """The state of one fit: everything that changes from step to step, and nothing else."""
+
+    def __init__(
+        self, train: list[View], points: PointCloud | None, config: FitConfig, device: torch.device,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0), priors: list[Prior] | None = None,
+        ready: Callable[[], object] = lambda: None,
+    ):  # fmt: skip
+        """Set up the first Gaussians.
+
+        Args:
+            train: The views to fit, at least one.
+            points: The reconstruction's points, or None.
+            config: Settings.
+            device: Where to work.
+            background: Colour behind the scene.
+            priors: What is believed of each view; None to find out where sampling or a loss term asks for it.
+            ready: Called before the device is used.
+
+        Raises:
+            DataError: There is nothing to start from.
+            UsageError: The memory limit is below what the smallest step needs, or a plug-in is not there.
+        """
+        if not train:
+            raise DataError("there is no training view; name at least one in --split")
+        self.config, self.device = config, device
+        self.generator = torch.Generator().manual_seed(config.seed)
+        made = prepare(train, points, config, np.random.default_rng(config.seed), device, priors, ready)
+        self.notes: list[str] = made.notes
+        """What was chosen for the user before the first step."""
+        self.messages: list[str] = []
+        """What the user must know of and was not told yet."""
+        cloud = made.start.cloud
+        self.extent = scene_extent([v.camera for v in train], cloud)
+        """Size of the scene [u]."""
+        self.background = torch.tensor(background, dtype=torch.float32, device=device)
+        self.phases = plan_phases(config.phases, config.steps)
+        self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
+        """Dropout probability at the last step."""
+        self.terms = (*built_in_terms(config.loss), *config.loss_terms)
+        self.step, self.order = 0, []
+
+        self.strategy = find_strategy(config.strategy)(self)
+        self.table = Table.of_gaussians(initial_gaussians(cloud, config.init, self.extent, device), self.strategy.columns())
+        own = {n: p for term in self.terms for n, p in term.view_parameters().items()}
+        first = {n: torch.tensor(p.initial, dtype=torch.float32, device=device).repeat(len(train), 1) for n, p in own.items()}
+        self.view_table = Table(first, {}, device, len(train))
+        self.view_lrs = {n: p.lr for n, p in own.items()}
+        self.graphs = StepGraphs(device) if device.type == "cuda" else None
+        self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(first)))
+        seed = config.seed if self.dropout > 0 else None
+        self.learned = Learned(self.table, self.view_table, self.strategy, seed)
+        views, self.disparities = prepared_views(train, made, config, self.terms, device)
+        self.set_views(views)
+        self.strategy.setup()
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The current Gaussians, detached."""
+        return Gaussians(**{n: t.detach() for n, t in self.table.params.items()})
+
+    @property
+    def capacity(self) -> int:
+        """Number of Gaussians that the settings and the memory limit allow."""
+        return min(self.config.max_gaussians, self.memory.cap)
+
+    def progress(self, step: int) -> float:
+        """Return the fraction of the fit that is done before a step, in [0, 1]."""
+        return (step - 1) / max(1, self.config.steps - 1)
+
+    def plan_of(self, step: int) -> StepPlan:
+        """Return what a step does."""
+        c = self.config
+        terms = tuple(t for t in self.terms if t.active(step, c.steps))
+        return StepPlan(self.strategy.sh_degree(step), step <= c.half_resolution * c.steps, terms, self.strategy.phase(step))
+
+    def next_view(self) -> int:
+        """Return the number of the next view; they come in random order, each once before any comes again."""
+        if not self.order:
+            self.order = torch.randperm(len(self.views), generator=self.generator).tolist()
+        return self.order.pop()
+
+    def advance(self, limit: int = 1) -> list[StepReport]:
+        """Take up to ``limit`` steps: render a view, compare it, update, and change the set of Gaussians when it is time.
+
+        On CUDA steps are replayed as graphs, several at a time, and end before anything that needs the host; elsewhere, and
+        where a memory limit leaves no capacity for graphs, one step is taken.
+
+        Raises:
+            NotFiniteError: A loss is not finite; the Gaussians are as before that step.
+            ResourceError: The instances would not fit into memory.
+        """
+        begin, first = time.perf_counter(), self.step + 1
+        plan, count = self.plan_of(first), 1
+        if self.layout.recordings:
+            while (
+                count < min(limit, MAX_BATCH, self.config.steps - self.step)
+                and self.plan_of(first + count) == plan
+                and not self.strategy.due(first + count - 1)
+            ):
+                count += 1
+        chosen = [self.next_view() for _ in range(count)]
+        places = [self.places[i + plan.half_size * len(self.views)] for i in chosen]
+        steps = range(first, first + count)
+        self.buffers.load([row for _, row in places], [self._lr_row(s) for s in steps], [self._settings(s) for s in steps])
+        if not self._take(places, plan):
+            self.order += reversed(chosen)
+            return self.advance()
+        done, stop, history = self.buffers.result()
+        self.order += reversed(chosen[done:])  # views of steps that were not taken come again
+        self.step += done
+        if stop == NOT_FINITE:
+            raise NotFiniteError(
+                f"the loss became {history[done][0]} at step {self.step + 1}; the last checkpoint is the state before"
+            )
+        if stop:
+            self.graphs.clear()  # captured anew with more capacity
+        counts = [len(self.table)] * done
+        if done == count:
+            self._update()
+            counts[-1] = len(self.table)
+        seconds = (time.perf_counter() - begin) / max(1, done)
+        return [
+            StepReport(first + k, loss, -10 * math.log10(max(mse, 1e-12)), counts[k], seconds)
+            for k, (loss, mse) in enumerate(history[:done])
+        ]
+
+    def _take(self, places: list[tuple[tuple, int]], plan: StepPlan) -> bool:
+        """Take steps with views at these places; False, and nothing taken, where graphs turned out to need too much memory."""
+        if not self.layout.recordings:
+            render = eager_renderer(self.config.rule, self.background, self.max_instances)
+            for kind, _ in places:
+                step(self.learned, self.stacks[kind], self.buffers, plan, render)
+            return True
+        how = (self.learned, self.buffers, plan, self.config.rule, self.background, self.max_instances)
+        try:
+            graphs = self.graphs.capture_all([kind for kind, _ in places], self.stacks, *how)
+        except OverLimitError as e:
+            self.graphs.clear()
+            self.layout = dataclasses.replace(self.layout, recordings=0)
+            self.count_changed()
+            self.messages.append(f"memory: steps are taken one by one from here on, because {e}")
+            return False
+        for graph in graphs:
+            graph.replay()
+        return True
+
+    def _lr_row(self, step: int) -> list[float]:
+        c = self.config.optimizer
+        row = self.table.lr_row(self.lrs(step), step, c.head_lrs)
+        return row + self.view_table.lr_row(self.view_lrs, step, {})
+
+    def lrs(self, step: int) -> dict[str, float]:
+        """Return the learning rate of each parameter of the Gaussians at a step."""
+        c, phases = self.config, self.phases
+        stable_start = phases.stable_start / c.steps if phases.stable_start < c.steps else 0.0
+        return c.optimizer.lrs(self.progress(step), self.extent, stable_start)
+
+    def _settings(self, step: int) -> tuple[float, float, float]:
+        return self.strategy.dropout(step), step, self.lrs(step)["means"]
+
+    def _update(self) -> None:
+        """Have the strategy change the set of Gaussians after the step that was just taken, where it is time."""
+        if not self.strategy.due(self.step):
+            return
+        self._forget_graphs()
+        for change in self.strategy.update(self.step):
+            self.table.apply(change)
+            self.count_changed()
+
+    def _forget_graphs(self) -> None:
+        if self.graphs is not None:
+            self.graphs.clear()
+
+    def set_views(self, views: list[TrainingView]) -> None:
+        """Train on these views from here on, and plan the memory that steps need."""
+        c = self.config
+        self._forget_graphs()
+        shown = [*views, *(half_size(v) for v in views if c.half_resolution > 0)]
+        shown, self.stacks, self.places = stack_views(shown, len(views))
+        self.views = shown[: len(views)]
+        cameras, masked = [v.camera for v in shown], [v.mask is not None for v in shown]
+        layout = layout_of(
+            self.gaussians, cameras, masked, scored=type(self.strategy).samples(c), recorded=c.cuda_graph,
+            depth_supervised=c.loss.depth_weight > 0,
+        )  # fmt: skip
+        self.memory, self.layout = plan(
+            layout, count=len(self.table), instances=most_instances(self.gaussians, cameras, c.rule), most=c.max_gaussians,
+            limit=c.memory_limit, available=available_bytes(self.device), capacity_factor=CAPACITY_FACTOR,
+        )  # fmt: skip
+        self.count_changed()
+
+    def count_changed(self) -> None:
+        """Set how many instances a step may have at a time, None for no limit: it depends on the number of Gaussians."""
+        limit = self.config.memory_limit
+        self.max_instances = None if limit is None else self.layout.most_instances(len(self.table), limit)
+
+    def state(self) -> tuple[dict[str, torch.Tensor], dict]:
+        """Return tensors and plain values from which the fit goes on as if it had never stopped."""
+        tensors, strategy = self.strategy.state()
+        views = {f"views.{n}": t for n, t in self.view_table.state().items()}
+        tensors = {**self.table.state(), **views, **tensors, "generator": self.generator.get_state()}
+        plain = {
+            "step": self.step, "order": self.order, "extent": self.extent, "notes": self.notes,
+            "config": self.config.to_json(), "strategy": strategy,
+        }  # fmt: skip
+        return tensors, plain
+
+    def load(self, tensors: dict[str, torch.Tensor], plain: dict) -> None:
+        """Take over what `state` gave."""
+        self.step, self.order = plain["step"], list(plain["order"])
+        self.extent, self.notes = plain["extent"], plain["notes"]
+        self.table.load(tensors)
+        self.view_table.load({n.removeprefix("views."): t for n, t in tensors.items() if n.startswith("views.")})
+        self.strategy.load(tensors, plain["strategy"])
+        self.set_views(self.views)
+        self.generator.set_state(tensors["generator"])
+
+
+def train_views(scene: Scene, names: tuple[str, ...]) -> list[View]:
+    """Return the named views of a scene, in the order named."""
+    return [scene.view(n) for n in names]
+
+
+def run(
+    trainer: Trainer, on_step: Callable[[StepReport], None], save: Callable[[Trainer], None], stopped: Callable[[], bool]
+) -> None:
+    """Take all remaining steps, reporting each and saving now and then and at the end.
+
+    Raises:
+        NotFiniteError: The loss or, when it is to be saved, a number of the state is not finite; nothing of it is saved.
+        KeyboardInterrupt: ``stopped`` said so after a step; the state after it is saved.
+    """
+    every, saved = trainer.config.checkpoint_every, time.monotonic()
+    while trainer.step < trainer.config.steps:
+        for report in trainer.advance(every - trainer.step % every):
+            on_step(report)
+        stop = stopped()
+        due = trainer.step % every == 0 and time.monotonic() - saved >= trainer.config.checkpoint_seconds
+        if stop or due or trainer.step == trainer.config.steps:
+            save(trainer)
+            saved = time.monotonic()
+        if stop:
+            raise KeyboardInterrupt

@@ -1,0 +1,123 @@
+"""Training views on the device, one by one and stacked by size, whole and at half their size."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch.nn.functional import interpolate
+
+from warpgs.scene import Camera, View
+
+
+@dataclass(frozen=True)
+class TrainingView:
+    """A training view on the device of the fit."""
+
+    camera: Camera
+    """Float32 tensors on the device."""
+    image: torch.Tensor
+    """Colours in [0, 1], shape [H, W, 3]."""
+    mask: torch.Tensor | None = None
+    """1 where a pixel counts, else 0, shape [H, W]; None where all count."""
+    semantic: torch.Tensor | None = None
+    """S_semantic in [0, 1], shape [H, W]; None where nothing is known of it."""
+    geometry: torch.Tensor | None = None
+    """S_geometry in [0, 1], shape [H, W]; None where nothing samples by it."""
+    consistent: torch.Tensor | None = None
+    """Geometrically consistent z-depth [u], confirmed by other views, 0 where none confirms it, shape [H, W]; None for none."""
+    maps: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    """What loss terms compare with, by name, each of shape [H, W] or [H, W, C]."""
+
+    @staticmethod
+    def of(view: View, device: torch.device) -> TrainingView:
+        """Return a view's pixels, mask and camera in float32 on a device."""
+
+        def there(array):
+            return torch.as_tensor(array, dtype=torch.float32, device=device)
+
+        c = view.camera
+        camera = Camera(there(c.viewmat), there(c.K), c.width, c.height)
+        return TrainingView(camera, there(view.image), None if view.mask is None else there(view.mask))
+
+    @property
+    def kind(self) -> tuple[int, int, bool]:
+        """Width, height and whether there is a mask: what the views of one stack share."""
+        return self.camera.width, self.camera.height, self.mask is not None
+
+
+def half_size(view: TrainingView) -> TrainingView:
+    """Return the view with both sides halved, rounded down but to at least one pixel; without scores.
+
+    Colours and maps are means over what a pixel covers, and a pixel counts where all of that does.
+    """
+    c = view.camera
+    width, height = max(1, c.width // 2), max(1, c.height // 2)
+    scale = torch.tensor([width / c.width, height / c.height, 1.0], dtype=c.K.dtype, device=c.K.device)
+
+    def mean(channels: torch.Tensor) -> torch.Tensor:
+        return interpolate(channels[None], (height, width), mode="area")[0]
+
+    def smaller(t: torch.Tensor) -> torch.Tensor:
+        return mean(t[None])[0] if t.ndim == 2 else mean(t.permute(2, 0, 1)).permute(1, 2, 0).contiguous()
+
+    mask = None if view.mask is None else (mean(view.mask[None])[0] > 1 - 1e-4).to(view.mask.dtype)
+    camera = Camera(c.viewmat, scale[:, None] * c.K, width, height)
+    return TrainingView(camera, smaller(view.image), mask, maps={n: smaller(t) for n, t in view.maps.items()})
+
+
+@dataclass(frozen=True)
+class ViewStack:
+    """Training views of one kind in one tensor each, from which a step takes its own."""
+
+    viewmats: torch.Tensor
+    """camera_from_world, shape [V, 4, 4]."""
+    Ks: torch.Tensor
+    """Intrinsics [px], shape [V, 3, 3]."""
+    images: torch.Tensor
+    """Colours in [0, 1], shape [V, H, W, 3]."""
+    masks: torch.Tensor | None
+    """1 where a pixel counts, else 0, shape [V, H, W]; None where all count."""
+    maps: Mapping[str, torch.Tensor]
+    """What loss terms compare with, by name, each of shape [V, H, W, ...]."""
+    numbers: torch.Tensor
+    """Number of each view among all training views, int64, shape [V]."""
+
+    @property
+    def size(self) -> dict[str, int]:
+        """Width and height [px] by name."""
+        return {"width": self.images.shape[2], "height": self.images.shape[1]}
+
+
+def stack_views(
+    views: list[TrainingView], count: int
+) -> tuple[list[TrainingView], dict[tuple, ViewStack], list[tuple[tuple, int]]]:
+    """Stack views by size and by whether they have a mask.
+
+    Args:
+        views: Views in the order of their numbers; those beyond ``count`` are the same views again at another size.
+        count: Number of training views.
+
+    Returns:
+        The views, whose pixels are now those of the stacks, so that nothing is held twice; the stacks by kind; and for each
+        view its kind and row there.
+    """
+    kinds = [v.kind for v in views]
+    stacks, shared = {}, list(views)
+    for kind in dict.fromkeys(kinds):
+        numbers = [i for i, k in enumerate(kinds) if k == kind]
+        same = [views[i] for i in numbers]
+        device = same[0].image.device
+        stack = ViewStack(
+            torch.stack([v.camera.viewmat for v in same]), torch.stack([v.camera.K for v in same]),
+            torch.stack([v.image for v in same]), torch.stack([v.mask for v in same]) if kind[2] else None,
+            {n: torch.stack([v.maps[n] for v in same]) for n in same[0].maps},
+            torch.tensor([i % count for i in numbers], device=device),
+        )  # fmt: skip
+        for row, i in enumerate(numbers):
+            maps = {n: t[row] for n, t in stack.maps.items()}
+            mask = None if stack.masks is None else stack.masks[row]
+            shared[i] = replace(views[i], image=stack.images[row], mask=mask, maps=maps)
+        stacks[kind] = stack
+    return shared, stacks, [(k, kinds[:i].count(k)) for i, k in enumerate(kinds)]

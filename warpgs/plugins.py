@@ -1,0 +1,132 @@
+"""Parts that plug in: classes found by name, whether ours or a user's."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import importlib.util
+import pkgutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import ClassVar, Generic, Protocol, TypeVar
+
+from warpgs.errors import UsageError
+
+
+class Named(Protocol):
+    """A class that carries the name by which it is found."""
+
+    name: ClassVar[str]
+
+
+T = TypeVar("T", bound=Named)
+
+
+class Registry(Generic[T]):
+    """Classes of one kind by name.
+
+    Ours are the modules of a package, each imported when a name is looked for, so that a new one is a new file. A user's own
+    is given as a class in Python, or as ``module:Class`` or ``path/to/file.py:Class`` on the command line. Nothing is ever
+    imported because a stored file names it.
+    """
+
+    def __init__(self, kind: str, base: type[T], package: str):
+        """Begin with nothing.
+
+        Args:
+            kind: What the classes are, for messages: strategy, loss term, reader.
+            base: What each class derives from.
+            package: Dotted name of the package, or module, that ours live in.
+        """
+        self.kind, self.base, self.package = kind, base, package
+        self._classes: dict[str, type[T]] = {}
+        self._searched = False
+
+    def register(self, name: str) -> Callable[[type[T]], type[T]]:
+        """Return a decorator that registers a class by a name and sets its ``name``."""
+
+        def decorate(cls: type[T]) -> type[T]:
+            cls.name = name
+            self._classes[name] = cls
+            return cls
+
+        return decorate
+
+    def names(self) -> list[str]:
+        """Return the names of ours, sorted."""
+        if not self._searched:
+            package = importlib.import_module(self.package)
+            for module in pkgutil.iter_modules(getattr(package, "__path__", [])):
+                importlib.import_module(f"{self.package}.{module.name}")
+            self._searched = True
+        return sorted(n for n in self._classes if ":" not in n)
+
+    def find(self, name: str | type[T]) -> type[T]:
+        """Return the class of a name, or the class itself.
+
+        Raises:
+            UsageError: No class has that name, or a user's own class was not loaded in this process.
+        """
+        if isinstance(name, type):
+            return self._checked(name, name.__name__)
+        if name in self._classes or name in self.names():
+            return self._classes[name]
+        if ":" in name:
+            raise UsageError(
+                f"the {self.kind} {name!r} is a class of your own, which is never imported because a file names it; give it "
+                "again, on the command line or as a class in Python"
+            )
+        raise UsageError(f"there is no {self.kind} {name!r}; choose one of {', '.join(self.names())}, or give module:Class")
+
+    def load(self, spec: str) -> type[T]:
+        """Return the class of a name, importing ``module:Class`` or ``path/to/file.py:Class``: runs that code.
+
+        Raises:
+            UsageError: The module, file or class is not there, or the class is of another kind.
+        """
+        where, colon, name = spec.rpartition(":")
+        if not colon or spec in self._classes:
+            return self.find(spec)
+        try:
+            module = _load_file(Path(where)) if where.endswith(".py") else _import_module(where)
+        except (ImportError, OSError) as e:
+            raise UsageError(f"the {self.kind} {spec!r} cannot be imported ({e}); give path/to/file.py:Class") from e
+        if not hasattr(module, name):
+            raise UsageError(f"the {self.kind} {spec!r} is not there: {where} has no class {name}")
+        cls = self._checked(getattr(module, name), spec)
+        self._classes[spec] = cls
+        cls.name = spec
+        return cls
+
+    def _checked(self, cls: object, name: str) -> type[T]:
+        if not (isinstance(cls, type) and issubclass(cls, self.base)):
+            raise UsageError(f"{name} is no {self.kind}: it must be a class that derives from warpgs.{self.base.__name__}")
+        return cls
+
+
+def _import_module(name: str) -> ModuleType:
+    """Import a module by its full dotted name."""
+    if not name or name.startswith("."):
+        raise ImportError(f"{name!r} is no full name of a module")
+    return importlib.import_module(name)
+
+
+def _load_file(path: Path) -> ModuleType:
+    """Import a file by its path, once, under a name of its own."""
+    path = path.resolve()
+    name = f"_warpgs_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise OSError(f"there is no file {path}")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module

@@ -1,0 +1,126 @@
+"""Planes of a depth sweep and the scale of their costs, which the CPU and the GPU backend share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from warpgs import geometry
+from warpgs.errors import UsageError
+from warpgs.geometry import check_pinhole, matmul
+from warpgs.priors.epipolar import homogeneous
+from warpgs.scene import Camera, View
+
+NOISE = (2 / 255) ** 2
+"""Variance of a window below which its pattern is noise: correlation fades to 0 there."""
+EDGE = 0.06
+"""Colour step between neighbouring pixels at which the penalty for a jump in depth falls to 1/e."""
+NEUTRAL_COST = 0.5
+"""Cost of correlation 0: where a plane leaves the other image, or nothing has texture."""
+UNIT = 4096
+"""Cost 1 in the 16-bit whole numbers that volumes hold: to touch memory for the first time takes as long as to compute what
+goes there, and this is half of float32's."""
+MAX_LARGE_STEP = 0.99
+"""P2 up to which the sum of four paths, each at most 1 + P2, stays below 2^15."""
+PLANES_AT_ONCE = 16
+"""Planes whose costs one thread, or the GPU, computes together: 32 bytes of each pixel."""
+
+
+@dataclass(frozen=True)
+class SweepConfig:
+    """Settings of the planes, of the smoothing of costs and of the consistency check."""
+
+    near_count: int = 4
+    """Number of nearest other views with which each view is compared."""
+    window: int = 7
+    """Side of the square in which pixels are correlated [px]; odd, at least 3."""
+    spacing: float = 0.5
+    """Largest step of a match from one plane to the next [px], while `max_planes` allows it."""
+    max_planes: int = 256
+    """Largest number of planes, at least 8; memory is 6 bytes per pixel and plane, for up to four views."""
+    max_pixels: int = 200_000
+    """Largest number of pixels of an image; larger ones are swept at a reduced size."""
+    small_step: float = 0.03
+    """Penalty for a depth one plane off the neighbouring pixel's (P1); costs lie in [0, 1]."""
+    large_step: float = 0.5
+    """Penalty for any other depth (P2) where the image is even; less across its edges, but above 1.5 P1."""
+    max_round_trip: float = 0.6
+    """Largest distance [px] from a pixel after a round trip by the depth that another view found."""
+    min_parallax: float = 0.5
+    """Smallest angle between the two rays [deg]; below it depth is noise."""
+
+    def __post_init__(self):
+        if not (self.window >= 3 and self.window % 2 == 1):
+            raise UsageError(f"sweep window {self.window} must be odd and at least 3")
+        if not (self.max_planes >= 8 and self.near_count >= 1 and self.max_pixels >= 1):
+            raise UsageError("sweep needs at least 8 planes, 1 near view and 1 pixel")
+        for name in ("spacing", "small_step", "large_step", "max_round_trip", "min_parallax"):
+            if not getattr(self, name) > 0:
+                raise UsageError(f"sweep {name.replace('_', '-')} must be above 0, not {getattr(self, name)}")
+        if not max(self.large_step, 1.5 * self.small_step) <= MAX_LARGE_STEP:
+            raise UsageError(
+                f"sweep large-step and 1.5 small-step must be at most {MAX_LARGE_STEP}, where the largest cost is 1"
+            )
+
+
+def project_inverse(first: Camera, second: Camera, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """Return the positions [px] in the second image, shape [N, 2], of pixels [N, 2] at inverse depths [1/u] [N]; NaN behind."""
+    check_pinhole(first)
+    check_pinhole(second)
+    rotation, translation = geometry.relative_pose(first, second)
+    rays = matmul(homogeneous(pixels), geometry.inverse(first.K).T)
+    p = matmul(matmul(rays, rotation.T) + inverse[:, None] * translation, second.K.T)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(p[:, 2:] > 1e-9, p[:, :2] / p[:, 2:], np.nan)
+
+
+def inside_image(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Return True where pixels [..., 2] [px] lie in the image of ``camera``; NaN does not."""
+    return (pixels >= 0).all(-1) & (pixels[..., 0] < camera.width) & (pixels[..., 1] < camera.height)
+
+
+def plane_inverses(
+    first: Camera, others: Sequence[Camera], bounds: tuple[float, float], spacing: float, max_planes: int
+) -> np.ndarray:
+    """Return inverse depths [1/u] of planes, evenly spaced and ascending, from the far to the near bound [u].
+
+    Their number, 8 to ``max_planes``, is the smallest at which no match inside an image moves more than about ``spacing`` px
+    between planes.
+    """
+    near, far = bounds
+    x, y = np.meshgrid(np.linspace(0, first.width, 5), np.linspace(0, first.height, 5))
+    pixels = np.stack([x.ravel(), y.ravel()], 1)
+    ladder = np.linspace(1 / far, 1 / near, 17)
+    longest = 0.0
+    for other in others:
+        found = np.stack([project_inverse(first, other, pixels, np.full(len(pixels), w)) for w in ladder])
+        inside = inside_image(other, found)
+        steps = np.linalg.norm(np.diff(found, axis=0), axis=2)[inside[1:] & inside[:-1]]
+        longest = max(longest, float(steps.max(initial=0)) * (len(ladder) - 1))
+    return np.linspace(1 / far, 1 / near, int(np.clip(np.ceil(longest / spacing) + 1, 8, max_planes)))
+
+
+def plane_homography(first: Camera, second: Camera, inverse: float) -> np.ndarray:
+    """Return H [3, 3] from first to second by the plane z = 1 / inverse, for pixel centres at whole numbers (OpenCV)."""
+    check_pinhole(first)
+    check_pinhole(second)
+    rotation, translation = geometry.relative_pose(first, second)
+    moved = rotation + inverse * np.outer(translation, [0, 0, 1])
+    H = matmul(matmul(second.K, moved), geometry.inverse(first.K))
+    back, shift = (np.array([[1, 0, s], [0, 1, s], [0, 0, 1]]) for s in (-0.5, 0.5))
+    return matmul(matmul(back, H), shift)
+
+
+def gray_of(view: View) -> np.ndarray:
+    """Return the brightness of a view's pixels in [0, 1], float32, shape [H, W]."""
+    import cv2
+
+    return cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
+
+
+def step_limits(colors: np.ndarray, small_step: float, large_step: float) -> np.ndarray:
+    """Return P2 of the steps along the first axis of an image [L, B, 3], in units of 1 / `UNIT`, int16, shape [L - 1, B]."""
+    jumps = np.abs(np.diff(colors, axis=0)).max(2).astype(float)  # float32's exp has other last digits on other processors
+    return np.rint(np.maximum(large_step * np.exp(-jumps / EDGE), 1.5 * small_step) * UNIT).astype(np.int16)

@@ -1,0 +1,1 @@
+"""The rasterizer, and other ways to render the same Gaussians."""

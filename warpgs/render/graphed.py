@@ -1,0 +1,343 @@
+"""Rasterizer calls that repeat: on CUDA their kernels are captured as graphs, and replayed.
+
+At training sizes the host takes longer to launch twenty kernels than the GPU to run them. A loop repeats its calls: the same
+tensors, with other values in them, and another camera. Its memory requests repeat, too, and so torch gives it the same
+addresses. A graph that was captured at certain addresses is replayed where a call gets those again; elsewhere the kernels are
+launched one by one. The bits are the same, and so is the memory, but for the spare capacity for instances.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import weakref
+
+import torch
+import warp as wp
+from torch.autograd.function import once_differentiable
+
+from warpgs.kernels import blend, project, sh
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, Tiles, bin_tiles
+from warpgs.render.settings import RenderSettings
+from warpgs.runtime import interop
+from warpgs.runtime.allocator import Allocator, fetch
+from warpgs.runtime.cuda_graph import MIN_REPLAYS, GraphedFunction, GraphPool
+from warpgs.runtime.device_memory import available_bytes
+
+MIN_CALLS = 3
+"""Equal calls in a row from which on kernels are captured. Where a capture did not pay, the number doubles for the next."""
+CAPACITY_FACTOR = 1.05
+"""Capacity for instances, as a multiple of the most that such calls were seen to have."""
+MAX_PROJECTED = 2**19
+"""Most projected Gaussians of a captured call. Beyond, the GPU takes longer than the host, and a graph would gain nothing."""
+MAX_MEMORY_FRACTION = 0.05
+"""Largest fraction of the free memory that lists and saved states may take; calls that need more are not captured."""
+
+
+class GraphedRasterizer:
+    """Render and gradients of one set of tensors for any camera, as four graphed functions."""
+
+    def __init__(self, settings: RenderSettings, cameras: int, capacity: int, graphs: GraphPool):
+        """Prepare the functions; nothing is rendered yet.
+
+        Args:
+            settings: Settings of the render.
+            cameras: Number of images at a time.
+            capacity: Number of instances to allocate memory for.
+            graphs: Pool to capture graphs in.
+        """
+        x, y, width, height = settings.window
+        self.settings, self.cameras, self.capacity, self.device = settings, cameras, capacity, graphs.device
+        size, sh_count = (settings.width, settings.height), sh.coefficient_count(settings.degree)
+        self._project_settings = project.ProjectSettings(
+            size, settings.window, sh_count, settings.rule, settings.tile_size, settings.camera_model
+        )
+        self._blend_settings = blend.BlendSettings((x, y), width, height, settings.rule)
+        self.rendered = 0
+        """Number of renders that fitted."""
+        self.instances = 0
+        """Number of instances of the last call."""
+        on_gpu = self.device.type == "cuda"
+        self._host_total = wp.zeros(1, dtype=wp.int64, device="cpu", pinned=on_gpu)
+        self._total, self._stream = self._host_total.numpy(), graphs.stream
+        self._total_ready = torch.cuda.Event() if on_gpu else None
+        self._table = wp.zeros(2, dtype=wp.uint64, device="cpu", pinned=on_gpu)
+        self._addresses = self._table.numpy()
+        # by proxy, so that this object is freed, and its graphs with it, as soon as nobody holds it
+        functions = [
+            functools.partial(f, weakref.proxy(self))
+            for f in (
+                GraphedRasterizer._project_and_count,
+                GraphedRasterizer._bin_and_blend,
+                GraphedRasterizer._blend_gradients,
+                GraphedRasterizer._project_gradients,
+            )
+        ]
+        self._forward_project, self._forward_blend, self._backward_blend, self._backward_project = (
+            GraphedFunction(f, graphs) for f in functions
+        )
+        self._no_factors = torch.empty(0, dtype=torch.float32, device=self.device)
+        self._black: torch.Tensor | None = None
+
+    def render(self, sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor | None):
+        """Return images, projected Gaussians and tile counts; None where the instances exceed the capacity.
+
+        Args:
+            sources: The seven tensors that `project` takes.
+            backgrounds: Colour behind everything, shape [C, 3]; None for black.
+        """
+        viewmats, Ks = sources[5].contiguous(), sources[6].contiguous()
+        self._addresses[:] = viewmats.data_ptr(), Ks.data_ptr()  # nobody reads them any more: the last call was waited for
+        (cameras, *projection), _ = self._forward_project(*sources[:5])
+        if self._total_ready is not None:
+            self._total_ready.record(self._stream)
+        if backgrounds is None:
+            if self._black is None:
+                self._black = torch.zeros(len(sources[5]), 3, dtype=torch.float32, device=self.device)
+            backgrounds = self._black
+        backgrounds = backgrounds.contiguous()
+        images, block = self._forward_blend(*projection, backgrounds.detach())
+        projected = _projected(*sources, self, cameras, projection)
+        images = _blended(projected, backgrounds, self, projection[1], images, block)
+        if self._total_ready is not None:
+            self._total_ready.synchronize()  # not before: the device goes on meanwhile
+        self.instances = int(self._total[0])
+        if self.instances > self.capacity:
+            return None
+        self.rendered += 1
+        return images, projected, projection[1]
+
+    def _seven(self, sources, cameras: torch.Tensor) -> list[torch.Tensor]:
+        """Return the seven tensors that `project` takes, from five and one that holds viewmats and Ks one after the other."""
+        first = 16 * self.cameras
+        return [*sources, cameras[:first].view(-1, 4, 4), cameras[first:].view(-1, 3, 3)]
+
+    def _project_and_count(self, allocator: Allocator, *sources: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        # a copy, since gradients are still to come when the next call's cameras are at the same addresses
+        cameras = allocator.output((25 * self.cameras,), torch.float32, self.device)
+        fetch(self._table.ptr, 16 * self.cameras, cameras)
+        _, counts = project.project_tensors(self._seven(sources, cameras), self._no_factors, self._project_settings, allocator)
+        total = allocator.workspace((1,), torch.int64, self.device)
+        torch.sum(counts.view(-1), 0, keepdim=True, dtype=torch.int64, out=total)
+        with interop.stream_of(self.device):
+            wp.copy(self._host_total, interop.view(total, wp.int64).array())
+        return ()
+
+    def _bin_and_blend(self, allocator: Allocator, projected, counts, backgrounds) -> tuple[torch.Tensor, ...]:
+        s = self._blend_settings
+        overflow = allocator.workspace((1,), torch.int32, self.device).zero_()  # not read: the count tells before
+        tiles = bin_tiles(
+            projected, counts, width=s.width, height=s.height, tile_size=self.settings.tile_size, rule=s.rule, origin=s.origin,
+            capacity=self.capacity, overflow=overflow, allocator=allocator,
+        )  # fmt: skip
+        _, _, _, *saved = blend.composite(projected, tiles, backgrounds, s, save=True, allocator=allocator)
+        return *(t for t in tiles.tensors() if t is not tiles.counts), *saved
+
+    def _blend_gradients(self, allocator: Allocator, projected, counts, backgrounds, rgb, depth, block, *v_images) -> tuple[()]:
+        ranges, ids, slots, starts, tile_ids, total, *saved = self._forward_blend.saved(block)
+        tiles = Tiles(self.settings.tile_size, ranges, ids, slots, starts, counts.view(-1), tile_ids, total)
+        saved = (rgb, depth, *saved)
+        blend.composite_gradients(projected, tiles, backgrounds, self._blend_settings, saved, v_images, allocator)
+        return ()
+
+    def _project_gradients(self, allocator: Allocator, *inputs: torch.Tensor) -> tuple[()]:
+        *sources, cameras, projected, counts, v_projected = inputs
+        seven = self._seven(sources, cameras)
+        project.project_gradients(
+            seven, self._project_settings, projected, counts, v_projected, wants_camera=False, allocator=allocator
+        )
+        return ()
+
+    def blend_gradients(self, saved: tuple[torch.Tensor, ...], v_images, wants_backgrounds: bool):
+        """Return the gradients of projected Gaussians and backgrounds, the latter None where not wanted."""
+        v_images = [None if v is None else v.contiguous() for v in v_images]
+        (v_projected,), _ = self._backward_blend(*saved, *v_images)
+        if not wants_backgrounds:
+            return v_projected, None
+        transmittances = self._forward_blend.saved(saved[5])[6]
+        return v_projected, blend.background_gradient(transmittances, v_images[0])
+
+    def project_gradients(self, saved: tuple[torch.Tensor, ...], v_projected: torch.Tensor | None, wants_camera: bool):
+        """Return the gradients of the seven tensors that `project` takes."""
+        *sources, cameras, projected, counts = saved
+        if len(sources[0]) != projected.shape[1]:  # by way of `.data`, which autograd does not see
+            raise RuntimeError(
+                f"{projected.shape[1]:,} Gaussians were rendered, and now there are {len(sources[0]):,}: render again first"
+            )
+        if v_projected is None or wants_camera:
+            seven = self._seven(sources, cameras)
+            return project.project_gradients(
+                seven, self._project_settings, projected, counts, v_projected, wants_camera=wants_camera
+            )
+        found, _ = self._backward_project(*saved, v_projected.contiguous())
+        return *found, None, None
+
+
+def _once(backward):
+    """Wrap a backward function as torch's `once_differentiable` does, but only where a gradient of it is possible."""
+    checked = once_differentiable(backward)
+
+    @functools.wraps(backward)
+    def once(ctx, *gradients):
+        return (checked if torch.is_grad_enabled() else backward)(ctx, *gradients)
+
+    return once
+
+
+class _Projected(torch.autograd.Function):
+    """The projected Gaussians as an autograd result of the seven tensors."""
+
+    @staticmethod
+    def forward(ctx, means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks, rasterizer, cameras, projection):
+        ctx.save_for_backward(means, quats, log_scales, logit_opacities, coefficients, cameras, *projection)
+        ctx.rasterizer = rasterizer
+        ctx.set_materialize_grads(False)
+        return projection[0]
+
+    @staticmethod
+    @_once
+    def backward(ctx, v_projected):
+        wants_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
+        return *ctx.rasterizer.project_gradients(ctx.saved_tensors, v_projected, wants_camera), None, None, None
+
+
+class _Blended(torch.autograd.Function):
+    """The images as an autograd result of projected Gaussians and backgrounds."""
+
+    @staticmethod
+    def forward(ctx, projected, backgrounds, rasterizer, counts, images, block):
+        rgb, _, depth = images
+        ctx.save_for_backward(projected, counts, backgrounds, rgb, depth, block)
+        ctx.rasterizer = rasterizer
+        ctx.set_materialize_grads(False)
+        return tuple(images)
+
+    @staticmethod
+    @_once
+    def backward(ctx, *v_images):
+        return *ctx.rasterizer.blend_gradients(ctx.saved_tensors, v_images, ctx.needs_input_grad[1]), None, None, None, None
+
+
+# Function.apply itself, which looks for functorch's wrappers first, takes as long again as what it calls
+_projected, _blended = (super(torch.autograd.Function, node).apply for node in (_Projected, _Blended))
+
+
+class Recorder:
+    """History of the calls on one stream, and the rasterizer of those that came often enough."""
+
+    def __init__(self, graphs: GraphPool):
+        self.graphs = graphs
+        self.rasterizer: GraphedRasterizer | None = None
+        """Rasterizer of the calls at hand; None where they were too few."""
+        self.min_calls = MIN_CALLS
+        """Equal calls in a row from which on kernels are captured."""
+        self._key, self._calls, self._too_large = None, 0, False
+        self._exceeded: tuple[tuple | None, int] = (None, 0)
+        """Key of the last call that exceeded its capacity, and its number of instances."""
+
+    def render(self, sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor | None, settings: RenderSettings):
+        """Return what `GraphedRasterizer.render` returns; None where the call must run without graphs."""
+        key = None if self.graphs.failed else call_key(sources, backgrounds, settings)
+        if key is None or not self.graphs.lock.acquire(blocking=False):
+            return None
+        try:
+            if key != self._key:
+                self._drop()
+                self._key = key
+            self._calls += 1
+            if self._calls < self.min_calls or self._too_large:
+                return None
+            if self.rasterizer is None:
+                self._make(sources, settings)
+            if self.rasterizer is None:
+                return None
+            try:
+                found = self.rasterizer.render(sources, backgrounds)
+            except BaseException:
+                if self.graphs.stream is not None:
+                    with contextlib.suppress(RuntimeError):  # what went wrong is raised below
+                        self.graphs.stream.synchronize()  # the device reads memory of the rasterizer
+                self._drop()
+                raise
+            if found is None:
+                self._exceeded = (key, self.rasterizer.instances)
+                self._drop()
+            return found
+        finally:
+            self.graphs.lock.release()
+
+    def _make(self, sources: tuple[torch.Tensor, ...], settings: RenderSettings) -> None:
+        """Make the rasterizer, unless its lists would take too much memory."""
+        with torch.no_grad():
+            instances = int(project.project(*sources, **settings.project_options())[1].sum())
+        if self._exceeded[0] == self._key:
+            instances = max(instances, self._exceeded[1])
+        budget = MAX_MEMORY_FRACTION * available_bytes(self.graphs.device)
+        self._too_large = CAPACITY_FACTOR * instances * BYTES_PER_INSTANCE > budget
+        if not self._too_large:
+            capacity = int(CAPACITY_FACTOR * instances) + 1024
+            self.rasterizer = GraphedRasterizer(settings, len(sources[5]), capacity, self.graphs)
+
+    def _drop(self) -> None:
+        if self.rasterizer is not None:
+            self.min_calls = MIN_CALLS if self.rasterizer.rendered >= MIN_REPLAYS else 2 * self.min_calls
+        self.rasterizer, self._key, self._calls, self._too_large = None, None, 0, False
+
+    def clear(self) -> None:
+        """Give back all memory, and begin anew as if there had been no call."""
+        with self.graphs.lock:
+            self._drop()
+            self.graphs.release()
+            self.min_calls, self._exceeded = MIN_CALLS, (None, 0)
+
+
+def call_key(sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor | None, settings: RenderSettings) -> tuple | None:
+    """Return the values that calls must share to share a rasterizer.
+
+    None for calls that cannot be captured, and for those that need not be: large ones, and those without gradients.
+    """
+    means, viewmats = sources[0], sources[5]
+    small = 0 < len(means) * len(viewmats) <= MAX_PROJECTED
+    fit = means.dtype == torch.float32 and torch.is_grad_enabled() and any(t.requires_grad for t in sources)
+    if not (small and fit) or torch.is_inference_mode_enabled() or not _can_capture(means.device):
+        return None
+    if backgrounds is not None and tuple(backgrounds.shape) != (len(viewmats), 3):
+        return None
+    places = []
+    for t in sources[:5]:
+        if not (t.is_contiguous() and t.dtype == torch.float32 and t.device == means.device):
+            return None
+        places.append((t.data_ptr(), t.shape))
+    return *places, viewmats.shape, sources[6].shape, backgrounds is None, settings
+
+
+def _can_capture(device: torch.device) -> bool:
+    """Return whether calls can be captured now, on this device.
+
+    They cannot while somebody captures a graph, on another device than the current one, and with hooks on saved tensors:
+    checkpointing, which has such hooks, wants the same number of saved tensors each time. Nor where torch or Warp were told to
+    do what no graph can hold: to ask the driver for each tensor, or to check for errors after each kernel.
+    """
+    if _UNCACHED or wp.config.verify_cuda:
+        return False
+    hooks = torch._C._autograd._top_saved_tensors_default_hooks(True)
+    # those of torch.cuda take several times as long
+    return hooks is None and device.index == torch._C._cuda_getDevice() and not torch._C._cuda_isCurrentStreamCapturing()
+
+
+_UNCACHED = os.environ.get("PYTORCH_NO_CUDA_MEMORY_CACHING") is not None
+_RECORDERS: dict[tuple[torch.device, int], Recorder] = {}
+
+
+def recorder(device: torch.device) -> Recorder:
+    """Return the recorder of torch's current stream on a CUDA device."""
+    key = (device, interop.warp_stream(device).cuda_stream)
+    found = _RECORDERS.get(key)
+    return found or _RECORDERS.setdefault(key, Recorder(GraphPool(device)))
+
+
+def clear_graph_cache() -> None:
+    """Give back the memory of all captured graphs; loops that go on are captured anew."""
+    for found in list(_RECORDERS.values()):
+        found.clear()

@@ -1,0 +1,178 @@
+"""The rasterizer as one differentiable call: Gaussians and cameras in, images out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from warpgs.constants import RULES, Rule
+from warpgs.errors import UsageError
+from warpgs.kernels.blend import blend, contributions
+from warpgs.kernels.cameras.base import CAMERA_MODELS
+from warpgs.kernels.project import project
+from warpgs.kernels.tiles import bin_tiles
+from warpgs.render import graphed
+from warpgs.render.chunked import ChunkedFrame, blend_chunked, contributions_chunked
+from warpgs.render.settings import RenderSettings, Window
+from warpgs.scene import Camera, Gaussians, Render
+
+TILE_SIZES = (8, 16)
+"""Sides of a tile that the kernels can be made for [px]."""
+
+
+@dataclass(frozen=True)
+class RasterizeOptions:
+    """Options of `rasterize`; the defaults are exact."""
+
+    rule: str | Rule = "exact"
+    """Cut-offs: exact, balanced, fast (docs/trade.md), gsplat, inria, or a `Rule` of your own."""
+    sh_degree: int | None = None
+    """Spherical-harmonics degree used; None for all that is stored."""
+    background: torch.Tensor | None = None
+    """Colour behind the scene, shape [3] or [C, 3]; None for black. Gradients flow into it."""
+    tile_size: int = 16
+    """Side of a tile [px]: 8 or 16. The image does not depend on it."""
+    contributions: bool = False
+    """True to report sum and maximum of each Gaussian's blending weight, too."""
+    memory_budget: int | None = None
+    """Bytes that the (Gaussian, tile) instances may take; None for four fifths of the free memory."""
+    deterministic: bool = True
+    """True to sum gradients in a fixed order, so that the same inputs give the same bits. False takes less memory on CUDA."""
+    opacity_factors: torch.Tensor | None = None
+    """Factors of the opacities, at least 0, shape [N]; 0 hides a Gaussian. None for 1. Not differentiable."""
+    capacity: int | None = None
+    """Number of (Gaussian, tile) instances to allocate memory for; None for as many as there are. With a number nothing is read
+    back from the device, so the call can be captured in a CUDA graph; check `Render.overflow` before using the result."""
+    window: tuple[int, int, int, int] | None = None
+    """Left, top, width and height [px] of the part to render: the images are the crop of the whole ones, to the bit. Edges lie
+    at multiples of ``tile_size`` or at the image's edges. None for all."""
+    max_instances: int | None = None
+    """Most (Gaussian, tile) instances at a time: an image of more is rendered in chunks, and each chunk again for its
+    gradients. That is the same image in less memory and more time. None for all at once. Not with ``capacity``."""
+    record: bool = True
+    """True to let CUDA graphs replay the calls that a loop repeats: the same bits in half the time. It applies to small calls
+    with gradients in a fixed order, without opacity factors, contributions and limits (docs/decisions/010-recorded-calls.md).
+    Choose False where other threads wait for the whole device, as torch.cuda.synchronize does."""
+
+    def repeatable(self) -> bool:
+        """Return whether calls with these options may be captured as CUDA graphs."""
+        others = (self.opacity_factors, self.memory_budget, self.capacity, self.max_instances)
+        return self.record and self.deterministic and not self.contributions and all(o is None for o in others)
+
+
+def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
+    """Return the rule that the options name.
+
+    Raises:
+        UsageError: The rule, the tile size or the camera model is unknown, or options exclude each other.
+    """
+    rule = options.rule if isinstance(options.rule, Rule) else RULES.get(options.rule)
+    if rule is None:
+        raise UsageError(f"unknown rule {options.rule!r}: choose one of {', '.join(RULES)}, or give a Rule")
+    if options.tile_size not in TILE_SIZES:
+        raise UsageError(f"tile size {options.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
+    CAMERA_MODELS.find(camera.model)
+    if options.max_instances is not None and (options.capacity is not None or options.max_instances < 1):
+        raise UsageError("max_instances must be at least 1 and does not go with a capacity")
+    return rule
+
+
+def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
+    """Return the part to render; UsageError where its edges are not where they must be."""
+    width, height, side = camera.width, camera.height, options.tile_size
+    if options.window is None:
+        return 0, 0, width, height
+    x, y, w, h = options.window
+    inside = 0 <= x < x + w <= width and 0 <= y < y + h <= height
+    if not inside or x % side or y % side or ((x + w) % side and x + w != width) or ((y + h) % side and y + h != height):
+        raise UsageError(
+            f"window {options.window} does not fit: in an image of {width} x {height} px its edges must lie at multiples of "
+            f"{side} px or at the image's edges"
+        )
+    return x, y, w, h
+
+
+def _as_batch(array: Any, like: torch.Tensor, rows: int) -> torch.Tensor:
+    """Return one matrix or a batch of them as a tensor [C, rows, rows] of the type and on the device of ``like``."""
+    if isinstance(array, torch.Tensor) and array.ndim == 3 and array.dtype == like.dtype and array.device == like.device:
+        return array
+    tensor = torch.as_tensor(array, dtype=like.dtype, device=like.device)
+    return tensor.reshape(-1, rows, rows) if tensor.ndim < 3 else tensor
+
+
+def _backgrounds(background: Any, viewmats: torch.Tensor) -> torch.Tensor:
+    """Return one colour or a batch of them as a tensor [C, 3]."""
+    colors: torch.Tensor = torch.as_tensor(background, dtype=viewmats.dtype, device=viewmats.device)
+    return colors.expand(len(viewmats), 3) if colors.ndim == 1 else colors
+
+
+def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = RasterizeOptions()) -> Render:
+    """Render Gaussians as one camera, or each camera of a batch, sees them.
+
+    Differentiable in the five tensors of ``gaussians``, in ``camera.viewmat`` and ``camera.K`` where those are tensors that
+    require gradients, and in ``options.background``. Float32 or float64, CPU or CUDA, as the tensors are; the same inputs
+    give the same bits every time, unless ``options.deterministic`` is False. Cameras are moved to the type and device of
+    ``gaussians.means``.
+
+    Args:
+        gaussians: The scene, N Gaussians.
+        camera: One camera ([4, 4], [3, 3]) or C of them ([C, 4, 4], [C, 3, 3]).
+        options: Options.
+
+    Returns:
+        The images, without a leading axis for a single camera. To get gradients of the projected means, call
+        ``render.projected.retain_grad()`` before the backward pass: they are ``render.projected.grad[..., :2]``.
+
+    Raises:
+        ResourceError: The Gaussians touch more tiles than memory allows.
+        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, or options exclude each
+            other.
+        ValueError: A shape or device disagrees; the message names argument, wanted and found.
+    """
+    rule = _checked_rule(camera, options)
+    means = gaussians.means
+    viewmats, Ks = _as_batch(camera.viewmat, means, 4), _as_batch(camera.K, means, 3)
+    degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
+    window = _checked_window(camera, options)
+    settings = RenderSettings(camera.width, camera.height, window, degree, rule, options.tile_size, camera.model)
+    backgrounds = None if options.background is None else _backgrounds(options.background, viewmats)
+    sources = (*gaussians.tensors().values(), viewmats, Ks)
+    if means.is_cuda and options.repeatable():
+        found = graphed.recorder(means.device).render(sources, backgrounds, settings)
+        if found is not None:
+            return _as_render(camera, *found)
+    backgrounds = _backgrounds(means.new_zeros(3), viewmats) if backgrounds is None else backgrounds
+    return _as_render(camera, *_rasterize(sources, backgrounds, settings, options))
+
+
+def _rasterize(
+    sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor, settings: RenderSettings, options: RasterizeOptions
+) -> tuple[Any, ...]:
+    """Return the images as one tuple, and the further fields of `Render`, by kernels that are launched one by one."""
+    projected, tile_counts = project(*sources, opacity_factors=options.opacity_factors, **settings.project_options())
+    if options.max_instances is not None and int(tile_counts.sum()) > options.max_instances:
+        frame = ChunkedFrame(settings, options.max_instances, options.deterministic)
+        factors = () if options.opacity_factors is None else (options.opacity_factors,)
+        sources = (*sources, *factors)
+        images = blend_chunked(projected, backgrounds, frame, sources)
+        weights = contributions_chunked(projected, frame, sources) if options.contributions else (None, None)
+        return images, projected, tile_counts, *weights
+    overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=projected.device)
+    x, y, width, height = settings.window
+    shared: dict[str, Any] = {"width": width, "height": height, "rule": settings.rule, "origin": (x, y)}
+    tiles = bin_tiles(
+        projected, tile_counts, tile_size=options.tile_size,
+        budget_bytes=options.memory_budget, capacity=options.capacity, overflow=overflow, **shared,
+    )  # fmt: skip
+    images = blend(projected, tiles, backgrounds, deterministic=options.deterministic, **shared)
+    weights = contributions(projected, tiles, **shared) if options.contributions else (None, None)
+    return images, projected, tile_counts, *weights, overflow
+
+
+def _as_render(camera: Camera, images: tuple[torch.Tensor, ...], *rest: Any) -> Render:
+    """Return the result; without a leading axis for a single camera."""
+    # not p[0], whose gradient would be a copy among zeros
+    return Render(*(p.squeeze(0) if len(camera.viewmat.shape) == 2 else p for p in images), *rest)

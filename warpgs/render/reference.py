@@ -1,0 +1,112 @@
+"""The image that rule ``exact`` defines, in float64 and by other means than the kernels: errors are measured against it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from warpgs.constants import FRUSTUM_MARGIN, RULES
+from warpgs.geometry import check_pinhole, rotation_matrices
+from warpgs.kernels import sh
+from warpgs.scene import Camera, Gaussians
+
+BLOCK = 16
+"""Side of the blocks of pixels that are composited at a time [px]."""
+
+
+@dataclass(frozen=True)
+class _Ellipses:
+    """The visible Gaussians in the image, from front to back."""
+
+    pixels: torch.Tensor
+    """Projected means [px], shape [N, 2]."""
+    half: torch.Tensor
+    """Half sides [px] of the box that holds every pixel with alpha at or above the cut, shape [N, 2]."""
+    power: tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+    """Factors of dx^2, dx dy and dy^2 in the exponent, each of shape [N, 1]."""
+    opacities: torch.Tensor
+    """Opacities, shape [N]."""
+    colors: torch.Tensor
+    """Colours, shape [N, 3]."""
+
+
+def _project(gaussians: Gaussians, camera: Camera, degree: int) -> _Ellipses:
+    """Project all Gaussians by the matrices of Kerbl et al. 2023, section 4."""
+    rule = RULES["exact"]
+    means, quats, log_scales, logits, coefficients = (t.detach().double() for t in gaussians.tensors().values())
+    view, K = (torch.as_tensor(t, dtype=torch.float64, device=means.device) for t in (camera.viewmat, camera.K))
+    rotation, translation = view[:3, :3], view[:3, 3]
+    unit = quats / quats.norm(dim=-1, keepdim=True)
+    positions = means @ rotation.T + translation
+    opacities = torch.sigmoid(logits)
+    visible = torch.nonzero((positions[:, 2] >= rule.near) & (opacities >= rule.alpha_cut)).squeeze(1)
+    visible = visible[torch.argsort(positions[visible, 2], stable=True)]
+    positions, opacities = positions[visible], opacities[visible]
+    z, focal, center = positions[:, 2:], torch.stack([K[0, 0], K[1, 1]]), K[:2, 2]
+    pixels = focal * positions[:, :2] / z + center
+    size = torch.tensor([camera.width, camera.height], dtype=torch.float64, device=means.device)
+    clamped = torch.minimum(torch.maximum(pixels, -FRUSTUM_MARGIN * size), (1 + FRUSTUM_MARGIN) * size)
+    jacobians = torch.cat([torch.diag_embed(focal / z), ((center - clamped) / z)[..., None]], -1)
+    axes = jacobians @ rotation @ rotation_matrices(unit[visible]) @ torch.diag_embed(log_scales[visible].exp())
+    covariances = axes @ axes.mT + rule.low_pass * torch.eye(2, dtype=torch.float64, device=means.device)
+    inverse = torch.linalg.inv_ex(covariances).inverse
+    A, B, C = -0.5 * inverse[:, 0, :1], -inverse[:, 0, 1:], -0.5 * inverse[:, 1, 1:]
+    away = means[visible] + rotation.T @ translation
+    directions, count = away / away.norm(dim=-1, keepdim=True), sh.coefficient_count(degree)
+    colors = torch.einsum("nk,nkc->nc", sh.basis(directions)[:, :count], coefficients[visible, :count])
+    colors = (colors + 0.5).clamp_min(0)
+    reach = torch.sqrt(2 * torch.log(opacities / rule.alpha_cut))[:, None] + 0.01  # a hair more than where alpha is the cut
+    half = reach * torch.sqrt(torch.diagonal(covariances, dim1=-2, dim2=-1))
+    return _Ellipses(pixels, half, (A, B, C), opacities, colors)
+
+
+def _block(g: _Ellipses, corner: torch.Tensor, size: tuple[int, int], steps: torch.Tensor, background: torch.Tensor):
+    """Return the colours [w * h, 3] of a block of ``size`` w x h, by rows; ``steps`` are pixel centres from its corner on."""
+    rule, (w, h), (A, B, C) = RULES["exact"], size, g.power
+    extent = torch.tensor([w, h], dtype=torch.float64, device=corner.device)
+    pixels, half, opacities, colors = g.pixels, g.half, g.opacities, g.colors
+    near = torch.nonzero(((pixels + half >= corner) & (pixels - half <= corner + extent)).all(1)).squeeze(1)
+    dx, dy = corner[0] + steps[:w] - pixels[near, :1], corner[1] + steps[:h] - pixels[near, 1:]
+    power = (A[near] * dx * dx)[:, None] + (B[near] * dy)[..., None] * dx[:, None] + (C[near] * dy * dy)[..., None]
+    alpha = opacities[near, None] * torch.exp(power.flatten(1))
+    alpha = torch.where(alpha >= rule.alpha_cut, alpha.clamp_max(rule.alpha_max), 0.0)
+    after = torch.cumprod(1 - alpha, 0)
+    before = torch.cat([torch.ones_like(alpha[:1]), after[:-1]])
+    weights = torch.where(before >= rule.transmittance_stop, alpha * before, 0.0)
+    return weights.T @ colors[near] + (1 - weights.sum(0))[:, None] * background.double()
+
+
+@torch.no_grad()
+def reference_image(
+    gaussians: Gaussians, camera: Camera, window: tuple[int, int, int, int], background: torch.Tensor, degree: int
+) -> torch.Tensor:
+    """Return the colours in a window of one camera's image under rule ``exact``, in float64.
+
+    Dense over the pixels of a block and by matrices throughout (Kerbl et al. 2023, section 4 and eq. 3), so for windows of
+    a few thousand pixels. Leave out Gaussians that do not reach the window: many are slow.
+
+    Args:
+        gaussians: N Gaussians of any scalar type, all finite.
+        camera: One camera.
+        window: Left, top, width and height [px].
+        background: Colour behind the scene, shape [3].
+        degree: Spherical-harmonics degree used.
+
+    Returns:
+        Colours, not clamped, shape [h, w, 3].
+
+    Raises:
+        UsageError: The camera is no pinhole.
+    """
+    check_pinhole(camera)
+    g, device = _project(gaussians, camera, degree), gaussians.means.device
+    left, top, width, height = window
+    image = torch.empty(height, width, 3, dtype=torch.float64, device=device)
+    steps = torch.arange(BLOCK, dtype=torch.float64, device=device) + 0.5
+    for v in range(0, height, BLOCK):
+        for u in range(0, width, BLOCK):
+            w, h = min(BLOCK, width - u), min(BLOCK, height - v)
+            corner = torch.tensor([left + u, top + v], dtype=torch.float64, device=device)
+            image[v : v + h, u : u + w] = _block(g, corner, (w, h), steps, background).view(h, w, 3)
+    return image

@@ -1,0 +1,68 @@
+"""Images of a report: PNG bytes, colour maps, error and depth maps."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from warpgs.errors import ResourceError
+
+GRAY = (0.5, 0.5, 0.5)
+
+
+def png(image: np.ndarray) -> bytes:
+    """Encode colours in [0, 1], [H, W, 3], as 8-bit PNG; values outside are clamped.
+
+    Raises:
+        ResourceError: OpenCV cannot encode the image.
+    """
+    import cv2
+
+    pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    done, data = cv2.imencode(".png", pixels[..., ::-1])
+    if not done:
+        raise ResourceError(f"an image of {image.shape[1]} x {image.shape[0]} px could not be encoded as PNG")
+    return data.tobytes()
+
+
+def resized(image: np.ndarray, width: int, height: int):
+    """Return colours in [0, 1], [H, W, 3], at another size, as a Pillow image; areas are averaged where it shrinks."""
+    from PIL import Image
+
+    pixels = Image.fromarray(np.round(np.clip(image, 0, 1) * 255).astype(np.uint8))
+    way = Image.Resampling.BOX if width < image.shape[1] else Image.Resampling.BICUBIC
+    return pixels.resize((width, height), way)
+
+
+def colored(values: np.ndarray, name: str) -> np.ndarray:
+    """Return colours [H, W, 3] of values in [0, 1], [H, W], by a colour map of OpenCV, such as INFERNO or TURBO."""
+    import cv2
+
+    table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], getattr(cv2, f"COLORMAP_{name}"))[:, 0, ::-1]
+    return table[np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)].astype(np.float32) / 255
+
+
+def error_map(image: np.ndarray, reference: np.ndarray, largest: float = 0.3) -> np.ndarray:
+    """Return colours [H, W, 3] of the absolute error averaged over channels; ``largest`` and above is the brightest."""
+    return colored(np.abs(np.clip(image, 0, 1) - reference).mean(-1) / largest, "INFERNO")
+
+
+def depth_map(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Return colours [H, W, 3] of depth, near warm and far cold, by inverse depth between its 2nd and 98th percentile.
+
+    Gray where less than half of the pixel is covered.
+    """
+    valid = (alpha > 0.5) & (depth > 0)
+    colors = np.full((*depth.shape, 3), GRAY, np.float32)
+    if valid.any():
+        inverse = 1 / depth[valid]
+        low, high = np.percentile(inverse, [2, 98])
+        colors[valid] = colored(((inverse - low) / max(high - low, 1e-12))[:, None], "TURBO")[:, 0]
+    return colors
+
+
+def side_by_side(images: list[np.ndarray], gap: int = 4) -> np.ndarray:
+    """Return images [H, W, 3] of one height in a row, with ``gap`` white columns between them."""
+    height = images[0].shape[0]
+    bar = np.ones((height, gap, 3), np.float32)
+    row = [part for image in images for part in (image, bar)][:-1]
+    return np.concatenate(row, axis=1)

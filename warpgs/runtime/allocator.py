@@ -1,0 +1,152 @@
+"""Allocators, which provide a function's tensors by how long those live, so that captured kernels find them again.
+
+For tensors that are at another address each time, `fetch` reads the address when the kernel runs.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import torch
+import warp as wp
+
+from warpgs.runtime import interop
+
+ALIGNMENT = 256
+"""Alignment of the parts of a block [bytes]: enough for sorts and 16-byte loads, and whole cache lines."""
+
+
+class Allocator:
+    """Provider of a function's tensors; this one asks torch for each."""
+
+    def output(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+        """Return a tensor that the caller may keep."""
+        return torch.empty(shape, dtype=dtype, device=device)
+
+    def saved(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+        """Return a tensor that the backward pass needs."""
+        return torch.empty(shape, dtype=dtype, device=device)
+
+    def workspace(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+        """Return a tensor that nobody needs when the function is done."""
+        return torch.empty(shape, dtype=dtype, device=device)
+
+
+TORCH = Allocator()
+"""The allocator that asks torch."""
+
+
+def _bytes(shape: tuple[int, ...], dtype: torch.dtype) -> int:
+    """Return the aligned size of a tensor [bytes]."""
+    return -(-math.prod(shape) * dtype.itemsize // ALIGNMENT) * ALIGNMENT
+
+
+class SizingAllocator(Allocator):
+    """An allocator that asks torch, and notes the sizes that a function asks for."""
+
+    def __init__(self):
+        self.outputs: list[tuple[torch.Tensor, tuple[int, ...]]] = []
+        """An empty tensor of the same type and device, and the shape, of each output tensor."""
+        self.saved_bytes = self.workspace_bytes = 0
+        """Sizes of all saved tensors, and of all workspace, with alignment."""
+
+    def output(self, shape, dtype, device):
+        """See `Allocator`."""
+        tensor = super().output(shape, dtype, device)
+        self.outputs.append((tensor.new_empty(0), tuple(shape)))
+        return tensor
+
+    def saved(self, shape, dtype, device):
+        """See `Allocator`."""
+        self.saved_bytes += _bytes(shape, dtype)
+        return super().saved(shape, dtype, device)
+
+    def workspace(self, shape, dtype, device):
+        """See `Allocator`."""
+        self.workspace_bytes += _bytes(shape, dtype)
+        return super().workspace(shape, dtype, device)
+
+
+class Arena(Allocator):
+    """An allocator of the tensors that a function asked for before: outputs one by one, the others as parts of two blocks."""
+
+    def __init__(self, sizes: SizingAllocator, byte: torch.Tensor, workspace: torch.Tensor | None = None):
+        """Ask torch for all of the memory.
+
+        Args:
+            sizes: Allocator that the function ran with before.
+            byte: Any tensor of bytes on the device. (`new_empty` takes half the time of `torch.empty`.)
+            workspace: A block that nobody else uses now; None for one of its own.
+        """
+        self.outputs = [kind.new_empty(shape) for kind, shape in sizes.outputs]
+        """Output tensors, in the order in which the function asks for them."""
+        self.block = byte.new_empty(sizes.saved_bytes) if sizes.saved_bytes else None
+        """Block of the saved tensors; None where there are none."""
+        self._workspace = byte.new_empty(sizes.workspace_bytes) if workspace is None else workspace
+        self.begin()
+
+    def begin(self) -> None:
+        """Hand out the same tensors again, from the first on."""
+        self._asked = self._saved_to = self._workspace_to = 0
+
+    def addresses(self) -> tuple[int, ...]:
+        """Return the addresses of all memory that is handed out."""
+        block = 0 if self.block is None else self.block.data_ptr()
+        return *[t.data_ptr() for t in self.outputs], block, self._workspace.data_ptr()
+
+    def place(self, tensor: torch.Tensor) -> tuple[int, tuple[int, ...], torch.dtype]:
+        """Return the place of a saved tensor: the arguments of `part` after the block."""
+        begin = tensor.data_ptr() - self.block.data_ptr() if tensor.numel() else 0  # without entries it has no address
+        return begin, tuple(tensor.shape), tensor.dtype
+
+    def output(self, shape, dtype, device):
+        """See `Allocator`."""
+        tensor = self.outputs[self._asked]
+        self._asked += 1
+        return tensor
+
+    def saved(self, shape, dtype, device):
+        """See `Allocator`."""
+        begin, self._saved_to = self._saved_to, self._saved_to + _bytes(shape, dtype)
+        return part(self.block, begin, shape, dtype)
+
+    def workspace(self, shape, dtype, device):
+        """See `Allocator`."""
+        begin, self._workspace_to = self._workspace_to, self._workspace_to + _bytes(shape, dtype)
+        return part(self._workspace, begin, shape, dtype)
+
+
+def part(block: torch.Tensor, begin: int, shape: tuple[int, ...], dtype: torch.dtype) -> torch.Tensor:
+    """Return a part of a block, from byte ``begin`` on, as a tensor."""
+    return block[begin : begin + math.prod(shape) * dtype.itemsize].view(dtype).view(shape)
+
+
+@functools.cache
+def _make_fetch():
+    @wp.func_native(
+        """
+        // volatile: the host has written since the last replay
+        const volatile unsigned long long* addresses = reinterpret_cast<const volatile unsigned long long*>(table);
+        const float* from = reinterpret_cast<const float*>(addresses[item < first ? 0 : 1]);
+        out.data[item] = from[item < first ? item : item - first];
+        """
+    )
+    def body(item: int, table: wp.uint64, first: int, out: wp.array(dtype=float)): ...
+
+    @wp.kernel(enable_backward=False, module="warpgs.runtime.allocator.fetch")
+    def fetch(begin: int, table: wp.uint64, first: int, out: wp.array(dtype=float)):
+        body(begin + wp.tid(), table, first, out)
+
+    return fetch
+
+
+def fetch(table: int, first: int, out: torch.Tensor) -> None:
+    """Copy two tensors into one, from the addresses that a table holds when the kernel runs.
+
+    Args:
+        table: Address of a table of two addresses of float32 numbers, in memory that the device of ``out`` can read.
+        first: Count of numbers at the first address; the rest is at the second.
+        out: Result, float32, contiguous.
+    """
+    interop.launch(_make_fetch(), out.numel(), [table, first, interop.view(out.view(-1), wp.float32)], out.device)

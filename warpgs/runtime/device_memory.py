@@ -1,0 +1,136 @@
+"""Memory that a device has, and has free now: on any system, and within the limits of a container."""
+
+from __future__ import annotations
+
+import functools
+import sys
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    import torch
+
+ASSUMED_BYTES = 2 * 2**30
+"""Memory of a machine that does not say how much it has; small machines have this much."""
+
+OWN_CGROUPS = Path("/proc/self/cgroup")
+CGROUPS = Path("/sys/fs/cgroup")
+
+
+class Memory(NamedTuple):
+    """Installed and available bytes; what the system keeps of files and would give up counts as available."""
+
+    installed: int
+    available: int
+
+
+def available_bytes(device: torch.device) -> int:
+    """Return the memory that is free now on a device [bytes]; on CUDA with what torch holds and has not given out."""
+    if device.type == "cuda":
+        import torch
+
+        free, _ = torch.cuda.mem_get_info(device)
+        return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return _machine_or_assumed().available
+
+
+@functools.cache
+def installed_bytes(device: torch.device) -> int:
+    """Return the memory of a device [bytes], on a CPU no more than its container may use; asked for once."""
+    if device.type == "cuda":
+        import torch
+
+        return torch.cuda.get_device_properties(device).total_memory
+    return _machine_or_assumed().installed
+
+
+def machine_memory() -> Memory | None:
+    """Return the memory of the machine within the limits of the container, if any; None where the system says nothing."""
+    found = [m for m in (_system_memory(), container_memory()) if m is not None]
+    if not found:
+        return None
+    return Memory(min(m.installed for m in found), max(0, min(m.available for m in found)))
+
+
+def container_memory(own: Path | None = None, mount: Path | None = None) -> Memory | None:
+    """Return the tightest limit that control groups set on this process, and the least that is left below one.
+
+    Linux alone has control groups; elsewhere, and where no group sets a limit, this is None. Both versions are read, from the
+    process's own group up to the root, since every group above counts too (kernel documentation, cgroup-v2 "Memory" and
+    cgroup-v1 "Memory Resource Controller"). Pages of files not used lately count as free: the kernel drops them first.
+
+    Args:
+        own: What names the process's groups; /proc/self/cgroup where None.
+        mount: Where groups are mounted; /sys/fs/cgroup where None.
+    """
+    limits, rooms = [], []
+    for folder, limit_name, used_name, cache_name in _groups(own or OWN_CGROUPS, mount or CGROUPS):
+        limit, used = _number(folder / limit_name), _number(folder / used_name)
+        if limit is None or limit >= 2**60:  # version 1 writes "no limit" as a number near 2^63
+            continue
+        limits.append(limit)
+        rooms.append(limit if used is None else limit - max(0, used - _row(folder / "memory.stat", cache_name)))
+    return Memory(min(limits), min(rooms)) if limits else None
+
+
+def _groups(own: Path, mount: Path) -> Iterator[tuple[Path, str, str, str]]:
+    """Yield folders of memory groups with the names of what they hold: limit, use, and file pages in ``memory.stat``."""
+    rows = [row.split(":", 2) for row in _text(own).splitlines()]
+    paths = {"": "/", "memory": "/"} | {c: p for _, names, p in (r for r in rows if len(r) == 3) for c in names.split(",")}
+    versions = {
+        "": (mount, "memory.max", "memory.current", "inactive_file"),
+        "memory": (mount / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+    }
+    for controller, (root, *names) in versions.items():
+        parts = PurePosixPath(paths[controller]).parts[1:]
+        # a path that leaves the mounted tree is a group that cannot be seen from here
+        for end in range(0 if ".." in parts else len(parts), -1, -1):
+            yield root.joinpath(*parts[:end]), *names
+
+
+def _system_memory() -> Memory | None:
+    """Return what psutil finds; it reads a different source on each system, and any of them may be closed off."""
+    try:
+        import psutil
+
+        found = psutil.virtual_memory()
+        return Memory(int(found.total), int(found.available))
+    except (ImportError, AttributeError, KeyError, OSError, RuntimeError, ValueError):
+        return None
+
+
+def _machine_or_assumed() -> Memory:
+    found = machine_memory()
+    if found is None:
+        _say_assumed()
+        return Memory(ASSUMED_BYTES, ASSUMED_BYTES)
+    return found
+
+
+@functools.cache
+def _say_assumed() -> None:
+    print(
+        f"warpgs: this system does not say how much memory it has (psutil finds none, nor does a container set a limit); "
+        f"{ASSUMED_BYTES / 2**30:.0f} GiB are assumed",
+        file=sys.stderr,
+    )
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text("utf-8")
+    except (OSError, ValueError):
+        return ""
+
+
+def _number(path: Path) -> int | None:
+    """Return the number in a file; None for `max`, and where there is no such file."""
+    text = _text(path).strip()
+    return int(text) if text.isdecimal() else None
+
+
+def _row(path: Path, name: str) -> int:
+    """Return the number behind a name in a file of rows, 0 where it is not there."""
+    rows = (row.split() for row in _text(path).splitlines())
+    return next((int(r[1]) for r in rows if len(r) == 2 and r[0] == name and r[1].isdecimal()), 0)

@@ -1,0 +1,58 @@
+"""Folders for what can be made again: the user's cache, or one that is private to this process and removed at its end."""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import os
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+from warpgs.errors import ResourceError
+
+
+def cache_home() -> Path | None:
+    """Return the folder that the system has for a user's caches; None where the user has no home folder.
+
+    XDG_CACHE_HOME or ~/.cache, ~/Library/Caches on macOS, %LOCALAPPDATA% on Windows. Nothing is created.
+    """
+    try:
+        home = Path.home()
+    except (RuntimeError, KeyError):  # HOME is not set, and the system does not know this user
+        home = Path("~")
+    if sys.platform == "win32":
+        found = Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local")
+    elif sys.platform == "darwin":
+        found = home / "Library" / "Caches"
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or "")
+        # the XDG rules ask to pass over a relative path
+        found = base if base.is_absolute() else home / ".cache"
+    # relative is what an unknown or a relative HOME gives: a folder named ~ or the like in whatever folder we are called from
+    return found if found.is_absolute() else None
+
+
+@functools.cache
+def private_folder() -> Path:
+    """Return a new folder that only this user can read or write (mode 0700), removed when Python ends; one for each process.
+
+    Raises:
+        ResourceError: No folder for temporary files can be written.
+    """
+    try:
+        made = Path(tempfile.mkdtemp(prefix="warpgs-")).resolve()
+    except OSError as e:
+        raise ResourceError(
+            f"no folder for temporary files can be written ({e.strerror or e}). Set TMPDIR (TEMP on Windows) to a folder that "
+            "you may write to"
+        ) from e
+    owner = os.getpid()
+
+    def remove() -> None:
+        if os.getpid() == owner:  # a forked child leaves it to its parent
+            shutil.rmtree(made, ignore_errors=True)
+
+    atexit.register(remove)
+    return made

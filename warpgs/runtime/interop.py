@@ -1,0 +1,308 @@
+"""Interop of torch and Warp: scalar types, zero-copy views, checks, streams, and launches spread over CPU threads."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import sys
+import threading
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import torch
+import warp as wp
+
+from warpgs.errors import ResourceError
+from warpgs.runtime.kernel_cache import prepare_kernel_cache
+
+wp.config.log_level = wp.LOG_WARNING  # its banner and compile notes are not for users
+
+
+@contextlib.contextmanager
+def _without_driver_notice():
+    """Hide the warning that Warp's native code prints where there is no CUDA driver."""
+    if torch.cuda.is_available():
+        yield
+        return
+    sys.stderr.flush()
+    saved, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(sink, 2)
+    try:
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(sink)
+
+
+prepare_kernel_cache()
+with _without_driver_notice():
+    wp.init()  # device_from_torch fails before this
+
+REALS = {torch.float32: wp.float32, torch.float64: wp.float64}
+"""Warp's scalar type by torch's."""
+
+CHUNKS_PER_THREAD = 8
+"""Ranges per thread of a CPU launch: several, so that a few heavy tiles do not hold up the rest."""
+
+FEW_THREADS = 4
+"""Number of threads above which each gets half as many ranges: Python hands them out one at a time."""
+
+SERIAL_WORK = 20_000
+"""Work (items times cost) below which a launch stays on the calling thread: a hand-over costs about 50 us."""
+
+MAX_SIZE = 2**31 - 1
+"""Largest number of entries of an axis, and of items of a launch: Warp numbers them in signed 32 bits."""
+
+
+def _check_size(size: int) -> None:
+    """Raise ResourceError where kernels cannot number so many entries."""
+    if size > MAX_SIZE:
+        raise ResourceError(
+            f"an array of {size:,} entries is beyond the {MAX_SIZE:,} that kernels can number; use fewer Gaussians or "
+            "coefficients, smaller images, or fewer cameras at once"
+        )
+
+
+def real_of(tensor: torch.Tensor) -> type:
+    """Return the Warp scalar type of a tensor, float32 or float64.
+
+    Raises:
+        TypeError: The tensor is of another type.
+    """
+    if tensor.dtype not in REALS:
+        raise TypeError(f"kernels take float32 or float64 tensors, not {tensor.dtype}")
+    return REALS[tensor.dtype]
+
+
+def set_threads(count: int) -> None:
+    """Set the number of threads of CPU launches, at least 1. The number is torch's own, so both agree."""
+    torch.set_num_threads(count)
+
+
+@functools.cache
+def _pool(count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(count, thread_name_prefix="warpgs")
+
+
+class View(NamedTuple):
+    """A tensor as a kernel argument: its memory, read as elements of a Warp type."""
+
+    tensor: torch.Tensor
+    dtype: object
+
+    def array(self) -> wp.array:
+        """Return the same memory as a Warp array, without a copy and without gradient."""
+        for size in self.tensor.shape:
+            _check_size(size)
+        return wp.from_torch(self.tensor.detach(), dtype=self.dtype, requires_grad=False)
+
+
+def view(tensor: torch.Tensor, dtype) -> View:
+    """Return a contiguous tensor as a kernel argument of that element type."""
+    return View(tensor, dtype)
+
+
+def warp_device(device: torch.device) -> wp.Device:
+    """Return Warp's object for a torch device, also for one without a number."""
+    if device.type == "cuda" and device.index is None:
+        device = torch.device("cuda", torch.cuda.current_device())
+    return wp.device_from_torch(device)
+
+
+@functools.cache
+def _several_devices() -> bool:
+    return torch.cuda.device_count() > 1
+
+
+def _current(device: torch.device):
+    """Return a context in which a CUDA device is the current one, and after which the caller's is again.
+
+    Warp makes a device current when it works there, and leaves it so; torch takes that for the caller's choice.
+    """
+    return torch.cuda.device(device) if _several_devices() else contextlib.nullcontext()
+
+
+@functools.cache
+def _warp_stream(device: torch.device, pointer: int) -> wp.Stream:
+    with _current(device):
+        return wp.Stream(warp_device(device), cuda_stream=pointer)
+
+
+def warp_stream(device: torch.device) -> wp.Stream:
+    """Return torch's current stream of a CUDA device as Warp's object."""
+    # torch.cuda.current_stream makes a Python object each time, which takes ten times as long
+    index = torch.cuda.current_device() if device.index is None else device.index
+    return _warp_stream(device, torch._C._cuda_getCurrentRawStream(index))
+
+
+_LOADING = threading.Lock()
+"""Lock held while a CPU module is loaded, since it is not safe to compile one from several threads at once; and in debug mode,
+in which kernels are not safe either, while one runs."""
+_SORTING = threading.RLock()
+"""Lock held by a thread while it sorts: Warp has one stream for all threads of a device."""
+
+
+@contextlib.contextmanager
+def stream_of(device: torch.device):
+    """Run Warp's own work (sorts, scans) on torch's current stream of that device; does nothing on a CPU.
+
+    Kernels started with `launch` need no such context.
+    """
+    if device.type != "cuda":
+        yield
+        return
+    wanted, where = warp_stream(device), warp_device(device)
+    with _SORTING, _current(device):
+        before = where.stream
+        where.set_stream(wanted, sync=False)
+        try:
+            yield
+        finally:
+            where.set_stream(before, sync=False)
+
+
+class _Recorded:
+    """A CUDA kernel whose launch is recorded once and then only patched.
+
+    ``wp.launch`` packs and checks every argument anew, which was measured at 47 us on an H200's host, more than most kernels
+    here take. The recorded launch keeps the packed arguments; a call writes pointers, sizes and scalars into them.
+    """
+
+    def __init__(self, kernel, device: torch.device, block_dim: int):
+        self.kernel, self.device, self.block_dim = kernel, warp_device(device), block_dim
+        self.command, self.known = None, []
+        self.lock = threading.Lock()  # autograd launches from a thread of its own
+
+    def launch(self, count: int, inputs: Sequence, stream: wp.Stream) -> None:
+        with self.lock:
+            if self.command is None:
+                arrays = [a.array() if isinstance(a, View) else a for a in inputs]
+                self.command = wp.launch(
+                    self.kernel, count, inputs=[0, *arrays], device=self.device, block_dim=self.block_dim, record_cmd=True
+                )
+                self.command.fwd_args = None  # else the first call's arrays would stay in memory
+                self.known = [None] * len(inputs)
+            else:
+                self._patch(count, inputs)
+            self.command.launch(stream)
+
+    def _patch(self, count: int, inputs: Sequence) -> None:
+        command, known = self.command, self.known
+        if command.bounds.size != count:
+            command.set_dim(count)
+        for i, value in enumerate(inputs):
+            # In a loop most arguments are those of the call before, memory addresses included.
+            if type(value) is View:
+                tensor = value.tensor
+                now = (tensor.data_ptr(), tensor.shape)
+                if known[i] == now:
+                    continue
+                packed = command.params[i + 2]  # after the bounds and ``begin``
+                for size in now[1][: packed.ndim]:
+                    _check_size(size)  # it would wrap around
+                known[i] = None  # an interrupt here must leave nothing that is taken for known
+                packed.data = now[0]
+                for axis in range(packed.ndim):
+                    packed.shape[axis] = now[1][axis]
+                if packed.ndim == 2:
+                    packed.strides[0] = tensor.stride(0) * tensor.element_size()
+                known[i] = now
+            elif known[i] != value:
+                command.params[i + 2].value = value
+                known[i] = value
+
+
+@functools.cache
+def _recorded(kernel, device: torch.device, block_dim: int) -> _Recorded:
+    return _Recorded(kernel, device, block_dim)
+
+
+def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: int = 1, block_dim: int = 256) -> None:
+    """Launch ``kernel`` over ``count`` independent items; its first argument is the number of the first item.
+
+    On a CPU the items are cut into ranges over torch's number of threads. That is safe and repeatable because every
+    kernel here writes to memory that its item alone owns.
+
+    Args:
+        kernel: Warp kernel whose item number is ``begin + wp.tid()``.
+        count: Number of items.
+        inputs: Arguments after ``begin``.
+        device: Device of the arrays.
+        cost: Rough work of an item in units of 10 ns, which decides whether threads pay.
+        block_dim: CUDA threads per block.
+
+    Raises:
+        ResourceError: There are more items, or entries along an axis, than 32 bits can number.
+    """
+    if count == 0:
+        return
+    _check_size(count)
+    if device.type == "cuda":
+        with _current(device):
+            _recorded(kernel, device, block_dim).launch(count, inputs, warp_stream(device))
+        return
+    inputs = [a.array() if isinstance(a, View) else a for a in inputs]
+    with _LOADING:  # launches on a CPU are compiled for blocks of one thread
+        kernel.module.load("cpu", block_dim=1)
+    threads = torch.get_num_threads()
+    # A kernel of Warp 1.19 for x86 keeps a pointer into its stack in a static variable, which only optimised code leaves out.
+    debugging = wp.config.mode == "debug"
+    if threads == 1 or count == 1 or count * cost < SERIAL_WORK or debugging:
+        with _LOADING if debugging else contextlib.nullcontext():
+            wp.launch(kernel, count, inputs=[0, *inputs], device="cpu", record_tape=False)
+        return
+    first = wp.launch(kernel, count, inputs=[0, *inputs], device="cpu", record_cmd=True)
+    chunks = min(count, threads * (CHUNKS_PER_THREAD if threads <= FEW_THREADS else CHUNKS_PER_THREAD // 2))
+    left = iter(range(chunks))  # threads take the next range when they are done with one
+
+    def run() -> None:
+        # a recorded launch of its own for each thread, which shares the packed arrays
+        bounds = type(first.bounds)((count,))
+        begin = type(first.params[1])(0)
+        command = wp.Launch(kernel, first.device, hooks=first.hooks, params=[bounds, begin, *first.params[2:]], bounds=bounds)
+        for i in left:
+            begin.value, end = count * i // chunks, count * (i + 1) // chunks
+            bounds.shape[0] = bounds.size = end - begin.value
+            command.launch()
+
+    for done in [_pool(threads).submit(run) for _ in range(min(threads, chunks))]:
+        done.result()
+
+
+def check(**tensors: tuple[torch.Tensor, str]) -> dict[str, int]:
+    """Check shapes, scalar types and devices of named tensors against patterns such as ``means=(means, "N 3")``.
+
+    A capital letter stands for a size that must agree wherever it occurs.
+
+    Returns:
+        The sizes by letter.
+
+    Raises:
+        TypeError: An argument is no tensor, or its scalar type is neither float32 nor float64, or types differ.
+        ValueError: A shape or a device disagrees; the message names the argument, what was wanted and what was found.
+    """
+    sizes: dict[str, int] = {}
+    first_name, first = "", None
+    for name, (tensor, pattern) in tensors.items():
+        if not isinstance(tensor, torch.Tensor):
+            raise TypeError(f"{name} must be a torch tensor, not {type(tensor).__name__}")
+        real_of(tensor)
+        if first is None:
+            first_name, first = name, tensor
+        if tensor.dtype != first.dtype:
+            raise TypeError(f"{name} is {tensor.dtype} but {first_name} is {first.dtype}; give both the same type")
+        if tensor.device != first.device:
+            raise ValueError(f"{name} is on {tensor.device} but {first_name} is on {first.device}; move one of them")
+        wanted = pattern.split()
+        found = tuple(tensor.shape)
+        fits = len(wanted) == len(found)
+        for symbol, size in zip(wanted, found):
+            expected = int(symbol) if symbol.isdigit() else sizes.setdefault(symbol, size)
+            fits = fits and expected == size
+        if not fits:
+            known = ", ".join(f"{k}={v}" for k, v in sizes.items())
+            raise ValueError(f"{name} must have shape [{', '.join(wanted)}] ({known}), not {list(found)}")
+    return sizes

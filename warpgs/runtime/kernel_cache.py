@@ -1,0 +1,144 @@
+"""The folder of compiled kernels: the one that Warp would take, if it can be written and by nobody else; else a private one.
+
+Warp runs what it finds there, so whoever can write to it can run code as this user.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import stat
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+from warpgs.errors import ResourceError
+from warpgs.runtime.folders import cache_home, private_folder
+
+REMEDY = "Set WARP_CACHE_PATH to a folder of your own to keep compiled kernels"
+
+
+class KernelCache(NamedTuple):
+    """Where kernels are compiled to, without Warp's version, and why that is not the usual folder; empty where it is."""
+
+    folder: Path
+    refused: str
+
+
+@functools.cache
+def prepare_kernel_cache() -> KernelCache:
+    """Choose the folder and tell Warp; to be called before `wp.init`. One line on stderr says if it is a private one.
+
+    Raises:
+        ResourceError: No folder at all can be written.
+    """
+    import warp
+
+    chosen = choose_kernel_cache(warp.config.kernel_cache_dir)
+    if chosen.refused:
+        print(
+            f"warpgs: {chosen.refused}; kernels are compiled into {chosen.folder} for this process alone, which takes a minute "
+            f"or two. {REMEDY}",
+            file=sys.stderr,
+        )
+    if chosen.refused or warp.config.kernel_cache_dir is None:
+        warp.config.kernel_cache_dir = str(chosen.folder)
+    return chosen
+
+
+def choose_kernel_cache(configured: str | None = None) -> KernelCache:
+    """Choose a folder: the one configured, that of WARP_CACHE_PATH, or Warp's own, where it is sound; else a private one.
+
+    Args:
+        configured: What ``warp.config.kernel_cache_dir`` is: set by the user's program, or by Warp once started.
+
+    Raises:
+        ResourceError: Neither can be written.
+    """
+    folder, refused = _usual(configured)
+    if folder is not None:
+        refused = _fault(folder)
+        if not refused:
+            return KernelCache(folder, "")
+    try:
+        own = private_folder() / "kernels"
+        own.mkdir(exist_ok=True)
+        return KernelCache(own, refused)
+    except (ResourceError, OSError) as e:
+        raise ResourceError(f"kernels have nowhere to be compiled to: {refused}, and {e}. {REMEDY}") from e
+
+
+def _usual(configured: str | None) -> tuple[Path | None, str]:
+    """Return the folder that is asked for, or that Warp takes by itself; or None, and the reason."""
+    asked = configured or os.environ.get("WARP_CACHE_PATH")
+    if asked:
+        folder = Path(os.path.expanduser(asked))  # as a shell does, but not within quotes
+        if asked.startswith("~") and not folder.is_absolute():
+            return None, f"the kernel cache {asked} lies in a home folder that is not known"
+        return folder.resolve(), ""
+    home = cache_home()
+    if home is None:
+        return None, "there is no home folder for a kernel cache"
+    # where Warp's appdirs would put it; Warp adds its version
+    return home.joinpath(*(("NVIDIA", "warp", "Cache") if sys.platform == "win32" else ("warp",))).resolve(), ""
+
+
+def _fault(folder: Path) -> str:
+    """Return why a folder cannot be used, made if it is not there; empty where it can."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as f:
+            f.write(b"0")
+            f.flush()
+        others = _open_to_others(folder)
+    except OSError as e:
+        return f"the kernel cache {folder} cannot be written ({e.strerror or e})"
+    return f"the kernel cache {folder} is not safe: other users can write to {others}" if others else ""
+
+
+def _open_to_others(folder: Path) -> Path | None:
+    """Return what another user could change in a cache: a folder above, it, or one in it; None where nobody can.
+
+    On Windows nothing is looked at: mode bits say nothing there, and the folder of a user's caches is private. A folder that
+    root owns is trusted, as root may do anything.
+    """
+    if not hasattr(os, "getuid"):
+        return None
+    for above in folder.parents:
+        mode = above.stat().st_mode
+        if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
+            return above
+    if _writable_by_others(folder.stat()):
+        return folder
+    if not folder.stat().st_mode & (stat.S_IXGRP | stat.S_IXOTH):
+        return None  # others do not even get in
+    # its versions, and the modules in them
+    for pattern in ("*", "*/*"):
+        for path in folder.glob(pattern):
+            try:
+                found = path.lstat()
+            except FileNotFoundError:  # another process has put its new module in place
+                continue
+            if stat.S_ISLNK(found.st_mode) or _writable_by_others(found):
+                return path
+    return None
+
+
+def _writable_by_others(found: os.stat_result) -> bool:
+    if found.st_uid not in (os.getuid(), 0) or found.st_mode & stat.S_IWOTH:
+        return True
+    return bool(found.st_mode & stat.S_IWGRP) and not _is_own_group(found.st_gid)
+
+
+def _is_own_group(gid: int) -> bool:
+    """Return whether a group is that of this user alone, which many systems make for each user under the user's number."""
+    import grp
+    import pwd
+
+    try:
+        name = pwd.getpwuid(os.getuid()).pw_name
+        group = grp.getgrgid(gid)
+    except KeyError:
+        return False
+    return set(group.gr_mem) <= {name} and (gid == os.getuid() or group.gr_name == name)

@@ -1,0 +1,1 @@
+"""Synthetic scenes: a ray caster, and the demo scene."""

@@ -1,0 +1,300 @@
+"""The demo scene: a textured still life, ray cast here and written as a COLMAP folder, so that a fit needs no download.
+
+It can be learnt from six images and not be copied from them: everything in it is smooth and matte, and the training
+views surround the held-out ones, but a step between neighbours moves the pattern by more than half its period, so that no
+training image, nor their mean, resembles a held-out view pixel by pixel.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from warpgs.errors import ResourceError, UsageError
+from warpgs.geometry import matmul
+from warpgs.scene import Camera
+from warpgs.synthetic import raycast
+
+TRAIN_VIEWS = 6
+MIN_VIEWS = 8
+MIN_SIDE = 32  # [px]; below that nothing of the texture is left
+CANDIDATES = 4800  # surface points tried at 320 x 240; fewer in smaller images, in proportion to the pixels
+TAU = 2 * np.pi
+
+
+def _texture(rng: np.random.Generator, low: str, high: str, period: float, kind: str = "solid") -> raycast.Texture:
+    """Return a smoothed checker with five tinting waves between half and twice its pitch.
+
+    Args:
+        rng: Generator of directions, tints and phases.
+        low: One colour, as six hexadecimal digits.
+        high: The other colour, likewise.
+        period: Period of the checker [u].
+        kind: ``solid``; ``flat`` where the surface is the local plane z = 0 and only x and y make a pattern; ``box``
+            where the period is half the edge, so that the faces lie in the strongest layers of the checker.
+    """
+    directions = rng.normal(size=(5, 3))
+    if kind == "flat":
+        directions[:, 2] = 0
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    octaves = np.geomspace(0.45, 1.6, 5)
+    tints = rng.normal(size=(5, 3))
+    tints *= 0.15 * np.sqrt(octaves[0] / octaves)[:, None] / np.linalg.norm(tints, axis=1, keepdims=True)
+    colors = [tuple(int(c[i : i + 2], 16) / 255 for i in (0, 2, 4)) for c in (low, high)]
+    checker = (TAU / period, TAU / period, 0.0 if kind == "flat" else TAU / period)
+    phases = rng.uniform(0, TAU, 8)
+    if kind == "box":
+        phases[:3] = TAU / 4
+    return raycast.Texture(*colors, checker, directions * (octaves * TAU / period)[:, None], tints, phases)
+
+
+def _turn(x: float = 0.0, y: float = 0.0) -> np.ndarray:
+    """Return the rotation by ``x`` degrees about the x axis, then by ``y`` degrees about the y axis, shape [3, 3]."""
+    (cx, cy), (sx, sy) = np.cos(np.radians([x, y])), np.sin(np.radians([x, y]))
+    return matmul(np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]), np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]]))
+
+
+def still_life(seed: int = 0) -> list[raycast.Shape]:
+    """Return the shapes of the scene: three walls and a floor that fill the frame, and six objects that hide one another.
+
+    Args:
+        seed: Seed of the patterns; the arrangement is fixed.
+
+    Returns:
+        The shapes, the four planes first.
+    """
+    rng = np.random.default_rng(seed)
+
+    def surface(low: str, high: str, period: float, kind: str = "solid") -> raycast.Texture:
+        return _texture(rng, low, high, period, kind)
+
+    return [
+        raycast.Plane((0, 0, 6.4), surface("1a3a5f", "f7e6c6", 0.92, "flat")),
+        raycast.Plane((-3.3, 0, 0), surface("7a2a22", "f5be78", 1.1, "flat"), _turn(y=-90)),
+        raycast.Plane((3.3, 0, 0), surface("1a5c4d", "c2e4a0", 1.1, "flat"), _turn(y=90)),
+        raycast.Plane((0, 1.3, 0), surface("3a2a24", "f2dfc0", 0.9, "flat"), _turn(x=-90)),
+        raycast.Sphere((-0.85, 0.6, 4.3), surface("143a9e", "facc40", 0.6), size=0.7),
+        raycast.Box((0.95, 0.65, 4.9), surface("b22433", "fadbb4", 0.6, "box"), _turn(y=32), half=(0.6, 0.65, 0.6)),
+        raycast.Torus((0.3, 1.08, 3.5), surface("0d6b66", "faed8c", 0.42), ring=0.5, tube=0.22),
+        raycast.Cylinder((-2.1, 0.3, 5.3), surface("5c1a75", "f5c4dc", 0.7), size=0.42, half_height=1.0),
+        raycast.Sphere((0.95, -0.33, 4.9), surface("1a6629", "f2f2bf", 0.42), size=0.33),
+        raycast.Box((2.05, 0.9, 3.9), surface("1f2973", "b2e6fa", 0.4, "box"), _turn(y=-20), half=(0.4, 0.4, 0.4)),
+    ]
+
+
+def camera_path(views: int, width: int, height: int) -> list[Camera]:
+    """Return cameras along a wave from left to right whose crests and troughs are the training views.
+
+    Args:
+        views: Number of cameras.
+        width: Image width [px].
+        height: Image height [px].
+
+    Returns:
+        The cameras in the order of the path. Held-out views lie between two training views in both directions, so that
+        they interpolate.
+    """
+    focal = 0.95 * max(width, height * 4 / 3)
+    K = np.array([[focal, 0, 0.515 * width], [0, focal, 0.485 * height], [0, 0, 1]])
+    out = []
+    for u in np.linspace(0, 1, views):
+        sweep, wave = 2 * u - 1, np.cos(np.pi * (TRAIN_VIEWS - 1) * u)
+        center = np.array([1.6 * sweep, -0.55 - 0.45 * wave, 0.2 * sweep**2])
+        forward = np.array([0.4 * center[0], 0.35 + 0.35 * center[1], 5.0]) - center
+        forward /= np.linalg.norm(forward)
+        right = np.cross([0, 1, 0], forward)
+        right /= np.linalg.norm(right)
+        R = np.stack([right, np.cross(forward, right), forward])
+        viewmat = np.eye(4)
+        viewmat[:3, :3], viewmat[:3, 3] = R, -matmul(R, center)
+        out.append(Camera(viewmat, K, width, height))
+    return out
+
+
+def split_spec(views: int) -> str:
+    """Return the split of a demo with that many views: six evenly spaced training views, all others held out."""
+    train = {round(i) for i in np.linspace(0, views - 1, TRAIN_VIEWS).tolist()}
+    names = [f"{i:03d}.png" for i in range(views)]
+    held_out = [n for i, n in enumerate(names) if i not in train]
+    return f"train={','.join(names[i] for i in sorted(train))};test={','.join(held_out)}"
+
+
+def _project(camera: Camera, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return image positions [px], shape [N, 2], and depths [u], shape [N], of world points [u], shape [N, 3]."""
+    p = matmul(x, camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        xy = p[:, :2] / p[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
+    return xy, p[:, 2]
+
+
+def _sees(shapes: list[raycast.Shape], camera: Camera, x: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """Return True for points that a camera sees well enough for a feature detector.
+
+    A point counts where the rays through its projection and 1.5 px around it all hit the point's own shape, and the one
+    in the middle hits the point itself. Points on a silhouette, where a pixel mixes two surfaces, do not count.
+
+    Args:
+        shapes: Shapes of the scene.
+        camera: The camera.
+        x: Surface points [u], shape [N, 3].
+        index: Index of the shape of each point, shape [N].
+
+    Returns:
+        True where seen, shape [N].
+    """
+    xy, depth = _project(camera, x)
+    size = np.array([camera.width, camera.height])
+    seen = (depth > 0) & (xy >= 2).all(axis=1) & (xy <= size - 2).all(axis=1)
+    for offset in ((0, 0), (-1.5, 0), (1.5, 0), (0, -1.5), (0, 1.5)):
+        rows = np.flatnonzero(seen)
+        t, which = raycast.cast(shapes, camera.center, raycast.pixel_rays(camera.K, camera.viewmat, xy[rows] + offset))
+        same = which == index[rows]
+        if offset == (0, 0):
+            distance = np.linalg.norm(x[rows] - camera.center, axis=1)
+            same &= np.abs(t - distance) < 1e-4 * distance
+        seen[rows] = same
+    return seen
+
+
+def surface_points(
+    shapes: list[raycast.Shape], light: raycast.Light, cameras: list[Camera], rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return points on the visible surfaces, as a reconstruction without error would find them.
+
+    Args:
+        shapes: Shapes of the scene.
+        light: Light of the scene.
+        cameras: C cameras.
+        rng: Generator of the pixels whose surface points are taken.
+
+    Returns:
+        Positions [u], float64, shape [N, 3]; colours in [0, 1], shape [N, 3]; and True where a camera sees a point, shape
+        [N, C]: every point is seen by at least two cameras.
+    """
+    width, height = cameras[0].width, cameras[0].height
+    count = int(np.clip(CANDIDATES * width * height / (320 * 240), 600, CANDIDATES))
+    xs, indices = [], []
+    for camera, fraction in zip(cameras, np.array_split(np.arange(count), len(cameras))):
+        xy = rng.uniform(2, np.array([width, height]) - 2.0, size=(len(fraction), 2))
+        d = raycast.pixel_rays(camera.K, camera.viewmat, xy)
+        t, index = raycast.cast(shapes, camera.center, d)
+        xs.append((camera.center + t[:, None] * d)[index >= 0])
+        indices.append(index[index >= 0])
+    x, index = np.concatenate(xs), np.concatenate(indices)
+    seen = np.stack([_sees(shapes, c, x, index) for c in cameras], axis=1)
+    keep = seen.sum(axis=1) >= 2
+    x, index = x[keep], index[keep]
+    return x, raycast.shade(shapes, light, x, index), seen[keep]
+
+
+def _quaternion(R: np.ndarray) -> np.ndarray:
+    """Return the unit quaternion wxyz [4] of a rotation [3, 3] by less than half a turn."""
+    w = np.sqrt(1 + np.trace(R)) / 2
+    return np.array([w, *(np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (4 * w))])
+
+
+def colmap_text(cameras: list[Camera], x: np.ndarray, colors: np.ndarray, seen: np.ndarray) -> dict[str, str]:
+    """Return the contents of the three text files of a COLMAP model, by file name.
+
+    Args:
+        cameras: C cameras with equal intrinsics; camera i took ``{i:03d}.png``.
+        x: Point positions [u], shape [N, 3].
+        colors: Point colours in [0, 1], shape [N, 3].
+        seen: True where a camera sees a point, bool, shape [N, C].
+    """
+
+    def join(values, digits: int) -> str:
+        return " ".join(f"{v:z.{digits}f}" for v in values)  # z: a zero has no sign
+
+    K, first = cameras[0].K, cameras[0]
+    camera_lines = ["# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    parameters = join((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), 6)
+    camera_lines.append(f"1 PINHOLE {first.width} {first.height} {parameters}")
+    image_lines = [
+        "# Image list with two lines of data per image:",
+        "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
+        "#   POINTS2D[] as (X, Y, POINT3D_ID)",
+    ]
+    tracks: list[list[str]] = [[] for _ in x]
+    for c, camera in enumerate(cameras):
+        V = camera.viewmat
+        image_lines.append(f"{c + 1} {join([*_quaternion(V[:3, :3]), *V[:3, 3]], 12)} 1 {c:03d}.png")
+        rows = np.flatnonzero(seen[:, c])
+        xy, _ = _project(camera, x[rows])
+        image_lines.append(" ".join(f"{join(p, 4)} {row + 1}" for p, row in zip(xy, rows)))
+        for k, row in enumerate(rows):
+            tracks[row].append(f"{c + 1} {k}")
+    point_lines = [
+        "# 3D point list with one line of data per point:",
+        "#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
+    ]
+    for i, (p, rgb) in enumerate(zip(x, np.round(255 * colors).astype(int))):
+        point_lines.append(f"{i + 1} {join(p, 8)} {rgb[0]} {rgb[1]} {rgb[2]} 0.0 {' '.join(tracks[i])}")
+    named = {"cameras.txt": camera_lines, "images.txt": image_lines, "points3D.txt": point_lines}
+    return {name: "\n".join(lines) + "\n" for name, lines in named.items()}
+
+
+def _check(folder: Path, views: int, width: int, height: int) -> None:
+    """Raise a UsageError for a demo that cannot be written, before anything is."""
+    if views < MIN_VIEWS:
+        raise UsageError(f"a demo needs at least {MIN_VIEWS} views ({TRAIN_VIEWS} to fit, the rest held out), not {views}")
+    if min(width, height) < MIN_SIDE:
+        raise UsageError(f"a demo image must be at least {MIN_SIDE} px on each side, not {width} x {height}")
+    try:
+        if folder.exists() and not folder.is_dir():
+            raise UsageError(f"{folder} is a file; name a new or an empty folder for the demo")
+        if folder.exists() and any(folder.iterdir()):
+            raise UsageError(f"{folder} is not empty, and the demo overwrites nothing; name a new or an empty folder")
+    except OSError as e:
+        raise ResourceError(f"cannot look into {folder} ({e.strerror or e}); name a folder that you may write to") from e
+
+
+def _files(views: int, width: int, height: int, seed: int) -> dict[str, bytes]:
+    """Return the contents of the demo folder by relative path, all at once, so that an interruption leaves no half a scene."""
+    import cv2
+
+    shapes, light = still_life(seed), raycast.Light()
+    cameras = camera_path(views, width, height)
+    files = {}
+    for i, camera in enumerate(cameras):
+        rgb = raycast.render(shapes, light, camera.K, camera.viewmat, width, height)
+        _, png = cv2.imencode(".png", np.round(255 * rgb[..., ::-1]).astype(np.uint8))
+        files[f"images/{i:03d}.png"] = png.tobytes()
+    points = surface_points(shapes, light, cameras, np.random.default_rng([seed, 1]))
+    for name, text in colmap_text(cameras, *points).items():
+        files[f"sparse/0/{name}"] = text.encode()
+    return files
+
+
+def write_demo(folder: Path, *, views: int = 24, width: int = 320, height: int = 240, seed: int = 0) -> str:
+    """Write the demo scene as a COLMAP folder: images, cameras, and exact points with their tracks.
+
+    The same arguments give the same bytes on the same machine and library versions.
+
+    Args:
+        folder: Target folder, new or empty.
+        views: Number of images, at least 8; six of them are training views.
+        width: Image width [px].
+        height: Image height [px].
+        seed: Seed of the patterns and of the choice of points.
+
+    Returns:
+        The split to use: six training views along the camera path, all others held out.
+
+    Raises:
+        UsageError: The folder is not empty, or the sizes are too small.
+        ResourceError: The folder cannot be written.
+    """
+    folder = Path(folder)
+    _check(folder, views, width, height)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)  # before the work: a folder that cannot be made is reported at once
+        for path, content in _files(views, width, height, seed).items():
+            target = folder / path
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(content)
+    except OSError as e:
+        why = e.strerror or e
+        raise ResourceError(f"cannot write the demo to {folder} ({why}); free some disk, or name another folder") from e
+    return split_spec(views)
