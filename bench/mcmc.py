@@ -1,4 +1,4 @@
-"""Strategy `mcmc` beside preset `3dgs` and gsplat's own MCMC: held-out PSNR from the same images, cameras, split and points.
+"""Preset `mcmc` beside preset `3dgs` and gsplat's own MCMC: held-out PSNR from the same images, cameras, split and points.
 
 usage: python -m bench.mcmc SCENE [--seeds 3] [--steps 7000] [--split every:8] [--downscale 1] [--device cuda] --out FILE.json
 
@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from bench import gsplat_trainer, result_file
-from bench.training import Trainer, finish, make_trainer, with_cap, with_strategy
+from bench.training import Trainer, finish, make_trainer, with_cap
 from warpgs import load_scene
 from warpgs.io.splits import split_views
 from warpgs.pipeline.metrics.evaluate import render_view, score
@@ -32,7 +32,7 @@ from warpgs.pipeline.runs.results import options_for
 from warpgs.pipeline.train.config import PRESETS, FitConfig
 from warpgs.scene import Scene, View
 
-WHAT = "held-out PSNR of preset 3dgs, of strategy mcmc and of gsplat's MCMC under the same cap, by seed"
+WHAT = "held-out PSNR of preset 3dgs, of preset mcmc and of gsplat's MCMC under the same cap, by seed"
 BASE, OURS, PEER, PEER_OWN = "warpgs 3dgs", "warpgs mcmc", "gsplat mcmc", "gsplat mcmc, own units"
 PROGRAMS = (BASE, OURS, PEER, PEER_OWN)
 
@@ -102,7 +102,8 @@ def measure(study: Study, program: str, seed: int, cap: int | None) -> dict:
     if program == BASE:
         return our_row(study, config)
     if program == OURS:
-        return our_row(study, with_strategy(with_cap(config, cap), "mcmc"))
+        ours = dataclasses.replace(PRESETS["mcmc"], steps=study.steps, seed=seed)
+        return our_row(study, with_cap(ours, cap))
     return peer_row(study, seed, cap, program == PEER_OWN)
 
 
@@ -128,7 +129,7 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def run(study: Study, seeds: int, programs: tuple[str, ...], facts: dict, out: Path) -> list[dict]:
+def run(study: Study, seeds: range, programs: tuple[str, ...], facts: dict, out: Path) -> list[dict]:
     """Measure what the file lacks, seed by seed, and write it after each row.
 
     Raises:
@@ -138,7 +139,7 @@ def run(study: Study, seeds: int, programs: tuple[str, ...], facts: dict, out: P
     if any(stored.get(k) != v for k, v in facts.items()):
         raise ValueError(f"{out}: holds a study of { ({k: stored.get(k) for k in facts}) }, not {facts}; choose another --out")
     rows = stored["rows"]
-    for seed in range(seeds):
+    for seed in seeds:
         for program in (BASE, *(p for p in programs if p != BASE)):
             if any((r["program"], r["seed"]) == (program, seed) for r in rows):
                 continue
@@ -157,6 +158,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene")
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--first-seed", type=int, default=0, help="so that several processes can share the work")
     parser.add_argument("--steps", type=int, default=7000)
     parser.add_argument("--split", default="every:8")
     parser.add_argument("--downscale", type=int, default=1)
@@ -171,7 +173,7 @@ def main(arguments: list[str] | None = None) -> int:
     camera = train[0].camera
     print(f"{len(train)} training and {len(test)} held-out views, {camera.width} x {camera.height} px")
     facts = {"scene": Path(a.scene).resolve().name, "split": a.split, "downscale": a.downscale, "steps": a.steps}
-    print(table(run(study, a.seeds, tuple(a.only), facts, a.out)))
+    print(table(run(study, range(a.first_seed, a.first_seed + a.seeds), tuple(a.only), facts, a.out)))
     return 0
 
 
