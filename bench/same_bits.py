@@ -173,7 +173,9 @@ def _first_step(trainer: Trainer) -> Iterator[Stage]:
         yield f"first gradient: {name}", digest(leaf.grad)
 
 
-def fit_stages(scene: Scene, train: list[View], config: FitConfig, device: torch.device, folder: Path) -> Iterator[Stage]:
+def fit_stages(
+    scene: Scene, train: list[View], config: FitConfig, device: torch.device, folder: Path, *, only_start: bool
+) -> Iterator[Stage]:
     """Yield the stages of one fit: its start, the first step, parameters after 1, 10 and all steps, and both PLY files."""
     trainer = Trainer(train, scene.points, config, device, scene.background)
     if find_strategy(config.strategy).samples(config):
@@ -186,6 +188,8 @@ def fit_stages(scene: Scene, train: list[View], config: FitConfig, device: torch
     yield "first points", digest(trainer.gaussians.means, trainer.gaussians.sh[:, 0])
     yield "first Gaussians", digest(*trainer.gaussians.tensors().values())
     yield "first PLY", _ply(trainer.gaussians, scene, folder)
+    if only_start:
+        return
     yield from _first_step(trainer)
     losses = []
     for step in sorted({1, min(10, config.steps), config.steps}):
@@ -197,9 +201,19 @@ def fit_stages(scene: Scene, train: list[View], config: FitConfig, device: torch
 
 
 def stages(
-    device: torch.device, *, views: int, width: int, height: int, steps: int, given: Path | None = None
+    device: torch.device, *, views: int, width: int, height: int, steps: int, only_start: bool, given: Path | None = None
 ) -> Iterator[Stage]:
-    """Yield names and digests in the order in which one stage feeds the next; ``given`` is a demo written elsewhere."""
+    """Yield names and digests in the order in which one stage feeds the next.
+
+    Args:
+        device: Device of the fits.
+        views: Number of views of the demo.
+        width: Width of its images [px].
+        height: Height of its images [px].
+        steps: Steps of each fit.
+        only_start: True to stop each fit before its first step.
+        given: Folder of such a demo that was written elsewhere; None to write one.
+    """
     yield from function_stages()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -215,7 +229,7 @@ def stages(
             # so that Gaussians are cloned, split and pruned in as few steps as these
             density = dataclasses.replace(config.density, start=steps // 6, every=max(1, steps // 6))
             config = dataclasses.replace(config, steps=steps, density=density)
-            for stage, value in fit_stages(scene, train, config, device, folder):
+            for stage, value in fit_stages(scene, train, config, device, folder, only_start=only_start):
                 yield f"{preset}: {stage}", value
 
 
@@ -235,7 +249,7 @@ def _versions() -> dict[str, str]:
     return found | {"libc": " ".join(platform.libc_ver())}
 
 
-def row(device: torch.device, label: str, arguments: dict, given: Path | None = None, echo=print) -> dict:
+def row(device: torch.device, label: str, arguments: dict, given: Path | None) -> dict:
     """Return one row of the table: the machine, what decides the code it runs, and the digest of each stage."""
     head = result_file.result(WHAT, device, [])
     kept = {name: head[name] for name in ("command", "commit", "date", "machine", "versions")}
@@ -248,7 +262,7 @@ def row(device: torch.device, label: str, arguments: dict, given: Path | None = 
     found = {}
     for name, value in stages(device, **arguments, given=given):
         found[name] = value
-        echo(f"{value}  {name}")
+        print(f"{value}  {name}")
     return record | {"stages": found}
 
 
@@ -309,6 +323,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--size", type=int, nargs=2, default=(240, 180), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--scene", type=Path, help="a demo of these views and size that `warpgs demo` wrote on another machine")
     parser.add_argument("--avx2", action="store_true", help="have all libraries take their code for processors without AVX-512")
+    parser.add_argument("--starts", action="store_true", help="stop each fit before its first step")
     parser.add_argument("--label", default="as it is", help="words about the run that belong in the table")
     return parser.parse_args()
 
@@ -324,7 +339,7 @@ def main() -> None:
         _compile_for("haswell")
     if a.threads:
         _set_threads(a.threads)
-    arguments = {"views": a.views, "width": a.size[0], "height": a.size[1], "steps": a.steps}
+    arguments = {"views": a.views, "width": a.size[0], "height": a.size[1], "steps": a.steps, "only_start": a.starts}
     made = row(torch.device(a.device), a.label, arguments, a.scene)
     rows = placed(result_file.read(a.out)["rows"] if a.out.exists() else [], made)
     first = next(r for r in rows if r["arguments"] == arguments and r["machine"]["device"] == a.device)
