@@ -134,7 +134,7 @@ class Steps:
         self.views = ViewStack(camera.viewmat, camera.K, target[None], None, {}, numbers)
         self.plan = StepPlan(gaussians.sh_degree, False, tuple(built_in_terms(LossConfig())), None)
         self.graphs = StepGraphs(device) if device.type == "cuda" else None
-        self._load(range(1, MAX_BATCH + 1))
+        self._load(range(1, (MAX_BATCH if device.type == "cuda" else 1) + 1))
 
     def _load(self, steps: range) -> None:
         config = OptimizerConfig()

@@ -54,7 +54,7 @@ def fuzz(device: str, gaussians: int, seed: int, largest: int, folder: Path) -> 
             error, some, visible = reference_error(seed, scenes, device)
             worst, compared, shown = max(worst, error), compared + some, shown + visible
             if not error <= REFERENCE_LIMIT:
-                wrong.append(f"twin_error({seed}, {scenes}, {device!r}) is {error:.2e}, above {REFERENCE_LIMIT:.0e}")
+                wrong.append(f"reference_error({seed}, {scenes}, {device!r}) is {error:.2e}, above {REFERENCE_LIMIT:.0e}")
         if wrong:
             failed += 1
             path = folder / f"fuzz-{seed}-{scenes}.safetensors"

@@ -251,7 +251,7 @@ def test_far_from_the_origin(tmp_path):
         assert np.allclose(scene.normalization.offset - shift, loaded(tmp_path, 0.0).normalization.offset, atol=1e-8)
         images.append(torch.stack([rasterize(gaussians, v.camera).rgb for v in scene.views]))
         fit = Trainer(list(scene.views), scene.points, config, torch.device("cpu"), (0.0, 0.0, 0.0))
-        scores.append([fit.advance().loss for _ in range(30)][-1])
+        scores.append([fit.advance()[0].loss for _ in range(30)][-1])
         write_ply(tmp_path / "model.ply", gaussians, scene.normalization)
         back = read_ply(tmp_path / "model.ply").means.double().numpy()
         wanted = gaussians.means.double().numpy() / scene.normalization.scale + scene.normalization.offset

@@ -52,7 +52,7 @@ def test_finite_extremes_equal_float64(device):
 def test_a_failure_can_be_replayed(tmp_path, monkeypatch, capsys):
     """A broken scene is kept, counted, and reads back as it was; the last line says how many there were."""
     monkeypatch.setattr("tests.numerics.fuzz.failures", lambda case, device: (["all of it"], 0))
-    monkeypatch.setattr("tests.numerics.fuzz.twin_error", lambda *_: (0.0, 0, 0))
+    monkeypatch.setattr("tests.numerics.fuzz.reference_error", lambda *_: (0.0, 0, 0))
     assert fuzz("cpu", 1, 5, 100, tmp_path) == 1
     out = capsys.readouterr().out
     assert "all of it" in out and out.splitlines()[-1].startswith("1 failures in ")

@@ -49,7 +49,7 @@ class InitConfig:
     opacity: float = 0.1
     """First opacity, in (0, 1)."""
     scale_factor: float = 1.0
-    """First width of a Gaussian, as a multiple of the distance to its neighbours, in (0, 10]."""
+    """First width of a Gaussian, as a multiple of the distance to its neighbours, in [0.001, 10]."""
     max_sh_degree: int = 3
     """Spherical-harmonics degree stored, 0 to 3."""
     near_views: int = 4
@@ -76,8 +76,8 @@ class InitConfig:
         if self.flow_range not in RANGES:
             raise UsageError(f"init flow-range {self.flow_range!r} is not one of {', '.join(RANGES)}")
         self.epipolar()  # its own checks
-        if not 0 < self.scale_factor <= 10:
-            raise UsageError(f"init scale-factor {self.scale_factor} must lie above 0 and be at most 10")
+        if not 1e-3 <= self.scale_factor <= 10:
+            raise UsageError(f"init scale-factor {self.scale_factor} must lie between 0.001 and 10")
         if not 0 < self.opacity < 1:
             raise UsageError(f"init opacity {self.opacity} must lie between 0 and 1")
         if not 0 <= self.max_sh_degree <= MAX_DEGREE:

@@ -18,6 +18,7 @@ import torch
 from warpgs.pipeline.metrics.evaluate import render_view, score
 from warpgs.pipeline.model.init import sweeps
 from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.trainer import Trainer, run
 from warpgs.priors.sweep import SweepConfig, sweep_depths
 from warpgs.render.rasterize import RasterizeOptions
@@ -61,6 +62,7 @@ def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool]
     small = replace(
         config, steps=STEPS, memory_limit=None, init=replace(config.init, source="points"),
         density=replace(config.density, every=1),
+        strategy_config=find_strategy(config.strategy).warmup_config(config.strategy_config),
     )  # fmt: skip
     black = (0.0, 0.0, 0.0)
     if sweeps(config.init, len(views)) and config.memory_limit is None:

@@ -48,6 +48,11 @@ class Strategy:
         """Return whether it samples by importance, for which views need priors and scores."""
         return False
 
+    @classmethod
+    def warmup_config(cls, own: Any) -> Any:
+        """Return the own settings for a warm-up of three steps, in which everything that a fit uses should come once."""
+        return own
+
     def columns(self) -> Mapping[str, Column]:
         """Return what the strategy keeps of each Gaussian, by name; it is saved with every checkpoint."""
         return {}

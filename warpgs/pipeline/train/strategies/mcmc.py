@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Iterator
@@ -138,6 +139,11 @@ class MCMC(Strategy):
     """Relocates dead Gaussians, adds new ones up to ``max_gaussians``, and perturbs all."""
 
     Config = MCMCConfig
+
+    @classmethod
+    def warmup_config(cls, own):
+        """Return the settings with an event after every step."""
+        return dataclasses.replace(own, start=0, every=1)
 
     def regularisation(self, gaussians):
         """Return the weighted mean opacity and mean axis length, which let the unneeded die."""
