@@ -326,7 +326,9 @@ def initial_gaussians(cloud: PointCloud, config: InitConfig, extent: float, devi
     points = torch.as_tensor(cloud.points, dtype=torch.float32, device=device)
     colors = torch.as_tensor(cloud.colors, dtype=torch.float32, device=device)
     count = len(points)
-    scales = config.scale_factor * mean_square_distances(points).sqrt().clamp(1e-6 * extent, 0.1 * extent)
+    # in float64: float32's roots and logarithms have other last digits on other processors (MKL)
+    distances = mean_square_distances(points).double().sqrt()
+    scales = config.scale_factor * distances.clamp(1e-6 * extent, 0.1 * extent)
     sh = points.new_zeros(count, coefficient_count(config.max_sh_degree), 3)
     sh[:, 0] = (colors - 0.5) / C0
     quats = points.new_zeros(count, 4)
@@ -334,7 +336,7 @@ def initial_gaussians(cloud: PointCloud, config: InitConfig, extent: float, devi
     return Gaussians(
         means=points,
         quats=quats,
-        log_scales=scales.log()[:, None].repeat(1, 3),
+        log_scales=scales.log().to(points.dtype)[:, None].repeat(1, 3),
         logit_opacities=points.new_full((count,), geometry.logit(config.opacity)),
         sh=sh,
     )

@@ -52,6 +52,18 @@ def _weights(fraction: float, count: int, dtype: torch.dtype, device: torch.devi
         return torch.tensor([fraction / count, (1 - fraction) / count], dtype=dtype, device=device)
 
 
+def _total(values: torch.Tensor) -> torch.Tensor:
+    """Return the sum of values [H, ...], on a CPU row by row: that of a whole tensor depends on the number of threads."""
+    return values.sum() if values.is_cuda else values.flatten(1).sum(1).sum()
+
+
+def _centred(values: torch.Tensor, fraction: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+    """Return values [H, W] less their mean over the pixels that count, and 0 at others."""
+    mean = _total(values * fraction) / pixels
+    # one number for each row: the gradient of a number for all is the sum of a whole tensor (see `_total`)
+    return (values - (mean if values.is_cuda else mean.expand(len(values), 1))) * fraction
+
+
 def photometric_loss(
     rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None, ssim_weight: float = 0.2
 ) -> torch.Tensor:
@@ -74,10 +86,10 @@ def photometric_loss(
     if mask is not None:
         rgb, target = rgb * mask[..., None], target * mask[..., None]
     pixels = target.shape[0] * target.shape[1] if mask is None else mask.sum().clamp_min(1)
-    l1 = (rgb - target).abs().sum() / (3 * pixels)
+    l1 = _total((rgb - target).abs()) / (3 * pixels)
     if mask is None or fraction == 0:
         return l1
-    structural = ((1 - ssim(rgb, target)) * mask[..., None]).sum() / (3 * pixels)
+    structural = _total((1 - ssim(rgb, target)) * mask[..., None]) / (3 * pixels)
     return (1 - fraction) * l1 + fraction * structural
 
 
@@ -104,12 +116,13 @@ def depth_disagreement(
     fraction = counts.to(depth.dtype)
     pixels = fraction.sum().clamp_min(1)
     depth = torch.where(counts, depth, 1)
-    mean = (depth.detach() * fraction).sum() / pixels
-    a, b = ((m - (m * fraction).sum() / pixels) * fraction for m in (mean / depth, disparity))
-    of_a, of_b = (a * a).sum() / pixels, (b * b).sum() / pixels
+    mean = _total(depth.detach() * fraction) / pixels
+    a, b = (_centred(m, fraction, pixels) for m in (mean / depth, disparity))
+    of_a, of_b = _total(a * a) / pixels, _total(b * b) / pixels
     flat = (of_a <= FLAT**2) | (of_b <= FLAT**2)
-    spread = torch.where(flat, 1, of_a).sqrt() * torch.where(flat, 1, of_b).sqrt()
-    return torch.where(flat, 0, 1 - (a * b).sum() / pixels / spread)
+    # roots in float64: float32's have other last digits on other processors (MKL)
+    spread = torch.where(flat, 1, of_a).double().sqrt() * torch.where(flat, 1, of_b).double().sqrt()
+    return torch.where(flat, 0, 1 - _total(a * b) / pixels / spread.to(a.dtype))
 
 
 @dataclass(frozen=True)

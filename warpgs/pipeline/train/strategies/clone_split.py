@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass
 
@@ -66,16 +67,26 @@ class DensityConfig:
         return refines, self.reset_every > 0 and step <= until - RESET_FREE_STEPS and step % self.reset_every == 0
 
 
+def _logit(p: float) -> float:
+    """Return the inverse sigmoid of a number in [0, 1]; infinite at both ends."""
+    return math.log(p / (1 - p)) if 0 < p < 1 else math.copysign(math.inf, p - 0.5)
+
+
+def _exp(x: torch.Tensor) -> torch.Tensor:
+    """Return e^x by way of float64: float32's has other last digits on other processors (MKL)."""
+    return x.double().exp().to(x.dtype)
+
+
 def _split(gaussians: dict[str, torch.Tensor], ids: torch.Tensor, generator: torch.Generator) -> dict[str, torch.Tensor]:
     """Return two children of each Gaussian, sampled from its own distribution and 1.6 times smaller (Kerbl et al. 2023)."""
     pair = ids.repeat(2)
     rows = {n: t[pair] for n, t in gaussians.items()}
-    noise = torch.randn(len(pair), 3, generator=generator).to(ids.device) * rows["log_scales"].exp()
+    noise = torch.randn(len(pair), 3, generator=generator).to(ids.device) * _exp(rows["log_scales"])
     w, *vector = (rows["quats"] / rows["quats"].norm(dim=1, keepdim=True)).unbind(1)
     axis = torch.stack(vector, 1)
     cross = 2 * torch.linalg.cross(axis, noise)
     rows["means"] = rows["means"] + noise + w[:, None] * cross + torch.linalg.cross(axis, cross)
-    rows["log_scales"] = rows["log_scales"] - torch.log(torch.tensor(1.6)).item()
+    rows["log_scales"] = rows["log_scales"] - math.log(1.6)
     return rows
 
 
@@ -109,8 +120,8 @@ def refine(
     """
     with torch.no_grad():
         tensors = {n: t.detach() for n, t in gaussians.tensors().items()}
-        scales = tensors["log_scales"].exp().amax(1)
-        opacities = tensors["logit_opacities"].sigmoid()
+        scales = _exp(tensors["log_scales"].amax(1))
+        logits = tensors["logit_opacities"]  # torch's sigmoid depends on the number of threads in its last digit
         grows = pull > config.gradient
         if growing is not None:
             grows &= growing
@@ -120,7 +131,7 @@ def refine(
             strongest = torch.topk(pull, free).indices
             grows = torch.zeros_like(grows).index_fill(0, strongest, True) & grows
         small = scales <= config.clone_size * extent
-        faint = ~(opacities >= config.prune_opacity)
+        faint = ~(logits >= _logit(config.prune_opacity))
         if after_reset and config.prune_size > 0:
             huge = scales > config.prune_size * extent
             if 2 * int(huge.sum()) <= len(gaussians):  # else it is the extent that is small: the cameras stand close together
@@ -128,7 +139,7 @@ def refine(
         if protected is not None:
             faint &= ~protected
         if len(gaussians) > 0 and bool(faint.all()):
-            faint[opacities.argmax()] = False
+            faint[logits.argmax()] = False
         cloned = torch.nonzero(grows & small & ~faint).squeeze(1)
         split = torch.nonzero(grows & ~small & ~faint).squeeze(1)
         remove = faint.clone()

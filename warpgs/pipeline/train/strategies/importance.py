@@ -43,7 +43,8 @@ def blur(image: torch.Tensor, sigma: float = BLUR) -> torch.Tensor:
     """Blur a map [H, W] by a Gaussian of standard deviation ``sigma`` [px], its border pixels repeated outwards."""
     radius = max(1, round(3 * sigma))
     offsets = torch.arange(-radius, radius + 1, dtype=image.dtype, device=image.device)
-    window = torch.exp(-0.5 * (offsets / sigma) ** 2)
+    # exponentials and roots in float64: float32's have other last digits on other processors (MKL)
+    window = torch.exp(-0.5 * (offsets.double() / sigma) ** 2).to(image.dtype)
     window = window / window.sum()
     padded = torch.nn.functional.pad(image[None, None], (radius,) * 4, mode="replicate")[0, 0]
     # sums of windows rather than a convolution, for which CUDA would load a library of its own
@@ -86,7 +87,7 @@ def geometry_score(disparity: torch.Tensor, curvature: float, valid: torch.Tenso
     smooth = blur(disparity)
     dx, dy = _slopes(smooth)
     (dxx, dxy), (_, dyy) = _slopes(dx), _slopes(dy)
-    bend = (dxx**2 + 2 * dxy**2 + dyy**2).sqrt()
+    bend = (dxx**2 + 2 * dxy**2 + dyy**2).double().sqrt().to(smooth.dtype)
     return normalized(normalized(torch.hypot(dx, dy), valid) + curvature * normalized(bend, valid), valid)
 
 

@@ -145,7 +145,7 @@ def fine_gaussians(
     return {
         "means": means,
         "quats": quats,
-        "log_scales": (math.log(config.footprint) + (depths / focal).log())[:, None].repeat(1, 3),
+        "log_scales": (math.log(config.footprint) + (depths / focal).double().log()).to(depths.dtype)[:, None].repeat(1, 3),
         "logit_opacities": torch.full_like(depths, logit(config.opacity)),
         "sh": sh,
     }
