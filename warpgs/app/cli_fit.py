@@ -94,8 +94,8 @@ def _terms(arguments: list[str], base: FitConfig) -> dict[str, Any]:
     given = word_after(arguments, "--loss-terms")
     if given is None:
         return {_group(t.name): t for t in base.loss_terms}
-    terms = {}
-    for name in filter(None, (n.strip() for n in given.split(","))):
+    terms: dict[str, Any] = {}
+    for name in filter(None, (n.strip() for n in ("" if given == "none" else given).split(","))):
         if _group(name) in terms:
             raise UsageError(f"--loss-terms {given}: two terms have the flags --{_group(name)}; leave one out")
         kind = _load(LOSS_TERMS, name)
@@ -159,7 +159,7 @@ def _flags(base: FitConfig, terms: dict[str, Any]) -> type:
     kind, default = flags_of(FitConfig, dataclasses.replace(base, loss_terms=tuple(terms.values())), special)
     fields: list[tuple[str, Any, Any]] = [("config", Annotated[kind, tyro.conf.arg(name="")], field(default=default))]
     own = {} if base.strategy_config is None else {_group(base.strategy): base.strategy_config}
-    taken = {f.name for f in dataclasses.fields(FitConfig)}
+    taken = {f.name for kind in (FitConfig, _request_type()) for f in dataclasses.fields(kind)} | {"config"}
     for name, settings in [*own.items(), *terms.items()]:
         if name in taken:
             raise UsageError(f"a plug-in has the name {name}, whose flags --{name} there are already; call it something else")

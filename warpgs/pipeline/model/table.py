@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import torch
 
+from warpgs.errors import DataError
 from warpgs.geometry import logit
 from warpgs.kernels.adam import adam_scheduled, scheduled_lrs
 from warpgs.kernels.knn import morton_codes
@@ -198,6 +199,12 @@ class Table:
 
     def load(self, state: Mapping[str, torch.Tensor]) -> None:
         """Load what `state` returned."""
+        own, stored = set(self.state()), {n for n in state if n.partition(".")[0] in self._groups()}
+        if own != stored:
+            raise DataError(
+                f"the stored table has other columns or parameters: {', '.join(sorted(own ^ stored))}; continue with the "
+                "code and the settings that the run was started with"
+            )
         for group, tensors in self._groups().items():
             for name in tensors:
                 tensors[name] = state[f"{group}.{name}"].to(self.device).contiguous()

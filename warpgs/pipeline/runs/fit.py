@@ -138,8 +138,9 @@ def fit(
     out = None if out is None else Path(out)
     if resume and out is None:
         raise UsageError("resume needs the run folder that it continues: give out")
+    made = False
     if out is not None:
-        prepare_folder(out, resume)
+        made = prepare_folder(out, resume)
         if resume:
             read_record(out)  # a run of another version is refused before anything takes time
     try:
@@ -155,8 +156,9 @@ def fit(
             job.notes.append(note)
         trainer, state, record = _prepare(job, out if resume else None)
     except WarpgsError:
-        if out is not None and not resume:
-            out.rmdir()  # nothing is in it yet
+        if out is not None and made:
+            with contextlib.suppress(OSError):  # it hides nothing: the error above is raised
+                out.rmdir()  # nothing is in it yet
         raise
     return _finish(job, trainer, state, record, resume)
 
@@ -277,6 +279,7 @@ def _stop_signals() -> Iterator[Callable[[], bool]]:
         nonlocal came
         came = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
     before = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -305,6 +308,7 @@ def _train(job: _Job, trainer: Trainer) -> None:
                 log.write(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=round(r.seconds, 6))
             while trainer.messages:
                 job.notes.append(trainer.messages.pop(0))
+                trainer.notes.append(job.notes[-1])  # a continued run has them in its report, too
                 job.say(f"  {job.notes[-1]}")
             if job.on_step is not None:
                 job.on_step(r)

@@ -14,7 +14,7 @@ from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossConfig, LossTerm, check_terms
 from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
-from warpgs.pipeline.train.strategies.base import find_strategy
+from warpgs.pipeline.train.strategies.base import STRATEGIES, find_strategy
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.strategies.holdout_blocks import HoldoutConfig
 from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
@@ -98,7 +98,9 @@ class FitConfig:
         if self.rule not in RULES:
             raise UsageError(f"rule {self.rule!r} is not one of {', '.join(RULES)}")
         check_terms(self.loss_terms)
-        own = None if ":" in self.strategy else find_strategy(self.strategy).Config
+        if isinstance(self.strategy, type):
+            object.__setattr__(self, "strategy", STRATEGIES.name_of(self.strategy))
+        own = find_strategy(self.strategy).Config if STRATEGIES.knows(self.strategy) else None
         if own is not None and self.strategy_config is None:
             object.__setattr__(self, "strategy_config", own())
 

@@ -24,7 +24,7 @@ from warpgs.pipeline.metrics.psnr import masked_mse
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.loss import LossTerm, Target
 from warpgs.pipeline.train.strategies.base import Strategy
-from warpgs.pipeline.train.views import Kind, ViewStack
+from warpgs.pipeline.train.views import Kind, Rows, ViewStack
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.runtime.cuda_graph import CapturedGraph, GraphMemory
 from warpgs.runtime.device_memory import available_bytes
@@ -96,10 +96,11 @@ class StepBuffers:
         rows = (self.view_rows, self.lr_rows, self.setting_rows, views.viewmats, views.Ks, views.images)
         return begin_step(self.counter, *rows)
 
-    def of_view(self, maps: torch.Tensor) -> torch.Tensor:
+    def of_view(self, maps: Rows) -> torch.Tensor:
         """Return the entry of the step's view in maps [V, ...]; before the step is counted."""
         if self.device.type == "cpu":
             return maps[int(self.view_rows[int(self.counter)])]
+        assert isinstance(maps, torch.Tensor)  # on CUDA stacks are tensors
         return maps.index_select(0, self.view_rows.index_select(0, self.counter))[0]
 
 
@@ -166,13 +167,14 @@ def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPla
     table, strategy = learned.table, learned.strategy
     lrs, settings, viewmat, K, image = buffers.begin(views)
     mask = None if views.masks is None else buffers.of_view(views.masks)
-    own = {n: t[buffers.of_view(views.numbers)] for n, t in learned.views.params.items()}
+    number = buffers.of_view(views.numbers).view(1)
+    own = {n: t.index_select(0, number)[0] for n, t in learned.views.params.items()}  # not t[number], which reads it back
     target = Target(image, mask, {n: buffers.of_view(t) for n, t in views.maps.items()}, own)
     factors = None
     if learned.dropout_seed is not None:
         factors = opacity_dropout(len(table), settings[:2], learned.dropout_seed)
     rendered = render(table.gaussians, Camera(viewmat, K, **views.size), plan.degree, factors)
-    loss = total_loss(plan.terms, rendered, target, table.gaussians, strategy)
+    loss = total_loss(plan, rendered, target, table.gaussians, strategy)
 
     projected, split = rendered.projected, 3 * len(table.params)
     params = [*table.params.values(), *learned.views.params.values()]
@@ -186,12 +188,10 @@ def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPla
         strategy.after_backward(plan.phase, v_projected, rendered.visible, size, going)
 
 
-def total_loss(
-    terms: Sequence[LossTerm], rendered: Render, target: Target, gaussians: Gaussians, strategy: Strategy
-) -> torch.Tensor:
+def total_loss(plan: StepPlan, rendered: Render, target: Target, gaussians: Gaussians, strategy: Strategy) -> torch.Tensor:
     """Return the sum of the terms and of the strategy's regularisation, shape []."""
-    values = [term(rendered, target, gaussians) for term in terms]
-    extra = strategy.regularisation(gaussians)
+    values = [term(rendered, target, gaussians) for term in plan.terms]
+    extra = strategy.regularisation(plan.phase, gaussians)
     total = values[0]
     for value in values[1:] if extra is None else [*values[1:], extra]:
         total = total + value
@@ -260,7 +260,7 @@ class StepGraphs:
     def _capture(self, work: Callable[[], None]) -> CapturedGraph:
         """Return the graph of a step."""
         buffers = self.buffers
-        here, loaded = torch.cuda.current_stream(), buffers.view_rows.clone()
+        here, loaded = torch.cuda.current_stream(self.device), buffers.view_rows.clone()
         self.stream.wait_stream(here)
         with torch.cuda.stream(self.stream):
             # a first run loads kernels and fills caches, which may not happen while capturing; it changes no parameter

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -70,6 +70,10 @@ def half_size(view: TrainingView) -> TrainingView:
     return TrainingView(camera, smaller(view.image), mask, maps={n: smaller(t) for n, t in view.maps.items()})
 
 
+Rows = torch.Tensor | tuple[torch.Tensor, ...]
+"""One entry for each view: a tensor [V, ...], or on a CPU a tensor for each."""
+
+
 @dataclass(frozen=True)
 class ViewStack:
     """Training views of one kind, stacked, from which a step takes its own."""
@@ -78,11 +82,11 @@ class ViewStack:
     """camera_from_world, shape [V, 4, 4]."""
     Ks: torch.Tensor
     """Intrinsics [px], shape [V, 3, 3]."""
-    images: torch.Tensor
+    images: Rows
     """Colours in [0, 1], shape [V, H, W, 3]."""
-    masks: torch.Tensor | None
+    masks: Rows | None
     """1 where a pixel counts, else 0, shape [V, H, W]; None where all count."""
-    maps: Mapping[str, torch.Tensor]
+    maps: Mapping[str, Rows]
     """Maps that loss terms asked for, by name, each of shape [V, H, W, ...]."""
     numbers: torch.Tensor
     """Number of each view among all training views, int64, shape [V]."""
@@ -90,7 +94,26 @@ class ViewStack:
     @property
     def size(self) -> dict[str, int]:
         """Width and height [px] by name."""
-        return {"width": self.images.shape[2], "height": self.images.shape[1]}
+        height, width = self.images[0].shape[:2]
+        return {"width": width, "height": height}
+
+
+def stacked(tensors: Sequence[torch.Tensor]) -> Rows:
+    """Return tensors of one shape as one, [V, ...]; on a CPU, where a step takes them one by one, as they are.
+
+    Tensors that lie behind each other in memory already, as those of an earlier stack do, are not copied.
+    """
+    first = tensors[0]
+    if first.device.type == "cpu":
+        return tuple(tensors)
+    step, storage = first.numel() * first.element_size(), first.untyped_storage().data_ptr()
+    behind = all(
+        t.is_contiguous() and t.untyped_storage().data_ptr() == storage and t.data_ptr() == first.data_ptr() + i * step
+        for i, t in enumerate(tensors)
+    )
+    if not behind:
+        return torch.stack(list(tensors))
+    return first.as_strided((len(tensors), *first.shape), (first.numel(), *first.stride()))
 
 
 def stack_views(
@@ -114,8 +137,8 @@ def stack_views(
         device = same[0].image.device
         stack = ViewStack(
             torch.stack([v.camera.viewmat for v in same]), torch.stack([v.camera.K for v in same]),
-            torch.stack([v.image for v in same]), torch.stack([v.mask for v in same]) if kind[2] else None,
-            {n: torch.stack([v.maps[n] for v in same]) for n in same[0].maps},
+            stacked([v.image for v in same]), stacked([v.mask for v in same]) if kind[2] else None,
+            {n: stacked([v.maps[n] for v in same]) for n in same[0].maps},
             torch.tensor([i % count for i in numbers], device=device),
         )  # fmt: skip
         for row, i in enumerate(numbers):

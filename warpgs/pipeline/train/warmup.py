@@ -71,7 +71,7 @@ def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool]
     run(fit, lambda _: None, lambda _: None, stopped)
     score(views[0], render_view(fit.gaussians, views[0], RasterizeOptions(rule=small.rule, background=fit.background))[0])
     if fit.graphs is not None:
-        fit.graphs.clear()  # graphs and trainer refer to each other, which would keep their memory
+        fit.graphs.clear()  # their memory is for the fit that follows
     return fit
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Hashable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -14,6 +15,7 @@ from warpgs.plugins import Registry
 if TYPE_CHECKING:
     from warpgs.pipeline.train.config import FitConfig
     from warpgs.pipeline.train.trainer import Trainer
+    from warpgs.scene import Gaussians
 
 
 class Strategy:
@@ -40,7 +42,8 @@ class Strategy:
         Args:
             trainer: The trainer. Its table exists, its views do not: see `setup`.
         """
-        self.trainer = trainer
+        # by proxy: with a cycle, a finished fit would keep its memory until Python looks for garbage
+        self.trainer: Trainer = weakref.proxy(trainer)
         own = trainer.config.strategy_config
         self.config: Any = self.Config() if own is None and self.Config is not None else own
         """The strategy's own settings."""
@@ -71,11 +74,16 @@ class Strategy:
         return sh_degree(step, self.trainer.config.sh_every, self.trainer.config.init.max_sh_degree)
 
     def dropout(self, step: int) -> float:
-        """Return the probability that a Gaussian is hidden in a step, in [0, 1)."""
+        """Return the probability that a Gaussian is hidden in a step, in [0, 1); asked only if `FitConfig.dropout` is not 0."""
         return self.trainer.dropout * self.trainer.progress(step)
 
-    def regularisation(self, gaussians: Any) -> torch.Tensor | None:
-        """Return a term that is added to the loss of every step, shape []; None for none."""
+    def regularisation(self, phase: Hashable, gaussians: Gaussians) -> torch.Tensor | None:
+        """Return a term that is added to the loss of every step, shape []; None for none.
+
+        Args:
+            phase: Result of `phase`.
+            gaussians: The current Gaussians, which require gradients.
+        """
         return None
 
     def lr_factors(self, phase: Hashable) -> torch.Tensor | None:

@@ -256,6 +256,7 @@ class Holdout(ImportanceSampling):
         enforce_bounds(t.table)
         self.forget()
         t.set_views(self.whole)
+        self.whole = t.views
         t.messages.append(
             f"holdout: growth ended at step {step} with {len(t.table):,} Gaussians, because {self.why}; all pixels are trained "
             "on from here"

@@ -24,6 +24,8 @@ MAX_COPIES = 51
 """Largest number of Gaussians that one may become at a time, as in the authors' program."""
 MAX_OPACITY = 1 - 2**-24
 """Largest opacity in relocation: below 1 the logit is finite."""
+NOISE_STREAM = 0x6D636D63
+"""Mixed into the seed, so that noise and opacity dropout do not take the same random numbers."""
 GATE_SLOPE, GATE_OPACITY = 100.0, 0.005
 """Perturbation fades above this opacity: sigmoid(-slope (opacity - this)), eq. 8 with k = 100 and t = 0.995 of 1 - opacity."""
 
@@ -147,7 +149,7 @@ class MCMC(Strategy):
         """Return the settings with an event after every step."""
         return dataclasses.replace(own, start=0, every=1)
 
-    def regularisation(self, gaussians):
+    def regularisation(self, phase, gaussians):
         """Return the weighted mean opacity plus the weighted mean axis length, shape [], by which unneeded Gaussians die."""
         c = self.config
         opacity, scale = gaussians.logit_opacities.sigmoid().mean(), gaussians.log_scales.exp().mean()
@@ -156,7 +158,7 @@ class MCMC(Strategy):
     def after_step(self, phase, settings, going):
         """Perturb the means; ``settings`` [3] holds step and learning rate, nothing changes where ``going`` [1] is False."""
         t = self.trainer
-        perturb(t.table.gaussians, settings, going, seed=t.config.seed, noise_lr=self.config.noise_lr)
+        perturb(t.table.gaussians, settings, going, seed=t.config.seed ^ NOISE_STREAM, noise_lr=self.config.noise_lr)
 
     def due(self, step: int) -> bool:
         """Return whether Gaussians are relocated and added after a step."""
