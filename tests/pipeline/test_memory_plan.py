@@ -127,10 +127,11 @@ def test_plan_counts_what_lasts(strategy):
     )  # fmt: skip
     fit = Trainer(views, seeds(500), config, CPU, priors=priors(views))
     tensors = list(fit.table.state().values())
-    of_views = [*fit.views, *fit.stacks.values(), *(fit.strategy.whole if strategy == "holdout" else ())]
-    for v in of_views:
-        tensors += [t for n, t in vars(v).items() if isinstance(t, torch.Tensor) and n not in ("viewmats", "Ks", "numbers")]
-        tensors += v.maps.values()
+    for v in (*fit.views, *fit.stacks.values(), *(fit.strategy.whole if strategy == "holdout" else ())):
+        for name, value in (*vars(v).items(), *v.maps.items()):
+            if name not in ("viewmats", "Ks", "numbers"):
+                tensors += [t for t in (value if isinstance(value, tuple) else [value]) if isinstance(t, torch.Tensor)]
+    tensors += [t for s in fit.stacks.values() for rows in s.maps.values() for t in rows]
     assert fit.layout.held(500) == bytes_of_tensors(tensors)
 
 

@@ -198,7 +198,11 @@ class Table:
         return {f"{group}.{n}": t.detach() for group, tensors in self._groups().items() for n, t in tensors.items()}
 
     def load(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Load what `state` returned."""
+        """Load what `state` returned.
+
+        Raises:
+            DataError: Columns or parameters are missing, or there are others.
+        """
         own, stored = set(self.state()), {n for n in state if n.partition(".")[0] in self._groups()}
         if own != stored:
             raise DataError(

@@ -7,7 +7,7 @@ since they are small: parameters of single views, and the buffers of learning ra
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import torch
@@ -53,7 +53,7 @@ class Layout:
     height: int
     """Height of the largest view [px]."""
     view_bytes: int
-    """Bytes of all views, with the copies that the strategy keeps (`view_bytes`)."""
+    """Bytes of all views, those included that the strategy keeps beside them (`view_bytes`)."""
     column_bytes: int = 0
     """Bytes of the strategy's columns for each Gaussian."""
     views: int = 1
@@ -219,7 +219,7 @@ def layout_of(
     table: Table,
     views: Sequence[TrainingView],
     *,
-    view_copies: int = 1,
+    kept: Sequence[TrainingView] = (),
     scored: bool = False,
     captured: bool = False,
     depth_supervised: bool = False,
@@ -229,7 +229,7 @@ def layout_of(
     Args:
         table: The Gaussians with their columns.
         views: Training views, those at half their size included.
-        view_copies: Copies of them that are held at a time (`Strategy.view_copies`).
+        kept: Views that the strategy keeps beside them.
         scored: True where fine Gaussians are sampled by scores.
         captured: True to capture steps as CUDA graphs where the device can.
         depth_supervised: True where the loss has its depth term.
@@ -237,23 +237,21 @@ def layout_of(
     largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
     cuda = table.device.type == "cuda"
     return Layout(
-        table.gaussians.sh.shape[1], largest.width, largest.height, view_bytes(views, view_copies),
+        table.gaussians.sh.shape[1], largest.width, largest.height, view_bytes([*views, *kept]),
         sum(c.element_size() for c in table.columns.values()), len(views), any(v.mask is not None for v in views),
         scored, depth_supervised, cuda, len({v.kind for v in views}) if cuda and captured else 0,
     )  # fmt: skip
 
 
-def view_bytes(views: Sequence[TrainingView], copies: int) -> int:
-    """Return the bytes of all views: images, masks and maps, ``copies`` times, and scores.
+def view_bytes(views: Iterable[TrainingView]) -> int:
+    """Return the bytes of views: images, masks, maps and scores, memory that several share counted once.
 
-    Stacks are not counted again: the images, masks and maps of the views are parts of them (`stack_views`). Scores are in no
-    stack, and copies of a view share them.
+    Stacks are not counted: on CUDA images, masks and maps of the views are parts of them (`stack_views`), elsewhere there are
+    none.
     """
-    total = 0
-    for v in views:
-        total += copies * sum(t.nbytes for t in (v.image, v.mask, *v.maps.values()) if t is not None)
-        total += sum(t.nbytes for t in (v.semantic, v.geometry, v.consistent) if t is not None)
-    return total
+    tensors = (t for v in views for t in (v.image, v.mask, v.semantic, v.geometry, v.consistent, *v.maps.values()))
+    storages = (t.untyped_storage() for t in tensors if t is not None)
+    return sum({s.data_ptr(): s.nbytes() for s in storages}.values())
 
 
 @torch.no_grad()

@@ -243,7 +243,7 @@ class Trainer:
         shown, self.stacks, self.places = stack_views(shown, len(views))
         self.views = shown[: len(views)]
         layout = layout_of(
-            self.table, shown, view_copies=self.strategy.view_copies, scored=self.strategy.samples(c), captured=c.cuda_graph,
+            self.table, shown, kept=self.strategy.kept_views(), scored=self.strategy.samples(c), captured=c.cuda_graph,
             depth_supervised=c.loss.depth_weight > 0,
         )  # fmt: skip
         cameras = [v.camera for v in shown]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
@@ -15,6 +15,7 @@ from warpgs.plugins import Registry
 if TYPE_CHECKING:
     from warpgs.pipeline.train.config import FitConfig
     from warpgs.pipeline.train.trainer import Trainer
+    from warpgs.pipeline.train.views import TrainingView
     from warpgs.scene import Gaussians
 
 
@@ -33,8 +34,6 @@ class Strategy:
     """Name that it is registered by."""
     Config: ClassVar[type | None] = None
     """Frozen dataclass of its own settings, None for none. They become flags, grouped under the strategy's name."""
-    view_copies: ClassVar[int] = 1
-    """Copies of the training views that are held at a time; 2 where the strategy keeps some beside those in training."""
 
     def __init__(self, trainer: Trainer):
         """Keep the trainer, whose table, views and settings the strategy works with; nothing is trained yet.
@@ -64,6 +63,10 @@ class Strategy:
 
     def setup(self) -> None:
         """Begin; the table, the training views and the memory plan exist by now."""
+
+    def kept_views(self) -> Sequence[TrainingView]:
+        """Return views that the strategy keeps beside those in training, whose memory counts."""
+        return ()
 
     def phase(self, step: int) -> Hashable:
         """Return a value for what the strategy does in a step; steps of equal phases share a CUDA graph."""

@@ -9,7 +9,6 @@ import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from typing import ClassVar
 
 import torch
 
@@ -31,6 +30,7 @@ from warpgs.pipeline.train.strategies.holdout_blocks import (
     sample_blocks,
 )
 from warpgs.pipeline.train.strategies.importance_sampling import MAX_VIEWS, ImportanceSampling
+from warpgs.pipeline.train.views import TrainingView
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Gaussians
 
@@ -70,9 +70,6 @@ class Holdout(ImportanceSampling):
     held-out blocks measure growth, merging and pruning, not the start.
     """
 
-    view_copies: ClassVar[int] = 2
-    """Copies of the training views: whole ones beside those without the blocks."""
-
     def __init__(self, trainer):
         """Begin with growth open and nothing measured."""
         super().__init__(trainer)
@@ -84,6 +81,8 @@ class Holdout(ImportanceSampling):
         """Levels of growth that were measured."""
         self.trims: list[dict] = []
         """Step of each trim, and the Gaussians and the training PSNR [dB] before and after it."""
+        self.whole: list[TrainingView] = []
+        """Views without hidden blocks."""
         self.growing = 0
         """Level of growth that new Gaussians come with."""
         self.before: torch.Tensor | None = None
@@ -93,6 +92,10 @@ class Holdout(ImportanceSampling):
         """Return the columns of importance sampling, the bounds of each Gaussian, and the level of growth that it came with."""
         bounds = bound_columns(self.trainer.config.init.max_sh_degree)
         return {**super().columns(), **bounds, "growth_level": Column(0, torch.int32, inherited=False)}
+
+    def kept_views(self):
+        """Return the whole views, from the time that blocks are hidden."""
+        return self.whole
 
     def setup(self) -> None:
         """Hold blocks out, where there are enough of them to tell a gain from noise."""
