@@ -74,11 +74,12 @@ def test_pictures_and_gradients_equal_reference(device, dtype, rule, tile_size):
         close("gradient", t.grad, reference_result.grad)
 
 
-def test_gradcheck(device):
+@pytest.mark.parametrize("cameras", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_gradcheck(device, cameras):
     """Finite differences agree with the backward kernel for every value of a projected Gaussian and for the background."""
-    gaussians, cam = hand_placed(device=device), camera(cameras=2, device=device)
+    gaussians, cam = hand_placed(device=device), camera(cameras=cameras, device=device)
     size = {"width": cam.width, "height": cam.height}
-    background = backgrounds(2, torch.float64, device).requires_grad_()
+    background = backgrounds(cameras, torch.float64, device).requires_grad_()
     projected, counts = project(*gaussians.tensors().values(), cam.viewmat, cam.K, **size, degree=3, rule=SMOOTH)
     tiles = bin_tiles(projected, counts, **size, rule=SMOOTH)
     tail = projected[..., 10:].detach()
