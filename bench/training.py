@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import torch
 
@@ -112,6 +111,12 @@ def step_parts(trainer: Trainer) -> StepParts:
     )  # fmt: skip
 
 
+class _Settings:
+    """All that the base strategy asks of a trainer."""
+
+    config = FitConfig()
+
+
 class Steps:
     """Training steps of given Gaussians on one image: image, L1 and SSIM, backward pass, Adam, as a fit takes them.
 
@@ -128,7 +133,8 @@ class Steps:
         self.rule, self.lr, self.background = rule, lr, torch.zeros(3, device=device)
         self.table = Table.of_gaussians(gaussians, {})
         self.buffers = StepBuffers(device, 3 * len(self.table.params))
-        strategy = Strategy(SimpleNamespace(config=FitConfig()))  # of the base class: it changes nothing
+        self._settings = _Settings()  # the strategy holds it by proxy
+        strategy = Strategy(self._settings)  # of the base class: it changes nothing
         self.learned = Learned(self.table, Table({}, {}, device, 1), strategy, None)
         numbers = torch.zeros(1, dtype=torch.int64, device=device)
         self.views = ViewStack(camera.viewmat, camera.K, target[None], None, {}, numbers)

@@ -101,20 +101,22 @@ class Layout:
         # an event keeps image, scores and gate of each view until its end
         seen = 7 * FLOAT * pixels * min(self.views, SAMPLED) if self.scored else 0
         sampling = {"sampling": projected + ranges + listing + seen + 3 * images} if self.scored else {}
+        # on CUDA a step copies image, mask and disparity of its view from the stacks
+        own = FLOAT * pixels * (3 + self.masked + self.depth_supervised) if self.cuda else 0
         if chunked:  # nothing of a chunk waits for the loss; in the backward pass its images stand beside the whole ones
-            apart = projected + 2 * one + images + upstream
+            apart = own + projected + 2 * one + images + upstream
             return {
                 "binning": apart + ranges + sorting + listing,
-                "loss": projected + images + loss,
+                "loss": own + projected + images + loss,
                 "blending": apart + ranges + images + kept + backward,
-                "projection": self._projection(count) + images + upstream,
+                "projection": own + self._projection(count) + images + upstream,
                 **sampling,
             }
         return {
-            "binning": projected + ranges + sorting + listing,
-            "loss": projected + ranges + images + kept + waiting + loss,
-            "blending": projected + one + ranges + images + kept + upstream + backward,
-            "projection": self._projection(count) + images + upstream,
+            "binning": own + projected + ranges + sorting + listing,
+            "loss": own + projected + ranges + images + kept + waiting + loss,
+            "blending": own + projected + one + ranges + images + kept + upstream + backward,
+            "projection": own + self._projection(count) + images + upstream,
             **sampling,
         }
 

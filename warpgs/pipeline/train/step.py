@@ -260,7 +260,7 @@ class StepGraphs:
     def _capture(self, work: Callable[[], None]) -> CapturedGraph:
         """Return the graph of a step."""
         buffers = self.buffers
-        here, loaded = torch.cuda.current_stream(self.device), buffers.view_rows.clone()
+        here, loaded = torch.cuda.current_stream(buffers.device), buffers.view_rows.clone()
         self.stream.wait_stream(here)
         with torch.cuda.stream(self.stream):
             # a first run loads kernels and fills caches, which may not happen while capturing; it changes no parameter
