@@ -5,7 +5,7 @@ import torch
 
 from tests.gaussians import cloud
 from tests.pipeline.tables import adam_step
-from warpgs.errors import DataError
+from warpgs.errors import DataError, UsageError
 from warpgs.pipeline.model.compress import rows_of
 from warpgs.pipeline.model.table import Column, DensityUpdate, Table
 from warpgs.scene import Gaussians
@@ -151,3 +151,14 @@ def test_a_table_may_have_no_parameters():
     adam_step(empty, {})
     empty.load(empty.state())
     assert len(empty) == 3 and empty.state() == {}
+
+
+def test_a_change_that_is_not_whole_is_refused():
+    """A row without a parent's number, or a parameter without rows: said before anything changes."""
+    made = table(4)
+    before = snapshot(made)
+    added = {n: t.detach()[:2] for n, t in made.params.items()}
+    for bad, parents in ((added, 1), ({n: t for n, t in added.items() if n != "sh"}, 2)):
+        with pytest.raises(UsageError, match="one row for each parent"):
+            made.apply(DensityUpdate(torch.arange(4), bad, torch.full((parents,), -1)))
+    assert all(torch.equal(t, before[n]) for n, t in made.state().items()) and len(made) == 4

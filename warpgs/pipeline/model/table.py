@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import torch
 
-from warpgs.errors import DataError
+from warpgs.errors import DataError, UsageError
 from warpgs.geometry import logit
 from warpgs.kernels.adam import adam_scheduled, scheduled_lrs
 from warpgs.kernels.knn import morton_codes
@@ -120,7 +120,17 @@ class Table:
 
     @torch.no_grad()
     def apply(self, update: DensityUpdate) -> None:
-        """Apply a change of the set: kept rows keep everything, new rows start with zero moments."""
+        """Apply a change of the set: kept rows keep everything, new rows start with zero moments.
+
+        Raises:
+            UsageError: The change is not whole: a parameter is missing, or there are more or fewer new rows than parents.
+        """
+        rows = {n: len(update.added[n]) if n in update.added else None for n in self.params}
+        if any(count != len(update.parents) for count in rows.values()):
+            raise UsageError(
+                f"a strategy's DensityUpdate names {len(update.parents)} parents and adds {rows} rows: each parameter needs one "
+                "row for each parent (-1 for none)"
+            )
         if update.overwritten is not None:
             self._overwrite(update.overwritten, update.values)
         keep, parents = update.keep, update.parents
