@@ -128,7 +128,7 @@ class Table:
         rows = {n: len(update.added[n]) if n in update.added else None for n in self.params}
         if any(count != len(update.parents) for count in rows.values()):
             raise UsageError(
-                f"a strategy's DensityUpdate names {len(update.parents)} parents and adds {rows} rows: each parameter needs one "
+                f"a DensityUpdate names {len(update.parents)} parents and adds {rows} rows: each parameter needs one "
                 "row for each parent (-1 for none)"
             )
         if update.overwritten is not None:
