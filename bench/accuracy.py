@@ -1,14 +1,14 @@
-"""Put the measured error budget and the needles into docs/accuracy.md.
+"""Put the measured error budget, the needles and the same bits into docs/accuracy.md.
 
 usage: python -m bench.accuracy
 
 The figures are those of bench/results/budget_*.json (`python -m tests.numerics.report`) and bench/results/needles_*.json
-(`python -m bench.needles`), a table for each machine.
+(`python -m bench.needles`), a table for each machine, and of bench/results/same_bits.json (`python -m bench.same_bits`).
 """
 
 from __future__ import annotations
 
-from bench import result_file
+from bench import result_file, same_bits
 
 PAGE = result_file.ROOT / "docs/accuracy.md"
 
@@ -76,9 +76,11 @@ def needles_text(results: dict[str, dict]) -> str:
 
 def filled(page: str) -> str:
     """The page with the text between each pair of marks made anew."""
+    bits = same_bits.table(result_file.read(same_bits.RESULTS)["rows"])
     for name, text in (
         ("budget", budget_text(result_file.stored("budget"))),
         ("needles", needles_text(result_file.stored("needles"))),
+        ("same bits", bits),
     ):
         begin, end = f"<!-- {name}: written by bench.accuracy -->\n", f"<!-- end of {name} -->"
         before, rest = page.split(begin)

@@ -133,7 +133,7 @@ class Steps:
         numbers = torch.zeros(1, dtype=torch.int64, device=device)
         self.views = ViewStack(camera.viewmat, camera.K, target[None], None, {}, numbers)
         self.plan = StepPlan(gaussians.sh_degree, False, tuple(built_in_terms(LossConfig())), None)
-        self.graphs = StepGraphs(device) if device.type == "cuda" else None
+        self.graphs = StepGraphs(self.learned, self.buffers, rule, self.background) if device.type == "cuda" else None
         self._load(range(1, (MAX_BATCH if device.type == "cuda" else 1) + 1))
 
     def _load(self, steps: range) -> None:
@@ -149,8 +149,7 @@ class Steps:
         step(self.learned, self.views, self.buffers, self.plan, eager_renderer(self.rule, self.background, None))
 
     def _graph(self) -> torch.cuda.CUDAGraph:
-        how = (self.learned, self.buffers, self.plan, self.rule, self.background, None)
-        return self.graphs.capture_all([KIND], {KIND: self.views}, *how)[0]
+        return self.graphs.capture_all([KIND], {KIND: self.views}, self.plan, None)[0]
 
     def replay(self) -> None:
         """Take the first step of a batch as a CUDA graph, again and again; captured at the first call."""

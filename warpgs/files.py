@@ -10,7 +10,7 @@ from pathlib import Path
 from warpgs.errors import ResourceError
 
 
-def write_bytes(path: Path, *chunks: bytes) -> None:
+def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:
     """Replace a file by chunks of bytes, once all of them are on disk.
 
     Raises:

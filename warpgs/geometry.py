@@ -55,12 +55,49 @@ def quaternions(rotations: torch.Tensor) -> torch.Tensor:
 
 
 def check_pinhole(camera: Camera) -> None:
-    """Raise UsageError for a camera that is no pinhole: its model is known to the kernels alone."""
+    """Check that a camera is a pinhole: other models are known to the kernels alone.
+
+    Raises:
+        UsageError: It is not.
+    """
     if camera.model != "pinhole":
         raise UsageError(
             f"points are projected outside of the rasterizer for pinhole cameras only, and this one is {camera.model!r}; "
             "undistort the images first"
         )
+
+
+def matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return a [..., J] times b [J] or [J, K], the same bits on every x86-64 processor.
+
+    ``@`` calls BLAS, which takes other kernels, and so another order of its sums, on another processor.
+    """
+    return np.einsum("...j,j->..." if b.ndim == 1 else "...j,jk->...k", a, b)
+
+
+def cofactors(m: np.ndarray) -> np.ndarray:
+    """Return the cofactor matrix of m [3, 3]: that of a rotation is the rotation itself."""
+    return np.stack([np.cross(m[1], m[2]), np.cross(m[2], m[0]), np.cross(m[0], m[1])])
+
+
+def inverse(m: np.ndarray) -> np.ndarray:
+    """Return the inverse of m [3, 3] by its cofactors, without LAPACK, whose kernels go by the processor (see `matmul`)."""
+    c = cofactors(m)
+    return c.T / (m[0] * c[0]).sum()
+
+
+def nearest_rotation(m: np.ndarray) -> np.ndarray:
+    """Return the rotation nearest to m [3, 3], whose determinant is positive: its polar factor, by Newton (Higham 1986)."""
+    for _ in range(10):  # from a matrix that is orthogonal to 0.1 it takes five; more change nothing
+        c = cofactors(m)
+        m = 0.5 * (m + c / (m[0] * c[0]).sum())
+    return m
+
+
+def relative_pose(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return rotation [3, 3] and translation [3] from the axes of the first camera to those of the second."""
+    rotation = matmul(second.viewmat[:3, :3], first.viewmat[:3, :3].T)
+    return rotation, second.viewmat[:3, 3] - matmul(rotation, first.viewmat[:3, 3])
 
 
 def project_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -70,10 +107,10 @@ def project_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.n
         UsageError: The camera is no pinhole.
     """
     check_pinhole(camera)
-    in_camera = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    in_camera = matmul(points, camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]
     z = in_camera[:, 2]
     safe = np.where(z == 0, np.finfo(float).tiny, z)
-    pixels = (in_camera / safe[:, None]) @ camera.K.T
+    pixels = matmul(in_camera / safe[:, None], camera.K.T)
     return pixels[:, :2], z
 
 
@@ -85,8 +122,8 @@ def back_project(camera: Camera, pixels: np.ndarray, depths: np.ndarray) -> np.n
     """
     check_pinhole(camera)
     homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
-    in_camera = depths[:, None] * (homogeneous @ np.linalg.inv(camera.K).T)
-    return (in_camera - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+    in_camera = depths[:, None] * matmul(homogeneous, inverse(camera.K).T)
+    return matmul(in_camera - camera.viewmat[:3, 3], camera.viewmat[:3, :3])
 
 
 def back_project_tensors(camera: Camera, pixels: torch.Tensor, depths: torch.Tensor) -> torch.Tensor:
@@ -134,11 +171,11 @@ def focus_point(cameras: list[Camera]) -> np.ndarray:
         axis = c.viewmat[2, :3]
         m = np.eye(3) - np.outer(axis, axis)
         normal += m
-        right += m @ c.center
+        right += matmul(m, c.center)
     # a tiny pull to the mean centre keeps the system solvable when all axes are parallel
     weight = 1e-6 * len(cameras)
     mean = np.mean([c.center for c in cameras], axis=0)
-    return np.linalg.solve(normal + weight * np.eye(3), right + weight * mean)
+    return matmul(inverse(normal + weight * np.eye(3)), right + weight * mean)
 
 
 def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -149,5 +186,5 @@ def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarra
     rotation = np.stack([x, np.cross(z, x), z])
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation
-    viewmat[:3, 3] = -rotation @ center
+    viewmat[:3, 3] = -matmul(rotation, center)
     return viewmat

@@ -45,9 +45,18 @@ class Registry(Generic[T]):
         self._searched = False
 
     def register(self, name: str) -> Callable[[type[T]], type[T]]:
-        """Return a decorator that registers a class by a name and sets its ``name``."""
+        """Return a decorator that registers a class by a name and sets its ``name``.
+
+        A class of the user's own may take the place of an earlier one, as when its file is loaded again, but not of ours.
+
+        Raises:
+            UsageError: One of ours has that name.
+        """
 
         def decorate(cls: type[T]) -> type[T]:
+            before = self._classes.get(name)
+            if before is not None and before.__module__.startswith("warpgs.") and not cls.__module__.startswith("warpgs."):
+                raise UsageError(f"{cls.__name__}: {name!r} is a {self.kind} of warpgs itself; register yours by another name")
             cls.name = name
             self._classes[name] = cls
             return cls
@@ -62,6 +71,23 @@ class Registry(Generic[T]):
                 importlib.import_module(f"{self.package}.{module.name}")
             self._searched = True
         return sorted(n for n in self._classes if ":" not in n)
+
+    def name_of(self, cls: type[T]) -> str:
+        """Return the name of a class, which is registered as ``module:Class`` where it has none yet.
+
+        Raises:
+            UsageError: It is a class of another kind.
+        """
+        self._checked(cls, cls.__name__)
+        return cls.name if self.has(cls) else self.register(f"{cls.__module__}:{cls.__qualname__}")(cls).name
+
+    def knows(self, name: str) -> bool:
+        """Return whether `find` needs no class that was not loaded: True for all names without a colon."""
+        return ":" not in name or name in self._classes
+
+    def has(self, cls: type) -> bool:
+        """Return whether a class itself, not only a base of it, is registered by its ``name``."""
+        return self._classes.get(getattr(cls, "name", "")) is cls
 
     def find(self, name: str | type[T]) -> type[T]:
         """Return the class of a name, or the class itself.

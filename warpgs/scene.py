@@ -37,7 +37,7 @@ class Camera:
 
     @property
     def center(self) -> np.ndarray:
-        """Return the camera centre in the world [u], shape [..., 3] (numpy cameras only)."""
+        """Camera centre in the world [u], shape [..., 3] (numpy cameras only)."""
         R, t = self.viewmat[..., :3, :3], self.viewmat[..., :3, 3]
         center: np.ndarray = -np.einsum("...ij,...i->...j", R, t)
         return center
@@ -164,7 +164,7 @@ class ViewDepth:
 
     @property
     def coverage(self) -> float:
-        """Return the fraction of the pixels that are valid, in [0, 1]."""
+        """Fraction of the pixels that are valid, in [0, 1]."""
         return float(self.valid.mean())
 
 
@@ -189,7 +189,7 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Return the highest spherical-harmonics degree stored."""
+        """Highest spherical-harmonics degree stored."""
         return int(round(self.sh.shape[1] ** 0.5)) - 1
 
     def tensors(self) -> dict[str, torch.Tensor]:
@@ -221,5 +221,5 @@ class Render:
 
     @property
     def visible(self) -> torch.Tensor:
-        """Return a mask [C, N], True where a Gaussian touches at least one tile."""
+        """Mask [C, N], True where a Gaussian touches at least one tile."""
         return self.tile_counts > 0

@@ -117,7 +117,8 @@ def test_what_a_fit_is_better_than_enough_goes_for_size():
 
 def test_a_trim_counts_on_half_of_what_training_recovered_of_the_one_before():
     """Except the last, after which nothing is. Before it less goes the farther a fit is below enough, and far below nothing."""
-    strategy = Trainer(photos(3), seeds(), with_trims(enough_db=30.0), CPU).strategy
+    fit = Trainer(photos(3), seeds(), with_trims(enough_db=30.0), CPU)
+    strategy = fit.strategy
     budget = strategy.psnr_budget
     assert budget(30.0, 50) == pytest.approx(0.1) and budget(31.5, 50) == pytest.approx(0.1 + 1.5)
     assert budget(30.0 - NEAR / 2, 50) == pytest.approx(0.05) and budget(30.0 - NEAR, 50) == 0 == budget(math.nan, 50)

@@ -22,7 +22,7 @@ from warpgs.pipeline.train.loss import (
     depth_disagreement,
     photometric_loss,
 )
-from warpgs.pipeline.train.step import total_loss
+from warpgs.pipeline.train.step import StepPlan, total_loss
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
@@ -143,20 +143,24 @@ def test_depth_term_reaches_the_gaussians():
     assert abs(slope) > 0.1 and float((gradient * towards).sum()) == pytest.approx(slope, rel=1e-4)
 
 
+def plan_of(terms) -> StepPlan:
+    return StepPlan(0, False, tuple(terms), None)
+
+
 def test_total_loss_is_the_sum_of_terms_and_of_what_the_strategy_adds():
     """The photometric loss alone without a depth weight, to the bit; then the weighted depth term; then a regularisation."""
     depth, alpha, disparity, mask = maps(torch.float32)
     rgb, image = torch.rand(2, 9, 11, 3)
     render, target = Render(rgb, alpha, depth, rgb, rgb), Target(image, mask, {"disparity": disparity}, {})
     strategy = Strategy.__new__(Strategy)
-    plain = total_loss(built_in_terms(LossConfig()), render, target, None, strategy)
+    plain = total_loss(plan_of(built_in_terms(LossConfig())), render, target, None, strategy)
     terms = built_in_terms(LossConfig(depth_weight=0.25, depth_until=0.5))
-    both = total_loss(terms, render, target, None, strategy)
+    both = total_loss(plan_of(terms), render, target, None, strategy)
     assert terms == (Photometric(0.2), DepthCorrelation(0.25, 0.5)) and built_in_terms(LossConfig()) == (Photometric(),)
     assert torch.equal(plain, photometric_loss(rgb, image, mask))
     assert float(both - plain) == pytest.approx(0.25 * float(depth_disagreement(depth, alpha, disparity, mask)), abs=1e-6)
-    strategy.regularisation = lambda gaussians: torch.tensor(2.0)
-    assert torch.equal(total_loss(terms, render, target, None, strategy), both + 2)
+    strategy.regularisation = lambda phase, gaussians: torch.tensor(2.0)
+    assert torch.equal(total_loss(plan_of(terms), render, target, None, strategy), both + 2)
 
 
 def fitted(config: FitConfig, found: list[Prior] | None = None) -> Trainer:

@@ -112,20 +112,60 @@ def test_plan_covers_sampling_events():
     assert found <= planned <= 1.35 * found
 
 
+def bytes_of_tensors(tensors) -> int:
+    """Bytes of the memory of tensors, what several share counted once."""
+    return sum({s._cdata: s.nbytes() for s in (t.untyped_storage() for t in tensors)}.values())
+
+
+@pytest.mark.parametrize("strategy", ["clone_split", "importance_sampling", "holdout", "mcmc"])
+def test_plan_counts_what_lasts(strategy):
+    """To the byte: every column of a strategy, each view once though steps take it from a stack, and holdout's whole views."""
+    views = masked(photos(4, 200, 150))
+    config = dataclasses.replace(
+        STEADY, steps=60, strategy=strategy, strategy_config=None, method=MethodConfig(events=True), phases=PhaseConfig(4, 6),
+        loss=LossConfig(depth_weight=0.1), half_resolution=0.0 if strategy == "holdout" else 0.5,
+    )  # fmt: skip
+    fit = Trainer(views, seeds(500), config, CPU, priors=priors(views))
+    tensors = list(fit.table.state().values())
+    for v in (*fit.views, *fit.stacks.values(), *(fit.strategy.whole if strategy == "holdout" else ())):
+        for name, value in (*vars(v).items(), *v.maps.items()):
+            if name not in ("viewmats", "Ks", "numbers"):
+                tensors += [t for t in (value if isinstance(value, tuple) else [value]) if isinstance(t, torch.Tensor)]
+    tensors += [t for s in fit.stacks.values() for rows in s.maps.values() for t in rows]
+    assert fit.layout.held(500) == bytes_of_tensors(tensors)
+
+
+def test_plan_covers_held_out_blocks():
+    """Whole views beside those without their blocks, bounds and levels, through growth, its end and trims."""
+    views = photos(4, 200, 150)
+    config = dataclasses.replace(GROWING, steps=30, strategy="holdout", sh_every=15)
+    fit = Trainer(views, seeds(1500), config, CPU)
+    fit.advance()
+    assert fit.strategy.measuring
+    planned = found = 0
+    while fit.step < 30:
+        before = len(fit.gaussians)
+        found = max(found, measured(fit, 1))
+        after = len(fit.gaussians)
+        event = fit.layout.held(after) + fit.layout.event(before, max(before, after))
+        planned = max(planned, fit.layout.step(max(before, after), instances(fit)), event)
+    assert fit.strategy.closed is not None and found <= planned
+
+
 @pytest.mark.parametrize("most", [400, 3000])
-def test_plan_covers_bands(most):
-    """The same for steps that draw in bands."""
+def test_plan_covers_chunks(most):
+    """The same for steps that render in chunks."""
     views = photos(2, 200, 150)
     fit = Trainer(views, seeds(800), STEADY, CPU)
     fit.advance()
     assert instances(fit) > most
     fit.max_instances = most
     found = measured(fit, 2)
-    assert found <= fit.layout.step(800, most, banded=True) <= 1.3 * found
+    assert found <= fit.layout.step(800, most, chunked=True) <= 1.3 * found
 
 
 def test_planned_instance_bytes_are_those_of_the_tensors(device):
-    """Lists, gradient slots and states of a picture, against all that has the size of so many instances."""
+    """Lists, gradient slots and states of an image, against all that has the size of so many instances."""
     gaussians, cam = leaves(cloud(8000, device=device)), camera(96, 80, dtype=torch.float32, device=device)
     render = rasterize(gaussians, cam)
     total, cuda = int(render.tile_counts.sum()), device.type == "cuda"
@@ -143,7 +183,7 @@ def test_planned_instance_bytes_are_those_of_the_tensors(device):
 
 
 def test_fit_keeps_to_its_limit(tmp_path):
-    """A limit that forces bands and fewer Gaussians: it is said, kept, and costs no quality."""
+    """A limit that forces chunks and fewer Gaussians: it is said, kept, and costs no quality."""
     views = photos(4, 160, 120)
     config = dataclasses.replace(
         STEADY, steps=50, sh_every=25, density=DensityConfig(start=10, every=10, gradient=2e-5), max_gaussians=4000
@@ -152,8 +192,8 @@ def test_fit_keeps_to_its_limit(tmp_path):
     whole = free.layout.step(1200, free.memory.instances)
     need = (whole + free.layout.smallest(1200)) // 2
     limited = Trainer(views, seeds(1200), dataclasses.replace(config, memory_limit=need), CPU)
-    said = limited.memory.sentence()
-    assert limited.memory.cap < 4000 and f"at most {limited.memory.cap:,} Gaussians, not 4,000" in said and "bands" in said
+    said = limited.memory.summary()
+    assert limited.memory.cap < 4000 and f"at most {limited.memory.cap:,} Gaussians, not 4,000" in said and "chunks" in said
     assert limited.memory.planned <= need and limited.memory.planned_at_cap <= need
     peak = 0
     for _ in range(50):
@@ -178,35 +218,35 @@ def test_limit_below_the_smallest_step_says_what_is_needed(tmp_path, capsys):
     assert main([*flags, "--memory-limit", "lots"]) == 2 and "such as 2GiB" in capsys.readouterr().err
 
 
-def test_recorded_steps_are_given_up_where_they_need_more():
-    """On CUDA a recording has room to spare and views twice; a limit between the two ways is kept by the smaller one."""
-    layout = Layout(16, 504, 378, 3 * 504 * 378, cuda=True, recordings=1)
-    single = dataclasses.replace(layout, recordings=0)
+def test_captured_steps_are_given_up_where_they_need_more():
+    """On CUDA a graph has capacity to spare; a limit between the two ways is kept by the smaller one."""
+    layout = Layout(16, 504, 378, 3 * 12 * 504 * 378, 16, cuda=True, graphs=1)
+    single = dataclasses.replace(layout, graphs=0)
     many = {"count": 20_000, "instances": 200_000, "most": 20_000, "available": 2**40}
     wide, _ = plan(layout, **many, limit=2**33, capacity_factor=1.3)
-    assert not wide.graph_refused and not wide.banded
+    assert not wide.graph_refused and not wide.chunked
     needed = single.step(20_000, 200_000)
     tight, chosen = plan(layout, **many, limit=needed, capacity_factor=1.3)
-    assert tight.graph_refused and chosen == single and not tight.banded and "one by one" in tight.sentence()
-    assert plan(layout, **many, limit=needed - 2**20, capacity_factor=1.3)[0].banded
+    assert tight.graph_refused and chosen == single and not tight.chunked and "one by one" in tight.summary()
+    assert plan(layout, **many, limit=needed - 2**20, capacity_factor=1.3)[0].chunked
     open_end, _ = plan(layout, **{**many, "most": 10**6, "available": 2**29}, limit=None)
-    assert "--memory-limit helps" in open_end.sentence() and open_end.lowered_from is None
+    assert "--memory-limit helps" in open_end.summary() and open_end.lowered_from is None
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("recorded", [True, False])
-def test_limit_holds_on_cuda(recorded):
-    """What torch's allocator counted at its peak lies below the limit, in bands and in recorded steps."""
+@pytest.mark.parametrize("captured", [True, False])
+def test_limit_holds_on_cuda(captured):
+    """What torch's allocator counted at its peak lies below the limit, in chunks and in captured steps."""
     device = torch.device("cuda", 0)
     views = photos(4, 160, 120)
     config = dataclasses.replace(STEADY, steps=60, density=DensityConfig(start=10, every=10, gradient=2e-5), max_gaussians=4000)
-    free = Trainer(views, seeds(1200), dataclasses.replace(config, cuda_graph=recorded), device)
-    most = 4 * free.memory.planned_at_cap if recorded else free.layout.smallest(1500)
+    free = Trainer(views, seeds(1200), dataclasses.replace(config, cuda_graph=captured), device)
+    most = 4 * free.memory.planned_at_cap if captured else free.layout.smallest(1500)
     del free
     torch.cuda.synchronize()
     before = torch.cuda.memory_allocated(device)
-    fit = Trainer(views, seeds(1200), dataclasses.replace(config, cuda_graph=recorded, memory_limit=most), device)
-    assert bool(fit.layout.recordings) == recorded
+    fit = Trainer(views, seeds(1200), dataclasses.replace(config, cuda_graph=captured, memory_limit=most), device)
+    assert bool(fit.layout.graphs) == captured
     torch.cuda.reset_peak_memory_stats(device)
     while fit.step < 60:
         fit.advance(100)

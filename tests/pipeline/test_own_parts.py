@@ -102,6 +102,45 @@ def test_a_term_that_is_not_active_changes_no_bit():
     assert all(torch.equal(t, plain.gaussians.tensors()[n]) for n, t in fit.gaussians.tensors().items())
 
 
+def test_a_term_without_a_name_of_its_own_is_refused():
+    """A run folder could not tell it: never registered, or only by the name of the class that it derives from."""
+    with pytest.raises(UsageError, match=r"the loss term Exposure has no name of its own.*register"):
+        dataclasses.replace(PLAIN, loss_terms=(Exposure(),))
+    LOSS_TERMS.register("exposure")(Exposure)
+
+    class Stronger(Exposure):
+        """Another class, which inherits the name."""
+
+    with pytest.raises(UsageError, match="Stronger has no name of its own"):
+        dataclasses.replace(PLAIN, loss_terms=(Stronger(),))
+    with pytest.raises(UsageError, match=r"0\.5 is no loss term"):
+        dataclasses.replace(PLAIN, loss_terms=(0.5,))
+    config = dataclasses.replace(PLAIN, loss_terms=(Exposure(3.0),))
+    assert FitConfig.from_json(config.to_json()) == config
+
+
+@pytest.mark.parametrize("what", ["map", "view parameter"])
+def test_two_terms_with_one_name_for_a_part_are_refused(what):
+    """The message names both, where one would have silently read what the other asked for."""
+
+    @LOSS_TERMS.register("first")
+    @dataclass(frozen=True)
+    class First(LossTerm):
+        def needs(self, view, prior):
+            return {"shared": view.image[..., 0]} if what == "map" else {}
+
+        def view_parameters(self):
+            return {"shared": ViewParameter((1.0,), 0.1)} if what != "map" else {}
+
+    @LOSS_TERMS.register("second")
+    class Second(First):
+        pass
+
+    config = dataclasses.replace(PLAIN, loss_terms=(First(), Second()))
+    with pytest.raises(UsageError, match=f"'first' and 'second' both have a {what} 'shared'; rename"):
+        Trainer(photos(2), seeds(), config, CPU)
+
+
 def test_a_term_sees_the_maps_that_it_asked_for():
     """Those of the step's own view, at the size at which it is fitted; and what it returns is trained on."""
     seen = []

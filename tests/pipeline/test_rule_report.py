@@ -87,8 +87,10 @@ def test_halved_views(size):
     image = np.random.default_rng(0).random((height, width, 3)).astype(np.float32)
     mask = np.ones((height, width), bool)
     mask[0, -1] = False
-    view = TrainingView.of(View("a", views(1, width, height)[0].camera, image, mask), CPU)
+    camera = dataclasses.replace(views(1, width, height)[0].camera, model="fisheye")
+    view = TrainingView.of(View("a", camera, image, mask), CPU)
     half = half_size(view)
+    assert view.camera.model == half.camera.model == "fisheye"
     h, w = max(1, height // 2), max(1, width // 2)
     assert half.image.shape == (h, w, 3) and half.mask.shape == (h, w) and (half.camera.width, half.camera.height) == (w, h)
     if size == (40, 32):

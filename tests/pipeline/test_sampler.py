@@ -12,7 +12,6 @@ from warpgs.kernels.sh import C0
 from warpgs.pipeline.train.strategies.sampler import (
     SUPPORT,
     SamplerConfig,
-    back_project,
     fine_gaussians,
     geometry_gate,
     sample_pixels,
@@ -95,7 +94,7 @@ def test_back_projection_is_undone_by_projection():
     pixels = np.random.default_rng(0).uniform(0, 30, (50, 2))
     depths = np.random.default_rng(1).uniform(0.5, 8, 50)
     tensors = Camera(torch.as_tensor(camera.viewmat), torch.as_tensor(camera.K), camera.width, camera.height)
-    points = back_project(tensors, torch.as_tensor(pixels), torch.as_tensor(depths))
+    points = geometry.back_project_tensors(tensors, torch.as_tensor(pixels), torch.as_tensor(depths))
     again, z = geometry.project_points(camera, points.numpy())
     assert np.abs(again - pixels).max() < 1e-10 and np.abs(z - depths).max() < 1e-10
 

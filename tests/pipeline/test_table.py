@@ -5,6 +5,7 @@ import torch
 
 from tests.gaussians import cloud
 from tests.pipeline.tables import adam_step
+from warpgs.errors import DataError
 from warpgs.pipeline.model.compress import rows_of
 from warpgs.pipeline.model.table import Column, DensityUpdate, Table
 from warpgs.scene import Gaussians
@@ -140,7 +141,7 @@ def test_state_comes_back_bit_for_bit():
     assert all(torch.equal(t, again.state()[n]) for n, t in made.state().items())
     assert all(t.requires_grad and t.is_leaf for t in again.params.values())
     del state["columns.age"]
-    with pytest.raises(KeyError, match=r"columns\.age"):
+    with pytest.raises(DataError, match=r"columns\.age"):
         again.load(state)
 
 

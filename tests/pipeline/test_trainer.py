@@ -4,22 +4,25 @@ import dataclasses
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from tests.scenes import photos, seeds
+from warpgs.app.flags import field_docs
 from warpgs.errors import DataError, NotFiniteError, UsageError
 from warpgs.geometry import look_at
 from warpgs.kernels.knn import morton_codes
 from warpgs.pipeline.metrics.region import counted_region
 from warpgs.pipeline.model.init import InitConfig, empty_votes, initial_gaussians, initial_points, nearest, random_points
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
-from warpgs.pipeline.train.config import PRESETS, FitConfig
+from warpgs.pipeline.train.config import PRESET_NOTES, PRESETS, FitConfig
 from warpgs.pipeline.train.loss import photometric_loss
 from warpgs.pipeline.train.schedule import log_linear, sh_degree
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
@@ -234,7 +237,16 @@ def test_config_survives_json():
     assert FitConfig.from_json(stored) == BUSY and FitConfig.from_json(stored).fingerprint() == BUSY.fingerprint()
     with pytest.raises(UsageError, match="another version"):
         FitConfig.from_json({**stored, "bogus": 1})
-    assert all(isinstance(p, FitConfig) for p in PRESETS.values())
+    assert all(isinstance(p, FitConfig) and p.preset == name for name, p in PRESETS.items())
+
+
+def test_every_preset_is_named_and_described():
+    """In its note, in the help of --preset, and in the README's table."""
+    assert PRESET_NOTES.keys() == PRESETS.keys()
+    table = (Path(__file__).parents[2] / "README.md").read_text("utf-8")
+    rows = " ".join(line.split("|")[1] for line in table.splitlines() if line.startswith("| `"))
+    for name in PRESETS:
+        assert name in re.findall(r"[\w-]+", field_docs(FitConfig)["preset"]) and f"`{name}`" in rows, name
 
 
 @pytest.mark.parametrize("bad", [{"steps": 0}, {"sh_every": 0}, {"rule": "best"}, {"max_gaussians": 0}, {"strategy": "best"}])

@@ -1,4 +1,4 @@
-"""A rehearsal uses what a fit of the same settings uses, says what goes wrong, and leaves no trace in the fit."""
+"""A warmup uses what a fit of the same settings uses, says what goes wrong, and leaves no trace in the fit."""
 
 import dataclasses
 import threading
@@ -17,7 +17,7 @@ from warpgs.pipeline.train.config import PRESETS
 from warpgs.pipeline.train.setup import prepare
 from warpgs.pipeline.train.strategies.importance_sampling import ImportanceSampling
 from warpgs.pipeline.train.trainer import Trainer, run
-from warpgs.pipeline.train.warmup import POINTS, STEPS, rehearsal, warm_up
+from warpgs.pipeline.train.warmup import POINTS, STEPS, background_warmup, warm_up
 from warpgs.scene import ViewDepth
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
@@ -42,12 +42,12 @@ def test_limits_of_the_real_fit_do_not_stop_it():
     assert fit.step == STEPS and len(fit.gaussians) <= 50
 
 
-def test_only_a_free_gpu_rehearses(monkeypatch):
+def test_only_a_free_gpu_is_warmed_up(monkeypatch):
     """Nothing is begun on a CPU, nor where networks for priors run on the GPU."""
     monkeypatch.setattr(warmups, "warm_up", lambda *_: pytest.fail("begun"))
     networks = dataclasses.replace(PRESETS["paper"].priors, onnx_provider="cuda")
     for config, device in ((PRESETS["paper"], CPU), (dataclasses.replace(PRESETS["paper"], priors=networks), CUDA)):
-        with rehearsal(config, device) as ready:
+        with background_warmup(config, device) as ready:
             assert ready() is None
 
 
@@ -59,12 +59,12 @@ def test_what_goes_wrong_is_raised(monkeypatch):
 
     monkeypatch.setattr(warmups, "warm_up", fail)
     monkeypatch.setattr(torch.cuda, "device", lambda _: torch.no_grad())  # there may be none here
-    with rehearsal(PRESETS["paper"], CUDA) as ready, pytest.raises(RuntimeError, match="out of order"):
+    with background_warmup(PRESETS["paper"], CUDA) as ready, pytest.raises(RuntimeError, match="out of order"):
         ready()
 
 
 def test_nothing_goes_on_after_the_block(monkeypatch):
-    """An error in the block, such as a scene with nothing to start from, ends the rehearsal after the step it is in."""
+    """An error in the block, such as a scene with nothing to start from, ends the warmup after the step it is in."""
     began, ended = threading.Event(), []
 
     def endless(config, device, stopped):
@@ -75,13 +75,13 @@ def test_nothing_goes_on_after_the_block(monkeypatch):
 
     monkeypatch.setattr(warmups, "warm_up", endless)
     monkeypatch.setattr(torch.cuda, "device", lambda _: torch.no_grad())
-    with pytest.raises(DataError), rehearsal(PRESETS["paper"], CUDA):
+    with pytest.raises(DataError), background_warmup(PRESETS["paper"], CUDA):
         began.wait()
         raise DataError("nothing to start from")
     assert len(ended) == 1 and not ended[0].is_alive()
 
 
-def test_a_rehearsal_that_nobody_waits_for_stops():
+def test_a_warmup_that_nobody_waits_for_stops():
     """Between its steps."""
     with pytest.raises(KeyboardInterrupt):
         warm_up(PRESETS["quick"], CPU, lambda: True)
@@ -115,7 +115,7 @@ def test_missing_points_are_said_before_anything_takes_time(monkeypatch):
 
 
 @pytest.mark.parametrize("preset", ["paper", "3dgs"])
-def test_only_fits_that_sweep_rehearse_a_sweep(preset, monkeypatch):
+def test_only_fits_that_sweep_warm_up_a_sweep(preset, monkeypatch):
     """And none under a memory limit, which leaves the sweep to the CPU."""
     swept = []
     monkeypatch.setattr(warmups, "sweep_depths", lambda views, *_: swept.append(len(views)))
@@ -125,13 +125,13 @@ def test_only_fits_that_sweep_rehearse_a_sweep(preset, monkeypatch):
 
 
 @pytest.mark.cuda
-def test_a_fit_is_the_same_after_a_rehearsal():
+def test_a_fit_is_the_same_after_a_background_warmup():
     """Bit for bit that of a fit without one."""
     device, views = torch.device("cuda"), photos(3)
     config = dataclasses.replace(PRESETS["quick"], steps=20)
     fits = []
     for warmed_up in (False, True):
-        with rehearsal(config, device if warmed_up else CPU) as ready:
+        with background_warmup(config, device if warmed_up else CPU) as ready:
             fit = Trainer(views, seeds(), config, device, priors=priors(views), ready=ready)
         run(fit, lambda _: None, lambda _: None, lambda: False)
         fits.append(fit.gaussians.tensors())

@@ -24,7 +24,7 @@ class Candidate:
     number: int
     """Line, from 1."""
     line: str
-    """Its text, stripped."""
+    """Text of the line, stripped."""
     change: str
     """The change, with ``#n`` where one statement offers the same change n times."""
 

@@ -28,7 +28,11 @@ class Claims:
 
 
 def load(path: Path = CLAIMS) -> Claims:
-    """Read the file; ValueError names an entry that is incomplete, unreadable or claimed twice."""
+    """Read the file.
+
+    Raises:
+        ValueError: An entry is incomplete, unreadable or claimed twice; the message names it.
+    """
     table = tomllib.loads(path.read_text("utf-8"))
     claims = Claims(table["files"], {})
     for reason, mutants in table["equivalent"].items():

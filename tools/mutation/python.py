@@ -103,6 +103,7 @@ class _Walker:
             side = cuda or (field == "body" and body_cuda) or (field == "orelse" and else_cuda)
             for part in children:
                 self.walk(part, replace(place, cuda=side))
+                side = side or rules.ends_cpu(part)
 
     def native(self, node: ast.Constant, place: Place) -> None:
         begin, end = self.begin(node), self.end(node)

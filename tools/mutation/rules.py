@@ -6,9 +6,9 @@ from pathlib import Path
 
 SPEED = {
     "AHEAD", "SHORT", "CHUNKS_PER_THREAD", "FEW_THREADS", "SERIAL_WORK", "SEGMENT", "LANES", "BATCH", "BLOCK", "BOX", "SMALL",
-    "MANY", "WARPS", "STRIP", "ABREAST",
+    "MAX_SMALL_TILES", "WARPS", "STRIP", "ABREAST", "MAX_GRAPHS", "MIN_REPLAYS", "FREE_CAPTURES", "SMALL_BYTES",
 }  # fmt: skip
-"""Sizes of portions of work; every value that divides as its comment says gives the same numbers."""
+"""Sizes of portions of work, and numbers of graphs; every value that divides as its comment says gives the same numbers."""
 
 HINTS = {
     "cost", "enable_backward", "grid_stride", "record_tape", "sync", "requires_grad", "cuda_max_registers", "launch_bounds",
@@ -20,30 +20,36 @@ SLACK = {"margin", "slack", "slack_x", "slack_y", "limit_of"}
 """Widths by which bounds are safe: a hundredth more lists a tile in excess, which draws nothing. Their operators count."""
 
 MUTATED = (
-    "warpgs/kernels/*.py", "warpgs/kernels/cuda/*.cu", "warpgs/runtime/interop.py", "warpgs/runtime/allocator.py",
+    "warpgs/kernels/*.py", "warpgs/kernels/cameras/*.py", "warpgs/kernels/cuda/*.cu", "warpgs/runtime/interop.py",
+    "warpgs/runtime/allocator.py", "warpgs/runtime/cuda_graph.py",
 )  # fmt: skip
 """The files that are mutated."""
 
 CUDA_FILES = ("warpgs/kernels/blend_cuda.py", "warpgs/kernels/ssim_cuda.py", "warpgs/kernels/native.py")
 CUDA_FUNCTIONS = {
     "warpgs/runtime/interop.py": ("_Recorded", "_recorded", "warp_stream", "_warp_stream", "stream_of", "warp_device"),
-    "warpgs/kernels/adam.py": ("make_scheduled_kernel", "scheduled_lrs", "adam_scheduled"),
-    "warpgs/kernels/ssim.py": ("make_kernels", "_Plan.padded", "_Plan.launch"),
-}
-"""Code that only a CUDA device runs, beside the branches that `sides` finds."""
+    "warpgs/runtime/cuda_graph.py": (
+        "CapturedGraph", "GraphMemory", "GraphPool.capture", "GraphPool.pool", "GraphPool.release",
+    ),
+    "warpgs/kernels/adam.py": ("make_scheduled_kernel",),
+    "warpgs/kernels/ssim.py": ("make_kernels", "_Launcher.padded", "_Launcher.launch"),
+}  # fmt: skip
+"""Code that only a CUDA device runs, beside what `sides` and `ends_cpu` find."""
 
 CUDA_ARGUMENTS = {"deterministic", "block_dim"}
-"""Arguments that mean something on CUDA alone: their defaults, and what is passed for them, are judged there."""
+"""Arguments that mean something on CUDA alone, where their defaults, and what is passed for them, are tested."""
 
 LIMITS, LIMITS_PROJECT, LIMITS_BLEND = (f"kernels/test_limits{what}.py" for what in ("", "_project", "_blend"))
 SPANS, CUTS = "kernels/test_spans.py", "runtime/test_interop.py"
 RECORDS, BODIES, GUARDS = (f"kernels/test_{what}.py" for what in ("limits_gradients", "native", "guard_bytes"))
 EXTREMES, LAYERS = "numerics/test_extreme_projection.py", "numerics/test_extreme_compositing.py"
 OPS = {
-    "adam": ["kernels/test_adam.py", LIMITS],
+    "adam": ["kernels/test_adam.py", LIMITS, "pipeline/test_table.py"],
     "blend": ["kernels/test_blend.py", "render/test_rasterize.py", LIMITS_BLEND],
     "blend_cpu": ["kernels/test_blend.py", LIMITS_BLEND, RECORDS, LAYERS, "render/test_window.py"],
     "blend_cuda": ["kernels/test_blend.py", "render/test_rasterize.py", LIMITS_BLEND, RECORDS, LAYERS, "render/test_window.py"],
+    "cameras/": ["kernels/test_project.py", LIMITS_PROJECT, EXTREMES, "kernels/test_cameras.py"],
+    "cuda_graph": ["runtime/test_cuda_graph.py", "render/test_graphed.py"],
     "step_buffers": ["kernels/test_step_buffers.py"],
     "interop": [CUTS, "kernels/test_adam.py", "kernels/test_sh.py", "kernels/test_tiles.py"],
     "compiler": ["kernels/test_blend.py"],
@@ -62,10 +68,11 @@ OPS = {
     "ssim": ["kernels/test_ssim.py", LIMITS],
     "tiles": ["kernels/test_tiles.py", LIMITS_BLEND, RECORDS, "render/test_rasterize.py", "render/test_window.py"],
 }  # fmt: skip
-"""The tests of a file by the beginning of its name, the longest that fits; those that fail soonest come first."""
+"""The tests of a file by the beginning of its name (of cameras: folder/name), the longest that fits; soonest failing first."""
 
 CUDA_OPS = {
-    "adam": [GUARDS, "pipeline/test_step.py"], "blend_cuda": [BODIES, GUARDS],
+    "adam": [GUARDS, "pipeline/test_step.py"], "blend_cuda": [BODIES, GUARDS], "cameras/": [GUARDS],
+    "cuda_graph": ["render/test_graphed_cuda.py", "pipeline/test_step.py"],
     "interop": [BODIES, "kernels/test_project.py", "pipeline/test_step.py"], "native": [BODIES, GUARDS], "project": [GUARDS],
     "project_backward": [GUARDS], "ssim": [GUARDS],
     "tiles": [BODIES, GUARDS, "pipeline/test_step.py"],
@@ -78,7 +85,8 @@ SKIPPED = ("tests/kernels/test_blend.py::test_gradcheck",)
 
 def tests_of(file: str, cuda: bool) -> list[str]:
     """Return the test files for a file that is mutated, on CUDA or on the CPU."""
-    stem = Path(file).stem
+    path = Path(file)
+    stem = f"cameras/{path.stem}" if path.parent.name == "cameras" else path.stem
     op = max((name for name in OPS if stem.startswith(name)), key=len)
     if file.endswith(".cu") and op == "blend":
         op = "blend_cuda"
@@ -133,3 +141,10 @@ def sides(node: ast.AST) -> tuple[bool, bool]:
     if "== 'cuda'" in test or re.fullmatch(r"native|wp\.static\(native\)|_native\(\w+\)", test):
         return True, False
     return False, "== 'cpu'" in test or "blocked" in test
+
+
+def ends_cpu(statement: ast.AST) -> bool:
+    """Return whether a statement is an ``if`` of the CPU alone that ends in a return: only CUDA runs what follows it."""
+    if not isinstance(statement, ast.If) or not isinstance(statement.body[-1], ast.Return):
+        return False
+    return re.fullmatch(r"[\w.]+\.type == 'cpu'", ast.unparse(statement.test)) is not None

@@ -15,7 +15,7 @@ from warpgs.app.flags import flags_of, settings_of, word_after
 from warpgs.errors import UsageError, WarpgsError
 from warpgs.io.readers import READERS
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device
-from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESETS, FitConfig
+from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESET_NOTES, PRESETS, FitConfig
 from warpgs.pipeline.train.loss import LOSS_TERMS
 from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.pipeline.train.time_budget import check_budget
@@ -94,8 +94,8 @@ def _terms(arguments: list[str], base: FitConfig) -> dict[str, Any]:
     given = word_after(arguments, "--loss-terms")
     if given is None:
         return {_group(t.name): t for t in base.loss_terms}
-    terms = {}
-    for name in filter(None, (n.strip() for n in given.split(","))):
+    terms: dict[str, Any] = {}
+    for name in filter(None, (n.strip() for n in ("" if given == "none" else given).split(","))):
         if _group(name) in terms:
             raise UsageError(f"--loss-terms {given}: two terms have the flags --{_group(name)}; leave one out")
         kind = _load(LOSS_TERMS, name)
@@ -119,6 +119,11 @@ def _preset(arguments: list[str]) -> tuple[FitConfig, str]:
         return base, kind
     own = _load(STRATEGIES, strategy).Config
     return dataclasses.replace(base, strategy=strategy, strategy_config=None if own is None else own()), kind
+
+
+def _presets() -> str:
+    """Return the presets and what they are, for people."""
+    return "presets:\n" + "\n".join(f"  {name}: {note}" for name, note in PRESET_NOTES.items())
 
 
 def _size() -> Any:
@@ -154,7 +159,7 @@ def _flags(base: FitConfig, terms: dict[str, Any]) -> type:
     kind, default = flags_of(FitConfig, dataclasses.replace(base, loss_terms=tuple(terms.values())), special)
     fields: list[tuple[str, Any, Any]] = [("config", Annotated[kind, tyro.conf.arg(name="")], field(default=default))]
     own = {} if base.strategy_config is None else {_group(base.strategy): base.strategy_config}
-    taken = {f.name for f in dataclasses.fields(FitConfig)}
+    taken = {f.name for kind in (FitConfig, _request_type()) for f in dataclasses.fields(kind)} | {"config"}
     for name, settings in [*own.items(), *terms.items()]:
         if name in taken:
             raise UsageError(f"a plug-in has the name {name}, whose flags --{name} there are already; call it something else")
@@ -202,7 +207,7 @@ def fit(arguments: list[str], description: str) -> FitRequest:
 
     base, kind = _preset(arguments)
     terms = _terms(arguments, base)
-    a: Any = tyro.cli(_flags(base, terms), args=arguments, prog="warpgs fit", description=description)
+    a: Any = tyro.cli(_flags(base, terms), args=arguments, prog="warpgs fit", description=f"{description}\n\n{_presets()}")
     if a.reader is not None:
         _load(READERS, a.reader)
     if a.threads < 0:

@@ -72,8 +72,11 @@ def word_after(arguments: list[str], flag: str) -> str | None:
     """Return the word after a flag that must be known before the others can be described; None where it is not given."""
     found = None
     for i, word in enumerate(arguments):
-        if word == flag and i + 1 < len(arguments):
+        name, given, value = word.partition("=")
+        if name.replace("_", "-") != flag:  # tyro takes either
+            continue
+        if given:
+            found = value
+        elif i + 1 < len(arguments):
             found = arguments[i + 1]
-        if word.startswith(f"{flag}="):
-            found = word.removeprefix(f"{flag}=")
     return found

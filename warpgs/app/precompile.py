@@ -28,6 +28,7 @@ from warpgs.kernels import (
     tiles,
 )
 from warpgs.kernels.native import BLOCK
+from warpgs.pipeline.train.strategies import mcmc
 from warpgs.runtime import interop
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.load_module import load_module
@@ -50,7 +51,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         (project.make_forward(real, cuda, CAMERA_MODEL), THREADS), (project.make_backward(real, cuda, CAMERA_MODEL), BLOCK),
         (tiles.make_kernels(real, cuda).pack_counts, THREADS), (tiles.make_kernels(real, cuda).find_ranges, THREADS),
         (tiles.make_emit(real, cuda), THREADS), (knn.make_kernels(real).search, THREADS), (dropout.make_kernel(), THREADS),
-        (step_buffers.make_kernels().end_step, THREADS),
+        (step_buffers.make_kernels().end_step, THREADS), (mcmc.make_kernel(), THREADS),
     ]  # fmt: skip
     if not cuda:
         blending, scoring = (

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError
+from warpgs.geometry import matmul
 from warpgs.io.folders import ViewList, has_folder, pixel_source, read_mask, resampling_note
 from warpgs.io.images import Lens, list_images, load_image
 from warpgs.io.poses import rigid
@@ -29,12 +30,14 @@ def decompose(P: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
     M = P[:3, :3]
     if not (np.isfinite(P).all() and abs(np.linalg.det(M)) > 1e-12 * np.abs(M).max() ** 3):
         raise DataError(f"{where}: the projection matrix is not finite or not invertible; calibrate again")
-    # RQ by QR of the reversed matrix
-    q, r = np.linalg.qr(np.flipud(M).T)
-    K, R = np.fliplr(np.flipud(r.T)), np.flipud(q.T)
-    signs = np.sign(np.diag(K))
-    K, R = K * signs, R * signs[:, None]
-    t = np.linalg.solve(K, P[:3, 3])
+    # M = K R by Gram-Schmidt from the last row, and K t by substitution: LAPACK's last digits go by the processor
+    K, R, t = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
+    for i in (2, 1, 0):
+        K[i, i + 1 :] = (R[i + 1 :] * M[i]).sum(1)
+        axis = M[i] - (K[i, i + 1 :, None] * R[i + 1 :]).sum(0)
+        K[i, i] = np.sqrt((axis * axis).sum())
+        R[i] = axis / K[i, i]
+        t[i] = (P[i, 3] - (K[i, i + 1 :] * t[i + 1 :]).sum()) / K[i, i]
     if np.linalg.det(R) < 0:  # P is given up to sign
         R, t = -R, -t
     K = K / K[2, 2]
@@ -116,7 +119,7 @@ class DTUReader(Reader):
             world, scale = matrices.get(f"world_mat_{i}"), matrices.get(f"scale_mat_{i}", np.eye(4))
             if world is None:
                 raise DataError(f"{where}: world_mat_{i} is missing; copy the archive again")
-            K, viewmat = decompose((world @ scale)[:3], where)
+            K, viewmat = decompose(matmul(world, scale)[:3], where)
             K[:2, 2] += 0.5  # the archives count pixels from the centre of the first one
             loaded = load_image(
                 file,

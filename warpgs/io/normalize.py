@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from warpgs.errors import DataError
+from warpgs.geometry import matmul
 from warpgs.scene import Normalization, PointCloud, View
 
 MIN_EXTENT = 1e-9
@@ -45,7 +46,7 @@ def normalization_of(views: list[View], points: PointCloud | None) -> Normalizat
 def normalize_view(view: View, n: Normalization) -> View:
     """Return the view with its camera in scene coordinates (float64); rotation and intrinsics stay as they are."""
     viewmat = view.camera.viewmat.copy()
-    viewmat[:3, 3] = n.scale * (viewmat[:3, :3] @ n.offset + viewmat[:3, 3])
+    viewmat[:3, 3] = n.scale * (matmul(viewmat[:3, :3], n.offset) + viewmat[:3, 3])
     return replace(view, camera=replace(view.camera, viewmat=viewmat))
 
 

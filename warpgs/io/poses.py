@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.geometry import rotation_matrices
+from warpgs.geometry import matmul, nearest_rotation, rotation_matrices
 
 TOLERANCE = 1e-3
 """Largest entry of R R^T - 1 that is put down to rounding in the file."""
@@ -28,9 +28,8 @@ def rigid(viewmat: np.ndarray, where: str) -> np.ndarray:
         )
     if np.linalg.det(R) < 0:
         raise DataError(f"{where}: the pose mirrors the scene (determinant -1); two axes are probably swapped")
-    u, _, vt = np.linalg.svd(R)
     result = np.eye(4)
-    result[:3, :3] = u @ vt
+    result[:3, :3] = nearest_rotation(R)
     result[:3, 3] = viewmat[:3, 3]
     return result
 
@@ -68,5 +67,5 @@ def from_camera_to_world(matrix: np.ndarray, where: str, *, opengl: bool) -> np.
     pose = rigid(pose, where)
     result = np.eye(4)
     result[:3, :3] = pose[:3, :3].T
-    result[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    result[:3, 3] = -matmul(pose[:3, :3].T, pose[:3, 3])
     return result

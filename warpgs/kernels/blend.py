@@ -152,12 +152,12 @@ def composite_gradients(
     """Return the gradient of ``projected``, shape [C, N, 12]. Nothing is checked.
 
     Args:
-        projected: As given to `composite`, like the next three.
-        tiles: See there.
-        backgrounds: See there.
-        settings: See there.
-        saved: The results of `composite` but for ``alpha``.
-        v_images: Gradients of ``rgb``, ``alpha`` and ``depth``, each of which may be None.
+        projected: Projected Gaussians as given to `composite`, shape [C, N, 12].
+        tiles: Their tiles.
+        backgrounds: Colour behind everything, shape [C, 3].
+        settings: Settings as given to `composite`.
+        saved: Results of `composite` but for ``alpha``.
+        v_images: Gradients of ``rgb`` [C, H, W, 3], ``alpha`` and ``depth`` [C, H, W], each of which may be None.
         allocator: Provider of the gradient's memory.
     """
     v_rgb, v_alpha, v_depth = v_images

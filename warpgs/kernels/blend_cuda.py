@@ -206,7 +206,12 @@ def forward(
     save: bool,
     allocator: Allocator = TORCH,
 ) -> tuple[torch.Tensor, ...]:
-    """Return what `blend.composite` returns: rgb, alpha, depth, transmittances, weights, ends, states."""
+    """Return what `blend.composite` returns for projected Gaussians [C, N, 12] and backgrounds [C, 3], on CUDA.
+
+    Returns:
+        rgb [C, H, W, 3]; alpha, depth, transmittances, weights and ends [C, H, W]; and states [S, P], with a row for each chunk
+        of instances and `STATE` numbers for each pixel of a tile.
+    """
     device, rule = projected.device, settings.rule
     shape = (backgrounds.shape[0], settings.height, settings.width)
     rgb, alpha, depth = (allocator.output(s, torch.float32, device) for s in ((*shape, 3), shape, shape))
@@ -241,12 +246,12 @@ def backward(
     """Return the gradient of ``projected``, shape [C, N, 12].
 
     Args:
-        projected: As given to `forward`, like the next three.
-        tiles: See there.
-        backgrounds: See there.
-        settings: See there.
-        saved: The results of `forward` but for ``alpha``.
-        v_images: Gradients of ``rgb``, ``alpha`` and ``depth``; the last two may be None.
+        projected: Projected Gaussians as given to `forward`, shape [C, N, 12].
+        tiles: Their tiles.
+        backgrounds: Colour behind everything, shape [C, 3].
+        settings: Settings as given to `forward`.
+        saved: Results of `forward` but for ``alpha``.
+        v_images: Gradients of ``rgb`` [C, H, W, 3], ``alpha`` and ``depth`` [C, H, W]; the last two may be None.
         allocator: Provider of the gradient's memory.
     """
     rgb, depth, transmittances, weights, ends, states = saved
@@ -281,10 +286,10 @@ def instance_weights(projected: torch.Tensor, tiles: Tiles, settings: BlendSetti
     """Return sum and maximum over a tile's pixels of the blending weight, for each instance at its slot, shape [M, 2].
 
     Args:
-        projected: As given to `forward`, like the next two.
-        tiles: See there.
-        settings: See there.
-        ends: One past the last instance that was blended into each pixel, as `forward` returns it.
+        projected: Projected Gaussians as given to `forward`, shape [C, N, 12].
+        tiles: Their tiles.
+        settings: Settings as given to `forward`.
+        ends: One past the last instance that was blended into each pixel, as `forward` returns it, int32, shape [C, H, W].
     """
     rule, weights = settings.rule, projected.new_zeros(tiles.slots.shape[0], 2)
     inputs = [

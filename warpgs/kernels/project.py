@@ -199,6 +199,9 @@ def project_tensors(
         factors: Opacity factors, shape [N]; shape [0] for none.
         settings: Everything else.
         allocator: Provider of the results' memory.
+
+    Returns:
+        Projected Gaussians, shape [C, N, 12], and the number of tiles that each touches, int32, shape [C, N].
     """
     means, real = tensors[0], interop.real_of(tensors[0])
     cameras, count, rule = len(tensors[5]), len(means), settings.rule
@@ -249,11 +252,14 @@ def project_gradients(
     Args:
         tensors: The seven tensors, contiguous.
         settings: The settings of the forward pass.
-        projected: First result of `project_tensors`.
-        tile_counts: Second result of `project_tensors`.
-        v_projected: Gradient of ``projected``; None for zero.
+        projected: First result of `project_tensors`, shape [C, N, 12].
+        tile_counts: Second result of `project_tensors`, int32, shape [C, N].
+        v_projected: Gradient of ``projected``, shape [C, N, 12]; None for zero.
         wants_camera: True to compute the gradients of viewmats and Ks; else they are None.
         allocator: Provider of the gradients' memory.
+
+    Returns:
+        One gradient of the shape of each tensor [...]; None where it is not wanted.
     """
     real, device = interop.real_of(projected), projected.device
     t, (width, height), rule = make_types(real), settings.size, settings.rule

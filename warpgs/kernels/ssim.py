@@ -215,7 +215,7 @@ def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
     Args:
         image: Colours in [0, 1], shape [H, W, 3] or [B, H, W, 3].
-        target: The same for the image to compare with; no gradient.
+        target: Colours of the image to compare with, shape [H, W, 3] or [B, H, W, 3]; no gradient.
 
     Returns:
         Similarities in [-1, 1], of the images' shape; their mean is the usual figure.
@@ -242,7 +242,7 @@ def differences(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
     Args:
         image: Colours in [0, 1], shape [H, W, 3] or [B, H, W, 3].
-        target: The same for the image to compare with; no gradient.
+        target: Colours of the image to compare with, shape [H, W, 3] or [B, H, W, 3]; no gradient.
 
     Returns:
         The two sums, shape [2]. The gradient of |image - target| is 0 where they are equal.

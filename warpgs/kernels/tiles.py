@@ -56,7 +56,7 @@ class Tiles:
     """M, int64, shape [1], where kernels can read it."""
 
     def tensors(self) -> tuple[torch.Tensor, ...]:
-        """Return all fields but the size, in the order in which the constructor takes them."""
+        """Return all fields but the size, with the shapes [...] named there, in the order of the constructor."""
         return self.ranges, self.gaussian_ids, self.slots, self.starts, self.counts, self.tile_ids, self.total
 
 

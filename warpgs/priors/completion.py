@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from warpgs.priors.opencv import single_threaded_opencv
+
 SMOOTHNESS = (1e2, 1e4, 1e6)
 """Strengths of the smoother, tried in turn; a stronger one reaches farther, and a pixel takes the first that reaches it."""
 COLOR_SIGMA = 8.0
@@ -35,11 +37,12 @@ def complete(depth: np.ndarray, valid: np.ndarray, image: np.ndarray) -> np.ndar
     guide = (image * 255).round().clip(0, 255).astype(np.uint8)
     filled = np.full(depth.shape, np.median(inverse[valid]))
     left = np.ones(depth.shape, bool)
-    for strength in SMOOTHNESS:
-        smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, strength, COLOR_SIGMA)
-        fraction = smoother.filter(valid.astype(np.float32))
-        filled_now = left & (fraction > MIN_FRACTION)
-        filled[filled_now] = smoother.filter(inverse)[filled_now] / fraction[filled_now]
-        left &= ~filled_now
+    with single_threaded_opencv():
+        for strength in SMOOTHNESS:
+            smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, strength, COLOR_SIGMA)
+            fraction = smoother.filter(valid.astype(np.float32))
+            filled_now = left & (fraction > MIN_FRACTION)
+            filled[filled_now] = smoother.filter(inverse)[filled_now] / fraction[filled_now]
+            left &= ~filled_now
     low, high = inverse[valid].min(), inverse[valid].max()
     return np.where(valid, depth, 1 / filled.clip(low, high)).astype(np.float32)

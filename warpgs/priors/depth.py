@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from warpgs.errors import DataError
+from warpgs.priors.opencv import single_threaded_opencv
 from warpgs.priors.preprocess import HALF, Preprocessing, resize
 from warpgs.priors.session import Network
 
@@ -109,9 +110,10 @@ def _spread(image: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.nda
     guide = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
     received = np.full(values.shape, MEAN_WEIGHT)
     total = received * np.average(values, weights=weight)
-    for reach, fraction in REACHES:
-        # in one dimension the smoother's response falls as exp(-x / sqrt(lambda))
-        smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, reach**2, COLOR_SIGMA)
-        total += fraction * smoother.filter(weight * values)
-        received += fraction * smoother.filter(weight)
+    with single_threaded_opencv():
+        for reach, fraction in REACHES:
+            # in one dimension the smoother's response falls as exp(-x / sqrt(lambda))
+            smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, reach**2, COLOR_SIGMA)
+            total += fraction * smoother.filter(weight * values)
+            received += fraction * smoother.filter(weight)
     return total / received

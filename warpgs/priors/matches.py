@@ -29,7 +29,7 @@ def _triangulate(a: View, b: View, pixels_a: np.ndarray, pixels_b: np.ndarray) -
     baseline = origins[1] - origins[0]
     cosine = (rays[0] * rays[1]).sum(1)
     sine2 = np.maximum(1 - cosine**2, 1e-12)
-    along = [rays[0] @ baseline, rays[1] @ baseline]
+    along = [geometry.matmul(r, baseline) for r in rays]
     s = (along[0] - cosine * along[1]) / sine2
     t = (cosine * along[0] - along[1]) / sine2
     points = 0.5 * (origins[0] + s[:, None] * rays[0] + origins[1] + t[:, None] * rays[1])

@@ -5,11 +5,15 @@ Paper, Multi-Modal Importance Assessment: S_semantic = F_seg(I) (omega_boundary 
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
 from warpgs.errors import DataError
+from warpgs.priors.opencv import single_threaded_opencv, without_ipp
 from warpgs.priors.preprocess import IMAGENET, Preprocessing, resize
 from warpgs.priors.session import Network
 
@@ -88,7 +92,8 @@ def _falloff(edge: np.ndarray) -> np.ndarray:
     if not edge.any():
         return np.zeros(edge.shape, np.float32)
     distance = cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.exp(-0.5 * (distance / (BOUNDARY_WIDTH * edge.shape[1])) ** 2)
+    squares = np.rint(distance.astype(float) ** 2)  # whole numbers, whatever the last digits of their roots
+    return np.exp(-0.5 / (BOUNDARY_WIDTH * edge.shape[1]) ** 2 * squares).astype(np.float32)
 
 
 def network_semantics(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> SemanticMaps:
@@ -124,6 +129,12 @@ def classical_semantics(image: np.ndarray) -> SemanticMaps:
     low, high = np.percentile(even, [2, 98])
     foreground = np.clip((even - low) / max(high - low, 1e-6), 0, 1).astype(np.float32)
     return SemanticMaps(np.maximum(foreground, 1 - foreground), boundary, foreground)
+
+
+def classical_maps(images: Sequence[np.ndarray]) -> list[SemanticMaps]:
+    """Return `classical_semantics` of each image; a thread works on one, so results do not depend on the number of threads."""
+    with single_threaded_opencv(), ThreadPoolExecutor(os.cpu_count() or 1, initializer=without_ipp) as pool:
+        return list(pool.map(classical_semantics, images))
 
 
 def knows_foreground(maps: SemanticMaps) -> bool:

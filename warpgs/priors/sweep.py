@@ -14,8 +14,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from warpgs import geometry
+from warpgs.geometry import matmul
 from warpgs.priors import sweep_cpu, sweep_cuda
 from warpgs.priors.epipolar import homogeneous, nearest_views, pixel_grid
+from warpgs.priors.opencv import single_threaded_opencv, without_ipp
 from warpgs.priors.sweep_planes import SweepConfig, inside_image, plane_inverses, project_inverse
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.device_memory import installed_bytes
@@ -59,8 +62,8 @@ def consistent_depth(views: Sequence[View], inverses: Sequence[np.ndarray], inde
     view, own = views[index], inverses[index]
     camera, pixels, w = view.camera, pixel_grid(view.camera), own.ravel()
     sensitivity = np.full(len(pixels), np.inf)
-    rays = homogeneous(pixels) @ np.linalg.inv(camera.K).T
-    world = (rays / w[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+    rays = matmul(homogeneous(pixels), geometry.inverse(camera.K).T)
+    world = matmul(rays / w[:, None] - camera.viewmat[:3, 3], camera.viewmat[:3, :3])
     notes, own_direction = [], world - camera.center
     own_direction /= np.linalg.norm(own_direction, axis=1, keepdims=True)
     for j in nearest_views(views, index, config.near_count):
@@ -129,7 +132,7 @@ def sweep_depths(
     import cv2
 
     small = [_reduced(v, config.max_pixels) for v in views]
-    with sweep_cpu.single_threaded_opencv(), ThreadPoolExecutor(torch.get_num_threads()) as pool:
+    with single_threaded_opencv(), ThreadPoolExecutor(torch.get_num_threads(), initializer=without_ipp) as pool:
         inverses, messages = _inverses(small, bounds, config, device, pool)
         consistent = list(pool.map(lambda i: consistent_depth(small, inverses, i, config), range(len(views))))
     out = []

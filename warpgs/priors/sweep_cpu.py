@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
@@ -107,19 +106,6 @@ def best_inverse(costs: np.ndarray, inverses: np.ndarray) -> np.ndarray:
     bend = left - 2 * middle + right
     offset = np.where(bend > 1e-9, 0.5 * (left - right) / np.maximum(bend, 1e-9), 0).clip(-1, 1)
     return inverses[0] + (k + offset) * (inverses[1] - inverses[0])
-
-
-@contextlib.contextmanager
-def single_threaded_opencv():
-    """Keep OpenCV from using threads: its calls here are so short that starting threads takes longer than they save."""
-    import cv2
-
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)
 
 
 def inverse_depths(

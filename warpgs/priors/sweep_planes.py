@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from warpgs import geometry
 from warpgs.errors import UsageError
-from warpgs.geometry import check_pinhole
+from warpgs.geometry import check_pinhole, matmul
 from warpgs.priors.epipolar import homogeneous
 from warpgs.scene import Camera, View
 
@@ -68,9 +69,9 @@ def project_inverse(first: Camera, second: Camera, pixels: np.ndarray, inverse: 
     """Return the positions [px] in the second image, shape [N, 2], of pixels [N, 2] at inverse depths [1/u] [N]; NaN behind."""
     check_pinhole(first)
     check_pinhole(second)
-    relative = second.viewmat @ np.linalg.inv(first.viewmat)
-    rays = homogeneous(pixels) @ np.linalg.inv(first.K).T
-    p = (rays @ relative[:3, :3].T + inverse[:, None] * relative[:3, 3]) @ second.K.T
+    rotation, translation = geometry.relative_pose(first, second)
+    rays = matmul(homogeneous(pixels), geometry.inverse(first.K).T)
+    p = matmul(matmul(rays, rotation.T) + inverse[:, None] * translation, second.K.T)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(p[:, 2:] > 1e-9, p[:, :2] / p[:, 2:], np.nan)
 
@@ -105,10 +106,11 @@ def plane_homography(first: Camera, second: Camera, inverse: float) -> np.ndarra
     """Return H [3, 3] from first to second by the plane z = 1 / inverse, for pixel centres at whole numbers (OpenCV)."""
     check_pinhole(first)
     check_pinhole(second)
-    relative = second.viewmat @ np.linalg.inv(first.viewmat)
-    H = second.K @ (relative[:3, :3] + inverse * np.outer(relative[:3, 3], [0, 0, 1])) @ np.linalg.inv(first.K)
-    shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
-    return np.linalg.inv(shift) @ H @ shift
+    rotation, translation = geometry.relative_pose(first, second)
+    moved = rotation + inverse * np.outer(translation, [0, 0, 1])
+    H = matmul(matmul(second.K, moved), geometry.inverse(first.K))
+    back, shift = (np.array([[1, 0, s], [0, 1, s], [0, 0, 1]]) for s in (-0.5, 0.5))
+    return matmul(matmul(back, H), shift)
 
 
 def gray_of(view: View) -> np.ndarray:
@@ -120,5 +122,5 @@ def gray_of(view: View) -> np.ndarray:
 
 def step_limits(colors: np.ndarray, small_step: float, large_step: float) -> np.ndarray:
     """Return P2 of the steps along the first axis of an image [L, B, 3], in units of 1 / `UNIT`, int16, shape [L - 1, B]."""
-    jumps = np.abs(np.diff(colors, axis=0)).max(2)
+    jumps = np.abs(np.diff(colors, axis=0)).max(2).astype(float)  # float32's exp has other last digits on other processors
     return np.rint(np.maximum(large_step * np.exp(-jumps / EDGE), 1.5 * small_step) * UNIT).astype(np.int16)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +14,7 @@ from warpgs.priors import depth, semantics
 from warpgs.priors.cache import MapCache
 from warpgs.priors.depth import complete_disparity, network_disparity
 from warpgs.priors.preprocess import check_value, describe
-from warpgs.priors.semantics import SemanticMaps, boundary_weight, classical_semantics, knows_foreground, network_semantics
+from warpgs.priors.semantics import SemanticMaps, boundary_weight, classical_maps, knows_foreground, network_semantics
 from warpgs.priors.session import PROVIDERS, open_network
 from warpgs.scene import Prior, View
 
@@ -162,8 +160,7 @@ def _classical(views: Sequence[View], notes: list[str]) -> SemanticsSource:
         "semantics: no network, so saliency stands for foreground and edges for boundaries; --segmentation-model takes one"
     )
 
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:  # OpenCV lets other threads run meanwhile
-        found = list(pool.map(lambda v: classical_semantics(v.image), views))
+    found = classical_maps([v.image for v in views])
     return lambda i: (found[i], "saliency and edges")
 
 

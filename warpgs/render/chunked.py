@@ -53,7 +53,7 @@ def chunks(frame: ChunkedFrame, sources: tuple[torch.Tensor, ...]) -> Iterator[t
 
     Args:
         frame: Settings.
-        sources: The seven tensors that `project` takes, and the opacity factors if there are any; all detached.
+        sources: The seven tensors that `project` takes, with their shapes [...], and the opacity factors [N] if any; detached.
     """
     left = [frame.settings.window]
     while left:
@@ -116,7 +116,17 @@ class _BlendChunked(torch.autograd.Function):
 def contributions_chunked(
     projected: torch.Tensor, frame: ChunkedFrame, sources: tuple[torch.Tensor, ...]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return sum and maximum of each projected Gaussian's weights, as `contributions` does, chunk by chunk."""
+    """Compute sum and maximum of each projected Gaussian's weights, as `contributions` does, chunk by chunk.
+
+    Args:
+        projected: Result of `project` for the frame's window, shape [C, N, 12].
+        frame: Settings.
+        sources: The seven tensors that ``projected`` was projected from, with their shapes [...], and the opacity factors [N]
+            if there were any.
+
+    Returns:
+        Sums and maxima, shape [C, N] each.
+    """
     sums, maxima = torch.zeros_like(projected[..., 0]), torch.zeros_like(projected[..., 0])
     for (x, y, width, height), counts in chunks(frame, tuple(t.detach() for t in sources)):
         options = {"width": width, "height": height, "rule": frame.settings.rule, "origin": (x, y)}
@@ -139,9 +149,10 @@ def blend_chunked(
         projected: Result of `project` for the frame's window, shape [C, N, 12]; differentiable.
         backgrounds: Colour behind everything, shape [C, 3]; differentiable.
         frame: Settings.
-        sources: The seven tensors that ``projected`` was projected from, and the opacity factors if there were any.
+        sources: The seven tensors that ``projected`` was projected from, with their shapes [...], and the opacity factors [N]
+            if there were any.
 
     Returns:
-        ``rgb``, ``alpha`` and ``depth`` as `blend` returns them.
+        ``rgb`` [C, H, W, 3], ``alpha`` and ``depth`` [C, H, W], as `blend` returns them.
     """
     return _BlendChunked.apply(projected, backgrounds, frame, *(t.detach() for t in sources))

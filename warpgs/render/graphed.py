@@ -84,7 +84,7 @@ class GraphedRasterizer:
         """Return images, projected Gaussians and tile counts; None where the instances exceed the capacity.
 
         Args:
-            sources: The seven tensors that `project` takes.
+            sources: The seven tensors that `project` takes, with their shapes [...].
             backgrounds: Colour behind everything, shape [C, 3]; None for black.
         """
         viewmats, Ks = sources[5].contiguous(), sources[6].contiguous()
@@ -150,7 +150,7 @@ class GraphedRasterizer:
         return ()
 
     def blend_gradients(self, saved: tuple[torch.Tensor, ...], v_images, wants_backgrounds: bool):
-        """Return the gradients of projected Gaussians and backgrounds, the latter None where not wanted."""
+        """Return the gradients of projected Gaussians [C, N, 12] and backgrounds [C, 3], the latter None where not wanted."""
         v_images = [None if v is None else v.contiguous() for v in v_images]
         (v_projected,), _ = self._backward_blend(*saved, *v_images)
         if not wants_backgrounds:
@@ -159,7 +159,11 @@ class GraphedRasterizer:
         return v_projected, blend.background_gradient(transmittances, v_images[0])
 
     def project_gradients(self, saved: tuple[torch.Tensor, ...], v_projected: torch.Tensor | None, wants_camera: bool):
-        """Return the gradients of the seven tensors that `project` takes."""
+        """Return the gradients of the seven tensors that `project` takes, in their shapes [...].
+
+        Raises:
+            RuntimeError: The number of Gaussians has changed since they were rendered.
+        """
         *sources, cameras, projected, counts = saved
         if len(sources[0]) != projected.shape[1]:  # by way of `.data`, which autograd does not see
             raise RuntimeError(
@@ -237,7 +241,10 @@ class Recorder:
         """Key of the last call that exceeded its capacity, and its number of instances."""
 
     def render(self, sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor | None, settings: RenderSettings):
-        """Return what `GraphedRasterizer.render` returns; None where the call must run without graphs."""
+        """Return what `GraphedRasterizer.render` returns; None where the call must run without graphs.
+
+        ``sources`` are the seven tensors that `project` takes, with their shapes [...]; ``backgrounds`` [C, 3] may be None.
+        """
         key = None if self.graphs.failed else call_key(sources, backgrounds, settings)
         if key is None or not self.graphs.lock.acquire(blocking=False):
             return None
@@ -293,9 +300,10 @@ class Recorder:
 
 
 def call_key(sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor | None, settings: RenderSettings) -> tuple | None:
-    """Return the values that calls must share to share a rasterizer.
+    """Return the values that calls must have in common to use one rasterizer.
 
-    None for calls that cannot be captured, and for those that need not be: large ones, and those without gradients.
+    None for calls that cannot be captured, and for those that need not be: large ones, and those without gradients. ``sources``
+    are the seven tensors that `project` takes, with their shapes [...]; ``backgrounds`` [C, 3] may be None.
     """
     means, viewmats = sources[0], sources[5]
     small = 0 < len(means) * len(viewmats) <= MAX_PROJECTED

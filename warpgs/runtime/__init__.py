@@ -1,1 +1,1 @@
-"""What everything runs on: torch and Warp side by side, memory, CUDA graphs; the machine, its caches and its processes."""
+"""The platform: torch and Warp side by side, memory, CUDA graphs; the machine, its caches and its processes."""

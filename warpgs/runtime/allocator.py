@@ -21,15 +21,15 @@ class Allocator:
     """Provider of a function's tensors; this one asks torch for each."""
 
     def output(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-        """Return a tensor that the caller may keep."""
+        """Return a new tensor of a shape [...] that the caller may keep."""
         return torch.empty(shape, dtype=dtype, device=device)
 
     def saved(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-        """Return a tensor that the backward pass needs."""
+        """Return a new tensor of a shape [...] that the backward pass needs."""
         return torch.empty(shape, dtype=dtype, device=device)
 
     def workspace(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-        """Return a tensor that nobody needs when the function is done."""
+        """Return a new tensor of a shape [...] that is needed only until the function returns."""
         return torch.empty(shape, dtype=dtype, device=device)
 
 
@@ -52,18 +52,18 @@ class SizingAllocator(Allocator):
         """Sizes of all saved tensors, and of all workspace, with alignment."""
 
     def output(self, shape, dtype, device):
-        """See `Allocator`."""
+        """Return a new tensor of a shape [...], and note its shape."""
         tensor = super().output(shape, dtype, device)
         self.outputs.append((tensor.new_empty(0), tuple(shape)))
         return tensor
 
     def saved(self, shape, dtype, device):
-        """See `Allocator`."""
+        """Return a new tensor of a shape [...], and add its size to `saved_bytes`."""
         self.saved_bytes += _bytes(shape, dtype)
         return super().saved(shape, dtype, device)
 
     def workspace(self, shape, dtype, device):
-        """See `Allocator`."""
+        """Return a new tensor of a shape [...], and add its size to `workspace_bytes`."""
         self.workspace_bytes += _bytes(shape, dtype)
         return super().workspace(shape, dtype, device)
 
@@ -96,29 +96,29 @@ class Arena(Allocator):
         return *[t.data_ptr() for t in self.outputs], block, self._workspace.data_ptr()
 
     def place(self, tensor: torch.Tensor) -> tuple[int, tuple[int, ...], torch.dtype]:
-        """Return the place of a saved tensor: the arguments of `part` after the block."""
+        """Return the place of a saved tensor [...], the arguments of `part` after the block."""
         begin = tensor.data_ptr() - self.block.data_ptr() if tensor.numel() else 0  # without entries it has no address
         return begin, tuple(tensor.shape), tensor.dtype
 
     def output(self, shape, dtype, device):
-        """See `Allocator`."""
+        """Return the next of the output tensors, of the given shape [...]."""
         tensor = self.outputs[self._asked]
         self._asked += 1
         return tensor
 
     def saved(self, shape, dtype, device):
-        """See `Allocator`."""
+        """Return the next part of the block, as a tensor of a shape [...]."""
         begin, self._saved_to = self._saved_to, self._saved_to + _bytes(shape, dtype)
         return part(self.block, begin, shape, dtype)
 
     def workspace(self, shape, dtype, device):
-        """See `Allocator`."""
+        """Return the next part of the workspace, as a tensor of a shape [...]."""
         begin, self._workspace_to = self._workspace_to, self._workspace_to + _bytes(shape, dtype)
         return part(self._workspace, begin, shape, dtype)
 
 
 def part(block: torch.Tensor, begin: int, shape: tuple[int, ...], dtype: torch.dtype) -> torch.Tensor:
-    """Return a part of a block, from byte ``begin`` on, as a tensor."""
+    """Return a part of a block of bytes [B], from byte ``begin`` on, as a tensor of ``shape`` [...]."""
     return block[begin : begin + math.prod(shape) * dtype.itemsize].view(dtype).view(shape)
 
 
@@ -147,6 +147,6 @@ def fetch(table: int, first: int, out: torch.Tensor) -> None:
     Args:
         table: Address of a table of two addresses of float32 numbers, in memory that the device of ``out`` can read.
         first: Count of numbers at the first address; the rest is at the second.
-        out: Result, float32, contiguous.
+        out: Result, float32, contiguous, any shape.
     """
     interop.launch(_make_fetch(), out.numel(), [table, first, interop.view(out.view(-1), wp.float32)], out.device)

@@ -122,7 +122,7 @@ class GraphPool:
 
     @functools.cached_property
     def byte(self) -> torch.Tensor:
-        """An empty tensor of bytes on the device."""
+        """Empty tensor of bytes on the device, shape [0]."""
         return torch.empty(0, dtype=torch.uint8, device=self.device)
 
     def capturing(self) -> bool:
@@ -200,7 +200,7 @@ class GraphedFunction:
         return arena.outputs, arena.block
 
     def saved(self, block: torch.Tensor) -> list[torch.Tensor]:
-        """Return the tensors that the function returned when it filled this block."""
+        """Return the tensors [...] that the function returned when it filled a block [B]."""
         return [part(block, *place) for place in self._places]
 
     def _run(self, arena: Arena, inputs: tuple[torch.Tensor | None, ...]) -> None:

@@ -95,14 +95,14 @@ class View(NamedTuple):
     dtype: object
 
     def array(self) -> wp.array:
-        """Return the same memory as a Warp array, without a copy and without gradient."""
+        """Return the same memory as a Warp array of the tensor's shape [...], without a copy and without gradient."""
         for size in self.tensor.shape:
             _check_size(size)
         return wp.from_torch(self.tensor.detach(), dtype=self.dtype, requires_grad=False)
 
 
 def view(tensor: torch.Tensor, dtype) -> View:
-    """Return a contiguous tensor as a kernel argument of that element type."""
+    """Return a contiguous tensor of any shape as a kernel argument of that element type."""
     return View(tensor, dtype)
 
 

@@ -20,10 +20,12 @@ REMEDY = "Set WARP_CACHE_PATH to a folder of your own to keep compiled kernels"
 
 
 class KernelCache(NamedTuple):
-    """Where kernels are compiled to, without Warp's version, and why that is not the usual folder; empty where it is."""
+    """Folder of compiled kernels."""
 
     folder: Path
+    """Folder, without the part that names Warp's version."""
     refused: str
+    """Reason why the usual folder is not taken; empty where it is."""
 
 
 @functools.cache

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import ResourceError, UsageError
+from warpgs.geometry import matmul
 from warpgs.scene import Camera
 from warpgs.synthetic import raycast
 
@@ -51,7 +52,7 @@ def _texture(rng: np.random.Generator, low: str, high: str, period: float, kind:
 def _turn(x: float = 0.0, y: float = 0.0) -> np.ndarray:
     """Return the rotation by ``x`` degrees about the x axis, then by ``y`` degrees about the y axis, shape [3, 3]."""
     (cx, cy), (sx, sy) = np.cos(np.radians([x, y])), np.sin(np.radians([x, y]))
-    return np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]) @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    return matmul(np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]), np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]]))
 
 
 def still_life(seed: int = 0) -> list[raycast.Shape]:
@@ -106,7 +107,7 @@ def camera_path(views: int, width: int, height: int) -> list[Camera]:
         right /= np.linalg.norm(right)
         R = np.stack([right, np.cross(forward, right), forward])
         viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = R, -R @ center
+        viewmat[:3, :3], viewmat[:3, 3] = R, -matmul(R, center)
         out.append(Camera(viewmat, K, width, height))
     return out
 
@@ -121,7 +122,7 @@ def split_spec(views: int) -> str:
 
 def _project(camera: Camera, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return image positions [px], shape [N, 2], and depths [u], shape [N], of world points [u], shape [N, 3]."""
-    p = x @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    p = matmul(x, camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         xy = p[:, :2] / p[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
     return xy, p[:, 2]
@@ -204,7 +205,7 @@ def colmap_text(cameras: list[Camera], x: np.ndarray, colors: np.ndarray, seen: 
     """
 
     def join(values, digits: int) -> str:
-        return " ".join(f"{v:.{digits}f}" for v in values)
+        return " ".join(f"{v:z.{digits}f}" for v in values)  # z: a zero has no sign
 
     K, first = cameras[0].K, cameras[0]
     camera_lines = ["# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]

@@ -15,6 +15,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from warpgs.geometry import matmul
+
 BAND_RAYS = 40_000
 """Number of rays cast at once: the working set of a band stays in the second-level cache."""
 
@@ -54,7 +56,7 @@ class Texture:
                 product *= np.sin(p[:, axis] * dt.type(frequency) + dt.type(self.phases[axis]))
         mix = (0.5 + 0.5 * np.tanh(dt.type(self.softness) * product))[:, None]
         low, high = np.asarray(self.low, dt), np.asarray(self.high, dt)
-        ripple = np.sin(p @ self.waves.T.astype(dt) + self.phases[3:].astype(dt)) @ self.tints.astype(dt)
+        ripple = matmul(np.sin(matmul(p, self.waves.T.astype(dt)) + self.phases[3:].astype(dt)), self.tints.astype(dt))
         return np.clip(low + mix * (high - low) + ripple, 0.0, 1.0)
 
 
@@ -76,7 +78,7 @@ class Shape(abc.ABC):
 
     def local(self, x: np.ndarray) -> np.ndarray:
         """Return world positions [u], shape [N, 3], in the local frame."""
-        return (x - np.asarray(self.center, x.dtype)) @ self.rotation.astype(x.dtype)
+        return matmul(x - np.asarray(self.center, x.dtype), self.rotation.astype(x.dtype))
 
     @abc.abstractmethod
     def hit(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
@@ -124,8 +126,8 @@ class Sphere(Shape):
 
     def hit(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
         """See ``Shape.hit``."""
-        b = d @ o
-        root = b * b - (o @ o - self.size**2)
+        b = matmul(d, o)
+        root = b * b - (matmul(o, o) - self.size**2)
         t = -b - np.sqrt(np.maximum(root, 0))
         return np.where((root > 0) & (t > 0), t, np.inf).astype(d.dtype)
 
@@ -224,8 +226,8 @@ class Torus(Shape):
         """See ``Shape.hit``."""
         # Steps as long as the distance to the surface never jump through it: simpler than a quartic, and as exact.
         tolerance = 1e-5 if d.dtype == np.float32 else 1e-9
-        b = d @ o
-        half = np.sqrt(np.maximum(b * b - (o @ o - self.radius**2), 0))
+        b = matmul(d, o)
+        half = np.sqrt(np.maximum(b * b - (matmul(o, o) - self.radius**2), 0))
         out = np.full(len(d), np.inf, d.dtype)
         live = np.flatnonzero(half > 0)
         t, end = (-b - half)[live], (-b + half)[live]
@@ -280,11 +282,11 @@ def cast(shapes: Sequence[Shape], origin: np.ndarray, dirs: np.ndarray) -> tuple
         away = origin - np.asarray(shape.center)
         rows = slice(None)
         if np.isfinite(shape.radius):
-            along = dirs @ away.astype(dirs.dtype)
-            rows = np.flatnonzero(along * along > float(away @ away) - 1.001 * shape.radius**2)
+            along = matmul(dirs, away.astype(dirs.dtype))
+            rows = np.flatnonzero(along * along > float(matmul(away, away)) - 1.001 * shape.radius**2)
             if not len(rows):
                 continue
-        found = shape.hit((away @ shape.rotation).astype(dirs.dtype), dirs[rows] @ rotation)
+        found = shape.hit(matmul(away, shape.rotation).astype(dirs.dtype), matmul(dirs[rows], rotation))
         closer = found < t[rows]
         t[rows] = np.where(closer, found, t[rows])
         index[rows] = np.where(closer, np.int16(i), index[rows])
@@ -309,7 +311,7 @@ def shade(shapes: Sequence[Shape], light: Light, x: np.ndarray, index: np.ndarra
         if len(rows):
             p = shape.local(x[rows])
             rgb[rows] = shape.texture(p)
-            normals[rows] = shape.normal(p) @ shape.rotation.T.astype(x.dtype)
+            normals[rows] = matmul(shape.normal(p), shape.rotation.T.astype(x.dtype))
     to_light = np.asarray(light.direction, x.dtype)
     to_light = to_light / np.linalg.norm(to_light)
     lit, open_sky = np.ones(len(x), x.dtype), np.ones(len(x), x.dtype)
@@ -323,11 +325,11 @@ def shade(shapes: Sequence[Shape], light: Light, x: np.ndarray, index: np.ndarra
         square = np.einsum("ij,ij->i", away, away)
         facing = np.maximum(np.einsum("ij,ij->i", away, normals[rows]), 0) / np.sqrt(square)
         open_sky[rows] *= 1 - 0.85 * facing * np.minimum(bulk**2 / square, 1)
-        along = away @ to_light
+        along = matmul(away, to_light)
         clearance = (np.sqrt(np.maximum(square - along * along, 0)) - bulk) / np.maximum(along, 1e-3)
         edge = np.clip(0.5 + light.sharpness * clearance, 0, 1)
         lit[rows] *= np.where(along > 0, edge * edge * (3 - 2 * edge), 1)
-    brightness = light.ambient * open_sky + light.sun * lit * np.maximum(normals @ to_light, 0)
+    brightness = light.ambient * open_sky + light.sun * lit * np.maximum(matmul(normals, to_light), 0)
     return np.clip(rgb * brightness[:, None], 0, 1)
 
 
@@ -346,7 +348,7 @@ def pixel_rays(K: np.ndarray, viewmat: np.ndarray, xy: np.ndarray) -> np.ndarray
     d[:, 0] = (xy[:, 0] - K[0, 2]) / K[0, 0]
     d[:, 1] = (xy[:, 1] - K[1, 2]) / K[1, 1]
     d /= np.sqrt(np.einsum("ij,ij->i", d, d))[:, None]
-    return d @ viewmat[:3, :3].astype(xy.dtype)
+    return matmul(d, viewmat[:3, :3].astype(xy.dtype))
 
 
 def render(
@@ -366,7 +368,7 @@ def render(
     Returns:
         Colours in [0, 1], float32, shape [H, W, 3].
     """
-    origin = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    origin = -matmul(viewmat[:3, :3].T, viewmat[:3, 3])
     sub = (np.arange(width * samples, dtype=np.float32) + 0.5) / samples
     out = np.empty((height, width, 3), np.float32)
     rows = max(1, BAND_RAYS // (width * samples**2))

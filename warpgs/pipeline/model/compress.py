@@ -1,4 +1,4 @@
-"""Less model for the same pictures: merge neighbours, remove what is not needed, lower degrees, as far as a judge allows."""
+"""Smaller models for the same images: neighbours merged, the dispensable removed, degrees lowered, while a test accepts it."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from warpgs.render.rasterize import RasterizeOptions
 from warpgs.scene import Camera, Gaussians
 
 ROUNDS = 5
-"""Halvings of the interval in which the largest share is looked for."""
+"""Halvings of the interval in which the largest fraction is looked for."""
 PASSES = 8
-"""Most rounds of merging: 2^8 neighbours become one."""
+"""Most rounds of merging: up to 2^8 neighbours become one."""
 DEGREES_FRACTION, MERGE_FRACTION = 1 / 3, 2 / 3
-"""Parts of the allowed loss of a finished model that may be spent after lower degrees, and after merging; removing takes it
-whole."""
+"""Fractions of the allowed loss of a model that may be spent once degrees are lowered, and once neighbours are merged; removing
+may spend all of it."""
 RAMP = 3
-"""Rounds of merging over which the loss that they may spend grows to the whole."""
+"""Rounds of merging over which the loss that they may spend grows to all of it."""
 WORTHWHILE = 0.02
-"""A round of merging that takes a smaller part of the Gaussians than this is the last."""
+"""Fraction of the Gaussians that a round of merging must take; two rounds in a row that take less are the last."""
 
 
 def largest_fraction(accepted: Callable[[float], bool], rounds: int = ROUNDS) -> float:
-    """The largest share in [0, 1] that is accepted, by bisection; 1 is tried first, 0 is taken without asking.
+    """Return the largest fraction in [0, 1] that is accepted, by bisection; 1 is tried first, 0 is taken without asking.
 
-    What is returned was itself asked for and accepted, or is 0: no promise rests on acceptance being monotone.
+    The fraction returned was itself accepted, or is 0, so acceptance need not be monotone.
     """
     if accepted(1.0):
         return 1.0
@@ -42,58 +42,70 @@ def largest_fraction(accepted: Callable[[float], bool], rounds: int = ROUNDS) ->
 
 
 def _ranks(values: torch.Tensor) -> torch.Tensor:
-    """Place of each value [N] in ascending order, equal values by number, int64."""
+    """Return the place of each value [N] in ascending order, equal values by row, int64 [N]."""
     places = torch.empty(len(values), dtype=torch.int64, device=values.device)
     places[torch.argsort(values, stable=True)] = torch.arange(len(values), device=values.device)
     return places
 
 
 def prune_order(maxima: torch.Tensor, sensitivity: torch.Tensor) -> torch.Tensor:
-    """Numbers of the Gaussians, the one to remove first first, int64 [N].
+    """Return the rows of the Gaussians in the order in which they may be removed, int64 [N].
 
     A Gaussian's place is the later of its places by largest contribution and by Fisher sensitivity: one goes only where both
     call it dispensable, so neither the thin nor the faint but wide is lost to one score alone.
+
+    Args:
+        maxima: Largest blending weight of each, shape [N].
+        sensitivity: Result of `fisher`, shape [N].
     """
     return torch.argsort(torch.maximum(_ranks(maxima), _ranks(sensitivity)), stable=True)
 
 
 def keep_last(order: torch.Tensor, fraction: float) -> torch.Tensor:
-    """Numbers in ascending order of what stays when the first ``fraction`` of an order goes; at least one stays."""
+    """Return the rows that stay when the first ``fraction`` of an order goes; at least one stays.
+
+    Args:
+        order: Rows, int64, shape [N].
+        fraction: Part that goes, in [0, 1].
+
+    Returns:
+        Rows in ascending order, int64, shape [K].
+    """
     return order[min(len(order) - 1, int(fraction * len(order))) :].sort().values
 
 
 def rows_of(gaussians: Gaussians, keep: torch.Tensor) -> Gaussians:
-    """The Gaussians with these numbers."""
+    """Return the Gaussians of the rows ``keep``, int64 or bool [N]."""
     return Gaussians(**{n: t[keep] for n, t in gaussians.tensors().items()})
 
 
 def changed(gaussians: Gaussians, change: DensityUpdate) -> Gaussians:
-    """The set after a change."""
+    """Return the set of Gaussians after a change."""
     return Gaussians(**{n: torch.cat([t[change.keep], change.added[n]]) for n, t in gaussians.tensors().items()})
 
 
 def with_degrees(gaussians: Gaussians, degrees: torch.Tensor) -> Gaussians:
-    """The same Gaussians without coefficients above their degrees [N]."""
+    """Return the same Gaussians with zeros for coefficients above their degrees [N]."""
     return Gaussians(**(gaussians.tensors() | {"sh": truncated(gaussians.sh, degrees)}))
 
 
 def degree_order(gaussians: Gaussians, seen: Coverage) -> torch.Tensor:
-    """Numbers of the Gaussians, the one that needs its harmonics least first, int64 [N].
+    """Return the rows of the Gaussians, those that need their harmonics least first, int64 [N].
 
-    By energy above degree 0 times the largest contribution: in an orthonormal basis the sum of squares is, up to a constant,
-    the variance of the colour over directions.
+    The order is by energy above degree 0 times the largest contribution: in an orthonormal basis the sum of squares is, up to a
+    constant, the variance of the colour over directions.
     """
     return torch.argsort(gaussians.sh[:, 1:].square().sum((1, 2)).sqrt() * seen.maxima, stable=True)
 
 
 def stored_degrees(sh: torch.Tensor) -> torch.Tensor:
-    """Highest degree of each Gaussian's coefficients [N, K, 3] that is not all zero, int32 [N]."""
+    """Return the highest degree at which coefficients [N, K, 3] of each Gaussian are not all zero, int32 [N]."""
     bands = torch.arange(sh.shape[1], device=sh.device).add(0.5).sqrt().to(torch.int32)
     return torch.where((sh != 0).any(2), bands, 0).amax(1)
 
 
 def drop_unused_sh(gaussians: Gaussians) -> Gaussians:
-    """The same Gaussians without the bands that none of them uses; a file has one number of coefficients for all."""
+    """Return the same Gaussians without the degrees that none of them uses; a file has one number of coefficients for all."""
     degrees = stored_degrees(gaussians.sh)
     highest = int(degrees.max()) if len(degrees) else 0
     return Gaussians(**(gaussians.tensors() | {"sh": gaussians.sh[:, : (highest + 1) ** 2].contiguous()}))
@@ -101,23 +113,26 @@ def drop_unused_sh(gaussians: Gaussians) -> Gaussians:
 
 @dataclass(frozen=True)
 class ViewSet:
-    """How the training views look at a model."""
+    """The training views, as measurements on a model use them."""
 
     cameras: list[Camera]
+    """Cameras with tensors on the device of the model."""
     options: RasterizeOptions
+    """Settings that they are rendered with."""
     seed: int
+    """Seed of the random signs of `fisher`."""
 
     def coverage(self, gaussians: Gaussians) -> Coverage:
-        """See `coverage`."""
+        """Return what these views see of each Gaussian, as `coverage` measures it."""
         return coverage(gaussians, self.cameras, self.options)
 
     def fisher(self, gaussians: Gaussians) -> torch.Tensor:
-        """See `fisher`."""
+        """Return how sensitive these views are to each Gaussian, as `fisher` estimates it, shape [N]."""
         return fisher(gaussians, self.cameras, self.options, self.seed)
 
 
 def cheapest(gaussians: Gaussians, pairs: Merges, accepted: Callable[[Gaussians], bool]) -> int:
-    """How many of the pairs, the cheapest first, may become one."""
+    """Return how many of the pairs, the cheapest first, may be merged so that the result is accepted."""
     count, total = len(gaussians), len(pairs.first)
     return int(total * largest_fraction(lambda s: accepted(changed(gaussians, pairs.change(count, int(s * total))))))
 
@@ -131,8 +146,8 @@ def merge_neighbours(
         gaussians: The set.
         kinds: Only Gaussians of the same number are paired, int, shape [N].
         view_set: Training views.
-        accepted: Whether a model is good enough when that part [0, 1] of the allowed loss may be spent. It grows over the first
-            `RAMP` rounds, for the cheapest pairs of the second are cheaper than the dearest of the first.
+        accepted: Test whether a model is good enough when a fraction in [0, 1] of the allowed loss may be spent. The fraction
+            grows over the first `RAMP` rounds: the cheapest pairs of the second are cheaper than the dearest of the first.
 
     Returns:
         The smaller set, and the row of it that each Gaussian went into, int64 [N].
@@ -157,7 +172,7 @@ def merge_neighbours(
 
 
 def dispensable(gaussians: Gaussians, view_set: ViewSet, accepted: Callable[[Gaussians], bool]) -> torch.Tensor:
-    """Numbers of the Gaussians that stay, ascending, when as many of the others go as the judge accepts."""
+    """Return the rows that stay, ascending, when as many of the others go as ``accepted`` allows, int64 [K]."""
     order = prune_order(view_set.coverage(gaussians).maxima, view_set.fisher(gaussians))
     return keep_last(order, largest_fraction(lambda s: accepted(rows_of(gaussians, keep_last(order, s)))))
 
@@ -165,7 +180,17 @@ def dispensable(gaussians: Gaussians, view_set: ViewSet, accepted: Callable[[Gau
 def needed_degrees(
     gaussians: Gaussians, highest: torch.Tensor, view_set: ViewSet, accepted: Callable[[Gaussians], bool]
 ) -> torch.Tensor:
-    """Degree of each Gaussian, int32 [N]: 0 for as many as the judge accepts, the others keep up to ``highest`` [N]."""
+    """Return the degree of each Gaussian: 0 for as many as ``accepted`` allows, the others keep up to ``highest``.
+
+    Args:
+        gaussians: N Gaussians.
+        highest: Degree that each may keep, int, shape [N].
+        view_set: Training views.
+        accepted: Test whether a model is good enough.
+
+    Returns:
+        Degrees, int32, shape [N].
+    """
     order = degree_order(gaussians, view_set.coverage(gaussians))
     degrees = torch.minimum(stored_degrees(gaussians.sh), highest.to(torch.int32))
 
@@ -186,7 +211,7 @@ class Pruned:
     degrees: torch.Tensor
     """Degree of each, int32, shape [N], ascending."""
     into: torch.Tensor
-    """Row that each Gaussian of the larger model went into, -1 where it was removed, int64."""
+    """Row that each Gaussian of the larger model went into, -1 where it was removed, int64, shape [N]."""
 
 
 def prune_model(
@@ -198,10 +223,10 @@ def prune_model(
         gaussians: N Gaussians.
         kinds: Only Gaussians of the same number are merged, int, shape [N].
         view_set: The training views.
-        accepted: Whether a model is good enough when that share [0, 1] of the allowed loss may be spent.
+        accepted: Test whether a model is good enough when a fraction in [0, 1] of the allowed loss may be spent.
 
     Returns:
-        The smaller model, which was accepted with a share of 1; the model itself where nothing may go.
+        The smaller model, which was accepted with fraction 1; the model itself where nothing may go.
     """
     degrees, model = stored_degrees(gaussians.sh), gaussians
     if bool((degrees > 0).any()):

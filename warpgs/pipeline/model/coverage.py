@@ -1,4 +1,4 @@
-"""What the training views know of each Gaussian: how much it contributes, who sees it from where, how much it matters."""
+"""Coverage of a model by the training views: contribution, viewing directions and sensitivity of each Gaussian."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
 
 SEEN = 4 / 255
-"""Largest blending weight from which a view sees a Gaussian: below, it changes no pixel by more than four of 255 levels."""
+"""Least blending weight at which a view sees a Gaussian: below, it changes no pixel by more than four of 255 levels."""
 CONE = math.radians(5)
 """Least angle of the cone of view directions for each band of harmonics. Over a smaller one the band changes by less than a
 twelfth of its range, and its coefficients answer for the noise of the photographs instead."""
@@ -24,7 +24,7 @@ class Coverage:
     """Per Gaussian, over all training views; tensors of shape [N] on the device of the Gaussians."""
 
     maxima: torch.Tensor
-    """Largest blending weight over all pixels of all views (RadSplat, 2403.13806: maximum, for sums delete what is thin)."""
+    """Largest blending weight over all pixels of all views (RadSplat, arXiv 2403.13806; a sum is small for thin Gaussians)."""
     views: torch.Tensor
     """Number of views with a weight of at least `SEEN`, int64."""
     cone: torch.Tensor
@@ -33,18 +33,18 @@ class Coverage:
     """Width of a pixel at the Gaussian in the nearest of those views [u]; 0 where no view sees it."""
 
     def supported_degree(self) -> torch.Tensor:
-        """Highest degree that the views can tell apart, int64 [N]: d needs d + 1 views within a cone of at least d `CONE`."""
+        """Return the highest degree that the views can tell apart, int64 [N]: d needs d + 1 views in a cone of d `CONE`."""
         return torch.minimum((self.views - 1).clamp_min(0), (self.cone / CONE).long()).clamp_max(3)
 
 
 @torch.no_grad()
 def coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> Coverage:
-    """Render every view once and see what each Gaussian has of it.
+    """Render every view once and measure what it sees of each Gaussian.
 
     Args:
         gaussians: N Gaussians.
-        cameras: Of the training views, tensors.
-        options: How to draw.
+        cameras: Cameras of the training views, tensors.
+        options: Settings of the rasterizer.
     """
     count, means = len(gaussians), gaussians.means
     maxima, views = means.new_zeros(count), torch.zeros(count, dtype=torch.int64, device=means.device)
@@ -76,17 +76,20 @@ def _directions(means: torch.Tensor, camera: Camera) -> torch.Tensor:
 
 @torch.enable_grad()  # whoever asks may have switched gradients off, as the trainer does when the set changes
 def fisher(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions, seed: int) -> torch.Tensor:
-    """How much the pictures change when a Gaussian is moved by its own width or its axes grow, shape [N], at least 0.
+    """Estimate how much the images change when a Gaussian moves by its own width or its axes grow.
 
-    The trace of PUP-3DGS' sensitivity (2406.10219, eq. 6: the sum over pixels of the outer product of the colour's gradient in
-    mean and scale), in units of the Gaussian's width, where PUP has the log-determinant. Estimated: with random signs e as the
-    gradient of a picture, the backward pass gives J^T e, and the mean of its square is the diagonal of J^T J.
+    The trace of PUP-3DGS' sensitivity (arXiv 2406.10219, eq. 6: the sum over pixels of the outer product of the gradient of the
+    colour in mean and scale), in units of the Gaussian's width, where PUP has the log-determinant. With random signs e as the
+    gradient of an image, the backward pass gives J^T e, and the mean of its square is the diagonal of J^T J.
 
     Args:
         gaussians: N Gaussians.
-        cameras: Of the training views, tensors.
-        options: How to draw.
-        seed: Decides the signs, the same on every device.
+        cameras: Cameras of the training views, tensors.
+        options: Settings of the rasterizer.
+        seed: Seed of the signs, the same on every device.
+
+    Returns:
+        Sensitivities, at least 0, shape [N].
     """
     leaves = {n: t.detach().clone().requires_grad_(n in ("means", "log_scales")) for n, t in gaussians.tensors().items()}
     width = leaves["log_scales"].detach().exp().amax(1, keepdim=True)

@@ -1,7 +1,7 @@
-"""The coarse start: one Gaussian per pixel with a confirmed depth, coarser ones where no other view confirms any.
+"""The coarse start: one Gaussian per pixel with geometrically consistent depth, coarser ones where no other view confirms any.
 
-The paper's first level ("initialized using the method proposed in" NexusGS). Sources, merging and filling were measured in
-docs/decisions/007-coarse-start.md.
+The paper's first level ("initialized using the method proposed in" NexusGS, Zheng et al. 2025). Sources, merging and filling
+were measured in docs/decisions/007-coarse-start.md.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from warpgs.priors.completion import complete
 from warpgs.scene import Camera, PointCloud, View, ViewDepth
 
 FREE_SPACE = 0.95
-"""A filled point nearer to another view than this share of the depth found there would hide what that view sees."""
+"""A filled point nearer to another view than this fraction of the depth found there would hide what that view sees."""
 NEAR_FRACTION, FAR_FRACTION = 1 / 1.3, 3.0
-"""Planes reach from this much of the 2nd to this much of the 98th percentile of the depths of known points: what is far takes
-few planes, what is near many."""
+"""Multiples of the 2nd and of the 98th percentile of the depths of known points between which planes lie: what is far takes few
+planes, what is near many."""
 MIN_KNOWN = 10
 """Known points that a view must hold to bound its depths."""
 
 
 def depth_bounds(view: View, known: np.ndarray, default: tuple[float, float]) -> tuple[float, float]:
-    """Nearest and farthest depth [u] to search in a view, from known points [N, 3], or ``default`` where it holds too few."""
+    """Return the range of depths [u] to search in a view, from known points [N, 3], or ``default`` where it holds too few."""
     _, z = geometry.project_points(view.camera, known)
     z = z[geometry.in_image(view.camera, known)]
     if len(z) < MIN_KNOWN:
@@ -36,9 +36,10 @@ def depth_bounds(view: View, known: np.ndarray, default: tuple[float, float]) ->
 
 
 def merge_cells(points: np.ndarray, widths: np.ndarray) -> np.ndarray:
-    """Number of the grid cell of each point, int64 [N]: cells are as wide as ``widths`` [N] [u], to the next power of two.
+    """Return the number of the grid cell of each point [N, 3], int64 [N].
 
-    Points of unequal width (far and near ones) live on grids of unequal fineness, so every cell is a few pixels wide.
+    Cells are as wide as ``widths`` [N] [u], rounded to a power of two. Points of unequal width (far and near ones) lie on grids
+    of unequal fineness, so every cell is a few pixels wide.
     """
     level = np.round(np.log2(widths)).astype(np.int64)
     cells = np.column_stack([level, np.floor(points / np.exp2(level)[:, None]).astype(np.int64)])
@@ -51,7 +52,13 @@ def merge_cells(points: np.ndarray, widths: np.ndarray) -> np.ndarray:
 
 
 def merge(points: np.ndarray, colors: np.ndarray, cells: np.ndarray) -> PointCloud:
-    """The mean point [N, 3] and colour [N, 3] of every cell, in the order of the cells' numbers [N]."""
+    """Return the mean point and colour of every cell, in the order of the cells' numbers.
+
+    Args:
+        points: Positions [u], shape [N, 3].
+        colors: Colours in [0, 1], shape [N, 3].
+        cells: Number of each point's cell, int64, shape [N].
+    """
     _, cells, counts = np.unique(cells, return_inverse=True, return_counts=True)
     counts = counts[:, None]
 
@@ -62,7 +69,7 @@ def merge(points: np.ndarray, colors: np.ndarray, cells: np.ndarray) -> PointClo
 
 
 def in_free_space(points: np.ndarray, views: Sequence[View], depths: Sequence[np.ndarray], without: int) -> np.ndarray:
-    """True where a point [N, 3] stands before the depths [H, W] (0: none) of a view other than number ``without``."""
+    """Return a mask [N], True where a point [N, 3] lies before the depths [H, W] (0: none) of a view other than ``without``."""
     hides = np.zeros(len(points), bool)
     for j, (view, depth) in enumerate(zip(views, depths)):
         if j == without:
@@ -75,7 +82,7 @@ def in_free_space(points: np.ndarray, views: Sequence[View], depths: Sequence[np
 
 
 def _lift(view: View, depth: np.ndarray, where: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """World points [N, 3], colours [N, 3] and pixel footprints [N] [u] of the pixels that ``where`` [H, W] names."""
+    """Return world points [N, 3] [u], colours [N, 3] and pixel footprints [N] [u] of the pixels of a mask ``where`` [H, W]."""
     rows, columns = np.nonzero(where)
     z = depth[rows, columns].astype(float)
     points = geometry.back_project(view.camera, np.stack([columns, rows], 1) + 0.5, z)
@@ -83,32 +90,32 @@ def _lift(view: View, depth: np.ndarray, where: np.ndarray) -> tuple[np.ndarray,
 
 
 def focal_length(camera: Camera) -> float:
-    """Geometric mean of both focal lengths [px]."""
+    """Return the geometric mean of both focal lengths [px]."""
     return float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
 
 
 def coarse_points(
     views: Sequence[View], depths: Sequence[ViewDepth], *, merge_px: float, fill_px: float, source: str
 ) -> tuple[PointCloud, list[str]]:
-    """The points of the coarse start.
+    """Return the points of the coarse start, and notes on them.
 
     Args:
         views: Training views.
-        depths: Confirmed depth of each.
-        merge_px: Width of the cells in which confirmed points become one [px]; 0 keeps every pixel.
-        fill_px: Width of the cells of points where no depth is confirmed [px]; 0 leaves those places empty. Their depths are
-            those of `complete`; none stands in space that another view looks through, nor beside a confirmed point.
-        source: Word for the notes.
+        depths: Geometrically consistent depth of each, confirmed by other views.
+        merge_px: Width of the cells in which consistent points become one [px]; 0 keeps every pixel.
+        fill_px: Width of the cells of points where no depth is consistent [px]; 0 leaves those places empty. Their depths are
+            those of `complete`; none lies in space that another view looks through, nor beside a consistent point.
+        source: Name of the source in the notes, sweep or flow.
 
     Returns:
-        The cloud, confirmed points first, empty where no depth is valid; and notes: one per view ("image001.png: 71 % of pixels
-        by flow, 20 % filled") and one on the merged cloud.
+        The cloud, consistent points first, empty where no depth is valid; and notes: one per view ("image001.png: 71 % of
+        pixels by flow, 20 % filled") and one on the merged cloud.
     """
     regions = [counted_region(v) for v in views]
-    sures = [d.valid if r is None else d.valid & r for d, (r, _) in zip(depths, regions)]
-    completed = [complete(d.depth, s, v.image) for v, d, s in zip(views, depths, sures)] if fill_px > 0 else []
-    found, guessed, notes = [], [], []
-    for i, (view, depth, sure, (region, name)) in enumerate(zip(views, depths, sures, regions)):
+    consistent = [d.valid if r is None else d.valid & r for d, (r, _) in zip(depths, regions)]
+    completed = [complete(d.depth, s, v.image) for v, d, s in zip(views, depths, consistent)] if fill_px > 0 else []
+    found, filled_in, notes = [], [], []
+    for i, (view, depth, sure, (region, name)) in enumerate(zip(views, depths, consistent, regions)):
         found.append(_lift(view, depth.depth, sure))
         total = sure.size if region is None else region.sum()
         text = f"{view.name}: {_fraction(sure.sum(), total)} of {'pixels' if region is None else f'the {name}'} by {source}"
@@ -116,14 +123,14 @@ def coarse_points(
             free = ~sure & (completed[i] > 0) if region is None else ~sure & region & (completed[i] > 0)
             points, colors, widths = _lift(view, completed[i], free)
             keep = ~in_free_space(points, views, completed, i)
-            guessed.append((points[keep], colors[keep], widths[keep]))
+            filled_in.append((points[keep], colors[keep], widths[keep]))
             text += f", {_fraction(keep.sum(), total)} filled"
         notes.append("; ".join((text, *depth.notes)))
     points, colors, widths = (np.concatenate(a) for a in zip(*found))
     cloud = merge(points, colors, merge_cells(points, merge_px * widths) if merge_px > 0 else np.arange(len(points)))
     filled = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
     if fill_px > 0:
-        more, more_colors, more_widths = (np.concatenate(a) for a in zip(*guessed))
+        more, more_colors, more_widths = (np.concatenate(a) for a in zip(*filled_in))
         cells = merge_cells(np.concatenate([points, more]), fill_px * np.concatenate([widths, more_widths]))
         alone = ~np.isin(cells[len(points) :], cells[: len(points)])
         filled = merge(more[alone], more_colors[alone], cells[len(points) :][alone])

@@ -1,4 +1,4 @@
-"""The first Gaussians: from depths that views confirm, the reconstruction's points, or at random where cameras look."""
+"""The first Gaussians: from depths that views confirm, from the reconstruction's points, or at random where cameras look."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ from warpgs.scene import Camera, Gaussians, PointCloud, View, ViewDepth
 
 SOURCES = ("auto", "sweep", "flow", "points", "random")
 MIN_POINTS = 100
-"""With fewer sparse points a random start is better: they leave most of the picture empty."""
+"""Fewest sparse points to start from: fewer leave most of the image empty, and a random start is better."""
 MIN_MATCHES = 10
-"""Matched points that a view must hold to guide its random points."""
+"""Fewest matched points of a view from which its random points take their depths."""
 NEIGHBORS = 5
 """Matched points that a random pixel takes its depth from."""
 PAIRS = 2**20
-"""Distances that are held at a time while neighbours are looked for."""
+"""Distances that are held at a time while neighbours are searched."""
 DEPTH_SPREAD = 0.1
 """Standard deviation of the logarithm of depth around a matched point."""
 
 
 @dataclass(frozen=True)
 class InitConfig:
-    """Where the first Gaussians come from."""
+    """Source and first values of the Gaussians."""
 
     source: str = "auto"
-    """sweep or flow (a point per pixel whose depth other views confirm), points (the reconstruction's), random, or auto: sweep
-    for few views, else points where the scene has at least 100 that training views saw, else random."""
+    """Source: sweep or flow (a point per pixel whose depth other views confirm), points (those of the reconstruction), random,
+    or auto: sweep for few views, else points where the scene has at least 100 that training views saw, else random."""
     sweep_up_to: int = 0
-    """auto: most views that are swept, which takes a second a view on two cores."""
+    """auto: most training views from which a fit starts with a sweep, which takes a second a view on two cores."""
     random_count: int = 20_000
     """Number of random points."""
     opacity: float = 0.1
@@ -55,9 +55,9 @@ class InitConfig:
     near_views: int = 4
     """sweep, flow: nearest other views that each view is matched with."""
     merge_px: float = 4.0
-    """sweep, flow: width of the cells in which confirmed points become one [px]; 0 keeps one for every pixel."""
+    """sweep, flow: width of the cells in which consistent points become one [px]; 0 keeps one for every pixel."""
     fill_px: float = 16.0
-    """sweep, flow: width of the cells of points where no depth is confirmed [px]; 0 leaves those places empty."""
+    """sweep, flow: width of the cells of points where no depth is consistent [px]; 0 leaves those places empty."""
     flow: str = "dis"
     """flow: dis, deepflow, sparse, a folder of .flo files or an ONNX file (images in, flow out)."""
     flow_range: str = "255"
@@ -86,22 +86,27 @@ class InitConfig:
             raise UsageError(f"init random count {self.random_count} must be at least 1")
 
     def epipolar(self) -> EpipolarConfig:
-        """The part that decides about flow."""
+        """Return the settings of depth from flow.
+
+        Raises:
+            UsageError: One of them is out of range.
+        """
         return EpipolarConfig(max_residual=self.max_residual, near_count=self.near_views, blend=self.blend)
 
 
 class Start(NamedTuple):
-    """What a fit starts from."""
+    """The points that a fit starts from."""
 
     cloud: PointCloud
+    """Positions and colours."""
     how: str
-    """Where it comes from, for the user."""
+    """Source of the points, for the user."""
     depths: list[ViewDepth] | None = None
-    """Depth of each view that the others confirm, where it was looked for."""
+    """Geometrically consistent depth of each view; None where none was computed."""
 
 
 def camera_depths(views: list[View]) -> tuple[float, float]:
-    """Near and far depth [u] where nothing else is known: 0.1 and 10 times the distance to the cameras' focus point.
+    """Return near and far depth [u] where nothing else is known: 0.1 and 10 times the distance to the cameras' focus point.
 
     Cameras in one place with one direction have no such point; then it is one unit, which the scene's scale was chosen for.
     """
@@ -112,7 +117,7 @@ def camera_depths(views: list[View]) -> tuple[float, float]:
 
 
 def nearest(points: np.ndarray, queries: np.ndarray, count: int) -> np.ndarray:
-    """Numbers of the ``count`` points [P, 2] nearest to each query [Q, 2], the nearest first, int64 [Q, count]."""
+    """Return the rows of the ``count`` points [P, 2] nearest to each query [Q, 2], the nearest first, int64 [Q, count]."""
     known, asked = torch.from_numpy(points), torch.from_numpy(queries)
     found = []
     # every pair, some rows at a time: a few hundred points take less time than importing a library of search trees
@@ -123,7 +128,7 @@ def nearest(points: np.ndarray, queries: np.ndarray, count: int) -> np.ndarray:
 
 
 class _Depths:
-    """Draws depths for pixels of one view: near those of matched points around the pixel, else anywhere the cameras allow."""
+    """Random depths for pixels of one view: near those of matched points around the pixel, else anywhere the cameras allow."""
 
     def __init__(self, view: View, matched: PointCloud, bounds: tuple[float, float]):
         seen = geometry.in_image(view.camera, matched.points)
@@ -131,8 +136,11 @@ class _Depths:
         self.pixels, self.known, self.bounds = pixels[seen], self.known[seen], bounds
         self.depth_supervised = len(self.known) >= MIN_MATCHES
 
-    def draw(self, pixels: np.ndarray, wanted: int, generator: np.random.Generator) -> np.ndarray:
-        """Depths [u] of the first ``wanted`` pixels. Random numbers are drawn for all, so one does not depend on how many."""
+    def sample(self, pixels: np.ndarray, wanted: int, generator: np.random.Generator) -> np.ndarray:
+        """Return depths [u] of the first ``wanted`` pixels, shape [wanted].
+
+        Random numbers are sampled for all pixels [N, 2], so that a depth does not depend on how many are wanted.
+        """
         count = len(pixels)
         if not self.depth_supervised:
             near, far = self.bounds
@@ -143,7 +151,7 @@ class _Depths:
 
 
 def empty_votes(views: list[View], regions: list[tuple[np.ndarray | None, str]], points: np.ndarray) -> np.ndarray:
-    """How many views see each point [N, 3] before the black around an object, int [N]: the visual hull has none."""
+    """Count the views that see each point [N, 3] before the black around an object, int [N]: the visual hull has none."""
     votes = np.zeros(len(points), int)
     for view, (region, name) in zip(views, regions):
         if name != "foreground":
@@ -156,13 +164,15 @@ def empty_votes(views: list[View], regions: list[tuple[np.ndarray | None, str]],
 
 
 def random_points(views: list[View], count: int, generator: np.random.Generator) -> tuple[PointCloud, str]:
-    """Points behind random pixels of the training views, with those pixels' colours.
+    """Return points behind random pixels of the training views with the pixels' colours, and a sentence on how they were made.
 
     A view in which at least 10 triangulated SIFT matches lie takes each depth from one of the 5 matches nearest to the pixel,
-    spread by a tenth (docs/decisions/003-random-start.md); any other view draws inverse depths uniformly, and keeps points
+    spread by a tenth (docs/decisions/003-random-start.md); any other view samples inverse depths uniformly, and keeps points
     that a second view sees where there are any. Where views show an object on black, points start on the object, and those
-    that fewest views see before black come first: nothing stands in empty space. Returns the cloud and a sentence on how it
-    was made.
+    that fewest views see before black come first, so that none lies in empty space.
+
+    Raises:
+        DataError: Masks leave no pixel of any training view.
     """
     regions = [counted_region(v) for v in views]
     matched = triangulate_matches(views)
@@ -181,7 +191,7 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
         elsewhere = not source.depth_supervised and len(views) > 1
         # where none is better than another, the first are taken, and the others need no depth
         useful = len(pixels) if elsewhere or any(name == "foreground" for _, name in regions) else wanted
-        candidates = geometry.back_project(view.camera, pixels[:useful], source.draw(pixels, useful, generator))
+        candidates = geometry.back_project(view.camera, pixels[:useful], source.sample(pixels, useful, generator))
         worse = empty_votes(views, regions, candidates)
         if elsewhere:
             worse += sum(geometry.in_image(v.camera, candidates).astype(int) for v in views) < 2
@@ -192,7 +202,7 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
     if not points:
         raise DataError("no random start: every pixel of the training views is masked out; check the masks' polarity")
     depth_supervised = sum(s.depth_supervised for s in sources)
-    how = f"{count:,} random points, {depth_supervised} of {len(views)} views guided by {len(matched):,} matched points"
+    how = f"{count:,} random points, {depth_supervised} of {len(views)} views with depths from {len(matched):,} matched points"
     objects = sum(name == "foreground" for _, name in regions)
     if objects:
         how += f", on the object that {objects} views show on black"
@@ -202,9 +212,13 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
 def consistent_depths(
     views: list[View], known: PointCloud, config: InitConfig, device: Callable[[], torch.device] = lambda: CPU
 ) -> list[ViewDepth]:
-    """Depth of each of at least two views that the others confirm, by flow or by sweeping planes between ``known`` points.
+    """Return the geometrically consistent depth of each of at least two views, by flow or by sweeping planes.
 
-    ``device`` gives where to sweep, once that may be used.
+    Args:
+        views: Training views.
+        known: Points that bound the planes.
+        config: Source and its settings.
+        device: Returns the device to sweep on, once it may be used.
     """
     if config.source == "flow":
         between = flow_between(views, config.flow, config.flow_range)
@@ -218,9 +232,9 @@ def consistent_points(
     views: list[View], points: PointCloud, config: InitConfig, generator: np.random.Generator,
     device: Callable[[], torch.device],
 ) -> Start:  # fmt: skip
-    """Points behind pixels whose depth other views confirm, and what was found in which view, a line each.
+    """Return points behind pixels whose depth other views confirm, and a line on each view.
 
-    Where a random start has more points than that, it is taken instead, and the reason said.
+    With fewer than `MIN_POINTS` such points the start is random, and says why.
     """
     reason, depths = "a single view has no other to compare with", None
     if len(views) > 1:
@@ -234,18 +248,22 @@ def consistent_points(
 
 
 def seen_points(views: list[View], points: PointCloud | None) -> PointCloud:
-    """The reconstruction's points that the views saw; none where there is no reconstruction."""
+    """Return the reconstruction's points that the views saw; none where there is no reconstruction."""
     nothing = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
     return nothing if points is None else points.seen_by({v.name for v in views})
 
 
 def sweeps(config: InitConfig, views: int) -> bool:
-    """Whether a fit of that many views starts from a sweep."""
+    """Return whether a fit of that many views starts from a sweep."""
     return config.source == "sweep" or (config.source == "auto" and 2 <= views <= config.sweep_up_to)
 
 
 def check_points(views: list[View], points: PointCloud | None, config: InitConfig) -> None:
-    """Raise DataError where points are asked for and the scene has none that the training views saw."""
+    """Refuse a start from points where the scene has none that the training views saw.
+
+    Raises:
+        DataError: There are none, and ``config`` asks for them.
+    """
     if config.source == "points" and len(seen_points(views, points)) == 0:
         raise DataError(
             "the scene holds no 3D points that the training views saw, and --init.source points asks for them; "
@@ -257,7 +275,7 @@ def initial_points(
     views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator,
     device: Callable[[], torch.device] = lambda: CPU,
 ) -> Start:  # fmt: skip
-    """The points to start from; ``device`` gives where to sweep, once that may be used.
+    """Return the points to start from; ``device`` returns the device to sweep on, once it may be used.
 
     Raises:
         DataError: Points were asked for and the scene has none that the training views saw.
@@ -277,17 +295,17 @@ def initial_points(
 
 
 def subsample(start: Start, most: int, generator: np.random.Generator) -> Start:
-    """The start with no more points than that, drawn at random; their Gaussians are wider as they lie farther apart."""
+    """Return the start with at most that many points, sampled at random; their Gaussians are wider, since they are sparser."""
     count = len(start.cloud)
     if count <= most:
         return start
     keep = np.sort(generator.permutation(count)[:most])
-    how = f"{start.how}\n{most:,} of these {count:,} points, drawn at random: --max-gaussians is {most:,}"
+    how = f"{start.how}\n{most:,} of these {count:,} points, sampled at random: --max-gaussians is {most:,}"
     return start._replace(cloud=PointCloud(start.cloud.points[keep], start.cloud.colors[keep]), how=how)
 
 
 def scene_extent(cameras: list[Camera], cloud: PointCloud) -> float:
-    """Size of the scene [u]: that of the camera set; where all cameras stand together, a tenth of the cloud's."""
+    """Return the size of the scene [u]: that of the camera set; where all cameras stand together, a tenth of the cloud's."""
     extent = geometry.camera_extent(cameras)
     spread = float(np.linalg.norm(np.std(cloud.points, axis=0)))
     return max(extent, 0.1 * spread if extent < 1e-3 * spread else 0.0, 1e-6)
@@ -300,7 +318,7 @@ def initial_gaussians(cloud: PointCloud, config: InitConfig, extent: float, devi
         cloud: At least one point.
         config: Opacity and degree.
         extent: Size of the scene [u]; widths are kept between 1e-6 and 0.1 of it, so coincident or lone points get one too.
-        device: Where the tensors go, float32.
+        device: Device of the tensors, float32.
 
     Returns:
         The Gaussians.
@@ -308,7 +326,9 @@ def initial_gaussians(cloud: PointCloud, config: InitConfig, extent: float, devi
     points = torch.as_tensor(cloud.points, dtype=torch.float32, device=device)
     colors = torch.as_tensor(cloud.colors, dtype=torch.float32, device=device)
     count = len(points)
-    scales = config.scale_factor * mean_square_distances(points).sqrt().clamp(1e-6 * extent, 0.1 * extent)
+    # in float64: float32's roots and logarithms have other last digits on other processors (MKL)
+    distances = mean_square_distances(points).double().sqrt()
+    scales = config.scale_factor * distances.clamp(1e-6 * extent, 0.1 * extent)
     sh = points.new_zeros(count, coefficient_count(config.max_sh_degree), 3)
     sh[:, 0] = (colors - 0.5) / C0
     quats = points.new_zeros(count, 4)
@@ -316,7 +336,7 @@ def initial_gaussians(cloud: PointCloud, config: InitConfig, extent: float, devi
     return Gaussians(
         means=points,
         quats=quats,
-        log_scales=scales.log()[:, None].repeat(1, 3),
+        log_scales=scales.log().to(points.dtype)[:, None].repeat(1, 3),
         logit_opacities=points.new_full((count,), geometry.logit(config.opacity)),
         sh=sh,
     )

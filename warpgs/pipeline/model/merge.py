@@ -1,4 +1,4 @@
-"""Two neighbouring Gaussians become one with their moments: the step of a coarse-to-fine tree, taken upwards."""
+"""Merging of two neighbouring Gaussians into one with the moments of both."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.scene import Gaussians
 
 OPAQUE = 0.99
-"""Opacity of a merged Gaussian at the most: what the rasterizer draws at the most."""
+"""Largest opacity of a merged Gaussian: the largest that the rasterizer blends."""
 
 
 def covariances(quats: torch.Tensor, log_scales: torch.Tensor) -> torch.Tensor:
-    """Covariances [N, 3, 3] [u^2]."""
+    """Return covariances [N, 3, 3] [u^2] from quaternions wxyz [N, 4] and log scales [N, 3] [ln u]."""
     axes = rotation_matrices(torch.nn.functional.normalize(quats, dim=1)) * log_scales.exp()[:, None, :]
     return axes @ axes.transpose(1, 2)
 
 
 def _area(log_scales: torch.Tensor) -> torch.Tensor:
-    """Product of the two longer axes [u^2]: what a splat covers when seen face on. Shape [N]."""
+    """Return the product of the two longer axes [u^2], the area that a Gaussian covers when seen face on, shape [N]."""
     return (log_scales.sum(1) - log_scales.amin(1)).exp()
 
 
 def _covered(opacity: torch.Tensor, area: torch.Tensor, own: torch.Tensor, means: torch.Tensor) -> torch.Tensor:
-    """Integral of 1 - (1 - a G)(1 - b H) over a plane that pairs are seen on face on, over 2 pi [u^2]. Shape [P].
+    """Return the integral of 1 - (1 - a G)(1 - b H) over a plane that pairs are seen on face on, over 2 pi [u^2], shape [P].
 
     Args:
         opacity: a and b, shape [P, 2].
@@ -52,10 +52,10 @@ class Merges:
     second: torch.Tensor
     """The other row of each, int64, shape [P]."""
     merged: dict[str, torch.Tensor]
-    """What each pair would become: rows of the five tensors, shape [P, ...]."""
+    """Merged Gaussian of each pair: rows of the five tensors, shape [P, ...]."""
 
     def change(self, count: int, taken: int) -> DensityUpdate:
-        """The change of a set of ``count`` Gaussians that merges the first ``taken`` pairs."""
+        """Return the change of a set of ``count`` Gaussians that merges the first ``taken`` pairs."""
         stays = torch.ones(count, dtype=torch.bool, device=self.first.device)
         stays[self.first[:taken]] = False
         stays[self.second[:taken]] = False
@@ -64,7 +64,7 @@ class Merges:
 
 
 def _curve(means: torch.Tensor, shift: float) -> torch.Tensor:
-    """Numbers of the means [N, 3] along the Morton curve of a box that is wider than theirs by ``shift`` on one side."""
+    """Return the rows of means [N, 3] along the Morton curve of a box that is wider than theirs by ``shift`` on one side."""
     low, high = means.amin(0), means.amax(0)
     boxed = torch.cat([means, (low - shift * (high - low))[None]])
     return torch.argsort(morton_codes(boxed)[:-1], stable=True)
@@ -72,7 +72,7 @@ def _curve(means: torch.Tensor, shift: float) -> torch.Tensor:
 
 @torch.no_grad()
 def merges(gaussians: Gaussians, maxima: torch.Tensor, kinds: torch.Tensor, odd: bool, shift: float = 0.0) -> Merges:
-    """Pair neighbours along the Morton curve and say what each pair would become.
+    """Pair neighbours along the Morton curve, and compute what each pair would become.
 
     Mean, covariance and colours are those of the mixture, weighted by opacity times face-on area. Opacity times area becomes
     what the pair covers face on, the part counted once that both cover; where that takes an opacity above `OPAQUE`, the two

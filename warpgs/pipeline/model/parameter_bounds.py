@@ -9,7 +9,7 @@ from warpgs.pipeline.model.table import Column, Table
 FINEST = 12**-0.5
 """Least standard deviation of an axis, in pixels of the nearest view that sees the Gaussian: that of one pixel's box filter."""
 NO_BOUND = torch.finfo(torch.float32).min
-"""Least log scale of a Gaussian that has no bound."""
+"""Least log scale [ln u] of a Gaussian that has no bound."""
 FLOAT = 4
 """Bytes of a stored number."""
 
@@ -60,9 +60,9 @@ def bound_columns(degree: int) -> dict[str, Column]:
 
 @torch.no_grad()
 def enforce_bounds(table: Table) -> None:
-    """Bring parameters to where their bounds allow, in place.
+    """Bring parameters within their bounds, in place.
 
-    A second time changes nothing, so a recorded step that is not taken may end with it.
+    A second time changes nothing, so a captured step that is not taken may end with it.
     """
     log_scales, sh = table.params["log_scales"].detach(), table.params["sh"].detach()
     log_scales.copy_(torch.maximum(log_scales, table.columns["min_log_scale"][:, None]))

@@ -6,12 +6,13 @@ parameters of each view.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import torch
 
+from warpgs.errors import DataError
+from warpgs.geometry import logit
 from warpgs.kernels.adam import adam_scheduled, scheduled_lrs
 from warpgs.kernels.knn import morton_codes
 from warpgs.scene import Gaussians
@@ -19,7 +20,7 @@ from warpgs.scene import Gaussians
 
 @dataclass(frozen=True)
 class Column:
-    """What is known of each row beside its parameters."""
+    """A value that each row has beside its parameters."""
 
     fill: float
     """Value of rows of which nothing is known."""
@@ -38,10 +39,10 @@ class DensityUpdate:
     added: Mapping[str, torch.Tensor]
     """New rows of each parameter, shape [A, ...]; their moments start at zero."""
     parents: torch.Tensor
-    """For each new row the number of the row it grew from, -1 for none, int64, shape [A]."""
+    """Row that each new row grew from, before the change, -1 for none, int64, shape [A]."""
     columns: Mapping[str, float] = field(default_factory=dict)
-    """Values of columns for new rows without a parent, and of columns that are not inherited; the column's ``fill`` where
-    nothing is said."""
+    """Values of columns for new rows without a parent, and of columns that are not inherited; a column that is not named takes
+    its ``fill``."""
     overwritten: torch.Tensor | None = None
     """Numbers of rows, before the change, whose parameters are replaced and whose moments start again at zero, int64, shape
     [R]; None for none."""
@@ -58,7 +59,7 @@ class Table:
         Args:
             params: Parameters by name, float32, shape [N, ...]; copied.
             columns: Columns by name.
-            device: Where the table lives.
+            device: Device of the table.
             count: Number of rows N.
         """
         self.device = device
@@ -84,7 +85,7 @@ class Table:
         return Gaussians(**self.params)
 
     def lr_row(self, lrs: Mapping[str, float], step: int, head_lrs: Mapping[str, float]) -> list[float]:
-        """Return what `adam_step` reads from memory at a step, 3 numbers a parameter, in order.
+        """Return the numbers that `adam_step` reads at a step, 3 for each parameter, in order.
 
         Args:
             lrs: Learning rate of each parameter.
@@ -105,9 +106,9 @@ class Table:
         Args:
             gradients: Gradient of each parameter, in the order of the table.
             lrs: A row of `lr_row`, float32, shape [3 P].
-            skip: 0, or why the step is not taken, int32, shape [1].
-            factors: Part of its step that each mean takes, shape [N]; None for all of it. Adam makes the size of a step
-                independent of the gradient's, so the part is taken of the step.
+            skip: 0, or the reason why the step is not taken, int32, shape [1].
+            factors: Fraction of its step that each mean takes, shape [N]; None for all of it. Adam makes the size of a step
+                independent of the gradient's, so the fraction is taken of the step.
         """
         before = None if factors is None else self.params["means"].detach().clone()
         for i, (name, gradient) in enumerate(gradients.items()):
@@ -119,7 +120,7 @@ class Table:
 
     @torch.no_grad()
     def apply(self, update: DensityUpdate) -> None:
-        """Follow a change of the set: kept rows keep everything, new rows start with zero moments."""
+        """Apply a change of the set: kept rows keep everything, new rows start with zero moments."""
         if update.overwritten is not None:
             self._overwrite(update.overwritten, update.values)
         keep, parents = update.keep, update.parents
@@ -184,7 +185,7 @@ class Table:
 
     def reset_opacities(self, opacity: float) -> None:
         """Lower every opacity to at most this, in (0, 1), and forget the moments of all opacities (the classic reset)."""
-        limit = math.log(opacity / (1 - opacity))  # in float64: the smallest float32 opacity would be 0
+        limit = logit(opacity)  # in float64: the smallest float32 opacity would be 0
         self.params["logit_opacities"] = self.params["logit_opacities"].detach().clamp(max=limit).requires_grad_()
         self.exp_avg["logit_opacities"].zero_()
         self.exp_avg_sq["logit_opacities"].zero_()
@@ -197,7 +198,17 @@ class Table:
         return {f"{group}.{n}": t.detach() for group, tensors in self._groups().items() for n, t in tensors.items()}
 
     def load(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Take over what `state` gave."""
+        """Load what `state` returned.
+
+        Raises:
+            DataError: Columns or parameters are missing, or there are others.
+        """
+        own, stored = set(self.state()), {n for n in state if n.partition(".")[0] in self._groups()}
+        if own != stored:
+            raise DataError(
+                f"the stored table has other columns or parameters: {', '.join(sorted(own ^ stored))}; continue with the "
+                "code and the settings that the run was started with"
+            )
         for group, tensors in self._groups().items():
             for name in tensors:
                 tensors[name] = state[f"{group}.{name}"].to(self.device).contiguous()

@@ -17,7 +17,14 @@ from warpgs.files import write_bytes
 TENSORS = "checkpoint.safetensors"
 FORMAT = 2
 """Number of the format of run folders: config.json and the checkpoint. 1 was that of warpgs 0.1.0."""
-DTYPES = {torch.float64: "F64", torch.float32: "F32", torch.int64: "I64", torch.int32: "I32", torch.uint8: "U8"}
+DTYPES = {
+    torch.float64: "F64",
+    torch.float32: "F32",
+    torch.int64: "I64",
+    torch.int32: "I32",
+    torch.uint8: "U8",
+    torch.bool: "BOOL",
+}
 """Names of scalar types in the format."""
 
 

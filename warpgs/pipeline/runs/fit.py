@@ -30,7 +30,7 @@ from warpgs.pipeline.train.complexity import complexity_figures, complexity_summ
 from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESETS, FitConfig
 from warpgs.pipeline.train.time_budget import within_budget
 from warpgs.pipeline.train.trainer import StepReport, Trainer, run, train_views
-from warpgs.pipeline.train.warmup import rehearsal
+from warpgs.pipeline.train.warmup import background_warmup
 from warpgs.report.events import EventLog
 from warpgs.report.progress import Progress
 from warpgs.scene import Scene, View
@@ -138,8 +138,9 @@ def fit(
     out = None if out is None else Path(out)
     if resume and out is None:
         raise UsageError("resume needs the run folder that it continues: give out")
+    made = False
     if out is not None:
-        prepare_folder(out, resume)
+        made = prepare_folder(out, resume)
         if resume:
             read_record(out)  # a run of another version is refused before anything takes time
     try:
@@ -155,8 +156,9 @@ def fit(
             job.notes.append(note)
         trainer, state, record = _prepare(job, out if resume else None)
     except WarpgsError:
-        if out is not None and not resume:
-            out.rmdir()  # nothing is in it yet
+        if out is not None and made:
+            with contextlib.suppress(OSError):  # it hides nothing: the error above is raised
+                out.rmdir()  # nothing is in it yet
         raise
     return _finish(job, trainer, state, record, resume)
 
@@ -189,7 +191,7 @@ def _prepare(job: _Job, resumed: Path | None) -> tuple[Trainer, State | None, di
         if (resumed / TENSORS).is_file():
             state = load_checkpoint(resumed)
     c = job.config
-    with rehearsal(c, job.device) as ready:
+    with background_warmup(c, job.device) as ready:
         trainer = Trainer(job.train, job.scene.points, c, job.device, job.scene.background, ready=ready)
     if job.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(job.device)  # the steps' need is told, not the start's or an earlier fit's
@@ -228,7 +230,7 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
 
 def _announce(job: _Job, trainer: Trainer) -> None:
     """Print what is fitted and every choice made for the user."""
-    job.notes += [*trainer.notes, trainer.memory.sentence()]
+    job.notes += [*trainer.notes, trainer.memory.summary()]
     train, test = job.train, job.test
     size = f"{train[0].camera.width} x {train[0].camera.height} px"
     job.say(f"{job.scene.path}: {job.scene.format}, {len(train)} views to fit, {len(test)} held out, {size}, {job.where}")
@@ -277,6 +279,7 @@ def _stop_signals() -> Iterator[Callable[[], bool]]:
         nonlocal came
         came = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
     before = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -305,6 +308,7 @@ def _train(job: _Job, trainer: Trainer) -> None:
                 log.write(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=round(r.seconds, 6))
             while trainer.messages:
                 job.notes.append(trainer.messages.pop(0))
+                trainer.notes.append(job.notes[-1])  # a continued run has them in its report, too
                 job.say(f"  {job.notes[-1]}")
             if job.on_step is not None:
                 job.on_step(r)

@@ -37,8 +37,8 @@ def versions() -> dict[str, str]:
     return found
 
 
-def prepare_folder(out: Path, resume: bool) -> None:
-    """Make a run folder, or check that one holds a run to continue.
+def prepare_folder(out: Path, resume: bool) -> bool:
+    """Make a run folder, or check that one holds a run to continue; return whether the folder was made.
 
     Raises:
         ResourceError: The folder cannot be written.
@@ -47,9 +47,10 @@ def prepare_folder(out: Path, resume: bool) -> None:
     if resume:
         if not (out / CONFIG).is_file():
             raise UsageError(f"--resume: {out} holds no {CONFIG}, so there is no run to continue; leave out --resume")
-        return
+        return False
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out} exists already; choose another --out, or continue that run with --resume")
+    made = not out.exists()
     try:
         out.mkdir(parents=True, exist_ok=True)
         probe = out / ".writable"
@@ -57,6 +58,7 @@ def prepare_folder(out: Path, resume: bool) -> None:
         probe.unlink()
     except OSError as e:
         raise ResourceError(f"{out}: cannot be written ({e.strerror}); choose another --out") from e
+    return made
 
 
 def _camera_values(camera: Camera) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The size of a model, in figures and in words."""
+"""The size of a model, in figures and in one line."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from warpgs.runtime.byte_units import format_bytes
 
 
 def complexity_figures(trainer: Trainer) -> dict:
-    """Return what metrics.json says of the size of a model: its Gaussians, mean degree and bytes, and why growth ended."""
+    """Return the size of a model for metrics.json: its Gaussians, mean degree and bytes, and why growth ended."""
     degrees = trainer.table.columns.get("max_degree")
     degrees = stored_degrees(trainer.gaussians.sh) if degrees is None else degrees
     figures = {

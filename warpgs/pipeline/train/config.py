@@ -12,9 +12,9 @@ from typing import Any
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.train.loss import LOSS_TERMS, LossConfig, LossTerm
+from warpgs.pipeline.train.loss import LOSS_TERMS, LossConfig, LossTerm, check_terms
 from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
-from warpgs.pipeline.train.strategies.base import find_strategy
+from warpgs.pipeline.train.strategies.base import STRATEGIES, find_strategy
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.strategies.holdout_blocks import HoldoutConfig
 from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
@@ -27,49 +27,59 @@ class FitConfig:
     """All settings of a fit."""
 
     preset: str = "3dgs"
-    """Named set of settings that the others start from; see `warpgs fit --help`."""
+    """Named set of settings that the others start from: paper, quick, balanced, strong-3dgs, 3dgs, mcmc, nexusgs, dropgaussian,
+    fsgs or paper-literal."""
     steps: int = 7000
-    """Optimisation steps, one view each."""
+    """Number of optimisation steps, one view each."""
     seed: int = 0
-    """Decides every random choice; the same seed, data and device kind give the same bytes."""
+    """Seed of every random choice; the same seed, data and kind of device give the same bytes."""
     rule: str = "exact"
     """Cut-offs of the rasterizer: exact, balanced, fast, gsplat or inria."""
     half_resolution: float = 0.0
     """Fraction of the steps, from the first, in which views are fitted at half their size (docs/trade.md)."""
     sh_every: int = 1000
-    """Steps after which the spherical-harmonics degree in use rises by one."""
+    """Number of steps after which the spherical-harmonics degree in use rises by one."""
     dropout: float = 0.0
     """Probability, at the last step, that a Gaussian is hidden for a step; it grows linearly from 0 (DropGaussian, Park et
     al. 2025)."""
     dropout_views: int = 3
-    """With more training views than this the probability is lower in proportion: they hold the Gaussians in place."""
+    """Number of training views up to which dropout has its full probability; with more it is lower in proportion."""
     checkpoint_every: int = 1000
-    """A checkpoint may be written at multiples of this step; one is written at the end in any case."""
+    """Number of steps at whose multiples a checkpoint may be written; one is written at the end in any case."""
     checkpoint_seconds: float = 20.0
-    """Time from one checkpoint to the next at the least [s]: writing takes time too. No result depends on it."""
+    """Least time from one checkpoint to the next [s], since writing takes time. No result depends on it."""
     memory_limit: int | None = None
-    """Bytes that the fit's tensors may take on its device while it takes steps; None for no limit. With one, densification
-    stops where a step would not fit, and pictures are drawn in bands where a whole one would not."""
+    """Bytes that the tensors of the fit may take on its device during steps; None for no limit. With one, densification stops
+    before a step would exceed it, and images are rendered in chunks where a whole one would."""
     cuda_graph: bool = True
-    """On CUDA, record a step once and replay it; the same kernels and the same bytes as without, in less time."""
+    """CUDA graphs: a step is captured once and replayed; the same kernels and the same bytes as without, in less time."""
     max_gaussians: int = 1_000_000
-    """No more Gaussians than this, from the start on."""
+    """Largest number of Gaussians, from the start on."""
     strategy: str = "clone_split"
-    """Where Gaussians are added and removed: clone_split, importance_sampling, holdout (held-out blocks of the training views
-    decide how many there are and of which degree, docs/complexity.md), mcmc, or module:Class of your own."""
+    """Density strategy, which adds and removes Gaussians: clone_split, importance_sampling, holdout (held-out blocks of the
+    training views decide how many there are and of which degree, docs/complexity.md), mcmc, or your own as module:Class or
+    path/to/file.py:Class."""
     strategy_config: Any = None
-    """Settings of the strategy's own, its ``Config``; None for their defaults. Those of clone_split, importance_sampling and
-    holdout are the groups below."""
+    """Own settings of the strategy, an instance of its ``Config``; None for their defaults. Those of clone_split,
+    importance_sampling and holdout are the groups ``density``, ``method`` and ``holdout``."""
     loss_terms: tuple[LossTerm, ...] = ()
-    """Terms that the loss has beside those of ``loss``."""
+    """Loss terms beside those of ``loss``; the class of each is registered by a name."""
     holdout: HoldoutConfig = field(default_factory=HoldoutConfig)
+    """Settings of strategy holdout."""
     init: InitConfig = field(default_factory=InitConfig)
+    """Source and first values of the Gaussians."""
     loss: LossConfig = field(default_factory=LossConfig)
+    """Weights of the built-in loss terms."""
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    """Learning rates."""
     density: DensityConfig = field(default_factory=DensityConfig)
+    """Settings of cloning, splitting and pruning (strategies clone_split, importance_sampling and holdout)."""
     phases: PhaseConfig = field(default_factory=PhaseConfig)
+    """Lengths of the three phases, and times of sampling."""
     method: MethodConfig = field(default_factory=MethodConfig)
+    """Settings of strategies importance_sampling and holdout."""
     priors: PriorConfig = field(default_factory=PriorConfig)
+    """Networks that priors of the views come from."""
 
     def __post_init__(self) -> None:
         for name in ("steps", "sh_every", "checkpoint_every", "dropout_views", "max_gaussians"):
@@ -87,7 +97,10 @@ class FitConfig:
             raise UsageError(f"dropout must lie in [0, 1), not {self.dropout}")
         if self.rule not in RULES:
             raise UsageError(f"rule {self.rule!r} is not one of {', '.join(RULES)}")
-        own = None if ":" in self.strategy else find_strategy(self.strategy).Config
+        check_terms(self.loss_terms)
+        if isinstance(self.strategy, type):
+            object.__setattr__(self, "strategy", STRATEGIES.name_of(self.strategy))
+        own = find_strategy(self.strategy).Config if STRATEGIES.knows(self.strategy) else None
         if own is not None and self.strategy_config is None:
             object.__setattr__(self, "strategy_config", own())
 
@@ -176,13 +189,27 @@ PRESETS: dict[str, FitConfig] = {
         phases=PhaseConfig(coarse=2000, stable=3000), method=MethodConfig(events=True, hier=True),
     ),
 }  # fmt: skip
-"""paper: the method, with the constants of docs/decisions/008-method.md. quick: the same in a fifth of the steps; balanced: in
-two fifths, the first at half size (docs/trade.md). strong-3dgs: the start, degree, rates, dropout and schedule of ``paper``,
-none of its parts. 3dgs: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few.
-mcmc: Kheradmand et al. 2024, from the same points. nexusgs: Zheng et al.
-2025, a start from flow with every pixel, and its resets. dropgaussian: Park et al. 2025. fsgs: our trainer with
-the depth term, rates, threshold and resets of Zhu et al. 2024, without their unpooling and unseen views, from our own sweep.
-paper-literal: the paper on ``nexusgs``, with what it leaves open as first proposed."""
+"""Presets by name; `PRESET_NOTES` describes them."""
+
+PRESET_NOTES: dict[str, str] = {
+    "paper": "the method, with the constants of docs/decisions/008-method.md",
+    "quick": "the method in a fifth of the steps of paper",
+    "balanced": "the method in two fifths of the steps of paper, the first of them at half size (docs/trade.md)",
+    "strong-3dgs": "the start, degree, learning rates, dropout and schedule of paper, none of its parts",
+    "3dgs": "Kerbl et al. 2023 without opacity resets, which cost decibels when views are few",
+    "mcmc": "Kheradmand et al. 2024, from the same points as 3dgs",
+    "nexusgs": (
+        "our trainer from a flow start with the thresholds and resets of Zheng et al. 2025; 10,000 of their 30,000 steps, "
+        "splits of 2 instead of 4, another flow: no reproduction"
+    ),
+    "dropgaussian": "our trainer with the dropout, threshold and learning rates of Park et al. 2025: no reproduction",
+    "fsgs": (
+        "our trainer with the depth term, learning rates, threshold and resets of Zhu et al. 2024, from our own sweep, without "
+        "their unpooling and unseen views: no reproduction"
+    ),
+    "paper-literal": "the paper on nexusgs, with what it leaves open as first proposed",
+}
+"""One description of each preset."""
 
 DEFAULT_PRESET = {"cuda": "paper", "cpu": "quick"}
 """Preset where the user names none, by kind of device."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import torch
 
@@ -16,10 +16,10 @@ from warpgs.plugins import Registry
 from warpgs.scene import Gaussians, Prior, Render
 
 MIN_ALPHA = 0.5
-"""Depth counts where the picture is more opaque than this: elsewhere the background has the larger share."""
+"""Opacity above which the depth of a pixel counts: elsewhere the background contributes more."""
 FLAT = 1e-3
-"""Standard deviation at or below which a map is constant: of a disparity in [0, 1], and of mean depth over depth, whose values
-lie around 1. The gradient of a correlation grows with the inverse of it."""
+"""Standard deviation at or below which a map counts as constant, for a disparity in [0, 1] and for mean depth over depth, whose
+values lie around 1. The gradient of a correlation grows with the inverse of it."""
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,12 @@ class LossConfig:
     """Weights of the loss."""
 
     ssim_weight: float = 0.2
-    """Share lambda of the structural term, in [0, 1]."""
+    """Fraction lambda of the structural term, in [0, 1]."""
     depth_weight: float = 0.0
     """Weight of the depth term, 1 minus the correlation of rendered inverse depth with the view's prior, in [0, 1000]; 0 for
     none, 0.05 in FSGS (Zhu et al. 2024)."""
     depth_until: float = 0.95
-    """Share of the steps, from the first, that have the depth term."""
+    """Fraction of the steps, from the first, that have the depth term, in [0, 1]."""
 
     def __post_init__(self) -> None:
         for name, most in (("depth_weight", 1000), ("depth_until", 1)):
@@ -44,9 +44,24 @@ class LossConfig:
 
 @functools.cache
 def _weights(fraction: float, count: int, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-    """Of the sums of 1 - SSIM and of absolute differences over ``count`` numbers; kept for good, as graphs refer to it."""
+    """Return the weights [2] of the sums of 1 - SSIM and of absolute differences over ``count`` numbers.
+
+    They are cached for good, as CUDA graphs refer to their memory.
+    """
     with torch.inference_mode(False):  # whoever asks first: what is made in that mode cannot be trained with
         return torch.tensor([fraction / count, (1 - fraction) / count], dtype=dtype, device=device)
+
+
+def _total(values: torch.Tensor) -> torch.Tensor:
+    """Return the sum of values [H, ...], on a CPU row by row: that of a whole tensor depends on the number of threads."""
+    return values.sum() if values.is_cuda else values.flatten(1).sum(1).sum()
+
+
+def _centred(values: torch.Tensor, fraction: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+    """Return values [H, W] less their mean over the pixels that count, and 0 at others."""
+    mean = _total(values * fraction) / pixels
+    # one number for each row: the gradient of a number for all is the sum of a whole tensor (see `_total`)
+    return (values - (mean if values.is_cuda else mean.expand(len(values), 1))) * fraction
 
 
 def photometric_loss(
@@ -66,26 +81,26 @@ def photometric_loss(
     fraction = ssim_weight
     if mask is None and fraction > 0:
         sums = differences(rgb, target)
-        # a product and a sum, where terms one by one would be a dozen kernels on a GPU
+        # one product and one sum, where terms one by one would be a dozen kernels on a GPU
         return (sums * _weights(fraction, target.numel(), sums.dtype, sums.device)).sum()
     if mask is not None:
         rgb, target = rgb * mask[..., None], target * mask[..., None]
     pixels = target.shape[0] * target.shape[1] if mask is None else mask.sum().clamp_min(1)
-    l1 = (rgb - target).abs().sum() / (3 * pixels)
+    l1 = _total((rgb - target).abs()) / (3 * pixels)
     if mask is None or fraction == 0:
         return l1
-    structural = ((1 - ssim(rgb, target)) * mask[..., None]).sum() / (3 * pixels)
+    structural = _total((1 - ssim(rgb, target)) * mask[..., None]) / (3 * pixels)
     return (1 - fraction) * l1 + fraction * structural
 
 
 def depth_disagreement(
     depth: torch.Tensor, alpha: torch.Tensor, disparity: torch.Tensor, mask: torch.Tensor | None
 ) -> torch.Tensor:
-    """1 minus Pearson's correlation of rendered inverse depth with a disparity, which may have any scale and offset.
+    """Compute 1 minus Pearson's correlation of rendered inverse depth with a disparity, which may have any scale and offset.
 
-    Over the pixels that count: alpha above `MIN_ALPHA`, and kept by the mask. Differentiable in ``depth`` alone. Where either
-    map is constant over them (`FLAT`), and where none counts, no correlation is known: then it is 0 and has no gradient. The
-    unit of depth does not matter from 1e-30 to 1e30 u: maps are brought to values around 1 and centred before squaring.
+    The pixels that count have alpha above `MIN_ALPHA` and are kept by the mask. Differentiable in ``depth`` alone. Where either
+    map is constant over them (`FLAT`), and where none counts, there is no correlation: then it is 0 and has no gradient. The
+    unit of depth does not matter from 1e-30 to 1e30 u: maps are scaled to values around 1 and centred before squaring.
 
     Args:
         depth: Expected z-depth [u], positive where alpha is, shape [H, W].
@@ -101,36 +116,41 @@ def depth_disagreement(
     fraction = counts.to(depth.dtype)
     pixels = fraction.sum().clamp_min(1)
     depth = torch.where(counts, depth, 1)
-    mean = (depth.detach() * fraction).sum() / pixels
-    a, b = ((m - (m * fraction).sum() / pixels) * fraction for m in (mean / depth, disparity))
-    of_a, of_b = (a * a).sum() / pixels, (b * b).sum() / pixels
+    mean = _total(depth.detach() * fraction) / pixels
+    a, b = (_centred(m, fraction, pixels) for m in (mean / depth, disparity))
+    of_a, of_b = _total(a * a) / pixels, _total(b * b) / pixels
     flat = (of_a <= FLAT**2) | (of_b <= FLAT**2)
-    spread = torch.where(flat, 1, of_a).sqrt() * torch.where(flat, 1, of_b).sqrt()
-    return torch.where(flat, 0, 1 - (a * b).sum() / pixels / spread)
+    # roots in float64: float32's have other last digits on other processors (MKL)
+    spread = torch.where(flat, 1, of_a).double().sqrt() * torch.where(flat, 1, of_b).double().sqrt()
+    return torch.where(flat, 0, 1 - _total(a * b) / pixels / spread.to(a.dtype))
 
 
 @dataclass(frozen=True)
 class Target:
-    """What a step compares its render with."""
+    """Image, mask, maps and parameters of a view, which a step compares its render with."""
 
     image: torch.Tensor
     """Colours in [0, 1], shape [H, W, 3]."""
     mask: torch.Tensor | None
     """1 where a pixel counts, else 0, shape [H, W]; None where all count."""
     maps: Mapping[str, torch.Tensor]
-    """What loss terms asked for (`LossTerm.needs`), by name."""
+    """Maps that loss terms asked for (`LossTerm.needs`), by name, each of shape [H, W] or [H, W, C]."""
     params: Mapping[str, torch.Tensor]
     """The view's own parameters (`LossTerm.view_parameters`), by name, shape [...]; differentiable."""
 
 
 @dataclass(frozen=True)
 class ViewParameter:
-    """A parameter that each training view has for itself, such as an exposure."""
+    """A parameter of each training view, such as an exposure.
+
+    The rows of all views are one tensor under dense Adam, as in `torch.optim.Adam`: a step has a gradient in the row of its own
+    view and zeros in the others, which still move by their decaying momentum.
+    """
 
     initial: tuple[float, ...]
-    """Its first value, the same for all views."""
+    """First value, the same for all views."""
     lr: float
-    """Learning rate."""
+    """Learning rate, the same for all steps."""
 
 
 @dataclass(frozen=True)
@@ -138,15 +158,19 @@ class LossTerm:
     """One term of the loss. A term of your own is a frozen dataclass that derives from this; its fields are its settings."""
 
     name: ClassVar[str] = ""
+    """Name that it is registered by."""
     needs_priors: ClassVar[bool] = False
-    """Whether `needs` reads the priors of the views, which then are found before the fit."""
+    """True where `needs` reads the priors of the views, which are then computed before the fit."""
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
-        """Return the maps of a view that the term compares with, by name, each of shape [H, W] or [H, W, C]."""
+        """Return the maps of a view that the term compares with, by name, each of shape [H, W] or [H, W, C].
+
+        No two terms of a fit may use the same name.
+        """
         return {}
 
     def view_parameters(self) -> dict[str, ViewParameter]:
-        """Return the parameters that the term has each view learn, by name."""
+        """Return the parameters that each view learns for this term, by name; no two terms of a fit may use the same name."""
         return {}
 
     def active(self, step: int, steps: int) -> bool:
@@ -154,12 +178,15 @@ class LossTerm:
         return True
 
     def __call__(self, render: Render, target: Target, gaussians: Gaussians) -> torch.Tensor:
-        """Return the term's value, shape [], differentiable; it must not read back from the device.
+        """Compute the term, a differentiable value of shape []; it must not read back from the device.
 
         Args:
             render: The render of the step's view: ``rgb`` [H, W, 3], ``alpha`` and ``depth`` [H, W].
-            target: What to compare it with.
+            target: Image, mask, maps and parameters of the view.
             gaussians: The Gaussians, parameters as stored.
+
+        Raises:
+            TypeError: The class does not define it.
         """
         raise TypeError(f"{type(self).__name__} must define __call__(render, target, gaussians)")
 
@@ -178,7 +205,7 @@ class Photometric(LossTerm):
     """Fraction lambda of the structural term, in [0, 1]."""
 
     def __call__(self, render: Render, target: Target, gaussians: Gaussians) -> torch.Tensor:
-        """See `photometric_loss`."""
+        """Compute `photometric_loss` of the render and the view's image, shape []."""
         return photometric_loss(render.rgb, target.image, target.mask, self.ssim_weight)
 
 
@@ -194,7 +221,7 @@ class DepthCorrelation(LossTerm):
     """Fraction of the steps, from the first, that have the term."""
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
-        """Return the disparity of the view's prior."""
+        """Return the disparity of the view's prior, shape [H, W]."""
         assert prior is not None  # `needs_priors`
         return {"disparity": torch.as_tensor(prior.disparity, dtype=torch.float32, device=view.image.device)}
 
@@ -203,11 +230,55 @@ class DepthCorrelation(LossTerm):
         return step <= self.until * steps
 
     def __call__(self, render: Render, target: Target, gaussians: Gaussians) -> torch.Tensor:
-        """See `depth_disagreement`."""
+        """Compute ``weight`` times `depth_disagreement` of the rendered depth and the prior's disparity, shape []."""
         return self.weight * depth_disagreement(render.depth, render.alpha, target.maps["disparity"], target.mask)
 
 
+Part = TypeVar("Part")
+
+
+def check_terms(terms: Sequence[LossTerm]) -> None:
+    """Check that a run folder could name the class of each loss term.
+
+    Raises:
+        UsageError: One is no loss term, or its class is not registered, or not by its own name.
+    """
+    for term in terms:
+        kind = type(term)
+        if not isinstance(term, LossTerm):
+            raise UsageError(f"{term!r} is no loss term: give an instance of a class that derives from warpgs.LossTerm")
+        if not LOSS_TERMS.has(kind):
+            raise UsageError(
+                f"the loss term {kind.__qualname__} has no name of its own, by which a run folder could tell it; register it "
+                'with @register("name") of warpgs.pipeline.train.loss above the class, or name it as module:Class'
+            )
+
+
+def collect(terms: Sequence[LossTerm], parts: Callable[[LossTerm], Mapping[str, Part]], what: str) -> dict[str, Part]:
+    """Return the named parts of all terms in one dictionary.
+
+    Args:
+        terms: Loss terms.
+        parts: Function that returns the parts of a term by name.
+        what: Word for a part, for the message.
+
+    Raises:
+        UsageError: Two terms have a part of one name.
+    """
+    found: dict[str, Part] = {}
+    owners: dict[str, LossTerm] = {}
+    for term in terms:
+        for name, part in parts(term).items():
+            if name in found:
+                raise UsageError(
+                    f"the loss terms {owners[name].name!r} and {term.name!r} both have a {what} {name!r}; rename it in one of "
+                    "them"
+                )
+            found[name], owners[name] = part, term
+    return found
+
+
 def built_in_terms(config: LossConfig) -> tuple[LossTerm, ...]:
-    """Return the terms that the settings ask for."""
+    """Return the terms that every fit has by its settings."""
     depth = (DepthCorrelation(config.depth_weight, config.depth_until),) if config.depth_weight > 0 else ()
     return (Photometric(config.ssim_weight), *depth)

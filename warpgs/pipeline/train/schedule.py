@@ -9,13 +9,13 @@ from warpgs.errors import UsageError
 
 
 def log_linear(start: float, end: float, progress: float) -> float:
-    """Value between ``start`` and ``end`` (both positive) on a straight line in the logarithm; progress in [0, 1]."""
+    """Interpolate between ``start`` and ``end`` (both positive) on a straight line in the logarithm; progress in [0, 1]."""
     progress = min(max(progress, 0.0), 1.0)
     return math.exp((1 - progress) * math.log(start) + progress * math.log(end))
 
 
 def sh_degree(step: int, every: int, highest: int) -> int:
-    """Degree in use at a step counted from 1: one more after every ``every`` steps, up to ``highest``."""
+    """Return the degree in use at a step counted from 1: one more after every ``every`` steps, up to ``highest``."""
     return min(highest, (step - 1) // every)
 
 
@@ -37,7 +37,7 @@ class OptimizerConfig:
     """Learning rate of the log scales; 0.005 in the reference (docs/decisions/004-scale-rate.md)."""
     scales_decay: float = 1.0
     """Fraction of that learning rate which is left at the last step; log-linear from the beginning of phase 3, or of a fit
-    without phases. 1 keeps it as it is."""
+    without phases. 1 for a constant rate."""
     opacities_lr: float = 0.05
     """Learning rate of the opacity logits."""
     sh_lr: float = 2.5e-3
@@ -107,7 +107,7 @@ class Phases:
 
 
 def plan_phases(config: PhaseConfig, steps: int) -> Phases:
-    """The phases of a fit of that many steps.
+    """Plan the phases of a fit of that many steps.
 
     With the paper's numbers there are 102 events in 25,000 steps of phase 2 and 21 in 5000.
     """

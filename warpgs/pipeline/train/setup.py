@@ -13,7 +13,7 @@ import torch
 from warpgs.pipeline.metrics.region import counted_region
 from warpgs.pipeline.model.init import Start, check_points, initial_points, subsample
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import LossTerm, built_in_terms
+from warpgs.pipeline.train.loss import LossTerm, built_in_terms, collect
 from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.strategies.importance_sampling import scored
 from warpgs.pipeline.train.views import TrainingView
@@ -24,14 +24,14 @@ from warpgs.scene import PointCloud, Prior, View
 
 @dataclass(frozen=True)
 class Preparation:
-    """Found before the first step."""
+    """Points, priors and notes, found before the first step."""
 
     start: Start
     """The first points, and the depths that views confirm."""
     priors: list[Prior] | None
     """One a view; None where nothing asks for them."""
     notes: list[str]
-    """What was chosen, assumed and missing."""
+    """Sentences on what was chosen, assumed and missing."""
 
 
 def prepare(
@@ -44,9 +44,9 @@ def prepare(
         train: The views to fit.
         points: The reconstruction's points, or None.
         config: Settings.
-        generator: For random points.
-        device: Where to sweep, unless there is a memory limit: depths take more than a step may.
-        priors: What is believed of each view, where that is known.
+        generator: Generator of random points.
+        device: Device to sweep on, unless there is a memory limit: depths take more than a step may.
+        priors: Prior of each view; None to compute them where they are needed.
         ready: Called before the device is used, and in any case before the end.
 
     Raises:
@@ -75,7 +75,7 @@ def prepare(
 
 
 def needs_priors(config: FitConfig) -> bool:
-    """Return whether sampling or a loss term asks for what is believed of the views."""
+    """Return whether sampling or a loss term needs the priors of the views."""
     terms = (*built_in_terms(config.loss), *config.loss_terms)
     return find_strategy(config.strategy).samples(config) or any(t.needs_priors for t in terms)
 
@@ -87,6 +87,9 @@ def prepared_views(
 
     Also returns each view's disparity, relative inverse depth in [0, 1], shape [H, W], where views are scored: only images of
     events show it. A note on the depth term is appended to the preparation's.
+
+    Raises:
+        UsageError: Two loss terms ask for a map of one name.
     """
     views, disparities = [TrainingView.of(v, device) for v in train], []
     priors = made.priors or [None] * len(train)
@@ -96,7 +99,7 @@ def prepared_views(
         views = [scored(v, p, d, config.method) for v, p, d in zip(views, priors, depths, strict=True)]
     found = []
     for view, prior in zip(views, priors, strict=True):
-        maps = {n: m for term in terms for n, m in term.needs(view, prior).items()}
+        maps = collect(terms, lambda term, view=view, prior=prior: term.needs(view, prior), "map")
         found.append(dataclasses.replace(view, maps=maps))
     if config.loss.depth_weight > 0:
         known = sum(bool(p.disparity.any()) for p in priors)

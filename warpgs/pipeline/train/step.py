@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -24,36 +24,36 @@ from warpgs.pipeline.metrics.psnr import masked_mse
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.loss import LossTerm, Target
 from warpgs.pipeline.train.strategies.base import Strategy
-from warpgs.pipeline.train.views import ViewStack
+from warpgs.pipeline.train.views import Kind, Rows, ViewStack
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.runtime.cuda_graph import CapturedGraph, GraphMemory
 from warpgs.runtime.device_memory import available_bytes
 from warpgs.scene import Camera, Gaussians, Render
 
 MAX_BATCH = 100
-"""Most steps between two looks at the device."""
+"""Largest number of steps after which results are read back from the device."""
 CAPACITY_FACTOR = 1.3
-"""Instances that a captured step has capacity for, as a multiple of the most that any view has when it is captured."""
+"""Capacity of a captured step for instances, as a multiple of the most that any view has when it is captured."""
 DEAD_BYTES = 2**30
-"""Memory of graphs no longer used that may pile up. To give it back takes milliseconds, in which the device waits."""
+"""Bytes of graphs no longer used that may pile up. To give them back takes milliseconds, in which the device waits."""
 
 
 @dataclass(frozen=True)
 class StepPlan:
-    """What a step does; steps of equal plans share a CUDA graph."""
+    """Choices that a step is made of; steps of equal plans share a CUDA graph."""
 
     degree: int
     """Spherical-harmonics degree in use."""
     half_size: bool
-    """Views are half their size."""
+    """True where views are half their size."""
     terms: tuple[LossTerm, ...]
     """Loss terms, in the order in which they are summed."""
     phase: Hashable
-    """What the strategy does (`Strategy.phase`)."""
+    """Value of `Strategy.phase`."""
 
 
 class StepBuffers:
-    """What steps read and write between two looks at the device: views, learning rates, losses, and the stop flag."""
+    """Tensors that a batch of steps reads and writes on the device: views, learning rates, losses, and the stop flag."""
 
     def __init__(self, device: torch.device, lrs: int):
         """Allocate for `MAX_BATCH` steps on CUDA, elsewhere for the one of a batch, with ``lrs`` learning rates each."""
@@ -66,9 +66,9 @@ class StepBuffers:
         self.setting_rows = torch.zeros(rows, 3, device=device)
         """Dropout probability, number, and learning rate of the means [u] of each step."""
         self.counter = torch.zeros(1, dtype=torch.int64, device=device)
-        """Number of the step at hand. It stays once a step stops, and so do all Gaussians."""
+        """Number of the current step in its batch. It stays once a step stops, and so do all Gaussians."""
         self.stop = torch.zeros(1, dtype=torch.int32, device=device)
-        """0 while all is well, else why the steps stopped."""
+        """0 while steps go on, else the reason why they stopped."""
         self.history = torch.zeros(rows, 2, device=device)
         """Loss and mean squared error of each step."""
         self.one = torch.ones((), device=device)
@@ -83,12 +83,12 @@ class StepBuffers:
         self.setting_rows[: len(settings)] = torch.tensor(settings, dtype=torch.float32).to(self.device)
 
     def result(self) -> tuple[int, int, list[list[float]]]:
-        """Return steps taken, the stop flag, and loss and squared error of each step taken and of one that was not finite."""
+        """Return steps taken, the stop flag, and loss and squared error of each step, the one that was not finite included."""
         done, stop = int(self.counter), int(self.stop)
         return done, stop, self.history[: done + 1].tolist()
 
     def begin(self, views: ViewStack) -> tuple[torch.Tensor, ...]:
-        """Return learning rates, settings [3], viewmat [1, 4, 4], K [1, 3, 3] and image [H, W, 3] of the step at hand."""
+        """Return learning rates, settings [3], viewmat [1, 4, 4], K [1, 3, 3] and image [H, W, 3] of the current step."""
         if self.device.type == "cpu":  # no copies
             step, row = int(self.counter), int(self.view_rows[int(self.counter)])
             view = views.viewmats[row : row + 1], views.Ks[row : row + 1], views.images[row]
@@ -96,33 +96,34 @@ class StepBuffers:
         rows = (self.view_rows, self.lr_rows, self.setting_rows, views.viewmats, views.Ks, views.images)
         return begin_step(self.counter, *rows)
 
-    def of_view(self, maps: torch.Tensor) -> torch.Tensor:
+    def of_view(self, maps: Rows) -> torch.Tensor:
         """Return the entry of the step's view in maps [V, ...]; before the step is counted."""
         if self.device.type == "cpu":
             return maps[int(self.view_rows[int(self.counter)])]
+        assert isinstance(maps, torch.Tensor)  # on CUDA stacks are tensors
         return maps.index_select(0, self.view_rows.index_select(0, self.counter))[0]
 
 
 Renderer = Callable[[Gaussians, Camera, int, "torch.Tensor | None"], Render]
-"""Renders Gaussians for a camera with tensors of one view, a degree, and factors of the opacities."""
+"""Function that renders Gaussians for a camera with tensors of one view, a degree, and factors of the opacities."""
 
 
 def eager_renderer(rule: str, background: torch.Tensor, max_instances: int | None) -> Renderer:
-    """Return a renderer that makes room for as many instances as there are, in chunks of at most ``max_instances``."""
+    """Return a renderer whose capacity follows the instances, in chunks of at most ``max_instances``; background [3]."""
 
     def render(gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None) -> Render:
         options = RasterizeOptions(
             rule=rule, sh_degree=degree, background=background, opacity_factors=factors, max_instances=max_instances,
-            record=False,  # it would make room for more than was planned
+            record=False,  # it would allocate more than was planned
         )  # fmt: skip
-        camera = Camera(camera.viewmat[0], camera.K[0], camera.width, camera.height)
+        camera = replace(camera, viewmat=camera.viewmat[0], K=camera.K[0])
         return rasterize(gaussians, camera, options)
 
     return render
 
 
 def captured_renderer(rule: str, background: torch.Tensor, capacity: int, overflow: torch.Tensor) -> Renderer:
-    """Return a renderer with a fixed capacity of instances, which sets ``overflow`` [1] where they do not fit."""
+    """Return a renderer with a fixed capacity of instances, which sets ``overflow`` [1] if they do not fit; background [3]."""
     cut, backgrounds = RULES[rule], background[None]
 
     def render(gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None) -> Render:
@@ -139,40 +140,41 @@ def captured_renderer(rule: str, background: torch.Tensor, capacity: int, overfl
 
 @dataclass(frozen=True)
 class Learned:
-    """What steps change."""
+    """The tables and the strategy that steps change."""
 
     table: Table
     """The Gaussians."""
     views: Table
     """Parameters of each training view, one row each; often none."""
     strategy: Strategy
-    """What gathers gradients and follows updates."""
+    """Density strategy, which gathers gradients and follows updates."""
     dropout_seed: int | None
     """Seed of the opacity dropout; None for none."""
 
 
 def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer) -> None:
-    """Take one training step: render the next view, compare it, update all parameters.
+    """Take one training step: render the next view, compute the loss, update all parameters.
 
-    Nothing changes where the render overflows or the loss is not finite: ``buffers.stop`` then says so.
+    Nothing changes where the render overflows or the loss is not finite: ``buffers.stop`` is set then.
 
     Args:
-        learned: What the step changes.
-        views: What it may look at.
-        buffers: Where it finds its settings and leaves its results.
-        plan: What it does.
-        render: How it renders.
+        learned: Tables and strategy that the step changes.
+        views: Views of one kind.
+        buffers: Settings of the batch, and its results.
+        plan: Choices that the step is made of.
+        render: Renderer.
     """
     table, strategy = learned.table, learned.strategy
     lrs, settings, viewmat, K, image = buffers.begin(views)
     mask = None if views.masks is None else buffers.of_view(views.masks)
-    own = {n: t[buffers.of_view(views.numbers)] for n, t in learned.views.params.items()}
+    number = buffers.of_view(views.numbers).view(1)
+    own = {n: t.index_select(0, number)[0] for n, t in learned.views.params.items()}  # not t[number], which reads it back
     target = Target(image, mask, {n: buffers.of_view(t) for n, t in views.maps.items()}, own)
     factors = None
     if learned.dropout_seed is not None:
         factors = opacity_dropout(len(table), settings[:2], learned.dropout_seed)
     rendered = render(table.gaussians, Camera(viewmat, K, **views.size), plan.degree, factors)
-    loss = total_loss(plan.terms, rendered, target, table.gaussians, strategy)
+    loss = total_loss(plan, rendered, target, table.gaussians, strategy)
 
     projected, split = rendered.projected, 3 * len(table.params)
     params = [*table.params.values(), *learned.views.params.values()]
@@ -186,12 +188,10 @@ def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPla
         strategy.after_backward(plan.phase, v_projected, rendered.visible, size, going)
 
 
-def total_loss(
-    terms: Sequence[LossTerm], rendered: Render, target: Target, gaussians: Gaussians, strategy: Strategy
-) -> torch.Tensor:
-    """Return the sum of the terms and of what the strategy adds, shape []."""
-    values = [term(rendered, target, gaussians) for term in terms]
-    extra = strategy.regularisation(gaussians)
+def total_loss(plan: StepPlan, rendered: Render, target: Target, gaussians: Gaussians, strategy: Strategy) -> torch.Tensor:
+    """Return the sum of the terms and of the strategy's regularisation, shape []."""
+    values = [term(rendered, target, gaussians) for term in plan.terms]
+    extra = strategy.regularisation(plan.phase, gaussians)
     total = values[0]
     for value in values[1:] if extra is None else [*values[1:], extra]:
         total = total + value
@@ -205,24 +205,37 @@ class OverLimitError(ResourceError):
 class StepGraphs:
     """Captured steps, one for each plan and kind of view; made when they are first asked for."""
 
-    def __init__(self, device: torch.device):
-        """Capture nothing yet."""
-        self.device = device
+    def __init__(self, learned: Learned, buffers: StepBuffers, rule: str, background: torch.Tensor):
+        """Capture nothing yet.
+
+        Args:
+            learned: Tables and strategy that steps change.
+            buffers: Settings and results of steps.
+            rule: Cut-offs of the rasterizer.
+            background: Colour behind the scene, shape [3].
+        """
+        self.learned, self.buffers, self.rule, self.background = learned, buffers, rule, background
+        device = buffers.device
         self.stream = torch.cuda.Stream(device)
-        """Where steps are captured: always the same one, since torch keeps freed memory for the stream that it was used on."""
+        """Stream of captures, always the same one, since torch keeps freed memory for the stream that it was used on."""
         self.memory = GraphMemory(device)
         """Account of the memory that torch keeps for graphs that are gone."""
-        self._graphs: dict[tuple, CapturedGraph] = {}
+        self._graphs: dict[tuple[Hashable, StepPlan], CapturedGraph] = {}
 
     def clear(self) -> None:
-        """Forget all graphs: what they refer to has changed."""
+        """Drop all graphs, because the tensors that they refer to have changed."""
         self._graphs.clear()
 
     def capture_all(
-        self, kinds: Sequence[Hashable], stacks: Mapping[Hashable, ViewStack], learned: Learned, buffers: StepBuffers,
-        plan: StepPlan, rule: str, background: torch.Tensor, max_instances: int | None,
-    ) -> list[CapturedGraph]:  # fmt: skip
-        """Return the graph of each of several steps of one plan, by the kind of their views; captured where there is none.
+        self, kinds: Sequence[Kind], stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None
+    ) -> list[CapturedGraph]:
+        """Return the graph of each of several steps of one plan, captured where there is none yet.
+
+        Args:
+            kinds: Kind of each step's view.
+            stacks: Views by kind.
+            plan: Choices that the steps are made of.
+            max_instances: Largest capacity for instances; None for no limit.
 
         Raises:
             OverLimitError: The capacity of one would be above ``max_instances``.
@@ -233,23 +246,24 @@ class StepGraphs:
             if (kind, plan) in self._graphs:
                 continue
             views = stacks[kind]
-            capacity = instance_capacity(learned.table.gaussians, views, plan.degree, rule)
+            capacity = instance_capacity(self.learned.table.gaussians, views, plan.degree, self.rule)
             if max_instances is not None and capacity > max_instances:
                 raise OverLimitError(
                     f"a captured step would need capacity for {capacity:,} instances, the limit allows {max_instances:,}"
                 )
             self.memory.give_back(0 if max_instances is not None else DEAD_BYTES)
-            render = captured_renderer(rule, background, capacity, buffers.stop)
-            work = functools.partial(step, learned, views, buffers, plan, render)
-            self._graphs[kind, plan] = self._capture(work, buffers)
+            render = captured_renderer(self.rule, self.background, capacity, self.buffers.stop)
+            work = functools.partial(step, self.learned, views, self.buffers, plan, render)
+            self._graphs[kind, plan] = self._capture(work)
         return [self._graphs[kind, plan] for kind in kinds]
 
-    def _capture(self, work: Callable[[], None], buffers: StepBuffers) -> CapturedGraph:
+    def _capture(self, work: Callable[[], None]) -> CapturedGraph:
         """Return the graph of a step."""
-        here, loaded = torch.cuda.current_stream(), buffers.view_rows.clone()
+        buffers = self.buffers
+        here, loaded = torch.cuda.current_stream(self.device), buffers.view_rows.clone()
         self.stream.wait_stream(here)
         with torch.cuda.stream(self.stream):
-            # a first run loads kernels and makes room in caches, which may not happen while capturing; it changes nothing
+            # a first run loads kernels and fills caches, which may not happen while capturing; it changes no parameter
             buffers.stop.fill_(NOT_FINITE)
             buffers.view_rows.zero_()
             work()
@@ -263,7 +277,7 @@ class StepGraphs:
 
 @torch.no_grad()
 def instance_capacity(gaussians: Gaussians, views: ViewStack, degree: int, rule: str) -> int:
-    """Return the (Gaussian, tile) instances that a captured step makes room for, over all views of a stack.
+    """Return the capacity of a captured step for (Gaussian, tile) instances, over all views of a stack.
 
     Raises:
         ResourceError: They would not fit into memory.

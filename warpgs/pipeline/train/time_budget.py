@@ -1,4 +1,4 @@
-"""A fit that is done in a given time: as many steps as this machine is foretold to take in it, by its own measured speed."""
+"""Number of steps for a fit of a given time, predicted from the measured speed of this machine."""
 
 from __future__ import annotations
 
@@ -15,22 +15,21 @@ from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians, View
 
 PIXELS_PER_GAUSSIAN = 4
-"""Of the probe's pictures: about what fits of preset `quick` have over their steps."""
+"""Pixels of the probe's render for each of its Gaussians, about the mean over a fit of preset `quick`."""
 REPEATS = 5
-
-
+"""Timed renders of a probe, after a first that compiles and loads kernels."""
 STEP, SETUP = 1.6, 11.0
 """Mean time of a step of a fit, and time before the first step for each training view, in probes (`probe_seconds`). Measured on
 a CPU on fern with preset `quick`: 1.54 and 11.2 at 126 x 94 px, 1.56 and 10.8 at 168 x 126 px (docs/trade.md). On CUDA, where
-steps are recorded and probes are not, a step takes less: what is foretold there is an upper limit."""
+steps are captured and probes are not, a step takes less, so that the prediction is an upper limit."""
 MIN_STEPS, MAX_STEPS = 100, 3000
-"""Steps that a budget may lead to: with fewer nothing is seen, with more held-out views gain nothing (docs/results.md)."""
+"""Range of the steps chosen: with fewer nothing is seen, with more held-out views gain nothing (docs/results.md)."""
 
 
 def probe_seconds(width: int, height: int, device: torch.device) -> float:
-    """Time of a step's picture, loss and gradients on this machine for a cloud that is always the same [s].
+    """Measure the time of a render, its loss and gradients on this machine for a cloud that is always the same [s].
 
-    Median of a few after a first that compiles and loads kernels; takes some hundred milliseconds.
+    Returns the median of `REPEATS`; takes some hundred milliseconds.
     """
     count = max(1, width * height // PIXELS_PER_GAUSSIAN)
     g = torch.Generator().manual_seed(0)
@@ -58,13 +57,13 @@ def probe_seconds(width: int, height: int, device: torch.device) -> float:
 
 
 def within_budget(config: FitConfig, seconds: float, views: list[View], device: torch.device) -> tuple[FitConfig, str]:
-    """As many steps as are foretold to take at most so long, set-up included.
+    """Choose the largest number of steps that is predicted to fit into a time budget, set-up included.
 
     Args:
-        config: Everything but the steps.
-        seconds: The budget [s].
+        config: Settings; the steps are replaced.
+        seconds: Budget [s].
         views: Training views.
-        device: Where the fit works.
+        device: Device of the fit.
 
     Returns:
         The configuration with its steps, and a sentence that says what was chosen and why.
@@ -80,18 +79,22 @@ def within_budget(config: FitConfig, seconds: float, views: list[View], device: 
     if steps < MIN_STEPS:
         raise UsageError(
             f"time-budget {seconds:g} s is too short: {MIN_STEPS} steps would take {setup + MIN_STEPS * step:.0f} s here, "
-            f"where a picture with gradients takes {1000 * probe:.0f} ms; give more time, or smaller images with --downscale"
+            f"where a render with gradients takes {1000 * probe:.0f} ms; give more time, or smaller images with --downscale"
         )
     needed = setup + steps * step
     return dataclasses.replace(config, steps=steps), (
-        f"time-budget {seconds:g} s: chose --steps {steps} of preset {config.preset}, foretold to take {needed:.0f} s "
-        f"here, where a picture with gradients takes {1000 * probe:.0f} ms"
+        f"time-budget {seconds:g} s: chose --steps {steps} of preset {config.preset}, predicted to take {needed:.0f} s "
+        f"here, where a render with gradients takes {1000 * probe:.0f} ms"
         + (f"; more than {MAX_STEPS} steps gain nothing" if steps == MAX_STEPS else "")
         + "; scores and report come on top"
     )
 
 
 def check_budget(seconds: float) -> None:
-    """UsageError where a time budget is no positive number."""
+    """Check a time budget [s].
+
+    Raises:
+        UsageError: It is no positive, finite number.
+    """
     if not 0 < seconds < float("inf"):
         raise UsageError(f"time-budget must be a positive number of seconds, not {seconds}")

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 
 from warpgs.errors import DataError, NotFiniteError
 from warpgs.kernels.step_buffers import NOT_FINITE
+from warpgs.pipeline.metrics.psnr import psnr_of
 from warpgs.pipeline.model.init import initial_gaussians, scene_extent
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import built_in_terms
-from warpgs.pipeline.train.memory_plan import layout_of, most_instances, plan
+from warpgs.pipeline.train.loss import built_in_terms, collect
+from warpgs.pipeline.train.memory_plan import Layout, layout_of, most_instances, plan
 from warpgs.pipeline.train.schedule import plan_phases
 from warpgs.pipeline.train.setup import prepare, prepared_views
 from warpgs.pipeline.train.step import (
@@ -32,14 +33,14 @@ from warpgs.pipeline.train.step import (
     step,
 )
 from warpgs.pipeline.train.strategies.base import find_strategy
-from warpgs.pipeline.train.views import TrainingView, half_size, stack_views
+from warpgs.pipeline.train.views import Kind, TrainingView, half_size, stack_views
 from warpgs.runtime.device_memory import available_bytes
 from warpgs.scene import Gaussians, PointCloud, Prior, Scene, View
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """What one step has to tell."""
+    """Figures of one step."""
 
     step: int
     """Steps done, from 1."""
@@ -67,14 +68,15 @@ class Trainer:
             train: The views to fit, at least one.
             points: The reconstruction's points, or None.
             config: Settings.
-            device: Where to work.
+            device: Device of the fit.
             background: Colour behind the scene.
-            priors: What is believed of each view; None to find out where sampling or a loss term asks for it.
+            priors: Prior of each view; None to compute them where sampling or a loss term needs them.
             ready: Called before the device is used.
 
         Raises:
             DataError: There is nothing to start from.
-            UsageError: The memory limit is below what the smallest step needs, or a plug-in is not there.
+            UsageError: The memory limit is below what the smallest step needs, a plug-in is not there, or two loss terms use
+                one name for a map or a parameter.
         """
         if not train:
             raise DataError("there is no training view; name at least one in --split")
@@ -82,29 +84,35 @@ class Trainer:
         self.generator = torch.Generator().manual_seed(config.seed)
         made = prepare(train, points, config, np.random.default_rng(config.seed), device, priors, ready)
         self.notes: list[str] = made.notes
-        """What was chosen for the user before the first step."""
+        """Sentences on what was chosen for the user before the first step."""
         self.messages: list[str] = []
-        """What the user must know of and was not told yet."""
+        """Sentences for the user that were not shown yet."""
         cloud = made.start.cloud
         self.extent = scene_extent([v.camera for v in train], cloud)
-        """Size of the scene [u]."""
+        """Size of the scene [u], as `scene_extent` measures it."""
         self.background = torch.tensor(background, dtype=torch.float32, device=device)
         self.phases = plan_phases(config.phases, config.steps)
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
         """Dropout probability at the last step."""
         self.terms = (*built_in_terms(config.loss), *config.loss_terms)
-        self.step, self.order = 0, []
+        self.step = 0
+        """Steps taken."""
+        self.order: list[int] = []
+        """Views that are still to come before any comes again, the next one last."""
 
         self.strategy = find_strategy(config.strategy)(self)
         self.table = Table.of_gaussians(initial_gaussians(cloud, config.init, self.extent, device), self.strategy.columns())
-        own = {n: p for term in self.terms for n, p in term.view_parameters().items()}
+        own = collect(self.terms, lambda t: t.view_parameters(), "view parameter")
         first = {n: torch.tensor(p.initial, dtype=torch.float32, device=device).repeat(len(train), 1) for n, p in own.items()}
         self.view_table = Table(first, {}, device, len(train))
         self.view_lrs = {n: p.lr for n, p in own.items()}
-        self.graphs = StepGraphs(device) if device.type == "cuda" else None
         self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(first)))
         seed = config.seed if self.dropout > 0 else None
         self.learned = Learned(self.table, self.view_table, self.strategy, seed)
+        graphs = StepGraphs(self.learned, self.buffers, config.rule, self.background) if device.type == "cuda" else None
+        self.graphs = graphs
+        self.layout: Layout
+        self.max_instances: int | None = None
         views, self.disparities = prepared_views(train, made, config, self.terms, device)
         self.set_views(views)
         self.strategy.setup()
@@ -124,7 +132,7 @@ class Trainer:
         return (step - 1) / max(1, self.config.steps - 1)
 
     def plan_of(self, step: int) -> StepPlan:
-        """Return what a step does."""
+        """Return the plan of a step, counted from 1."""
         c = self.config
         terms = tuple(t for t in self.terms if t.active(step, c.steps))
         return StepPlan(self.strategy.sh_degree(step), step <= c.half_resolution * c.steps, terms, self.strategy.phase(step))
@@ -136,7 +144,7 @@ class Trainer:
         return self.order.pop()
 
     def advance(self, limit: int = 1) -> list[StepReport]:
-        """Take up to ``limit`` steps: render a view, compare it, update, and change the set of Gaussians when it is time.
+        """Take up to ``limit`` steps, and have the strategy change the set of Gaussians after the last when that is due.
 
         On CUDA steps are replayed as graphs, several at a time, and end before anything that needs the host; elsewhere, and
         where a memory limit leaves no capacity for graphs, one step is taken.
@@ -147,7 +155,7 @@ class Trainer:
         """
         begin, first = time.perf_counter(), self.step + 1
         plan, count = self.plan_of(first), 1
-        if self.layout.recordings:
+        if self.layout.graphs:
             while (
                 count < min(limit, MAX_BATCH, self.config.steps - self.step)
                 and self.plan_of(first + count) == plan
@@ -169,30 +177,30 @@ class Trainer:
                 f"the loss became {history[done][0]} at step {self.step + 1}; the last checkpoint is the state before"
             )
         if stop:
-            self.graphs.clear()  # captured anew with more capacity
+            self._forget_graphs()  # they are captured anew with more capacity
         counts = [len(self.table)] * done
         if done == count:
             self._update()
             counts[-1] = len(self.table)
         seconds = (time.perf_counter() - begin) / max(1, done)
         return [
-            StepReport(first + k, loss, -10 * math.log10(max(mse, 1e-12)), counts[k], seconds)
+            StepReport(first + k, loss, psnr_of(max(mse, 1e-12)), counts[k], seconds)
             for k, (loss, mse) in enumerate(history[:done])
         ]
 
-    def _take(self, places: list[tuple[tuple, int]], plan: StepPlan) -> bool:
-        """Take steps with views at these places; False, and nothing taken, where graphs turned out to need too much memory."""
-        if not self.layout.recordings:
+    def _take(self, places: list[tuple[Kind, int]], plan: StepPlan) -> bool:
+        """Take steps with views at these places; return False, and take none, where graphs would need too much memory."""
+        if self.graphs is None or not self.layout.graphs:
             render = eager_renderer(self.config.rule, self.background, self.max_instances)
             for kind, _ in places:
                 step(self.learned, self.stacks[kind], self.buffers, plan, render)
             return True
-        how = (self.learned, self.buffers, plan, self.config.rule, self.background, self.max_instances)
+        kinds = [kind for kind, _ in places]
         try:
-            graphs = self.graphs.capture_all([kind for kind, _ in places], self.stacks, *how)
+            graphs = self.graphs.capture_all(kinds, self.stacks, plan, self.max_instances)
         except OverLimitError as e:
             self.graphs.clear()
-            self.layout = dataclasses.replace(self.layout, recordings=0)
+            self.layout = dataclasses.replace(self.layout, graphs=0)
             self.count_changed()
             self.messages.append(f"memory: steps are taken one by one from here on, because {e}")
             return False
@@ -215,7 +223,7 @@ class Trainer:
         return self.strategy.dropout(step), step, self.lrs(step)["means"]
 
     def _update(self) -> None:
-        """Have the strategy change the set of Gaussians after the step that was just taken, where it is time."""
+        """Have the strategy change the set of Gaussians after the step that was just taken, where that is due."""
         if not self.strategy.due(self.step):
             return
         self._forget_graphs()
@@ -234,11 +242,11 @@ class Trainer:
         shown = [*views, *(half_size(v) for v in views if c.half_resolution > 0)]
         shown, self.stacks, self.places = stack_views(shown, len(views))
         self.views = shown[: len(views)]
-        cameras, masked = [v.camera for v in shown], [v.mask is not None for v in shown]
         layout = layout_of(
-            self.gaussians, cameras, masked, scored=type(self.strategy).samples(c), recorded=c.cuda_graph,
+            self.table, shown, kept=self.strategy.kept_views(), scored=self.strategy.samples(c), captured=c.cuda_graph,
             depth_supervised=c.loss.depth_weight > 0,
         )  # fmt: skip
+        cameras = [v.camera for v in shown]
         self.memory, self.layout = plan(
             layout, count=len(self.table), instances=most_instances(self.gaussians, cameras, c.rule), most=c.max_gaussians,
             limit=c.memory_limit, available=available_bytes(self.device), capacity_factor=CAPACITY_FACTOR,
@@ -250,8 +258,8 @@ class Trainer:
         limit = self.config.memory_limit
         self.max_instances = None if limit is None else self.layout.most_instances(len(self.table), limit)
 
-    def state(self) -> tuple[dict[str, torch.Tensor], dict]:
-        """Return tensors and plain values from which the fit goes on as if it had never stopped."""
+    def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+        """Return tensors by name, of any shape [...], and plain values from which the fit continues with the same bits."""
         tensors, strategy = self.strategy.state()
         views = {f"views.{n}": t for n, t in self.view_table.state().items()}
         tensors = {**self.table.state(), **views, **tensors, "generator": self.generator.get_state()}
@@ -261,8 +269,8 @@ class Trainer:
         }  # fmt: skip
         return tensors, plain
 
-    def load(self, tensors: dict[str, torch.Tensor], plain: dict) -> None:
-        """Take over what `state` gave."""
+    def load(self, tensors: dict[str, torch.Tensor], plain: dict[str, Any]) -> None:
+        """Load what `state` returned, ``tensors`` of shape [...] by name."""
         self.step, self.order = plain["step"], list(plain["order"])
         self.extent, self.notes = plain["extent"], plain["notes"]
         self.table.load(tensors)
@@ -284,7 +292,7 @@ def run(
 
     Raises:
         NotFiniteError: The loss or, when it is to be saved, a number of the state is not finite; nothing of it is saved.
-        KeyboardInterrupt: ``stopped`` said so after a step; the state after it is saved.
+        KeyboardInterrupt: ``stopped`` returned True after a step; the state after it is saved.
     """
     every, saved = trainer.config.checkpoint_every, time.monotonic()
     while trainer.step < trainer.config.steps:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -10,25 +10,28 @@ from torch.nn.functional import interpolate
 
 from warpgs.scene import Camera, View
 
+Kind = tuple[int, int, bool]
+"""Width and height [px] of a view, and whether it has a mask."""
+
 
 @dataclass(frozen=True)
 class TrainingView:
     """A training view on the device of the fit."""
 
     camera: Camera
-    """Float32 tensors on the device."""
+    """Camera with float32 tensors on the device."""
     image: torch.Tensor
     """Colours in [0, 1], shape [H, W, 3]."""
     mask: torch.Tensor | None = None
     """1 where a pixel counts, else 0, shape [H, W]; None where all count."""
     semantic: torch.Tensor | None = None
-    """S_semantic in [0, 1], shape [H, W]; None where nothing is known of it."""
+    """S_semantic in [0, 1], shape [H, W]; None for a view without a semantic score."""
     geometry: torch.Tensor | None = None
-    """S_geometry in [0, 1], shape [H, W]; None where nothing samples by it."""
+    """S_geometry in [0, 1], shape [H, W]; None where no strategy samples by it."""
     consistent: torch.Tensor | None = None
-    """Geometrically consistent z-depth [u], confirmed by other views, 0 where none confirms it, shape [H, W]; None for none."""
+    """Geometrically consistent z-depth [u], 0 where no other view confirms it, shape [H, W]; None for none at all."""
     maps: Mapping[str, torch.Tensor] = field(default_factory=dict)
-    """What loss terms compare with, by name, each of shape [H, W] or [H, W, C]."""
+    """Maps that loss terms asked for, by name, each of shape [H, W] or [H, W, C]."""
 
     @staticmethod
     def of(view: View, device: torch.device) -> TrainingView:
@@ -38,12 +41,12 @@ class TrainingView:
             return torch.as_tensor(array, dtype=torch.float32, device=device)
 
         c = view.camera
-        camera = Camera(there(c.viewmat), there(c.K), c.width, c.height)
+        camera = replace(c, viewmat=there(c.viewmat), K=there(c.K))
         return TrainingView(camera, there(view.image), None if view.mask is None else there(view.mask))
 
     @property
-    def kind(self) -> tuple[int, int, bool]:
-        """Width, height and whether there is a mask: what the views of one stack share."""
+    def kind(self) -> Kind:
+        """Width, height and presence of a mask, which the views of one stack share."""
         return self.camera.width, self.camera.height, self.mask is not None
 
 
@@ -63,36 +66,59 @@ def half_size(view: TrainingView) -> TrainingView:
         return mean(t[None])[0] if t.ndim == 2 else mean(t.permute(2, 0, 1)).permute(1, 2, 0).contiguous()
 
     mask = None if view.mask is None else (mean(view.mask[None])[0] > 1 - 1e-4).to(view.mask.dtype)
-    camera = Camera(c.viewmat, scale[:, None] * c.K, width, height)
+    camera = replace(c, K=scale[:, None] * c.K, width=width, height=height)
     return TrainingView(camera, smaller(view.image), mask, maps={n: smaller(t) for n, t in view.maps.items()})
+
+
+Rows = torch.Tensor | tuple[torch.Tensor, ...]
+"""One entry for each view: a tensor [V, ...], or on a CPU a tensor for each."""
 
 
 @dataclass(frozen=True)
 class ViewStack:
-    """Training views of one kind in one tensor each, from which a step takes its own."""
+    """Training views of one kind, stacked, from which a step takes its own."""
 
     viewmats: torch.Tensor
     """camera_from_world, shape [V, 4, 4]."""
     Ks: torch.Tensor
     """Intrinsics [px], shape [V, 3, 3]."""
-    images: torch.Tensor
+    images: Rows
     """Colours in [0, 1], shape [V, H, W, 3]."""
-    masks: torch.Tensor | None
+    masks: Rows | None
     """1 where a pixel counts, else 0, shape [V, H, W]; None where all count."""
-    maps: Mapping[str, torch.Tensor]
-    """What loss terms compare with, by name, each of shape [V, H, W, ...]."""
+    maps: Mapping[str, Rows]
+    """Maps that loss terms asked for, by name, each of shape [V, H, W, ...]."""
     numbers: torch.Tensor
     """Number of each view among all training views, int64, shape [V]."""
 
     @property
     def size(self) -> dict[str, int]:
         """Width and height [px] by name."""
-        return {"width": self.images.shape[2], "height": self.images.shape[1]}
+        height, width = self.images[0].shape[:2]
+        return {"width": width, "height": height}
+
+
+def stacked(tensors: Sequence[torch.Tensor]) -> Rows:
+    """Return tensors of one shape as one, [V, ...]; on a CPU, where a step takes them one by one, as they are.
+
+    Tensors that lie behind each other in memory already, as those of an earlier stack do, are not copied.
+    """
+    first = tensors[0]
+    if first.device.type == "cpu":
+        return tuple(tensors)
+    step, storage = first.numel() * first.element_size(), first.untyped_storage().data_ptr()
+    behind = all(
+        t.is_contiguous() and t.untyped_storage().data_ptr() == storage and t.data_ptr() == first.data_ptr() + i * step
+        for i, t in enumerate(tensors)
+    )
+    if not behind:
+        return torch.stack(list(tensors))
+    return first.as_strided((len(tensors), *first.shape), (first.numel(), *first.stride()))
 
 
 def stack_views(
     views: list[TrainingView], count: int
-) -> tuple[list[TrainingView], dict[tuple, ViewStack], list[tuple[tuple, int]]]:
+) -> tuple[list[TrainingView], dict[Kind, ViewStack], list[tuple[Kind, int]]]:
     """Stack views by size and by whether they have a mask.
 
     Args:
@@ -100,8 +126,8 @@ def stack_views(
         count: Number of training views.
 
     Returns:
-        The views, whose pixels are now those of the stacks, so that nothing is held twice; the stacks by kind; and for each
-        view its kind and row there.
+        The views, whose pixels are parts of the stacks, so that nothing is held twice; the stacks by kind; and for each view
+        its kind and row there.
     """
     kinds = [v.kind for v in views]
     stacks, shared = {}, list(views)
@@ -111,8 +137,8 @@ def stack_views(
         device = same[0].image.device
         stack = ViewStack(
             torch.stack([v.camera.viewmat for v in same]), torch.stack([v.camera.K for v in same]),
-            torch.stack([v.image for v in same]), torch.stack([v.mask for v in same]) if kind[2] else None,
-            {n: torch.stack([v.maps[n] for v in same]) for n in same[0].maps},
+            stacked([v.image for v in same]), stacked([v.mask for v in same]) if kind[2] else None,
+            {n: stacked([v.maps[n] for v in same]) for n in same[0].maps},
             torch.tensor([i % count for i in numbers], device=device),
         )  # fmt: skip
         for row, i in enumerate(numbers):

@@ -1,4 +1,4 @@
-"""A tiny fit beside the preparations of the real one: what a CUDA device loads at first use is there when it is asked for.
+"""Warmup: a tiny fit beside the preparations of the real one, so that a CUDA device has loaded what the real one uses.
 
 Contexts, kernels, libraries and modules of Python are loaded one by one as they are first used, which took two to three seconds
 of a fit on an H200. Semantics and matches are found on the CPU meanwhile.
@@ -25,9 +25,9 @@ from warpgs.render.rasterize import RasterizeOptions
 from warpgs.scene import Camera, PointCloud, Prior, View
 
 STEPS = 3
-"""With phases, one step for each."""
+"""Steps of the tiny fit: one for each phase."""
 SIDE, POINTS, PLANES = 48, 200, 8
-"""Sides of the views [px]; number of points, and of planes."""
+"""Sides of the tiny fit's views [px]; its number of points, and of planes."""
 
 
 def _views(generator: np.random.Generator) -> list[View]:
@@ -41,18 +41,18 @@ def _views(generator: np.random.Generator) -> list[View]:
 
 
 def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool] = lambda: False) -> Trainer:
-    """Fit noise in two small views with the same settings, refinement and sampling included, and score one.
+    """Fit noise in two small views with the same settings, refinement and sampling included, and score one view.
 
     Args:
         config: Settings of the real fit. Where that sweeps on the device, these views are swept, too.
-        device: Where to work.
-        stopped: Asked after each step whether nobody waits any more.
+        device: Device to work on.
+        stopped: Returns, after each step, whether to stop.
 
     Returns:
-        The fit, done.
+        The trainer, after its last step.
 
     Raises:
-        KeyboardInterrupt: ``stopped`` said so.
+        KeyboardInterrupt: ``stopped`` returned True.
     """
     generator = np.random.default_rng(0)
     views = _views(generator)
@@ -64,6 +64,8 @@ def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool]
         density=replace(config.density, every=1),
         strategy_config=find_strategy(config.strategy).warmup_config(config.strategy_config),
     )  # fmt: skip
+    if hasattr(small.strategy_config, "every"):  # a strategy with events of its own, such as mcmc: it has some, too
+        small = replace(small, strategy_config=replace(small.strategy_config, every=1))
     black = (0.0, 0.0, 0.0)
     if sweeps(config.init, len(views)) and config.memory_limit is None:
         sweep_depths(views, [(2, 4)] * len(views), SweepConfig(max_planes=PLANES), device)
@@ -71,16 +73,16 @@ def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool]
     run(fit, lambda _: None, lambda _: None, stopped)
     score(views[0], render_view(fit.gaussians, views[0], RasterizeOptions(rule=small.rule, background=fit.background))[0])
     if fit.graphs is not None:
-        fit.graphs.clear()  # graphs and trainer refer to each other, which would keep their memory
+        fit.graphs.clear()  # their memory is for the fit that follows
     return fit
 
 
 @contextlib.contextmanager
-def rehearsal(config: FitConfig, device: torch.device) -> Iterator[Callable[[], object]]:
-    """Rehearse in a thread within the block, where the device is a GPU that networks for priors leave alone.
+def background_warmup(config: FitConfig, device: torch.device) -> Iterator[Callable[[], object]]:
+    """Run `warm_up` in a thread within the block, where the device is a GPU that networks for priors do not use.
 
-    Gives what waits for the end and raises what went wrong; until then nothing else may use the device, since steps may be
-    being recorded. However the block ends, the thread has ended by then.
+    Yields a function that waits for the end of the warmup and raises its errors; until it has returned nothing else may use the
+    device, since steps may be being captured. The thread has ended when the block has, also after an error.
     """
     if device.type != "cuda" or config.priors.onnx_provider == "cuda":
         yield lambda: None
@@ -91,7 +93,7 @@ def rehearsal(config: FitConfig, device: torch.device) -> Iterator[Callable[[], 
         with torch.cuda.device(device):
             warm_up(config, device, stop.is_set)
 
-    with ThreadPoolExecutor(1, thread_name_prefix="rehearsal") as thread:
+    with ThreadPoolExecutor(1, thread_name_prefix="warmup") as thread:
         done = thread.submit(on_device)
         try:
             yield done.result

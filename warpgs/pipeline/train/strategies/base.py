@@ -1,8 +1,9 @@
-"""What a density strategy is: the one part of training that adds, moves and removes Gaussians."""
+"""Base class of density strategies, the one part of training that adds, moves and removes Gaussians."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping
+import weakref
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
@@ -14,16 +15,18 @@ from warpgs.plugins import Registry
 if TYPE_CHECKING:
     from warpgs.pipeline.train.config import FitConfig
     from warpgs.pipeline.train.trainer import Trainer
+    from warpgs.pipeline.train.views import TrainingView
+    from warpgs.scene import Gaussians
 
 
 class Strategy:
-    """Decides where Gaussians are added, moved and removed.
+    """Rules by which Gaussians are added, moved and removed.
 
     A strategy of your own is a class that derives from this one and overrides what it needs; nothing else has to change. The
     trainer calls, for each step: `phase` on the host; then, as part of the step, `lr_factors`, `after_step` and
     `after_backward`; then `due` and, where that is true, `update` on the host.
 
-    What is part of a step is recorded once as a CUDA graph and replayed, so it must not read back from the device, must write
+    What is part of a step is captured once as a CUDA graph and replayed, so it must not read back from the device, must write
     its results into tensors that are there already, and may depend on the host only by `phase`.
     """
 
@@ -38,7 +41,8 @@ class Strategy:
         Args:
             trainer: The trainer. Its table exists, its views do not: see `setup`.
         """
-        self.trainer = trainer
+        # by proxy: with a cycle, a finished fit would keep its memory until Python looks for garbage
+        self.trainer: Trainer = weakref.proxy(trainer)
         own = trainer.config.strategy_config
         self.config: Any = self.Config() if own is None and self.Config is not None else own
         """The strategy's own settings."""
@@ -54,14 +58,18 @@ class Strategy:
         return own
 
     def columns(self) -> Mapping[str, Column]:
-        """Return what the strategy keeps of each Gaussian, by name; it is saved with every checkpoint."""
+        """Return the columns that the strategy keeps of each Gaussian, by name; they are saved with every checkpoint."""
         return {}
 
     def setup(self) -> None:
-        """Begin: the table, the training views and the plan of memory are there."""
+        """Begin; the table, the training views and the memory plan exist by now."""
+
+    def kept_views(self) -> Sequence[TrainingView]:
+        """Return views that the strategy keeps beside those in training, whose memory counts."""
+        return ()
 
     def phase(self, step: int) -> Hashable:
-        """Return what the strategy does in a step; steps of equal phases share a CUDA graph."""
+        """Return a value for what the strategy does in a step; steps of equal phases share a CUDA graph."""
         return None
 
     def sh_degree(self, step: int) -> int:
@@ -69,22 +77,27 @@ class Strategy:
         return sh_degree(step, self.trainer.config.sh_every, self.trainer.config.init.max_sh_degree)
 
     def dropout(self, step: int) -> float:
-        """Return the probability that a Gaussian is hidden in a step, in [0, 1)."""
+        """Return the probability that a Gaussian is hidden in a step, in [0, 1); asked only if `FitConfig.dropout` is not 0."""
         return self.trainer.dropout * self.trainer.progress(step)
 
-    def regularisation(self, gaussians: Any) -> torch.Tensor | None:
-        """Return what is added to the loss of every step, shape []; None for nothing."""
+    def regularisation(self, phase: Hashable, gaussians: Gaussians) -> torch.Tensor | None:
+        """Return a term that is added to the loss of every step, shape []; None for none.
+
+        Args:
+            phase: Result of `phase`.
+            gaussians: The current Gaussians, which require gradients.
+        """
         return None
 
     def lr_factors(self, phase: Hashable) -> torch.Tensor | None:
-        """Return the part of its step that each mean takes, shape [N]; None for all of it."""
+        """Return the fraction of its step that each mean takes, shape [N]; None for all of it."""
         return None
 
     def after_step(self, phase: Hashable, settings: torch.Tensor, going: torch.Tensor) -> None:
-        """Follow the update of the parameters within a step.
+        """Change parameters or columns after the update of the parameters, within a step.
 
         Args:
-            phase: What `phase` returned.
+            phase: Value of `phase` for the step.
             settings: Dropout probability, number of the step, and learning rate of the means [u], float32, shape [3].
             going: Whether the step is taken, bool, shape [1]; where it is not, nothing may change.
         """
@@ -92,10 +105,10 @@ class Strategy:
     def after_backward(
         self, phase: Hashable, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int], going: torch.Tensor
     ) -> None:
-        """Take in the gradients of a step.
+        """Gather statistics of the gradients of a step, within it.
 
         Args:
-            phase: What `phase` returned.
+            phase: Value of `phase` for the step.
             v_projected: Gradient of the projected Gaussians, shape [1, N, 12]; the first two are of the mean [1/px].
             visible: Gaussians that touch a tile, bool, shape [1, N].
             size: Width and height of the view [px].
@@ -111,14 +124,17 @@ class Strategy:
         return iter(())
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-        """Return tensors and plain values beside the table from which the strategy goes on as if it had never stopped."""
+        """Return tensors by name, of any shape [...], and plain values from which the strategy continues with the same bits.
+
+        The table is saved by the trainer.
+        """
         return {}, {}
 
     def load(self, tensors: Mapping[str, torch.Tensor], plain: dict[str, Any]) -> None:
-        """Take over what `state` gave."""
+        """Load what `state` returned."""
 
     def figures(self) -> dict[str, Any]:
-        """Return what the report says of it, plain values for metrics.json."""
+        """Return what the report says of the strategy, plain values for metrics.json."""
         return {}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from warpgs.pipeline.train.strategies.base import Strategy, register
 from warpgs.scene import Gaussians
 
 RESET_FREE_STEPS = 500
-"""Steps before the set is left alone in which no opacity is reset any more: what is transparent then stays so."""
+"""Steps before the last event in which no opacity is reset any more: what is transparent then stays so."""
 
 
 @dataclass(frozen=True)
@@ -25,23 +26,23 @@ class DensityConfig:
     every: int = 100
     """Steps between two such events."""
     stop_fraction: float = 0.5
-    """Share of the fit after which the set is left alone."""
+    """Fraction of the fit after which the set is left alone."""
     gradient: float = 2e-4
     """Mean gradient of the projected mean, in half image widths and heights, above which a Gaussian is densified."""
     clone_size: float = 0.01
-    """Gaussians smaller than this share of the extent are cloned, larger ones split."""
+    """Gaussians smaller than this fraction of the scene's extent are cloned, larger ones split."""
     prune_opacity: float = 0.005
     """Gaussians below this opacity are removed."""
     prune_size: float = 0.1
-    """Gaussians larger than this share of the extent are removed, once an opacity reset has happened, but not where more than
-    half of all are; 0 for never."""
+    """Gaussians larger than this fraction of the extent are removed once an opacity reset has happened, but not where more
+    than half of all are larger; 0 for never."""
     reset_every: int = 0
     """Steps between opacity resets, 3000 in Kerbl et al. 2023; 0 for none. With few views a reset costs decibels that the
     rest of the fit does not win back (docs/decisions/002-no-opacity-reset.md)."""
     reset_opacity: float = 0.01
     """Largest opacity after a reset."""
     morton_order: bool = True
-    """Whether the Gaussians are sorted along a Morton curve after each event (docs/decisions/009-morton-order.md)."""
+    """Order the Gaussians along a Morton curve after each event (docs/decisions/009-morton-order.md)."""
 
     def __post_init__(self):
         if self.every < 1 or self.start < 0 or self.reset_every < 0:
@@ -56,26 +57,36 @@ class DensityConfig:
             raise UsageError(f"density reset opacity {self.reset_opacity} must lie between 0 and 1")
 
     def times(self, steps: int) -> tuple[int, int, int]:
-        """First event, interval and last event [steps] in a fit of that length; a short fit starts after a quarter of it."""
+        """Return first event, interval and last event [steps] of a fit; a short one starts after a quarter of its length."""
         return min(self.start, steps // 4), self.every, int(self.stop_fraction * steps)
 
     def due(self, step: int, steps: int, until: int) -> tuple[bool, bool]:
-        """Whether the set is refined, and opacities reset, after a step of a fit in which ``until`` is the last such step."""
+        """Return whether the set is refined, and opacities reset, after a step; ``until`` is the last step for either."""
         start, every, _ = self.times(steps)
         refines = start < step <= until and step % every == 0
         return refines, self.reset_every > 0 and step <= until - RESET_FREE_STEPS and step % self.reset_every == 0
 
 
+def _logit(p: float) -> float:
+    """Return the inverse sigmoid of a number in [0, 1]; infinite at both ends."""
+    return math.log(p / (1 - p)) if 0 < p < 1 else math.copysign(math.inf, p - 0.5)
+
+
+def _exp(x: torch.Tensor) -> torch.Tensor:
+    """Return e^x by way of float64: float32's has other last digits on other processors (MKL)."""
+    return x.double().exp().to(x.dtype)
+
+
 def _split(gaussians: dict[str, torch.Tensor], ids: torch.Tensor, generator: torch.Generator) -> dict[str, torch.Tensor]:
-    """Two children for each: drawn from the parent's own distribution, 1.6 times smaller (Kerbl et al. 2023)."""
+    """Return two children of each Gaussian, sampled from its own distribution and 1.6 times smaller (Kerbl et al. 2023)."""
     pair = ids.repeat(2)
     rows = {n: t[pair] for n, t in gaussians.items()}
-    noise = torch.randn(len(pair), 3, generator=generator).to(ids.device) * rows["log_scales"].exp()
+    noise = torch.randn(len(pair), 3, generator=generator).to(ids.device) * _exp(rows["log_scales"])
     w, *vector = (rows["quats"] / rows["quats"].norm(dim=1, keepdim=True)).unbind(1)
     axis = torch.stack(vector, 1)
     cross = 2 * torch.linalg.cross(axis, noise)
     rows["means"] = rows["means"] + noise + w[:, None] * cross + torch.linalg.cross(axis, cross)
-    rows["log_scales"] = rows["log_scales"] - torch.log(torch.tensor(1.6)).item()
+    rows["log_scales"] = rows["log_scales"] - math.log(1.6)
     return rows
 
 
@@ -91,26 +102,26 @@ def refine(
     growing: torch.Tensor | None = None,
     protected: torch.Tensor | None = None,
 ) -> DensityUpdate:
-    """Clone small Gaussians and split large ones where the image pulls at them; prune the transparent and the huge.
+    """Clone small Gaussians and split large ones where the gradient of the mean is large; prune the transparent and the huge.
 
     Args:
         gaussians: The current set, N rows.
-        pull: Mean norm of the gradient of each projected mean, in half image sizes, shape [N].
+        pull: Mean norm of the gradient of each projected mean, in half image widths and heights, shape [N].
         config: Thresholds.
         extent: Size of the scene [u].
-        capacity: Gaussians that there may be.
-        after_reset: An opacity reset has happened, so size pruning is on.
-        generator: CPU generator for the children's positions; the same numbers on every device.
+        capacity: Largest number of Gaussians after the change.
+        after_reset: True once opacities were reset; only then are huge Gaussians pruned.
+        generator: CPU generator of the children's positions, the same numbers on every device.
         growing: Gaussians that may be cloned and split, bool, shape [N]; None for all.
         protected: Gaussians that are not pruned, bool, shape [N]; None for none.
 
     Returns:
-        Rows that stay and rows to append. At least one Gaussian always stays, the most opaque.
+        The change; at least one Gaussian, the most opaque, always stays.
     """
     with torch.no_grad():
         tensors = {n: t.detach() for n, t in gaussians.tensors().items()}
-        scales = tensors["log_scales"].exp().amax(1)
-        opacities = tensors["logit_opacities"].sigmoid()
+        scales = _exp(tensors["log_scales"].amax(1))
+        logits = tensors["logit_opacities"]  # torch's sigmoid depends on the number of threads in its last digit
         grows = pull > config.gradient
         if growing is not None:
             grows &= growing
@@ -120,7 +131,7 @@ def refine(
             strongest = torch.topk(pull, free).indices
             grows = torch.zeros_like(grows).index_fill(0, strongest, True) & grows
         small = scales <= config.clone_size * extent
-        faint = ~(opacities >= config.prune_opacity)
+        faint = ~(logits >= _logit(config.prune_opacity))
         if after_reset and config.prune_size > 0:
             huge = scales > config.prune_size * extent
             if 2 * int(huge.sum()) <= len(gaussians):  # else it is the extent that is small: the cameras stand close together
@@ -128,7 +139,7 @@ def refine(
         if protected is not None:
             faint &= ~protected
         if len(gaussians) > 0 and bool(faint.all()):
-            faint[opacities.argmax()] = False
+            faint[logits.argmax()] = False
         cloned = torch.nonzero(grows & small & ~faint).squeeze(1)
         split = torch.nonzero(grows & ~small & ~faint).squeeze(1)
         remove = faint.clone()
@@ -140,16 +151,16 @@ def refine(
 
 @register("clone_split")
 class CloneSplit(Strategy):
-    """Clones and splits where images pull at a projected mean, prunes the transparent and the huge."""
+    """Cloning and splitting by the gradient of projected means, pruning of the transparent and the huge; the default."""
 
     def __init__(self, trainer):
-        """See `Strategy`."""
+        """Begin without statistics, and before the first opacity reset."""
         super().__init__(trainer)
         self.was_reset = False
-        """Whether opacities were reset, after which huge Gaussians are removed."""
+        """True once opacities were reset, after which huge Gaussians are pruned."""
 
     def columns(self) -> Mapping[str, Column]:
-        """See `Strategy`."""
+        """Return the sum of the gradient norms of each projected mean, and the number of renders that it was seen in."""
         return {"grad_sum": Column(0.0, inherited=False), "seen_count": Column(0.0, inherited=False)}
 
     @property
@@ -159,14 +170,17 @@ class CloneSplit(Strategy):
         return phases.stable_start if c.phases.coarse + c.phases.stable > 0 else c.density.times(c.steps)[2]
 
     def phase(self, step: int) -> Hashable:
-        """Return whether gradients are gathered."""
+        """Return whether gradients are gathered in a step."""
         return step <= self.densify_until
 
     def after_backward(self, phase, v_projected, visible, size, going):
-        """Add the norm of each projected mean's gradient, in half image sizes, to its sum, and count the views that see it."""
+        """Add the norm of each projected mean's gradient to its sum, and count the renders that see it.
+
+        The unit is half image widths and heights; ``v_projected`` has shape [1, N, 12], ``visible`` [1, N], ``going`` [1].
+        """
         if not phase:
             return
-        # a product with a tensor of the two sizes would copy them to the device, which a recorded step must not
+        # a product with a tensor of the two sizes would copy them to the device, which a captured step must not
         norms = torch.hypot(v_projected[..., 0] * (0.5 * size[0]), v_projected[..., 1] * (0.5 * size[1]))
         columns = self.trainer.table.columns
         columns["grad_sum"] += torch.where(visible, norms, 0).sum(0) * going
@@ -191,7 +205,13 @@ class CloneSplit(Strategy):
     def refine(
         self, step: int, growing: torch.Tensor | None = None, protected: torch.Tensor | None = None
     ) -> Iterator[DensityUpdate]:
-        """Yield the refinement, then sort the Gaussians and forget what was gathered; arguments as in `refine`."""
+        """Yield the change by `refine`, then order the Gaussians and begin to gather anew.
+
+        Args:
+            step: Steps done.
+            growing: Gaussians that may be cloned and split, bool, shape [N]; None for all.
+            protected: Gaussians that are not pruned, bool, shape [N]; None for none.
+        """
         t = self.trainer
         columns, c = t.table.columns, t.config.density
         pull = columns["grad_sum"] / columns["seen_count"].clamp_min(1)
@@ -204,14 +224,14 @@ class CloneSplit(Strategy):
         self.forget()
 
     def forget(self) -> None:
-        """Begin to gather gradients anew."""
+        """Reset the statistics of gradients."""
         for name in ("grad_sum", "seen_count"):
             self.trainer.table.columns[name].zero_()
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict]:
-        """Return whether opacities were reset."""
+        """Return no tensors, shape [...], and whether opacities were reset."""
         return {}, {"was_reset": self.was_reset}
 
     def load(self, tensors, plain):
-        """Take over what `state` gave."""
+        """Load whether opacities were reset; ``tensors`` [...] are not read."""
         self.was_reset = plain["was_reset"]

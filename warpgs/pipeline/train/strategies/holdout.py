@@ -1,6 +1,6 @@
-"""A strategy that finds its own size: growth is measured on held-out blocks, what the evidence does not ask for goes.
+"""Density strategy that chooses the number of Gaussians by the error of held-out blocks of the training views.
 
-docs/complexity.md. On top of importance sampling, it decides when growth ends and what is left of the model.
+On top of importance sampling it decides when growth ends, and which Gaussians and degrees stay (docs/complexity.md).
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from warpgs.pipeline.train.strategies.holdout_blocks import (
     sample_blocks,
 )
 from warpgs.pipeline.train.strategies.importance_sampling import MAX_VIEWS, ImportanceSampling
+from warpgs.pipeline.train.views import TrainingView
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Gaussians
 
 RECOVERED_AGAIN = 0.5
 """Fraction of what training recovered of one trim that it is expected to recover of the next: a smaller model recovers less.
-With all of it smooth walls ended up to 1.1 dB below enough, with half of it at enough (docs/complexity.md)."""
-
+With all of it smooth walls ended up to 1.1 dB below `HoldoutConfig.enough_db`, with half of it there (docs/complexity.md)."""
 NEAR = 4.0
-"""Below enough by less than this a trim may take the less the farther [dB]. With an edge there a tenth of a decibel decided
-whether a smooth wall kept 167 or 696 Gaussians (docs/complexity.md)."""
+"""Distance below `HoldoutConfig.enough_db` over which the loss that a trim may cause falls to 0 [dB]. With a threshold instead,
+a tenth of a decibel decided whether a smooth wall kept 167 or 696 Gaussians (docs/complexity.md)."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Level:
     step: int
     """Steps done when it was measured."""
     count: int
-    """Gaussians then."""
+    """Gaussians at that step."""
     held_out_psnr: float
     """PSNR of the held-out blocks, the error floor included [dB]."""
     fall: float
@@ -64,31 +64,38 @@ class Level:
 
 @register("holdout")
 class Holdout(ImportanceSampling):
-    """Importance sampling, or with ``method.events`` off clone and split, that ends growth where held-out evidence says so.
+    """Importance sampling, or clone and split if ``method.events`` is off, with growth ended by the error of held-out blocks.
 
-    Until growth ends, blocks of every view are held out of the loss and of sampling. The start sees whole images: its colours
-    and depths come from them, and the evidence is about growth, merging and pruning.
+    Until growth ends, blocks of every view are held out of the loss and of sampling. The start uses whole images: the
+    held-out blocks measure growth, merging and pruning, not the start.
     """
 
     def __init__(self, trainer):
-        """See `Strategy`."""
+        """Begin with growth open and nothing measured."""
         super().__init__(trainer)
         self.closed: int | None = None
         """Steps done when growth ended; None before."""
         self.why = ""
-        """Why growth ended, for the user."""
+        """Reason why growth ended, for the user."""
         self.levels: list[Level] = []
+        """Levels of growth that were measured."""
         self.trims: list[dict] = []
         """Step of each trim, and the Gaussians and the training PSNR [dB] before and after it."""
+        self.whole: list[TrainingView] = []
+        """Views without hidden blocks."""
         self.growing = 0
         """Level of growth that new Gaussians come with."""
         self.before: torch.Tensor | None = None
         """Errors of the blocks when they were measured last, shape [B]."""
 
     def columns(self):
-        """See `Strategy`."""
+        """Return the columns of importance sampling, the bounds of each Gaussian, and the level of growth that it came with."""
         bounds = bound_columns(self.trainer.config.init.max_sh_degree)
         return {**super().columns(), **bounds, "growth_level": Column(0, torch.int32, inherited=False)}
+
+    def kept_views(self):
+        """Return the whole views, from the time that blocks are hidden."""
+        return self.whole
 
     def setup(self) -> None:
         """Hold blocks out, where there are enough of them to tell a gain from noise."""
@@ -102,7 +109,7 @@ class Holdout(ImportanceSampling):
         self.blocks = sample_blocks(t.views, c.holdout.fraction, c.seed)
         held = sum(map(len, self.blocks))
         self.measuring = held >= MIN_BLOCKS and ends < c.steps
-        """Whether there is evidence at all."""
+        """True where blocks are held out and growth is measured on them."""
         if self.measuring:
             t.set_views([hide(v, b) for v, b in zip(self.whole, self.blocks)])
             pixels = sum(len(b) * b.side**2 for b in self.blocks) / sum(v.camera.width * v.camera.height for v in t.views)
@@ -125,7 +132,7 @@ class Holdout(ImportanceSampling):
         return ends if self.closed is None else min(ends, self.closed - 1)
 
     def sh_degree(self, step: int) -> int:
-        """Return the degree in use; the highest comes when growth begins: else nothing would speak for it."""
+        """Return the degree in use; the highest is in use when growth begins, so that its use can be measured."""
         c = self.trainer.config
         highest = c.init.max_sh_degree
         if not self.measuring or highest == 0:
@@ -133,15 +140,15 @@ class Holdout(ImportanceSampling):
         return sh_degree(step, max(1, min(c.sh_every, self.marks[0] // highest)), highest)
 
     def dropout(self, step: int) -> float:
-        """Return the dropout probability, such that a trimmed model shows no fewer Gaussians than the whole one would have.
+        """Return the dropout probability, lower such that a trimmed model shows as many Gaussians as one without trims.
 
-        Hiding some teaches the others to stand in for them, and what was redundant that way has gone.
+        Dropout makes Gaussians redundant, and a trim has removed the redundant ones.
         """
         kept = math.prod(t["after"] / t["before"] for t in self.trims)
         return max(0.0, 1 - (1 - super().dropout(step)) / kept)
 
     def samples_after(self, step: int) -> bool:
-        """Return whether fine Gaussians are sampled after a step."""
+        """Return whether fine Gaussians are sampled after a step, which ends with growth."""
         return super().samples_after(step) and (self.closed is None or step < self.closed)
 
     def _measures_after(self, step: int) -> bool:
@@ -170,13 +177,16 @@ class Holdout(ImportanceSampling):
         return dataclasses.replace(change, columns={**change.columns, "growth_level": self.growing})
 
     def refine(self, step, growing=None, protected=None):
-        """Refine, but never what one view alone sees, nor what is as fine as a pixel."""
+        """Yield the refinement; Gaussians that only one view sees, or that are as fine as a pixel, do not grow.
+
+        Arguments are those of `CloneSplit.refine`: ``growing`` and ``protected`` are bool [N] or None.
+        """
         if self.measuring:
             self._observe()
         yield from super().refine(step, growing, protected)
 
     def after_step(self, phase, settings, going):
-        """Keep the bounds of each Gaussian, and what `ImportanceSampling` protects."""
+        """Apply the bounds of each Gaussian, and raise the opacities of protected ones; ``settings`` [3], ``going`` [1]."""
         enforce_bounds(self.trainer.table)
         super().after_step(phase, settings, going)
 
@@ -195,7 +205,7 @@ class Holdout(ImportanceSampling):
         return block_errors(gaussians, self.whole, self.blocks, self._options())
 
     def _observe(self) -> None:
-        """Bound every Gaussian by what the views can tell of it, and take growth from what one view alone sees."""
+        """Set the bounds of every Gaussian by what the views can resolve, and stop growth of what only one view sees."""
         t, columns, seen = self.trainer, self.trainer.table.columns, self._view_set.coverage(self.trainer.gaussians)
         columns["min_log_scale"] = min_log_scale(seen.footprint)
         columns["max_degree"] = torch.minimum(columns["max_degree"], seen.supported_degree().to(torch.int32))
@@ -210,7 +220,7 @@ class Holdout(ImportanceSampling):
         c, model = self.trainer.config.holdout, self.trainer.gaussians
         last = max((m for m in self.marks if m < step), default=step)
         if last < step < self.marks[-1] and not any(super(Holdout, self).due(s) for s in range(last, step)):
-            return  # nothing could have grown
+            return  # the set has not changed since
         errors = self._errors(model)
         if self.before is not None:
             old = self.trainer.table.columns["growth_level"] < self.growing
@@ -235,7 +245,7 @@ class Holdout(ImportanceSampling):
         self.growing += 1
 
     def _close(self, step: int) -> Iterator[DensityUpdate]:
-        """End growth: no harmonics but those that held-out evidence asks for, and all pixels are trained on from here on."""
+        """End growth: lower the degrees that held-out blocks do not need, and train on all pixels from here on."""
         t, c = self.trainer, self.trainer.config.holdout
         self.closed = step
         yield from map(self._of_level, self._catch_up(step))
@@ -249,6 +259,7 @@ class Holdout(ImportanceSampling):
         enforce_bounds(t.table)
         self.forget()
         t.set_views(self.whole)
+        self.whole = t.views
         t.messages.append(
             f"holdout: growth ended at step {step} with {len(t.table):,} Gaussians, because {self.why}; all pixels are trained "
             "on from here"
@@ -262,10 +273,10 @@ class Holdout(ImportanceSampling):
         return float((-10 * torch.log10(torch.stack(errors) + FLOOR)).mean())
 
     def psnr_budget(self, psnr: float, step: int) -> float:
-        """Return what a trim may take of that PSNR on the training views [dB]; 0 before the last step of a fit far from enough.
+        """Return the PSNR on the training views that a trim may cost [dB].
 
-        That is ``holdout.trim_db``, less below enough; what the fit has beyond enough; and before the last step what training
-        is expected to recover.
+        It is ``holdout.trim_db``, plus what the fit has above ``holdout.enough_db``, plus, before the last step, what training
+        is expected to recover. Before the last step it falls to 0 over `NEAR` decibels below ``enough_db``.
         """
         c = self.trainer.config.holdout
         over = psnr - c.enough_db
@@ -278,7 +289,7 @@ class Holdout(ImportanceSampling):
         return min(fraction, 1.0) * c.trim_db + max(over, 0.0) + RECOVERED_AGAIN * max(recovered, 0.0)
 
     def _trim(self, step: int) -> None:
-        """Make the model smaller, within its PSNR budget on the training views."""
+        """Prune the model within its PSNR budget on the training views."""
         t = self.trainer
         whole, before = self.view_psnr(t.gaussians), len(t.table)
         budget = self.psnr_budget(whole, step)
@@ -300,7 +311,7 @@ class Holdout(ImportanceSampling):
         )
 
     def _catch_up(self, step: int) -> Iterator[DensityUpdate]:
-        """Give the blocks, where nothing was sampled so far, as many fine Gaussians a pixel as there are elsewhere."""
+        """Sample as many fine Gaussians per pixel in the blocks, where none were sampled so far, as there are elsewhere."""
         method, pixels = self.method, sum(v.image[..., 0].numel() for v in self.whole)
         held = sum(len(b) * b.side**2 for b in self.blocks)
         fraction = int(self.fine.sum()) / (pixels - held) * held / pixels
@@ -313,7 +324,7 @@ class Holdout(ImportanceSampling):
             yield self.sample(step, views, dataclasses.replace(method, sampler=sampler)).change
 
     def state(self):
-        """Return what was measured so far."""
+        """Return the last errors of the blocks [B] and all measurements so far."""
         tensors, plain = super().state()
         if self.before is not None:
             tensors["holdout.before"] = self.before
@@ -323,7 +334,7 @@ class Holdout(ImportanceSampling):
         }  # fmt: skip
 
     def load(self, tensors, plain):
-        """Take over what `state` gave."""
+        """Load what `state` returned, ``tensors`` of shape [...] by name; once growth has ended, whole views are trained on."""
         super().load(tensors, plain)
         self.closed, self.why, self.trims, self.growing = (plain[k] for k in ("closed", "why", "trims", "growing"))
         self.levels = [Level(**x) for x in plain["levels"]]

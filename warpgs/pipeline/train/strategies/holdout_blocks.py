@@ -1,6 +1,6 @@
-"""Evidence for the size of a model: blocks of pixels that the loss does not see, and whether they change by more than noise.
+"""Held-out blocks of pixels, and the gain on them with its noise, by which the size of a model is chosen (docs/complexity.md).
 
-docs/complexity.md; leaving views or pixels out to find a size is VGNC's idea (2504.14548) without its generative model.
+To leave views or pixels out to choose a size is VGNC's idea (arXiv 2504.14548), here without its generative model.
 """
 
 from __future__ import annotations
@@ -11,50 +11,51 @@ from dataclasses import dataclass, replace
 import torch
 
 from warpgs.errors import UsageError
+from warpgs.pipeline.metrics.psnr import psnr_of
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Gaussians
 
 FLOOR = (2 / 255) ** 2
-"""Mean squared error that is added to every block's: below two levels of an 8-bit photograph there is nothing to explain."""
+"""Mean squared error that is added to every block's: errors below two levels of an 8-bit photograph count as none."""
 SIDES = 16, 32
-"""Least and largest side of a block [px]; between them a sixteenth of the picture's shorter side. In pictures of which an
+"""Least and largest side of a block [px]; between them a sixteenth of the image's shorter side. In images of which an
 eighth is less than the least, it is that eighth."""
 MAX_COST_FACTOR = 3
-"""What is lost within the noise may be this many times what is allowed."""
+"""Largest loss within the noise, as a multiple of the loss that is allowed."""
 MIN_BLOCKS = 12
-"""With fewer blocks over all views there is no telling a gain from noise."""
+"""Fewest blocks over all views with which a gain can be told from noise."""
 MAX_FRACTION = 0.1
-"""Small pictures hold out more than was asked for, up to this share, where it takes that to have `MIN_BLOCKS` blocks."""
+"""Largest fraction of the pixels that small images hold out to reach `MIN_BLOCKS`, where less was asked for."""
 
 
 @dataclass(frozen=True)
 class HoldoutConfig:
-    """How an adaptive fit finds its size."""
+    """Settings of strategy holdout."""
 
     fraction: float = 0.03
-    """Part of the pixels that is held out until growth ends."""
+    """Fraction of the pixels that is held out until growth ends."""
     levels: int = 4
-    """Parts of equal length that growth is judged after."""
+    """Number of levels of growth, of equal length; after each its gain is measured."""
     noise: float = 1.0
     """Standard errors of the mean gain over the blocks that count as its noise."""
     least_db: float = 0.02
-    """Growth ends early where a level's gain with its noise is below this [dB]: only where it surely bought nothing."""
+    """Gain of a level, its noise added, below which growth ends early [dB]."""
     degrees: bool = True
-    """Each Gaussian keeps only the spherical harmonics that its views can tell apart and that the held-out blocks ask for."""
+    """Lower degrees: each Gaussian keeps only the harmonics that its views can resolve and the held-out blocks need."""
     keep_db: float = 0.1
-    """PSNR that lower degrees may cost on the held-out blocks when growth ends, before the rest of the fit mends it [dB]; what
-    is within the noise of that difference may go in any case."""
+    """PSNR that lower degrees may cost on the held-out blocks when growth ends, before training recovers some of it [dB]; a
+    cost within its noise is accepted up to `MAX_COST_FACTOR` times this."""
     trims: int = 8
-    """Times that the model may be made smaller, at equal distances from the end of growth to the last step. Before the last
-    only where the fit is better than `enough_db` or near it: what such a trim takes, training mends."""
+    """Number of trims, at equal distances from the end of growth to the last step. Those before the last step happen only
+    where the fit is above `enough_db` or near it; training recovers some of what they cost."""
     trim_db: float = 0.1
     """PSNR on the training views that a trim may take below what the fit has, or below `enough_db` where it has more [dB];
-    before the last step also part of what training will probably mend. 0 for no trims."""
+    before the last step also part of what training will probably recover. 0 for no trims."""
     enough_db: float = 36.0
-    """PSNR on the training views, `FLOOR` included, that no Gaussian is spent on improving: size then follows from the content
-    and not from how well a fit happened to go [dB]. The default is 37.2 dB without `FLOOR`, an error of 3.5 levels of an 8-bit
-    photograph; 42.1 is no error at all, so with more every fit keeps what it has."""
+    """PSNR on the training views, `FLOOR` included, above which quality is traded for fewer Gaussians [dB]. The default is
+    37.2 dB without `FLOOR`, an error of 3.5 levels of an 8-bit photograph; 42.1 is no error at all, so that above it nothing is
+    traded."""
 
     def __post_init__(self):
         if not 0 < self.fraction <= 0.5:
@@ -80,16 +81,16 @@ class Blocks:
         return len(self.corners)
 
     def pixels(self, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
-        """Rows and columns of all pixels, int64, each of shape [B, side, side] once broadcast."""
+        """Return rows and columns of all pixels, int64, each of shape [B, side, side] once broadcast."""
         along = torch.arange(self.side)
         rows, columns = (self.corners[:, i, None] + along for i in range(2))
         return rows[:, :, None].to(device), columns[:, None, :].to(device)
 
 
 def sample_blocks(views: list[TrainingView], fraction: float, seed: int) -> list[Blocks]:
-    """Squares of a random grid in every view, about ``fraction`` of its pixels; more than half of each counts by the mask.
+    """Sample squares of a random grid in every view, about ``fraction`` of its pixels; masks keep more than half of each.
 
-    In small pictures it is more: see `MAX_FRACTION`.
+    In small images the fraction is larger, see `MAX_FRACTION`.
     """
     found = []
     for number, view in enumerate(views):
@@ -110,14 +111,14 @@ def sample_blocks(views: list[TrainingView], fraction: float, seed: int) -> list
 
 
 def hide(view: TrainingView, blocks: Blocks) -> TrainingView:
-    """The view whose mask leaves out the blocks."""
+    """Return the view with a mask that leaves out the blocks."""
     mask = torch.ones_like(view.image[..., 0]) if view.mask is None else view.mask.clone()
     mask[blocks.pixels(mask.device)] = 0
     return replace(view, mask=mask)
 
 
 def only(view: TrainingView, blocks: Blocks) -> TrainingView:
-    """The view whose mask leaves out all but the blocks."""
+    """Return the view with a mask that leaves out all but the blocks."""
     mask = torch.zeros_like(view.image[..., 0])
     mask[blocks.pixels(mask.device)] = 1
     return replace(view, mask=mask if view.mask is None else mask * view.mask)
@@ -127,13 +128,13 @@ def only(view: TrainingView, blocks: Blocks) -> TrainingView:
 def block_errors(
     gaussians: Gaussians, views: list[TrainingView], blocks: list[Blocks], options: RasterizeOptions
 ) -> torch.Tensor:
-    """Mean squared error of every block over the pixels that count, float64 on the CPU, shape [B] over all views.
+    """Return the mean squared error of every block over the pixels that count, float64 on the CPU, shape [B] over all views.
 
     Args:
         gaussians: The model.
         views: Views with their own masks, not those of `hide`.
         blocks: Blocks of each.
-        options: How to draw.
+        options: Settings of the rasterizer.
     """
     errors = []
     for view, held in zip(views, blocks, strict=True):
@@ -147,37 +148,40 @@ def block_errors(
 
 
 def decibels(errors: torch.Tensor) -> float:
-    """PSNR of the mean of block errors [B], with the floor; NaN where there is no block [dB]."""
-    return -10 * math.log10(float(errors.mean()) + FLOOR) if len(errors) else math.nan
+    """Return the PSNR of the mean of block errors [B], with the floor [dB]; NaN where there is no block."""
+    return psnr_of(float(errors.mean()) + FLOOR) if len(errors) else math.nan
 
 
 @dataclass(frozen=True)
 class Gain:
-    """What a change bought on the held-out blocks."""
+    """Gain of a change on the held-out blocks."""
 
     mean: float
     """Mean over blocks of the fall of their error [dB]."""
     noise: float
-    """Standard error of that mean; infinite with fewer than two blocks [dB]. Blocks of a view are not independent, so it is
+    """Standard error of that mean [dB]; infinite with fewer than two blocks. Blocks of a view are not independent, so it is
     rather too small than too large."""
 
     def upper_bound_below(self, least: float, noises: float) -> bool:
-        """Whether the mean and so many standard errors are together below ``least`` [dB]; a gain that is no number is.
+        """Return whether mean plus so many standard errors is below ``least`` [dB]; True for a gain that is no number.
 
-        Few blocks are a weak judge: it may end growth that bought nothing, never growth of which it cannot tell.
+        With few blocks the noise is large, so that growth of unknown gain goes on.
         """
         return not self.mean + noises * self.noise >= least
 
     def cost_below(self, allowed: float, noises: float) -> bool:
         """Return whether no more was lost than ``allowed`` [dB], or than the noise up to `MAX_COST_FACTOR` times that.
 
-        Without the bound few blocks would excuse anything: a large loss differs much from block to block.
+        Without that bound few blocks would allow any loss: a large loss differs much from block to block.
         """
         return -self.mean <= max(allowed, min(noises * self.noise, MAX_COST_FACTOR * allowed))
 
 
 def gain(before: torch.Tensor, after: torch.Tensor) -> Gain:
-    """Paired over blocks: ten times the decimal logarithm of the ratio of their errors [B], the floor added to both."""
+    """Compute the gain from the errors of blocks before and after a change, shape [B] each.
+
+    Paired over blocks: ten times the decimal logarithm of the ratio of the errors, the floor added to both.
+    """
     each = 10 * torch.log10((before + FLOOR) / (after + FLOOR))
     count = len(each)
     if count == 0:

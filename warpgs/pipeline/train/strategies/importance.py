@@ -1,7 +1,7 @@
-"""Where detail can be recovered: the paper's three scores of a training view, and their weighted sum.
+"""Importance of the pixels of a training view: the paper's three scores, and their weighted sum.
 
 Paper, section "Multi-Modal Importance Assessment". What it leaves open (the scale of each score, the unit of depth, the
-weight of curvature) is settled here and in docs/decisions/008-method.md.
+weight of curvature) is decided here and in docs/decisions/008-method.md.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from warpgs.errors import UsageError
 from warpgs.pipeline.metrics.quantiles import quantiles
 
 PERCENTILES = (0.02, 0.98)
-"""Quantiles of a view's score that become 0 and 1: a few extreme pixels must not flatten the rest."""
+"""Quantiles of a view's score that map to 0 and 1, so that a few extreme pixels do not flatten the rest."""
 BLUR = 1.0
-"""Standard deviation [px] of the blur that residuals and disparities get first: single noisy pixels must not draw samples."""
+"""Standard deviation [px] of the blur of residuals and disparities, so that single noisy pixels attract no samples."""
 
 
 @dataclass(frozen=True)
@@ -25,13 +25,13 @@ class ImportanceConfig:
     """Weights of the scores."""
 
     render: float = 0.4
-    """Of the rendering residual (paper, w1)."""
+    """Weight of the rendering residual (paper, w1)."""
     semantic: float = 0.2
-    """Of the semantic score (paper, w2)."""
+    """Weight of the semantic score (paper, w2)."""
     geometry: float = 0.4
-    """Of the geometric score (paper, w3)."""
+    """Weight of the geometric score (paper, w3)."""
     curvature: float = 0.5
-    """Of the second derivatives within the geometric score (lambda_curv, which the paper leaves open)."""
+    """Weight of the second derivatives within the geometric score (lambda_curv, which the paper leaves open)."""
 
     def __post_init__(self):
         for name, value in vars(self).items():
@@ -40,10 +40,11 @@ class ImportanceConfig:
 
 
 def blur(image: torch.Tensor, sigma: float = BLUR) -> torch.Tensor:
-    """Gaussian blur of a map [H, W], its border pixels repeated outwards."""
+    """Blur a map [H, W] by a Gaussian of standard deviation ``sigma`` [px], its border pixels repeated outwards."""
     radius = max(1, round(3 * sigma))
     offsets = torch.arange(-radius, radius + 1, dtype=image.dtype, device=image.device)
-    window = torch.exp(-0.5 * (offsets / sigma) ** 2)
+    # exponentials and roots in float64: float32's have other last digits on other processors (MKL)
+    window = torch.exp(-0.5 * (offsets.double() / sigma) ** 2).to(image.dtype)
     window = window / window.sum()
     padded = torch.nn.functional.pad(image[None, None], (radius,) * 4, mode="replicate")[0, 0]
     # sums of windows rather than a convolution, for which CUDA would load a library of its own
@@ -52,7 +53,7 @@ def blur(image: torch.Tensor, sigma: float = BLUR) -> torch.Tensor:
 
 
 def normalized(score: torch.Tensor, valid: torch.Tensor | None = None) -> torch.Tensor:
-    """A score [H, W] with its 2nd percentile over the valid pixels [H, W] at 0 and its 98th at 1, clipped; 0 where constant."""
+    """Scale a score [H, W] so that its 2nd percentile over valid pixels [H, W] is 0 and its 98th 1, clipped; 0 if constant."""
     values = score.flatten() if valid is None else score[valid]
     if len(values) == 0:
         return torch.zeros_like(score)
@@ -63,20 +64,20 @@ def normalized(score: torch.Tensor, valid: torch.Tensor | None = None) -> torch.
 
 
 def _slopes(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Central differences [1/px] along x and y, one-sided at the border."""
+    """Return central differences [1/px] along x and y, one-sided at the border."""
     dy, dx = torch.gradient(image)
     return dx, dy
 
 
 def geometry_score(disparity: torch.Tensor, curvature: float, valid: torch.Tensor | None = None) -> torch.Tensor:
-    """S_geometry: length of the disparity's gradient plus ``curvature`` times the norm of its second derivatives.
+    """Compute S_geometry: length of the disparity's gradient plus ``curvature`` times the norm of its second derivatives.
 
     Both are brought to [0, 1] before they are added, and so is the sum, since relative disparity has no unit.
 
     Args:
         disparity: Relative inverse depth, shape [H, W].
         curvature: Weight of the second derivatives.
-        valid: Pixels that set the range, shape [H, W].
+        valid: Pixels that set the range, bool, shape [H, W]; None for all.
 
     Returns:
         Score in [0, 1], shape [H, W].
@@ -86,31 +87,31 @@ def geometry_score(disparity: torch.Tensor, curvature: float, valid: torch.Tenso
     smooth = blur(disparity)
     dx, dy = _slopes(smooth)
     (dxx, dxy), (_, dyy) = _slopes(dx), _slopes(dy)
-    bend = (dxx**2 + 2 * dxy**2 + dyy**2).sqrt()
+    bend = (dxx**2 + 2 * dxy**2 + dyy**2).double().sqrt().to(smooth.dtype)
     return normalized(normalized(torch.hypot(dx, dy), valid) + curvature * normalized(bend, valid), valid)
 
 
 def semantic_score(confidence: torch.Tensor, boundary: torch.Tensor, foreground: torch.Tensor) -> torch.Tensor:
-    """S_semantic = F_seg (omega_boundary + omega_foreground), all of shape [H, W]; normalised to [0, 1]."""
+    """Compute S_semantic = F_seg (omega_boundary + omega_foreground), all of shape [H, W], and normalise it to [0, 1]."""
     return normalized(confidence * (boundary + foreground))
 
 
 def render_score(rendered: torch.Tensor, image: torch.Tensor, valid: torch.Tensor | None = None) -> torch.Tensor:
-    """S_render: length of the colour difference of two images [H, W, 3], blurred; normalised to [0, 1], shape [H, W]."""
+    """Compute S_render: blurred length of the colour difference of two images [H, W, 3], in [0, 1], shape [H, W]."""
     return normalized(blur((rendered - image).norm(dim=-1)), valid)
 
 
 def weights(config: ImportanceConfig, *, render: bool, semantic: bool, geometry: bool) -> tuple[float, float, float]:
-    """The three weights with those of absent scores set to 0 and the rest summing to 1; all 0 where none is left."""
+    """Return the three weights, those of absent scores 0, the others scaled to sum to 1; all 0 where none is left."""
     chosen = (config.render * render, config.semantic * semantic, config.geometry * geometry)
     total = sum(chosen)
     return chosen if total == 0 else tuple(w / total for w in chosen)
 
 
 def importance(scores: tuple[torch.Tensor, torch.Tensor, torch.Tensor], by: tuple[float, float, float]) -> torch.Tensor:
-    """S_importance = w . s of the render, semantic and geometric score, each [H, W] in [0, 1].
+    """Compute S_importance = w . s of the render, semantic and geometric score, each [H, W] in [0, 1].
 
-    1 everywhere where no weight is above 0, so that sampling without a score is uniform.
+    It is 1 everywhere where no weight is above 0, so that sampling without a score is uniform.
     """
     if sum(by) == 0:
         return torch.ones_like(scores[0])

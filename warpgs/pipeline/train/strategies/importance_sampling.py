@@ -6,13 +6,13 @@ Paper, sections "Hierarchical Gaussian Representation", "Geometric-Aware Samplin
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 
+from warpgs import geometry
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.table import Column, DensityUpdate
 from warpgs.pipeline.train.strategies import importance as scoring
@@ -33,19 +33,19 @@ from warpgs.scene import Gaussians, Prior, ViewDepth
 COARSE, FINE = 0, 1
 """Layers."""
 NOT_SAMPLED = -(2**30)
-"""``created_step`` of what was never sampled: the coarse layer."""
+"""``created_step`` of Gaussians that were not sampled: the coarse layer."""
 MAX_VIEWS = 8
-"""Views that one event looks at; drawn at random where there are more."""
+"""Largest number of views that one event samples in; chosen at random where there are more."""
 
 
 @dataclass(frozen=True)
 class ProtectConfig:
-    """How long and how well new Gaussians are protected."""
+    """Protection of new Gaussians."""
 
     steps: int = 500
     """Age [steps] up to which a sampled Gaussian is protected (T_protect, which the paper leaves open): five refinements."""
     opacity: float = 0.05
-    """Its opacity does not fall below this meanwhile (alpha_minimum): ten times what is pruned."""
+    """Least opacity of a protected Gaussian, in (0, 1) (alpha_minimum): ten times what is pruned."""
 
     def __post_init__(self):
         if self.steps < 0 or not 0 < self.opacity < 1:
@@ -53,52 +53,53 @@ class ProtectConfig:
 
     @property
     def logit(self) -> float:
-        """The least opacity as it is stored."""
-        return math.log(self.opacity / (1 - self.opacity))
+        """Least opacity as a logit, as it is stored."""
+        return geometry.logit(self.opacity)
 
 
 @dataclass(frozen=True)
 class MethodConfig:
-    """The paper's parts, each by itself (its Table 2), and what they are made of. All off is plain 3D Gaussian splatting."""
+    """Switches of the paper's parts (its Table 2), and their settings. All off is plain 3D Gaussian splatting."""
 
     events: bool = False
     """Sampling events: fine Gaussians are added in phase 2."""
     hier: bool = False
-    """Two layers: from phase 2 on the coarse one is neither cloned nor split, and moves slowly."""
+    """Two layers: from phase 2 on the coarse one is neither cloned nor split, and its means move slowly."""
     s_render: bool = True
-    """The rendering residual has its weight in the importance."""
+    """Weight of the rendering residual in the importance."""
     s_semantic: bool = True
-    """The semantic score has its weight in the importance."""
+    """Weight of the semantic score in the importance."""
     s_geometry: bool = True
-    """The geometric score has its weight in the importance; the gate uses it in any case."""
+    """Weight of the geometric score in the importance. A gate with gate_quantile above 0 (paper-literal) uses the map even when
+    this is off; with 0 (paper, quick, balanced) no gate uses it."""
     ra: bool = True
-    """Reliability assessment: only pixels of high geometric score are drawn, and with ``sampler.depth`` confirmed only those
-    whose depth other views confirm."""
+    """Reliability gate: only pixels above gate_quantile of the geometric score (0: no such gate) and, with sampler.depth
+    consistent, only pixels with consistent depth in views that have some."""
     agp: bool = True
-    """Adaptive Gaussian placement: pixels are drawn at random by importance, not the highest ones."""
+    """Adaptive Gaussian placement: pixels are sampled at random by importance; off takes the highest ones."""
     pm: bool = True
-    """Protection mechanism: young fine Gaussians keep a least opacity and are not pruned."""
+    """Protection mechanism: new fine Gaussians keep a least opacity and are not pruned."""
     coarse_lr_factor: float = 0.1
-    """Share of the position rate that the coarse layer moves with from phase 2 on."""
+    """Fraction of its Adam step that each mean of the coarse layer takes from phase 2 on, in [0, 1]."""
     importance: ImportanceConfig = field(default_factory=ImportanceConfig)
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
     protect: ProtectConfig = field(default_factory=ProtectConfig)
 
     def __post_init__(self):
         if not 0 <= self.coarse_lr_factor <= 1:
-            raise UsageError(f"method coarse rate {self.coarse_lr_factor} must lie between 0 and 1")
+            raise UsageError(f"method coarse-lr-factor {self.coarse_lr_factor} must lie between 0 and 1")
 
     def weights(self, semantics: bool = True) -> tuple[float, float, float]:
-        """Weights of the render, semantic and geometric score that are switched on, summing to 1.
+        """Return the weights of the render, semantic and geometric score, 0 where switched off, scaled to sum to 1.
 
-        ``semantics`` is False where nothing is known of a view's.
+        ``semantics`` is False for a view without a semantic score.
         """
         semantic = self.s_semantic and semantics
         return scoring.weights(self.importance, render=self.s_render, semantic=semantic, geometry=self.s_geometry)
 
 
 def scored(view: TrainingView, prior: Prior, depth: ViewDepth | None, config: MethodConfig) -> TrainingView:
-    """Return the view with the scores of its prior and the depth that other views confirm."""
+    """Return the view with the scores of its prior and its geometrically consistent depth."""
     maps = {n: torch.as_tensor(getattr(prior, n), dtype=torch.float32, device=view.image.device)
             for n in ("disparity", "confidence", "boundary", "foreground")}  # fmt: skip
     valid = None if view.mask is None else view.mask > 0
@@ -113,7 +114,7 @@ def scored(view: TrainingView, prior: Prior, depth: ViewDepth | None, config: Me
 
 @dataclass(frozen=True)
 class SampledView:
-    """What an event saw and did in one view; maps on the device of the fit."""
+    """Maps and samples of an event in one view, on the device of the fit."""
 
     view: int
     """Number of the training view."""
@@ -124,11 +125,11 @@ class SampledView:
     score: torch.Tensor
     """Their weighted sum, shape [H, W]."""
     gate: torch.Tensor
-    """Pixels that could be drawn, shape [H, W]."""
+    """Pixels that could be sampled, bool, shape [H, W]."""
     quantile: float
     """Quantile of the geometric score that the gate used; lower than asked for where too few pixels passed."""
     at: torch.Tensor
-    """Rows and columns of the pixels drawn, shape [S, 2]."""
+    """Rows and columns of the sampled pixels, int64, shape [S, 2]."""
 
 
 @dataclass(frozen=True)
@@ -138,16 +139,16 @@ class Event:
     change: DensityUpdate
     """Rows that stay and rows that are new."""
     evicted: int
-    """Fine Gaussians removed to make room."""
+    """Fine Gaussians that were removed for the new ones."""
     views: tuple[SampledView, ...]
-    """What happened in each view."""
+    """Samples of each view."""
 
 
 def sample_view(
     gaussians: Gaussians, view: TrainingView, number: int, config: MethodConfig, options: RasterizeOptions,
     generator: torch.Generator,
 ) -> tuple[SampledView, dict[str, torch.Tensor]]:  # fmt: skip
-    """Score one view, draw its pixels, and make the fine Gaussians behind them."""
+    """Score one view, sample its pixels, and return them with the rows [S, ...] of the fine Gaussians behind them."""
     c = config.sampler
     render = rasterize(gaussians, view.camera, options)
     depth, alpha = render.depth, render.alpha
@@ -170,7 +171,7 @@ def sample_view(
 def least_contributing(
     gaussians: Gaussians, candidates: torch.Tensor, count: int, views: list[TrainingView], options: RasterizeOptions
 ) -> torch.Tensor:
-    """Numbers of the ``count`` candidates (bool [N]) whose blending weights over all views sum to least, int64."""
+    """Return the rows of the ``count`` candidates (bool [N]) with the least sums of blending weights, int64 [count]."""
     total = torch.zeros(len(gaussians), device=gaussians.means.device)
     for view in views:
         total += rasterize(gaussians, view.camera, options).weight_sums[0]
@@ -191,10 +192,10 @@ def sampling_event(
     options: RasterizeOptions,
     generator: torch.Generator,
 ) -> Event:
-    """Add fine Gaussians where the importance of the training views says.
+    """Sample fine Gaussians by the importance of the pixels of the training views.
 
     Where the fine layer is as large as it may be (``sampler.max_fraction`` of the coarse one), those of its Gaussians that
-    contribute least to the training views are evicted, the protected ones excepted; what still has no room is not added.
+    contribute least to the training views are evicted, the protected ones excepted; new ones beyond the limit are not added.
 
     Args:
         gaussians: The current set, N rows.
@@ -203,12 +204,12 @@ def sampling_event(
         views: Training views with their scores.
         config: Switches and settings.
         step: Steps done.
-        capacity: Gaussians that may be added before the whole set is full.
-        options: How to render.
-        generator: CPU generator; the same numbers on every device.
+        capacity: Gaussians that may be added.
+        options: Settings of the rasterizer.
+        generator: CPU generator, the same numbers on every device.
 
     Returns:
-        The change and what led to it.
+        The change, and the maps that led to it.
     """
     numbers = list(range(len(views)))
     if len(views) > MAX_VIEWS:
@@ -243,14 +244,15 @@ class ImportanceSampling(CloneSplit):
     """
 
     def __init__(self, trainer):
-        """See `Strategy`."""
+        """Begin without events."""
         super().__init__(trainer)
         self.events: list[dict] = []
         """Step of each sampling event, Gaussians added and evicted, and the quantile of the gate in each view."""
         self.on_event: Callable[[int, Event], None] | None = None
+        """Function that is called with the step and the event after each event."""
 
     def columns(self) -> Mapping[str, Column]:
-        """See `Strategy`."""
+        """Return the columns of clone and split, the layer of each Gaussian, and the step at which it was sampled."""
         own = {"level": Column(COARSE, torch.int32), "created_step": Column(NOT_SAMPLED, torch.int32)}
         return {**super().columns(), **own}
 
@@ -271,7 +273,7 @@ class ImportanceSampling(CloneSplit):
 
     @property
     def protects(self) -> bool:
-        """Whether fine Gaussians are protected at all."""
+        """True where fine Gaussians are protected."""
         return self.method.events and self.method.pm
 
     def is_protected(self, step: int | torch.Tensor) -> torch.Tensor:
@@ -279,25 +281,25 @@ class ImportanceSampling(CloneSplit):
         return step - self.trainer.table.columns["created_step"] <= self.method.protect.steps
 
     def phase(self, step: int) -> Hashable:
-        """Return whether gradients are gathered, and whether the coarse layer is held."""
+        """Return whether gradients are gathered, and whether the coarse layer moves slowly."""
         layered = self.method.hier and self.method.events and step > self.trainer.phases.refine
         return super().phase(step), layered
 
     def lr_factors(self, phase):
-        """Return ``method.coarse_lr_factor`` for the coarse layer, 1 for the fine one, from phase 2 on."""
+        """Return ``method.coarse_lr_factor`` for the coarse layer and 1 for the fine one, shape [N]; None before phase 2."""
         if not phase[1]:
             return None
         return torch.where(self.fine, 1.0, self.method.coarse_lr_factor)
 
     def after_step(self, phase, settings, going):
-        """Raise the opacities of the protected to the least value: alpha = max(alpha, alpha_minimum)."""
+        """Raise the opacities of protected Gaussians to alpha_minimum; ``settings`` [3] holds the step, ``going`` [1] if so."""
         if self.protects:
             logits = self.trainer.table.params["logit_opacities"].detach()
             held = self.is_protected(settings[1]) & going
             logits.copy_(torch.where(held, logits.clamp_min(self.method.protect.logit), logits))
 
     def after_backward(self, phase, v_projected, visible, size, going):
-        """See `CloneSplit`."""
+        """Gather gradients as `CloneSplit` does, whose phase is the first of the two; ``v_projected`` has shape [1, N, 12]."""
         super().after_backward(phase[0], v_projected, visible, size, going)
 
     def samples_after(self, step: int) -> bool:
@@ -322,7 +324,10 @@ class ImportanceSampling(CloneSplit):
                 self.on_event(step, event)
 
     def refine(self, step, growing=None, protected=None):
-        """See `CloneSplit`; from phase 2 on only the fine layer grows."""
+        """Yield the refinement; from phase 2 on only the fine layer grows, and protected Gaussians are not pruned.
+
+        Arguments are those of `CloneSplit.refine`: ``growing`` and ``protected`` are bool [N] or None.
+        """
         growing = self.fine if self.phase(step)[1] else growing
         protected = self.is_protected(step) if self.protects else protected
         yield from super().refine(step, growing, protected)
@@ -339,11 +344,11 @@ class ImportanceSampling(CloneSplit):
         )  # fmt: skip
 
     def state(self):
-        """Return the events so far."""
+        """Return no tensors [...] of its own, and the events so far."""
         tensors, plain = super().state()
         return tensors, plain | {"events": self.events}
 
     def load(self, tensors, plain):
-        """Take over what `state` gave."""
+        """Load the events so far; ``tensors`` [...] are not read."""
         super().load(tensors, plain)
         self.events = plain["events"]

@@ -1,4 +1,4 @@
-"""Gaussians as samples: dead ones are relocated to where opacity is, and all are perturbed (Kheradmand et al. 2024).
+"""Markov chain Monte Carlo: dead Gaussians are relocated by opacity, and all are perturbed (Kheradmand et al. 2024).
 
 "3D Gaussian Splatting as Markov Chain Monte Carlo", arXiv 2404.09591. Equation numbers are that paper's.
 """
@@ -23,14 +23,16 @@ from warpgs.scene import Gaussians
 MAX_COPIES = 51
 """Largest number of Gaussians that one may become at a time, as in the authors' program."""
 MAX_OPACITY = 1 - 2**-24
-"""Opacities are taken for at most this: below 1 their logit is finite."""
+"""Largest opacity in relocation: below 1 the logit is finite."""
+NOISE_STREAM = 0x6D636D63
+"""Mixed into the seed, so that noise and opacity dropout do not take the same random numbers."""
 GATE_SLOPE, GATE_OPACITY = 100.0, 0.005
 """Perturbation fades above this opacity: sigmoid(-slope (opacity - this)), eq. 8 with k = 100 and t = 0.995 of 1 - opacity."""
 
 
 @dataclass(frozen=True)
 class MCMCConfig:
-    """Settings of the strategy; the defaults are the paper's."""
+    """Settings of strategy mcmc; the defaults are the paper's."""
 
     start: int = 500
     """First step after which Gaussians are relocated and added."""
@@ -41,7 +43,7 @@ class MCMCConfig:
     growth: float = 0.05
     """Gaussians added at an event, as a fraction of those there are, up to --max-gaussians."""
     min_opacity: float = 0.005
-    """A Gaussian of at most this opacity is dead."""
+    """Largest opacity of a dead Gaussian, in [0, 0.5]."""
     noise_lr: float = 5e5
     """Size of the perturbation, times the learning rate of the means."""
     opacity_weight: float = 0.01
@@ -85,7 +87,9 @@ def relocated(opacities: torch.Tensor, copies: torch.Tensor) -> tuple[torch.Tens
 
 
 @functools.cache
-def _perturb_kernel():
+def make_kernel() -> wp.Kernel:
+    """Return the kernel of `perturb`."""
+
     @wp.kernel(enable_backward=False, module="warpgs.pipeline.train.strategies.mcmc")
     def perturb(
         begin: int, settings: wp.array(dtype=float), seed: int, noise_lr: float, going: wp.array(dtype=wp.bool),
@@ -131,12 +135,12 @@ def perturb(
         interop.view(g["log_scales"], wp.vec3), interop.view(g["logit_opacities"], wp.float32),
         interop.view(g["means"], wp.vec3),
     ]  # fmt: skip
-    interop.launch(_perturb_kernel(), len(gaussians), inputs, settings.device)
+    interop.launch(make_kernel(), len(gaussians), inputs, settings.device)
 
 
 @register("mcmc")
 class MCMC(Strategy):
-    """Relocates dead Gaussians, adds new ones up to ``max_gaussians``, and perturbs all."""
+    """Relocation of dead Gaussians, addition of new ones up to ``max_gaussians``, and perturbation of all."""
 
     Config = MCMCConfig
 
@@ -145,16 +149,16 @@ class MCMC(Strategy):
         """Return the settings with an event after every step."""
         return dataclasses.replace(own, start=0, every=1)
 
-    def regularisation(self, gaussians):
-        """Return the weighted mean opacity and mean axis length, which let the unneeded die."""
+    def regularisation(self, phase, gaussians):
+        """Return the weighted mean opacity plus the weighted mean axis length, shape [], by which unneeded Gaussians die."""
         c = self.config
         opacity, scale = gaussians.logit_opacities.sigmoid().mean(), gaussians.log_scales.exp().mean()
         return c.opacity_weight * opacity + c.scale_weight * scale
 
     def after_step(self, phase, settings, going):
-        """Perturb the means."""
+        """Perturb the means; ``settings`` [3] holds step and learning rate, nothing changes where ``going`` [1] is False."""
         t = self.trainer
-        perturb(t.table.gaussians, settings, going, seed=t.config.seed, noise_lr=self.config.noise_lr)
+        perturb(t.table.gaussians, settings, going, seed=t.config.seed ^ NOISE_STREAM, noise_lr=self.config.noise_lr)
 
     def due(self, step: int) -> bool:
         """Return whether Gaussians are relocated and added after a step."""
@@ -162,7 +166,7 @@ class MCMC(Strategy):
         return min(c.start, steps // 4) < step <= c.stop_fraction * steps and step % c.every == 0
 
     def update(self, step: int) -> Iterator[DensityUpdate]:
-        """Relocate the dead, then add."""
+        """Relocate dead Gaussians, then add new ones."""
         t = self.trainer
         opacities = t.gaussians.logit_opacities.sigmoid()
         dead = torch.nonzero(opacities <= self.config.min_opacity).squeeze(1)
