@@ -18,7 +18,7 @@ from warpgs.io.load import load_scene
 from warpgs.io.splits import split_views
 
 FUZZ = settings(
-    max_examples=4 * settings.default.max_examples, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck)
+    max_examples=2 * settings.default.max_examples, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck)
 )
 FILES = {**scenes.colmap_bin(), **scenes.colmap_txt()}
 READERS = {

@@ -156,7 +156,7 @@ def straight(tmp_path_factory):
     return fit, saved
 
 
-@pytest.mark.parametrize("at", SAVED)
+@pytest.mark.parametrize("at", [pytest.param(17, marks=pytest.mark.slow), 24, 50])
 def test_continued_fit_equals_uninterrupted_one(straight, at):
     """Saved before blocks are measured, between two measurements, or between trims: the same bits and story at the end."""
     straight, saved = straight
