@@ -112,13 +112,13 @@ def test_a_stopped_study_goes_on_and_another_is_refused(tmp_path, monkeypatch, c
     monkeypatch.setattr(mcmc, "measure", measure)
     out, facts = tmp_path / "m.json", {"scene": "s", "steps": 7}
     study = SimpleNamespace(device=CPU)
-    mcmc.run(study, 2, (mcmc.OURS,), facts, out)
+    mcmc.run(study, range(2), (mcmc.OURS,), facts, out)
     assert calls == [(mcmc.BASE, 0, None), (mcmc.OURS, 0, 100), (mcmc.BASE, 1, None), (mcmc.OURS, 1, 101)]
-    rows = mcmc.run(study, 2, (mcmc.OURS, mcmc.PEER), facts, out)
+    rows = mcmc.run(study, range(2), (mcmc.OURS, mcmc.PEER), facts, out)
     assert calls[4:] == [(mcmc.PEER, 0, 100), (mcmc.PEER, 1, 101)] and result_file.read(out)["rows"] == rows
     assert f"| {mcmc.OURS} | 2 | 21.50 ± 0.71 | +1.00 ± 0.00 |" in mcmc.table(rows)
     with pytest.raises(ValueError, match="choose another --out"):
-        mcmc.run(study, 2, (mcmc.OURS,), facts | {"steps": 8}, out)
+        mcmc.run(study, range(2), (mcmc.OURS,), facts | {"steps": 8}, out)
 
 
 @pytest.mark.slow

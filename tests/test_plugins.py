@@ -5,11 +5,13 @@ import sys
 
 import pytest
 
+from warpgs.app.cli import main
 from warpgs.errors import UsageError
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
 from warpgs.pipeline.train.strategies.base import STRATEGIES, Strategy
 from warpgs.plugins import Registry
+from warpgs.synthetic.demo import split_spec, write_demo
 
 OWN = """
 from pathlib import Path
@@ -161,3 +163,16 @@ def test_settings_of_ones_own_travel_through_json(registry, monkeypatch):
         assert FitConfig.from_json(config.to_json()).fingerprint() == config.fingerprint()
     assert FitConfig(strategy="fast").strategy_config == Settings()
     assert FitConfig(loss_terms=(Faint(),)).fingerprint() != FitConfig(loss_terms=(Faint(0.1),)).fingerprint()
+
+
+def test_an_error_in_own_code_names_its_file(tmp_path, capsys):
+    """What a user's own class raises is not called a defect of warpgs: the line says which file and line."""
+    own = tmp_path / "mine.py"
+    own.write_text(
+        "import warpgs\n\n\nclass Mine(warpgs.Strategy):\n    def columns(self):\n        raise ValueError('my own bug')\n"
+    )
+    write_demo(tmp_path / "scene", views=8, width=48, height=36)
+    flags = ["--split", split_spec(8), "--preset", "3dgs", "--steps", "2", "--device", "cpu", "--strategy", f"{own}:Mine"]
+    assert main(["fit", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), *flags]) == 2
+    said = capsys.readouterr().err
+    assert "my own bug" in said and f"{own}, line 6" in said and "defect of warpgs" not in said

@@ -122,6 +122,7 @@ class Registry(Generic[T]):
         if not hasattr(module, name):
             raise UsageError(f"the {self.kind} {spec!r} is not there: {where} has no class {name}")
         cls = self._checked(getattr(module, name), spec)
+        LOADED.add(module.__name__)
         self._classes[spec] = cls
         cls.name = spec
         return cls
@@ -130,6 +131,20 @@ class Registry(Generic[T]):
         if not (isinstance(cls, type) and issubclass(cls, self.base)):
             raise UsageError(f"{name} is no {self.kind}: it must be a class that derives from warpgs.{self.base.__name__}")
         return cls
+
+
+LOADED: set[str] = set()
+"""Names of the modules that users' own classes were loaded from."""
+
+
+def own_frame(error: BaseException) -> str:
+    """Return file and line of the last frame of a user's own code in an error's traceback; empty where it has none."""
+    place, traceback = "", error.__traceback__
+    while traceback is not None:
+        if traceback.tb_frame.f_globals.get("__name__") in LOADED:
+            place = f"{traceback.tb_frame.f_code.co_filename}, line {traceback.tb_lineno}"
+        traceback = traceback.tb_next
+    return place
 
 
 def _import_module(name: str) -> ModuleType:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from warpgs import __version__
 from warpgs.errors import ResourceError, UsageError, WarpgsError
+from warpgs.plugins import own_frame
 
 COMMANDS = {
     "fit": "fit Gaussians to a scene folder and fill a run folder",
@@ -328,6 +329,10 @@ def _internal_error(error: Exception, arguments: list[str]) -> int:
     except OSError:  # no folder can be written
         print(details, file=sys.stderr)
         where = "above"
+    own = own_frame(error)
+    if own:
+        print(f"warpgs: {type(error).__name__}: {error} (in your own code, {own}; the details are {where})", file=sys.stderr)
+        return UsageError.exit_code
     print(
         f"warpgs: internal error, {type(error).__name__}: {error}. This is a defect of warpgs; the details are {where}, "
         "please report them",

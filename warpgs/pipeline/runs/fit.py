@@ -39,7 +39,7 @@ State = tuple[dict[str, torch.Tensor], dict[str, Any]]
 """Tensors and plain values of a checkpoint."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FitResult(FittedModel):
     """A finished fit."""
 

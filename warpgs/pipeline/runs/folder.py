@@ -46,7 +46,7 @@ def prepare_folder(out: Path, resume: bool) -> bool:
     """
     if resume:
         if not (out / CONFIG).is_file():
-            raise UsageError(f"--resume: {out} holds no {CONFIG}, so there is no run to continue; leave out --resume")
+            raise UsageError(f"--resume: {out} holds no {CONFIG}, so there is no run to continue; give a run's folder")
         return False
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out} exists already; choose another --out, or continue that run with --resume")
@@ -122,8 +122,10 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
             if isinstance(now, dict) and isinstance(then, dict):
                 changed = [k for k in now if now[k] != then.get(k)]
                 key = f"{key} ({', '.join(changed)})"
+            words = {"fingerprint": "the scene (images, cameras or points, as --downscale and --reader give them)"}
             raise UsageError(
-                f"--resume: {key} differs from the run in {out}; give the flags it was started with, or a new --out"
+                f"--resume: {words.get(key, key)} differs from the run in {out}; give all flags that it was started "
+                "with, or a new --out"
             )
 
 
@@ -142,7 +144,7 @@ def _check_named_again(now: dict[str, Any], then: dict[str, Any], out: Path) -> 
             )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class StoredRun(FittedModel):
     """A finished or interrupted run, read from its folder."""
 

@@ -34,7 +34,7 @@ class Model:
         return convert_gaussians(self.scene_gaussians, self.normalization, "scene", units)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FittedModel(Model):
     """A model with the cameras it was fitted to and the settings it is rendered with."""
 
@@ -50,6 +50,11 @@ class FittedModel(Model):
     """Colour behind the scene."""
     step: int
     """Steps done."""
+
+    def __repr__(self) -> str:
+        """Say in one line what it is."""
+        sizes = f"{len(self.scene_gaussians):,} Gaussians, {len(self.scene_cameras)} cameras"
+        return f"<{type(self).__name__}: {sizes}, step {self.step}>"
 
     def cameras(self, units: str = "scene") -> dict[str, Camera]:
         """Return the cameras of all views by name, in ``scene`` or ``file`` units."""
