@@ -305,8 +305,8 @@ def main(arguments: list[str] | None = None) -> int:
         return _out_of_memory(e) if ran_out else _internal_error(e, arguments)
 
 
+def _out_of_memory(error: Exception) -> int:
     """Print that no memory is left, in words that say what to do; return the exit code."""
-    """What torch, the driver or Python says when there is no room, in words that say what to do; returns the exit code."""
     reason = (str(error).strip() or "MemoryError").splitlines()[0].partition(" GPU ")[0].rstrip(".")
     print(
         f"warpgs: no memory is left ({reason}). Give the fit less with --memory-limit, fit smaller images with "

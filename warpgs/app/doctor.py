@@ -176,7 +176,7 @@ def _quiet_warp():
 
 
 def _warp_cuda() -> Finding:
-    """Whether Warp sees the devices that torch sees, and through which driver."""
+    """Check that Warp sees the devices that torch sees, and through which driver."""
     try:
         warp = _quiet_warp()
         if warp.is_cuda_available():
@@ -200,7 +200,7 @@ def _size(folder: Path) -> int:
 
 
 def _prior_cache() -> Iterable[Finding]:
-    """Where maps of networks are kept; a fit works without."""
+    """Check the folder that maps of networks are kept in; a fit works without."""
     from warpgs.priors.cache import cache_folder
 
     folder = cache_folder()
@@ -216,7 +216,7 @@ def _prior_cache() -> Iterable[Finding]:
 
 
 def _kernel_cache() -> Iterable[Finding]:
-    """Where Warp keeps compiled kernels: without a writable place no kernel runs."""
+    """Check the folder of compiled kernels: without a writable place no kernel runs."""
     topic = "Kernel cache"
     try:
         folder = Path(_quiet_warp().config.kernel_cache_dir)
