@@ -41,7 +41,7 @@ def test_libraries_for_other_processors_give_the_same_start(tmp_path):
     own = {"stages": dict(same_bits.stages(torch.device("cpu"), **size, only_start=True))}
     other = run(tmp_path / "other.json", "--starts", "--threads", "1", **OTHER_MAKER)
     assert len(own["stages"]) > 45 and not any("step" in n for n in own["stages"])
-    assert "torch.exp" in same_bits.differing(own, other)  # else the variables chose nothing
+    assert same_bits.differing(own, other)  # else the variables chose nothing; what they change depends on the processor
     assert fit_differs(own, other) == []
 
 
