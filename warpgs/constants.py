@@ -40,6 +40,10 @@ length."""
 LARGEST_COEFFICIENT = 1e6
 """Largest magnitude of a spherical-harmonics coefficient that is read."""
 
+SMALLEST_WEIGHT = 1e-20
+"""Smallest sum of blending weights of a pixel that has a depth. The gradient of depth is divided by the sum, and multiplied by
+depths up to `FAR`: 1e30, within float32. Only a rule with an alpha cut of 0 blends less than it."""
+
 FRUSTUM_MARGIN = 0.15
 """Margin around the image, as a fraction of its size on every side. The Jacobian is taken at the projected mean, clamped to the
 image with this margin: the factor 1.3 on tan(fov / 2) of Kerbl et al. 2023 for a centred principal point."""

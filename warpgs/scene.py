@@ -206,7 +206,7 @@ class Render:
     alpha: torch.Tensor
     """Accumulated opacity in [0, 1], shape [..., H, W]."""
     depth: torch.Tensor
-    """Expected z-depth [u], divided by alpha; 0 where alpha is 0. Shape [..., H, W]."""
+    """Expected z-depth [u], divided by alpha; 0 where nothing is blended. Shape [..., H, W]."""
     projected: torch.Tensor
     """Projected Gaussians in the layout of kernels/project.py, shape [C, N, 12]; keeps gradients after ``retain_grad()``."""
     tile_counts: torch.Tensor

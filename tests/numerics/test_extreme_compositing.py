@@ -325,6 +325,20 @@ def test_exponential_in_ulps(device):
     assert bool((found[-2:] <= 1e-33).all())
 
 
+def test_depth_where_weights_are_denormal(device, dtype):
+    """C12: with a cut of 0, weights fall with distance to the smallest numbers; depth and its gradients stay finite there."""
+    cam = camera(96, 8, cameras=1, dtype=dtype, device=device)
+    gaussians, rule = cloud(3, dtype=dtype, device=device), dataclasses.replace(EXACT, alpha_cut=0.0)
+    gaussians.means[:] = torch.tensor([[-0.5, 0.0, 3.0], [-0.5, 0.0, 1e6], [0.0, 0.0, 3.0]], dtype=dtype)
+    gaussians.means[1, 0] *= 1e6 / 3
+    gaussians.log_scales[:] = math.log(1e-4)
+    gaussians = leaves(gaussians)
+    _, alpha, depth = images(gaussians, cam, rule)
+    found = gradients(depth.sum() + alpha.sum(), gaussians)
+    assert bool((depth > 0).any()) and bool((depth == 0).any())
+    assert finite(depth, *found.values())
+
+
 def test_depth_of_pixels_that_nothing_covers(device, dtype):
     """C12: 0, with finite gradients, beside pixels that are covered; and so for a weight just above the cut."""
     gaussians, cam = cloud(1, dtype, device), camera(40, 30, cameras=1, dtype=dtype, device=device)

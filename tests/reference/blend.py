@@ -4,6 +4,8 @@ import math
 
 import torch
 
+from warpgs.constants import SMALLEST_WEIGHT
+
 
 def blend_reference(means, covs, opacities, colors, depths, background, width, height, rule, keep=None, tile_size=16):
     """One camera: rgb [H, W, 3], alpha [H, W], depth [H, W], weights [N, H, W]; inputs [N, ...], background [3].
@@ -36,7 +38,7 @@ def blend_reference(means, covs, opacities, colors, depths, background, width, h
     w = torch.stack(weights) if len(means) else torch.zeros(0, height, width, dtype=means.dtype)
     rgb = torch.einsum("nhw,nc->hwc", w, colors) + T[..., None] * background
     total = w.sum(0)
-    covered = total > 0
+    covered = total >= SMALLEST_WEIGHT
     depth = torch.where(covered, torch.einsum("nhw,n->hw", w, depths) / torch.where(covered, total, 1.0), 0.0)
     return rgb, 1 - T, depth, w
 

@@ -236,7 +236,7 @@ def blend(
 
     Returns:
         ``rgb`` [C, H, W, 3]; ``alpha`` [C, H, W], accumulated opacity; ``depth`` [C, H, W], the mean z-depth [u] under the
-        blending weights, 0 where nothing was blended.
+        blending weights, 0 where less than `SMALLEST_WEIGHT` was blended in all.
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.

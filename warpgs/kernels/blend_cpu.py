@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from warpgs.constants import SMALLEST_WEIGHT
 from warpgs.kernels.blend_cpu_backward import make_backward
 from warpgs.kernels.compiler import ROLLED
 from warpgs.kernels.falloff import ABREAST, STRIP, make_functions
@@ -38,6 +39,7 @@ def make_kernels(real, tile_size: int):
     batch = wp.constant(BATCH)
     bits = wp.constant(BATCH - 1)
     finished = wp.constant(real(2.0))
+    smallest = wp.constant(real(SMALLEST_WEIGHT))
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def forward(
@@ -218,7 +220,7 @@ def make_kernels(real, tile_size: int):
                 rgb[o, 1] = green[p] + t[p] * backgrounds[camera, 1]
                 rgb[o, 2] = blue[p] + t[p] * backgrounds[camera, 2]
                 alpha_out[o] = real(1.0) - t[p]
-                depth[o] = wp.where(total[p] > real(0.0), z[p] / total[p], real(0.0))
+                depth[o] = wp.where(total[p] >= smallest, z[p] / total[p], real(0.0))
                 transmittances[o] = t[p]
                 weights[o] = total[p]
                 ends[o] = end[p]

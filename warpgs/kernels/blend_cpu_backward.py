@@ -4,6 +4,7 @@ import functools
 
 import warp as wp
 
+from warpgs.constants import SMALLEST_WEIGHT
 from warpgs.kernels.compiler import ROLLED
 from warpgs.kernels.falloff import ABREAST, STRIP, make_functions
 
@@ -33,6 +34,7 @@ def make_backward(real, tile_size: int):
     half = wp.constant(STRIP // 2)
     parts = wp.constant(tile_size // STRIP)
     abreast = wp.constant(ABREAST)
+    smallest = wp.constant(real(SMALLEST_WEIGHT))
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def backward(
@@ -72,7 +74,7 @@ def make_backward(real, tile_size: int):
                 g0[p] = v_rgb[o, 0]
                 g1[p] = v_rgb[o, 1]
                 g2[p] = v_rgb[o, 2]
-                if weights[o] > real(0.0):
+                if weights[o] >= smallest:
                     v_z[p] = v_depth[o] / weights[o]
                     v_w[p] = -v_z[p] * depth[o]
                 v_w[p] = v_w[p] + v_alpha[o]

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
+from warpgs.constants import SMALLEST_WEIGHT
 from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.native import source
 from warpgs.kernels.tiles import Tiles
@@ -40,6 +41,7 @@ SCALE = "0.84932180028801904272f"  # sqrt(log2(e) / 2)
 def _source(name: str, tile_size: int, **numbers) -> str:
     """Return the CUDA text of one body, after the text that all bodies share."""
     numbers |= {"SIDE": tile_size, "STATE": STATE, "SCALE": SCALE, "WARPS": WARPS, "STRIDE": STRIDE}
+    numbers["SMALLEST_WEIGHT"] = f"{SMALLEST_WEIGHT}f"
     return source("blend_common.cu", f"blend_{name}.cu", **numbers)
 
 

@@ -70,7 +70,7 @@ while (top_instance > floor) {
                 float z_end = 0.0f;
                 if (with_depth) {
                     const float W = weights.data[o];
-                    if (W > 0.0f) {
+                    if (W >= SMALLEST_WEIGHT) {
                         vz[k] = v_depth.data[o] / W;
                         vw[k] = -vz[k] * depth.data[o];
                         z_end = depth.data[o] * W;

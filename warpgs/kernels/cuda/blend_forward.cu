@@ -91,7 +91,7 @@ if (inside) {
     rgb.data[3 * o + 1] = green + T * background[1];
     rgb.data[3 * o + 2] = blue + T * background[2];
     alpha_out.data[o] = 1.0f - T;
-    depth.data[o] = total > 0.0f ? z / total : 0.0f;
+    depth.data[o] = total >= SMALLEST_WEIGHT ? z / total : 0.0f;
     transmittances.data[o] = T;
     weights.data[o] = total;
     ends.data[o] = last;
