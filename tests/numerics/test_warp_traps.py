@@ -77,7 +77,7 @@ from tests.gaussians import camera, cloud, leaves
 from warpgs.kernels.adam import adam_step
 from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.ssim import differences
-from warpgs.rasterizer import RasterizeOptions, rasterize
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 device = torch.device(sys.argv[1])
 g, cam = leaves(cloud(300, device=device)), camera(45, 37, cameras=2, dtype=torch.float32, device=device)
 for tile_size in (8, 16):
