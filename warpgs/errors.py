@@ -31,3 +31,12 @@ class ResourceError(WarpgsError):
     """Memory, disk or a device does not suffice; the message names what is needed and what there is."""
 
     exit_code = 4
+
+
+class OutOfMemoryError(ResourceError):
+    """A step of a fit asked for more memory than the device had."""
+
+    def __init__(self, message: str, intact: bool):
+        """Take a message, and whether the state of the fit is still that before the step."""
+        super().__init__(message)
+        self.intact = intact

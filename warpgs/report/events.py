@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import BinaryIO
 
 from warpgs.errors import ResourceError
 from warpgs.files import write_bytes
@@ -13,6 +14,8 @@ from warpgs.files import write_bytes
 class EventLog:
     """A log to which events are appended; a resumed fit first drops the events after its checkpoint."""
 
+    _file: BinaryIO | None = None
+
     def __init__(self, path: Path, step: int = 0):
         """Open the log of a fit that has done ``step`` steps: events of later steps are dropped, 0 starts empty.
 
@@ -20,6 +23,16 @@ class EventLog:
             ResourceError: The file cannot be written.
         """
         self.path = Path(path)
+        self.rewind(step)
+
+    def rewind(self, step: int) -> None:
+        """Drop the events of later steps than ``step``.
+
+        Raises:
+            ResourceError: The file cannot be written.
+        """
+        if self._file is not None:
+            self.close()
         kept = [e for e in read_events(self.path) if e["step"] <= step] if step and self.path.is_file() else []
         # The old log stays until the shortened one is on the disk.
         write_bytes(self.path, *(_line(e) for e in kept))

@@ -18,6 +18,10 @@ OWN_CGROUPS = Path("/proc/self/cgroup")
 CGROUPS = Path("/sys/fs/cgroup")
 
 
+OUT_OF_MEMORY = ("out of memory", "can't allocate memory", "failed to allocate", "insufficient memory", "std::bad_alloc")
+"""Parts of the messages, in small letters, by which torch, Warp and OpenCV say that no memory is left."""
+
+
 class Memory(NamedTuple):
     """Installed and available bytes; what the system keeps of files and would give up counts as available."""
 
@@ -33,6 +37,11 @@ def available_bytes(device: torch.device) -> int:
         free, _ = torch.cuda.mem_get_info(device)
         return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     return _machine_or_assumed().available
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Return whether an error says that no memory is left: libraries raise it as errors of many classes."""
+    return isinstance(error, MemoryError) or any(words in str(error).lower() for words in OUT_OF_MEMORY)
 
 
 @functools.cache

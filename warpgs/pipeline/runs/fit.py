@@ -299,6 +299,13 @@ def _train(job: _Job, trainer: Trainer) -> None:
             log.flush()
             save_checkpoint(out, *current.state())
 
+    def restore(current: Trainer) -> bool:
+        if out is None or log is None or not (out / TENSORS).is_file():
+            return False
+        current.load(*load_checkpoint(out))
+        log.rewind(current.step)
+        return True
+
     with Progress(trainer.config.steps, trainer.step) if job.verbose else contextlib.nullcontext() as progress:
 
         def on_step(r: StepReport) -> None:
@@ -315,7 +322,7 @@ def _train(job: _Job, trainer: Trainer) -> None:
 
         try:
             with _stop_signals() as stopped:
-                run(trainer, on_step, save, stopped)
+                run(trainer, on_step, save, stopped, restore)
         finally:
             if log is not None:
                 log.close()

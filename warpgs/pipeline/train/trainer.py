@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from warpgs.errors import DataError, NotFiniteError
+from warpgs.errors import DataError, NotFiniteError, OutOfMemoryError, ResourceError, UsageError
 from warpgs.kernels.step_buffers import NOT_FINITE
 from warpgs.pipeline.metrics.psnr import psnr_of
 from warpgs.pipeline.model.init import initial_gaussians, scene_extent
@@ -34,7 +34,8 @@ from warpgs.pipeline.train.step import (
 )
 from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.views import Kind, TrainingView, half_size, stack_views
-from warpgs.runtime.device_memory import available_bytes
+from warpgs.runtime.byte_units import format_bytes
+from warpgs.runtime.device_memory import available_bytes, is_out_of_memory
 from warpgs.scene import Gaussians, PointCloud, Prior, Scene, View
 
 
@@ -97,8 +98,12 @@ class Trainer:
         self.terms = (*built_in_terms(config.loss), *config.loss_terms)
         self.step = 0
         """Steps taken."""
+        self.memory_limit, self.captured = config.memory_limit, config.cuda_graph
+        """Bytes that steps may take, None for no limit; and whether they may be captured (`spare_memory`)."""
         self.order: list[int] = []
         """Views that are still to come before any comes again, the next one last."""
+        self.chosen: list[int] | None = None
+        """Views of the steps that are being taken; None where none is."""
 
         self.strategy = find_strategy(config.strategy)(self)
         self.table = Table.of_gaussians(initial_gaussians(cloud, config.init, self.extent, device), self.strategy.columns())
@@ -151,8 +156,52 @@ class Trainer:
 
         Raises:
             NotFiniteError: A loss is not finite; the Gaussians are as before that step.
+            OutOfMemoryError: No memory was left for a step, or for a change of the set of Gaussians.
             ResourceError: The instances would not fit into memory.
         """
+        try:
+            return self._advance(limit)
+        except (MemoryError, RuntimeError) as e:
+            if not is_out_of_memory(e):
+                raise
+            raise self._no_memory(e) from e
+
+    def _no_memory(self, error: Exception) -> OutOfMemoryError:
+        """Return the error for a step that ran out of memory; where none of its batch was taken, its views come again."""
+        intact = self.chosen is not None and int(self.buffers.counter) == 0
+        if intact:
+            self.order += reversed(self.chosen)
+        self.chosen = None
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0].partition(" GPU ")[0].rstrip(".")
+        return OutOfMemoryError(
+            f"no memory is left for step {self.step + 1} ({reason}). Give the fit less with --memory-limit, fit smaller images "
+            "with --downscale, or end other programs; --resume continues from the last checkpoint", intact,
+        )  # fmt: skip
+
+    def spare_memory(self) -> None:
+        """Give back memory that is not in use, and take steps one by one from here on, in chunks that fit into what is free.
+
+        Raises:
+            ResourceError: Not even the smallest step fits.
+        """
+        self._forget_graphs()
+        if self.device.type == "cuda":
+            torch.cuda.empty_cache()
+        held = self.layout.held(len(self.table))
+        self.memory_limit, self.captured = held + available_bytes(self.device) * 4 // 5, False
+        if self.config.memory_limit is not None:
+            self.memory_limit = min(self.memory_limit, self.config.memory_limit)
+        try:
+            self.set_views(self.views)
+        except UsageError as e:
+            raise ResourceError(str(e)) from e
+        self.messages.append(
+            f"memory: none was left for step {self.step + 1}; steps are taken one by one from here on, within "
+            f"{format_bytes(self.memory_limit)}"
+        )
+
+    def _advance(self, limit: int) -> list[StepReport]:
+        """Take steps as `advance` does."""
         begin, first = time.perf_counter(), self.step + 1
         plan, count = self.plan_of(first), 1
         if self.layout.graphs:
@@ -166,9 +215,11 @@ class Trainer:
         places = [self.places[i + plan.half_size * len(self.views)] for i in chosen]
         steps = range(first, first + count)
         self.buffers.load([row for _, row in places], [self._lr_row(s) for s in steps], [self._settings(s) for s in steps])
+        self.chosen = chosen
         if not self._take(places, plan):
             self.order += reversed(chosen)
-            return self.advance()
+            return self._advance(1)
+        self.chosen = None
         done, stop, history = self.buffers.result()
         self.order += reversed(chosen[done:])  # views of steps that were not taken come again
         self.step += done
@@ -243,19 +294,19 @@ class Trainer:
         shown, self.stacks, self.places = stack_views(shown, len(views))
         self.views = shown[: len(views)]
         layout = layout_of(
-            self.table, shown, kept=self.strategy.kept_views(), scored=self.strategy.samples(c), captured=c.cuda_graph,
+            self.table, shown, kept=self.strategy.kept_views(), scored=self.strategy.samples(c), captured=self.captured,
             depth_supervised=c.loss.depth_weight > 0,
         )  # fmt: skip
         cameras = [v.camera for v in shown]
         self.memory, self.layout = plan(
             layout, count=len(self.table), instances=most_instances(self.gaussians, cameras, c.rule), most=c.max_gaussians,
-            limit=c.memory_limit, available=available_bytes(self.device), capacity_factor=CAPACITY_FACTOR,
+            limit=self.memory_limit, available=available_bytes(self.device), capacity_factor=CAPACITY_FACTOR,
         )  # fmt: skip
         self.count_changed()
 
     def count_changed(self) -> None:
         """Set how many instances a step may have at a time, None for no limit: it depends on the number of Gaussians."""
-        limit = self.config.memory_limit
+        limit = self.memory_limit
         self.max_instances = None if limit is None else self.layout.most_instances(len(self.table), limit)
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
@@ -286,17 +337,46 @@ def train_views(scene: Scene, names: tuple[str, ...]) -> list[View]:
 
 
 def run(
-    trainer: Trainer, on_step: Callable[[StepReport], None], save: Callable[[Trainer], None], stopped: Callable[[], bool]
+    trainer: Trainer,
+    on_step: Callable[[StepReport], None],
+    save: Callable[[Trainer], None],
+    stopped: Callable[[], bool],
+    restore: Callable[[Trainer], bool] = lambda _: False,
 ) -> None:
     """Take all remaining steps, reporting each and saving now and then and at the end.
 
+    A step that runs out of memory is tried once more with less (`Trainer.spare_memory`), from the last saved state where the
+    set of Gaussians was being changed.
+
+    Args:
+        trainer: The fit.
+        on_step: Called after each step.
+        save: Saves the state.
+        stopped: Whether to end after a step.
+        restore: Loads the state that was saved last; returns False where there is none.
+
     Raises:
         NotFiniteError: The loss or, when it is to be saved, a number of the state is not finite; nothing of it is saved.
+        OutOfMemoryError: A step ran out of memory twice; the state before it is saved where it is whole.
         KeyboardInterrupt: ``stopped`` returned True after a step; the state after it is saved.
     """
-    every, saved = trainer.config.checkpoint_every, time.monotonic()
+    every, saved, ran_out = trainer.config.checkpoint_every, time.monotonic(), -1
     while trainer.step < trainer.config.steps:
-        for report in trainer.advance(every - trainer.step % every):
+        reports, failure = [], None
+        try:
+            reports = trainer.advance(every - trainer.step % every)
+        except OutOfMemoryError as e:
+            failure = e.with_traceback(None)  # whose frames hold tensors
+            failure.__cause__ = failure.__context__ = None
+        if failure is not None:
+            again, ran_out = trainer.step > ran_out, trainer.step
+            if failure.intact and not again:
+                save(trainer)
+            if not again or not (failure.intact or restore(trainer)):
+                raise failure
+            trainer.spare_memory()
+            continue
+        for report in reports:
             on_step(report)
         stop = stopped()
         due = trainer.step % every == 0 and time.monotonic() - saved >= trainer.config.checkpoint_seconds

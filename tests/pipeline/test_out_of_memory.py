@@ -1,0 +1,136 @@
+"""A step that runs out of memory is tried once more with less, and what cannot go on is saved."""
+
+import copy
+
+import pytest
+import torch
+
+from tests.pipeline.test_trainer import BUSY, fitted
+from tests.scenes import photos, seeds
+from warpgs.errors import OutOfMemoryError
+from warpgs.pipeline.train import trainer as trainer_module
+from warpgs.pipeline.train.trainer import Trainer, run
+
+CPU = torch.device("cpu")
+CUDA = torch.device("cuda", 0)
+
+
+def no_memory(*_, **__):
+    raise RuntimeError("[enforce fail at alloc_cpu.cpp:124] DefaultCPUAllocator: can't allocate memory: 1 bytes")
+
+
+def failing(monkeypatch, owner, name: str, calls: set[int]):
+    """Have some calls of a function, counted from 1, find no memory."""
+    honest, count = getattr(owner, name), []
+
+    def scarce(*arguments, **keywords):
+        count.append(1)
+        return no_memory() if len(count) in calls else honest(*arguments, **keywords)
+
+    monkeypatch.setattr(owner, name, scarce)
+
+
+def saved(fit: Trainer) -> tuple[dict, dict]:
+    """A state of its own memory, as a file has it."""
+    tensors, plain = fit.state()
+    return {n: t.clone() for n, t in tensors.items()}, copy.deepcopy(plain)
+
+
+def finished(fit: Trainer, states: list) -> list[int]:
+    """Take the remaining steps, save the state every 10 steps and after the last, and return the numbers of steps reported."""
+    seen = []
+
+    def on_step(report):
+        seen.append(report.step)
+        if report.step % 10 == 0:
+            states.append(saved(fit))
+
+    def restore(_):
+        if not states:
+            return False
+        fit.load(*states[-1])
+        return True
+
+    run(fit, on_step, lambda f: states.append(saved(f)), lambda: False, restore)
+    return seen
+
+
+def same(a: Trainer, b: Trainer) -> bool:
+    tensors, others = a.state()[0], b.state()[0]
+    return tensors.keys() == others.keys() and all(torch.equal(tensors[k], others[k]) for k in tensors)
+
+
+def test_a_step_is_tried_again_and_nothing_else_changes(monkeypatch):
+    """The same bits as without the lack; it is said once for each."""
+    reference = fitted(BUSY, 60)
+    fit = fitted(BUSY, 0)
+    failing(monkeypatch, trainer_module, "step", {3, 30})
+    assert finished(fit, []) == list(range(1, 61))
+    assert same(fit, reference)
+    assert len(fit.messages) == 2 and "none was left for step 3" in fit.messages[0]
+
+
+def test_a_step_that_fails_twice_ends_the_fit_and_is_saved(monkeypatch):
+    """The state saved is that before the step, with its view still to come; a fit that continues from it is the same."""
+    reference, fit, states = fitted(BUSY, 60), fitted(BUSY, 0), []
+    failing(monkeypatch, trainer_module, "step", {26, 27})
+    with pytest.raises(OutOfMemoryError, match=r"step 26 .*--memory-limit.*--downscale.*--resume") as found:
+        finished(fit, states)
+    assert found.value.exit_code == 4 and states[-1][1]["step"] == 25
+    again = fitted(BUSY, 0)
+    again.load(*states[-1])
+    finished(again, [])
+    assert same(again, reference)
+
+
+@pytest.mark.parametrize(("calls", "ends"), [({2}, False), ({2, 3}, True)])
+def test_a_change_of_the_set_starts_from_the_last_saved_state(monkeypatch, calls, ends):
+    """Half a change is nothing to go on from: steps since the last save are taken again; a second lack there ends the fit."""
+    reference, fit, states = fitted(BUSY, 60), fitted(BUSY, 0), []
+    failing(monkeypatch, fit.table, "apply", calls)
+    if ends:
+        with pytest.raises(OutOfMemoryError) as found:
+            finished(fit, states)
+        assert not found.value.intact
+        return
+    seen = finished(fit, states)
+    assert set(seen) == set(range(1, 61)) and len(seen) >= 60
+    assert same(fit, reference)
+
+
+def test_a_change_with_nothing_saved_before_ends_the_fit(monkeypatch):
+    fit = fitted(BUSY, 0)
+    failing(monkeypatch, fit.table, "apply", {1})
+    with pytest.raises(OutOfMemoryError):
+        run(fit, lambda _: None, lambda _: None, lambda: False)
+
+
+def test_other_errors_pass(monkeypatch):
+    fit = fitted(BUSY, 0)
+
+    def broken(*_):
+        raise RuntimeError("something else")
+
+    monkeypatch.setattr(trainer_module, "step", broken)
+    with pytest.raises(RuntimeError, match="something else"):
+        finished(fit, [])
+
+
+@pytest.mark.cuda
+def test_a_full_device_is_noticed_and_the_fit_goes_on():
+    """Another program takes all but a little of the device's memory; steps go on in chunks, and end as they should."""
+    import warp as wp
+
+    fit, states = Trainer(photos(4, 1600, 1200), seeds(), BUSY, CUDA), []
+    fit.advance()
+    torch.cuda.empty_cache()
+    free, _ = torch.cuda.mem_get_info(CUDA)
+    with wp.ScopedMempool(f"cuda:{CUDA.index}", False):
+        taken = wp.empty(free - 300 * 2**20, dtype=wp.uint8, device=f"cuda:{CUDA.index}")
+    try:
+        seen = finished(fit, states)
+    finally:
+        del taken
+    assert seen == list(range(2, 61))
+    assert any("none was left" in m for m in fit.messages), fit.messages
+    assert all(bool(torch.isfinite(t).all()) for t in fit.gaussians.tensors().values())
