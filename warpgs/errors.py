@@ -26,6 +26,9 @@ class DataError(WarpgsError):
 class NotFiniteError(WarpgsError):
     """The loss or a parameter of a fit stopped being a number."""
 
+    view: int | None = None
+    """Number of the training view whose loss it was; None where it was another number."""
+
 
 class ResourceError(WarpgsError):
     """Memory, disk or a device does not suffice; the message names what is needed and what there is."""

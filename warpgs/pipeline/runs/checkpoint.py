@@ -28,7 +28,7 @@ DTYPES = {
 """Names of scalar types in the format."""
 
 
-def _chunks(tensors: dict[str, torch.Tensor], metadata: dict[str, str]) -> list[memoryview | bytes]:
+def safetensors_chunks(tensors: dict[str, torch.Tensor], metadata: dict[str, str]) -> list[memoryview | bytes]:
     """Return a safetensors file in pieces; those of tensors on the CPU are their own memory, so nothing is held twice."""
     ordered = sorted(tensors.items(), key=lambda item: (-item[1].element_size(), item[0]))  # aligned for every reader
     parts = [t.detach().cpu().contiguous().reshape(-1).view(torch.uint8) for _, t in ordered]
@@ -69,7 +69,7 @@ def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict[
                 "other settings, lower learning rates above all, lead elsewhere"
             )
     metadata = {"format": str(FORMAT), "version": __version__, "state": json.dumps(state)}
-    chunks = _chunks(tensors, metadata)
+    chunks = safetensors_chunks(tensors, metadata)
     digest = hashlib.sha256()
     for chunk in chunks:
         digest.update(chunk)

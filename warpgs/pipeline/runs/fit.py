@@ -13,13 +13,15 @@ from typing import Any
 
 import torch
 
-from warpgs.errors import UsageError, WarpgsError
+from warpgs.errors import NotFiniteError, UsageError, WarpgsError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.splits import Split
 from warpgs.pipeline.metrics.lpips import Lpips, load_lpips
 from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
+from warpgs.pipeline.runs.failed_step import FILE as FAILED
+from warpgs.pipeline.runs.failed_step import failed_step, save_failed_step
 from warpgs.pipeline.runs.folder import CONFIG, check_same, prepare_folder, read_record, record_of
 from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device, choose_split, read_scene
@@ -323,6 +325,17 @@ def _train(job: _Job, trainer: Trainer) -> None:
         try:
             with _stop_signals() as stopped:
                 run(trainer, on_step, save, stopped, restore)
+        except NotFiniteError as e:
+            if out is None or e.view is None:
+                raise
+            name = job.split.train[e.view]
+            save_failed_step(out / FAILED, failed_step(trainer, e.view, name))
+            save(trainer)
+            raise NotFiniteError(
+                f"{e}, on {name}. The state before is saved, and so is what that step computed with: `warpgs doctor --repeat "
+                f"{out / FAILED}` says what is not finite. A fit repeats exactly: continued with --resume, it comes to the "
+                "same place; other settings, lower learning rates above all, lead elsewhere"
+            ) from e
         finally:
             if log is not None:
                 log.close()

@@ -214,7 +214,7 @@ class Trainer:
         chosen = [self.next_view() for _ in range(count)]
         places = [self.places[i + plan.half_size * len(self.views)] for i in chosen]
         steps = range(first, first + count)
-        self.buffers.load([row for _, row in places], [self._lr_row(s) for s in steps], [self._settings(s) for s in steps])
+        self.buffers.load([row for _, row in places], [self._lr_row(s) for s in steps], [self.settings(s) for s in steps])
         self.chosen = chosen
         if not self._take(places, plan):
             self.order += reversed(chosen)
@@ -224,9 +224,9 @@ class Trainer:
         self.order += reversed(chosen[done:])  # views of steps that were not taken come again
         self.step += done
         if stop == NOT_FINITE:
-            raise NotFiniteError(
-                f"the loss became {history[done][0]} at step {self.step + 1}; the last checkpoint is the state before"
-            )
+            error = NotFiniteError(f"the loss became {history[done][0]} at step {self.step + 1}")
+            error.view = chosen[done]
+            raise error
         if stop:
             self._forget_graphs()  # they are captured anew with more capacity
         counts = [len(self.table)] * done
@@ -270,7 +270,8 @@ class Trainer:
         stable_start = phases.stable_start / c.steps if phases.stable_start < c.steps else 0.0
         return c.optimizer.lrs(self.progress(step), self.extent, stable_start)
 
-    def _settings(self, step: int) -> tuple[float, float, float]:
+    def settings(self, step: int) -> tuple[float, float, float]:
+        """Return dropout probability, number, and learning rate of the means [u] of a step, as `StepBuffers` takes them."""
         return self.strategy.dropout(step), step, self.lrs(step)["means"]
 
     def _update(self) -> None:

@@ -183,8 +183,9 @@ class CloneSplit(Strategy):
         # a product with a tensor of the two sizes would copy them to the device, which a captured step must not
         norms = torch.hypot(v_projected[..., 0] * (0.5 * size[0]), v_projected[..., 1] * (0.5 * size[1]))
         columns = self.trainer.table.columns
-        columns["grad_sum"] += torch.where(visible, norms, 0).sum(0) * going
-        columns["seen_count"] += visible.sum(0) * going
+        counted = visible & going  # not times going: 0 times NaN is NaN
+        columns["grad_sum"] += torch.where(counted, norms, 0).sum(0)
+        columns["seen_count"] += counted.sum(0)
 
     def _due(self, step: int) -> tuple[bool, bool]:
         return self.trainer.config.density.due(step, self.trainer.config.steps, self.densify_until)

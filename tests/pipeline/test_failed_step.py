@@ -1,0 +1,86 @@
+"""A loss that is not finite: the state before it is kept, and a small file computes it again without the scene."""
+
+import dataclasses
+
+import pytest
+import torch
+
+import warpgs
+from tests.pipeline.test_trainer import BUSY
+from tests.scenes import photos, seeds
+from warpgs.errors import DataError, NotFiniteError
+from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
+from warpgs.pipeline.runs.failed_step import FILE, failed_step, findings, read_failed_step, save_failed_step
+from warpgs.pipeline.train.loss import LossTerm, register
+from warpgs.pipeline.train.trainer import Trainer
+from warpgs.scene import Scene
+
+CPU = torch.device("cpu")
+
+
+@register("nan_later")
+@dataclasses.dataclass(frozen=True)
+class NanLater(LossTerm):
+    """A term that is no number from some step on."""
+
+    first: int = 15
+
+    def active(self, step, steps):
+        return step >= self.first
+
+    def __call__(self, render, target, gaussians):
+        return render.rgb.mean() * float("nan")
+
+
+def test_the_state_before_is_kept_and_the_step_repeats(tmp_path):
+    """Checkpoint of the step before, a file that names the term, and the same end where the run is continued."""
+    views = tuple(photos(5))
+    scene = Scene("", "made", views, seeds(), fingerprint="x", pixels="as made")
+    config = dataclasses.replace(BUSY, loss_terms=(NanLater(),), half_resolution=0.5, dropout=0.1)
+    split = f"train={','.join(v.name for v in views[:4])};test={views[4].name}"
+    run = {"split": split, "device": "cpu", "verbose": False}
+    with pytest.raises(NotFiniteError, match=r"nan at step 15, on .*\.png\. .*doctor --repeat .*not_finite") as found:
+        warpgs.fit(scene, config, out=tmp_path / "run", **run)
+    assert load_checkpoint(tmp_path / "run")[1]["step"] == 14
+    bundle = read_failed_step(tmp_path / "run" / FILE, CPU)
+    assert (tmp_path / "run" / FILE).stat().st_size < 2 * (tmp_path / "run" / TENSORS).stat().st_size
+    lines = findings(bundle)
+    assert "loss term nan_later: nan" in "\n".join(lines) and not any("NOT FINITE" in line for line in lines)
+    assert any(line.startswith("  loss term photometric: 0.") for line in lines)
+    with pytest.raises(NotFiniteError) as again:
+        warpgs.fit(scene, config, out=tmp_path / "run", resume=True, **run)
+    assert str(again.value) == str(found.value)
+
+
+def test_the_loss_is_that_of_the_fit():
+    """The file's loss is the loss that the next step reports."""
+    fit = Trainer(photos(4), seeds(), dataclasses.replace(BUSY, dropout=0.3), CPU)
+    for _ in range(20):
+        fit.advance()
+    view = fit.order[-1] if fit.order else None
+    while view is None:
+        fit.advance()
+        view = fit.order[-1] if fit.order else None
+    bundle = failed_step(fit, view, "x")
+    (term,) = [line for line in findings(bundle) if "photometric" in line]
+    (report,) = fit.advance()
+    assert float(term.split(": ")[1]) == pytest.approx(report.loss, rel=1e-5)
+
+
+def test_what_is_not_finite_is_counted(tmp_path):
+    """A NaN in the image, and a file of another kind."""
+    fit = Trainer(photos(4), seeds(), BUSY, CPU)
+    bundle = failed_step(fit, 0, "x")
+    bundle[0]["image"] = bundle[0]["image"].clone()
+    bundle[0]["image"][:2, :3] = torch.nan
+    save_failed_step(tmp_path / FILE, bundle)
+    lines = findings(read_failed_step(tmp_path / FILE, CPU))
+    assert any(line == "  image: 18 of 3,840 NOT FINITE" for line in lines)
+    assert any("photometric: nan" in line for line in lines)
+    (tmp_path / "other").write_bytes(b"12345678")
+    for name in ("other", "none"):
+        with pytest.raises(DataError, match="is no step that failed"):
+            read_failed_step(tmp_path / name, CPU)
+    del bundle[0]["K"]
+    with pytest.raises(DataError, match="not whole"):
+        findings(bundle)
