@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from warpgs.errors import UsageError, WarpgsError
+from warpgs.errors import DataError, UsageError, WarpgsError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.splits import Split
@@ -203,7 +203,10 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
     if job.out is not None and not resume:
         write_json(job.out / CONFIG, record)
     if state is not None:
-        trainer.load(*state)
+        try:
+            trainer.load(*state)
+        except DataError as e:
+            raise DataError(f"{job.out}/{TENSORS}: {e}") from e
         job.notes.append(f"continued from step {trainer.step}")
     _announce(job, trainer)
     setup = time.perf_counter() - job.began
