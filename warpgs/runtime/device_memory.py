@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import functools
-import sys
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, NamedTuple
+
+from warpgs.runtime.terminal import say
 
 if TYPE_CHECKING:
     import torch
@@ -110,10 +111,10 @@ def _machine_or_assumed() -> Memory:
 
 @functools.cache
 def _say_assumed() -> None:
-    print(
+    say(
         f"warpgs: this system does not say how much memory it has (psutil finds none, nor does a container set a limit); "
         f"{ASSUMED_BYTES / 2**30:.0f} GiB are assumed",
-        file=sys.stderr,
+        error=True,
     )
 
 
