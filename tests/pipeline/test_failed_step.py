@@ -8,6 +8,7 @@ import torch
 import warpgs
 from tests.pipeline.test_trainer import BUSY
 from tests.scenes import photos, seeds
+from warpgs.app.cli import main
 from warpgs.errors import DataError, NotFiniteError
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
 from warpgs.pipeline.runs.failed_step import FILE, failed_step, findings, read_failed_step, save_failed_step
@@ -67,14 +68,15 @@ def test_the_loss_is_that_of_the_fit():
     assert float(term.split(": ")[1]) == pytest.approx(report.loss, rel=1e-5)
 
 
-def test_what_is_not_finite_is_counted(tmp_path):
-    """A NaN in the image, and a file of another kind."""
+def test_what_is_not_finite_is_counted(tmp_path, capsys):
+    """A NaN in the image, shown by the command that the message names, and a file of another kind."""
     fit = Trainer(photos(4), seeds(), BUSY, CPU)
     bundle = failed_step(fit, 0, "x")
     bundle[0]["image"] = bundle[0]["image"].clone()
     bundle[0]["image"][:2, :3] = torch.nan
     save_failed_step(tmp_path / FILE, bundle)
-    lines = findings(read_failed_step(tmp_path / FILE, CPU))
+    assert main(["doctor", "--repeat", str(tmp_path / FILE), "--device", "cpu"]) == 0
+    lines = capsys.readouterr().out.splitlines()
     assert any(line == "  image: 18 of 3,840 NOT FINITE" for line in lines)
     assert any("photometric: nan" in line for line in lines)
     (tmp_path / "other").write_bytes(b"12345678")

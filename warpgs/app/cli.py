@@ -8,8 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from warpgs import __version__
-from warpgs.errors import ResourceError, UsageError, WarpgsError
-from warpgs.plugins import own_frame
+from warpgs.app.failures import report_defect, report_no_memory
+from warpgs.errors import UsageError, WarpgsError
+from warpgs.runtime.device_memory import is_out_of_memory
+from warpgs.runtime.stop_signals import ignored_signals, interrupting_signals
+from warpgs.runtime.terminal import accept_all_letters, say
 
 COMMANDS = {
     "fit": "fit Gaussians to a scene folder and fill a run folder",
@@ -50,11 +53,10 @@ def _importing():
         gc.enable()
 
 
-def _parse(kind: type, name: str, arguments: list[str], default: object = None):
-    import tyro
+def _parse(kind: type, name: str, arguments: list[str]):
+    from warpgs.app.flags import parse_flags
 
-    extra = {} if default is None else {"default": default}
-    return tyro.cli(kind, args=arguments, prog=f"warpgs {name}", description=COMMANDS[name.split(maxsplit=1)[0]], **extra)
+    return parse_flags(kind, arguments, f"warpgs {name}", COMMANDS[name.split(maxsplit=1)[0]])
 
 
 def _fit(arguments: list[str]) -> int:
@@ -85,7 +87,7 @@ def _eval(arguments: list[str]) -> int:
     from warpgs.pipeline.runs.commands import evaluate
 
     for line in evaluate(a.run, a.device, a.lpips_weights, a.reader):
-        print(line)
+        say(line)
     return 0
 
 
@@ -110,7 +112,7 @@ def _render(arguments: list[str]) -> int:
     a = _parse(Render, "render", arguments)
     from warpgs.pipeline.runs.commands import render
 
-    print(render(a.run, a.path, a.out, a.frames, a.fps, a.device))
+    say(render(a.run, a.path, a.out, a.frames, a.fps, a.device))
     return 0
 
 
@@ -127,7 +129,7 @@ def _export(arguments: list[str]) -> int:
     a = _parse(Export, "export", arguments)
     from warpgs.pipeline.runs.commands import export
 
-    print(export(a.run, a.to))
+    say(export(a.run, a.to))
     return 0
 
 
@@ -151,7 +153,7 @@ def _prune(arguments: list[str]) -> int:
     from warpgs.pipeline.runs.prune import prune
 
     for line in prune(a.run, a.keep_psnr, a.out, a.device, a.reader):
-        print(line)
+        say(line)
     return 0
 
 
@@ -159,8 +161,8 @@ def _priors(arguments: list[str]) -> int:
     kinds = {"show": _priors_show, "export": _priors_export}
     if not arguments or arguments[0] not in kinds:
         if arguments and arguments[0] in ("-h", "--help"):
-            print("usage: warpgs priors show SCENE --out DIR [flags]")
-            print("       warpgs priors export --model MODEL --out FILE.onnx [flags]")
+            say("usage: warpgs priors show SCENE --out DIR [flags]")
+            say("       warpgs priors export --model MODEL --out FILE.onnx [flags]")
             return 0
         raise UsageError("priors: say show or export; `warpgs priors show --help` lists flags")
     return kinds[arguments[0]](arguments[1:])
@@ -194,7 +196,7 @@ def _priors_show(arguments: list[str]) -> int:
     if a.threads < 0:
         raise UsageError(f"--threads must be 0 or more, not {a.threads}")
     for line in show_priors(SceneRequest(str(a.scene), a.split, a.downscale), a.priors, a.source, a.out, a.threads):
-        print(line)
+        say(line)
     return 0
 
 
@@ -213,7 +215,7 @@ def _priors_export(arguments: list[str]) -> int:
     from warpgs.priors.export import export_network
 
     for line in export_network(a.request, a.out):
-        print(line)
+        say(line)
     return 0
 
 
@@ -237,8 +239,8 @@ def _demo(arguments: list[str]) -> int:
     from warpgs.synthetic.demo import write_demo
 
     split = write_demo(a.folder, views=a.views, width=a.width, height=a.height, seed=a.seed)
-    print(f"{a.folder}: {a.views} views of {a.width} x {a.height} px as a COLMAP folder")
-    print(f"next: warpgs fit {a.folder} --split '{split}' --out run")
+    say(f"{a.folder}: {a.views} views of {a.width} x {a.height} px as a COLMAP folder")
+    say(f"next: warpgs fit {a.folder} --split '{split}' --out run")
     return 0
 
 
@@ -247,8 +249,18 @@ def _doctor(arguments: list[str]) -> int:
     class Doctor:
         warm: bool = False
         """Instead, compile all kernels that a fit uses on this machine's devices, so that none waits for it."""
+        repeat: Path | None = None
+        """Instead, compute a step again whose loss was not finite, and say what is not: not_finite.safetensors of a run."""
+        device: str = "auto"
+        """Device for --repeat: auto, cpu or cuda."""
 
     a = _parse(Doctor, "doctor", arguments)
+    if a.repeat is not None:
+        from warpgs.pipeline.runs.commands import repeat_failed_step
+
+        for line in repeat_failed_step(a.repeat, a.device):
+            say(line)
+        return 0
     if a.warm:
         with _importing():
             from warpgs.app.precompile import print_warming
@@ -279,12 +291,19 @@ RUN = {
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns its exit code: 0 done, 2 usage, 3 data, 4 resources, 5 internal, 130 interrupted."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    accept_all_letters()
+    with interrupting_signals():
+        return _run(sys.argv[1:] if arguments is None else arguments)
+
+
+def _run(arguments: list[str]) -> int:
+    """Run one command; an error becomes one line and an exit code."""
     if not arguments or arguments[0] in ("-h", "--help", "help"):
-        print(_help(), end="")
+        for line in _help().splitlines():
+            say(line)
         return 0 if arguments else 2
     if arguments[0] in ("--version", "-V"):
-        print(f"warpgs {__version__}")
+        say(f"warpgs {__version__}")
         return 0
     name = arguments[0]
     try:
@@ -292,53 +311,17 @@ def main(arguments: list[str] | None = None) -> int:
             raise UsageError(f"there is no command {name!r}; choose one of {', '.join(RUN)}")
         return RUN[name](arguments[1:])
     except WarpgsError as e:
-        print(f"warpgs: {e}", file=sys.stderr)
+        say(f"warpgs: {e}", error=True)
         return e.exit_code
     except KeyboardInterrupt:
-        print("warpgs: interrupted; --resume continues from the last checkpoint", file=sys.stderr)
+        with ignored_signals():
+            say("warpgs: interrupted; --resume continues from the last checkpoint", error=True)
         return 130
     except BrokenPipeError:  # the reader, `head` for one, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as e:
-        ran_out = isinstance(e, MemoryError) or "out of memory" in str(e).lower()
-        return _out_of_memory(e) if ran_out else _internal_error(e, arguments)
-
-
-def _out_of_memory(error: Exception) -> int:
-    """Print that no memory is left, in words that say what to do; return the exit code."""
-    reason = (str(error).strip() or "MemoryError").splitlines()[0].partition(" GPU ")[0].rstrip(".")
-    print(
-        f"warpgs: no memory is left ({reason}). Give the fit less with --memory-limit, fit smaller images with "
-        "--downscale, or end other programs; --resume continues from the last checkpoint",
-        file=sys.stderr,
-    )
-    return ResourceError.exit_code
-
-
-def _internal_error(error: Exception, arguments: list[str]) -> int:
-    """Keep the traceback for a bug report; the user sees one line."""
-    import tempfile
-    import traceback
-
-    details = f"warpgs {__version__} {' '.join(arguments)}\n\n{''.join(traceback.format_exception(error))}"
-    try:
-        with tempfile.NamedTemporaryFile("w", prefix="warpgs-error-", suffix=".txt", delete=False, encoding="utf-8") as f:
-            f.write(details)
-        where = f"in {f.name}"
-    except OSError:  # no folder can be written
-        print(details, file=sys.stderr)
-        where = "above"
-    own = own_frame(error)
-    if own:
-        print(f"warpgs: {type(error).__name__}: {error} (in your own code, {own}; the details are {where})", file=sys.stderr)
-        return UsageError.exit_code
-    print(
-        f"warpgs: internal error, {type(error).__name__}: {error}. This is a defect of warpgs; the details are {where}, "
-        "please report them",
-        file=sys.stderr,
-    )
-    return 5
+        return report_no_memory(e) if is_out_of_memory(e) else report_defect(e, arguments)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from warpgs.app.flags import flags_of, settings_of, word_after
+from warpgs.app.flags import flags_of, parse_flags, settings_of, word_after
 from warpgs.errors import UsageError, WarpgsError
 from warpgs.io.readers import READERS
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device
@@ -23,6 +23,7 @@ from warpgs.plugins import Registry
 from warpgs.render.rule_costs import select_rule
 from warpgs.runtime.byte_units import parse_bytes
 from warpgs.runtime.interop import set_threads
+from warpgs.runtime.terminal import say
 
 
 def _request_type() -> type:
@@ -203,11 +204,9 @@ def fit(arguments: list[str], description: str) -> FitRequest:
         ResourceError: The device is not there.
         UsageError: A flag is wrong, or a plug-in cannot be loaded.
     """
-    import tyro
-
     base, kind = _preset(arguments)
     terms = _terms(arguments, base)
-    a: Any = tyro.cli(_flags(base, terms), args=arguments, prog="warpgs fit", description=f"{description}\n\n{_presets()}")
+    a: Any = parse_flags(_flags(base, terms), arguments, "warpgs fit", f"{description}\n\n{_presets()}")
     if a.reader is not None:
         _load(READERS, a.reader)
     if a.threads < 0:
@@ -217,7 +216,7 @@ def fit(arguments: list[str], description: str) -> FitRequest:
     config, notes = _chosen(a, arguments, _config(a, base, terms))
     if word_after(arguments, "--preset") is None:
         steps = "as many steps as the time allows" if a.time_budget else f"{config.steps} steps"
-        print(f"preset {base.preset}, as usual on {kind}, {steps}; the time left stands in the line of progress")
+        say(f"preset {base.preset}, as usual on {kind}, {steps}; the time left stands in the line of progress")
     masks = None if a.score_masks is None else str(a.score_masks.resolve())
     scene = SceneRequest(str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.invert_masks, masks, a.reader)
     return FitRequest(scene, a.out, config, a.device, a.resume, a.lpips_weights, a.time_budget, notes)

@@ -3,11 +3,12 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from warpgs.app.flags import parse_flags
+from warpgs.runtime.terminal import say
+
 
 def _parse(kind: type, name: str, arguments: list[str], description: str):
-    import tyro
-
-    return tyro.cli(kind, args=arguments, prog=f"warpgs {name}", description=description)
+    return parse_flags(kind, arguments, f"warpgs {name}", description)
 
 
 def _flags() -> type:
@@ -43,7 +44,7 @@ def _study(a, variants: dict, marks: dict) -> int:
 
     scenes = tuple(SceneRequest(str(s), a.split, a.downscale) for s in a.scenes)
     for line in run_study(StudyRequest(scenes, variants, a.seeds, a.out, a.device, a.lpips_weights, marks)):
-        print(line)
+        say(line)
     return 0
 
 
@@ -99,5 +100,5 @@ def convert_lpips(arguments: list[str], description: str) -> int:
     from warpgs.pipeline.metrics.lpips_weights import convert_lpips as convert
 
     for line in convert(a.backbone, a.heads, a.out):
-        print(line)
+        say(line)
     return 0

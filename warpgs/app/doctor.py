@@ -19,6 +19,7 @@ from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.device_memory import ASSUMED_BYTES, machine_memory
 from warpgs.runtime.kernel_cache import prepare_kernel_cache
 from warpgs.runtime.processor import processor_name, usable_cores
+from warpgs.runtime.terminal import printable
 
 OK, MISSING, NOTE = "ok", "missing", "note"
 PYTHON = ((3, 11), (3, 14))  # from, and below
@@ -328,7 +329,7 @@ def print_report(findings: list[Finding], console=None) -> int:
     table.add_column("Status", no_wrap=True)
     table.add_column("Detail", overflow="fold")
     for f in findings:
-        table.add_row(escape(names.get(f.topic, f.topic)), f"[{styles[f.status]}]{f.status}[/]", escape(f.detail))
+        table.add_row(escape(names.get(f.topic, f.topic)), f"[{styles[f.status]}]{f.status}[/]", escape(printable(f.detail)))
     console.print(table)
     open_ends = [f for f in findings if f.status != OK and f.remedy]
     if open_ends:
@@ -336,7 +337,7 @@ def print_report(findings: list[Finding], console=None) -> int:
         remedies.add_column(no_wrap=True)
         remedies.add_column(overflow="fold")
         for f in open_ends:
-            remedies.add_row(f"[{styles[f.status]}]{escape(names.get(f.topic, f.topic))}[/]", escape(f.remedy))
+            remedies.add_row(f"[{styles[f.status]}]{escape(names.get(f.topic, f.topic))}[/]", escape(printable(f.remedy)))
         console.print("[bold]What to do[/]")
         console.print(remedies)
         console.print()

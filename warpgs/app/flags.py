@@ -1,13 +1,18 @@
 """Flags from settings: a dataclass of settings as a command line that takes its names, defaults and help texts from it."""
 
 import ast
+import contextlib
 import dataclasses
 import inspect
+import io
 import itertools
+import re
 import textwrap
 import typing
 from collections.abc import Mapping
 from typing import Annotated, Any, TypeVar
+
+from warpgs.runtime.terminal import say
 
 Settings = TypeVar("Settings")
 
@@ -66,6 +71,69 @@ def settings_of(kind: type[Settings], flags: Any) -> Settings:
     hints = typing.get_type_hints(kind)
     values = {f.name: getattr(flags, f.name) for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
     return kind(**{n: settings_of(hints[n], v) if dataclasses.is_dataclass(hints[n]) else v for n, v in values.items()})
+
+
+MAX_WHOLE = 2**63 - 1
+"""Largest whole number that a flag takes: that of 64 bits."""
+MAX_NUMBER = 3e38
+"""Largest number that a flag takes: about that of float32, in which everything is computed."""
+
+
+def _whole(words: list[str]) -> int:
+    """Return the whole number that a word stands for; ValueError where it is none, or none of 64 bits."""
+    if not re.fullmatch(r"[+-]?[0-9][0-9_]{0,40}", words[0]) or abs(number := int(words[0])) > MAX_WHOLE:
+        raise ValueError(f"{words[0][:40]!r} is no whole number of digits 0 to 9, at most 2^63 - 1")
+    return number
+
+
+def _number(words: list[str]) -> float:
+    """Return the number that a word stands for; ValueError where it is none, not finite, or beyond float32."""
+    plain = re.fullmatch(r"[+-]?([0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)([eE][+-]?[0-9]+)?", words[0])
+    if not plain or not abs(number := float(words[0])) <= MAX_NUMBER:
+        raise ValueError(f"{words[0][:40]!r} is no finite number of digits 0 to 9, at most {MAX_NUMBER:g}")
+    return number
+
+
+def _number_rule(info: Any) -> Any:
+    """Return how a number is parsed; None for what is no number."""
+    import tyro
+
+    parsers: dict[Any, Any] = {int: _whole, float: _number}
+    if info.type not in parsers:
+        return None
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1, metavar=info.type.__name__.upper(), instance_from_str=parsers[info.type],
+        is_instance=lambda value: isinstance(value, (int, info.type)) and not isinstance(value, bool),
+        str_from_instance=lambda value: [str(value)],
+    )  # fmt: skip
+
+
+def parse_flags(kind: type, arguments: list[str], program: str, description: str) -> Any:
+    """Return an instance of a dataclass of flags from the words of a command line.
+
+    Numbers are finite and written in the digits 0 to 9. Where a word is wrong, tyro says which, and the process ends with exit
+    code 2.
+
+    Args:
+        kind: The dataclass.
+        arguments: Words after the name of the command.
+        program: Name of the program and the command, for the help.
+        description: Words about the command, for the help.
+
+    Raises:
+        SystemExit: A word is wrong, or help was asked for.
+    """
+    import tyro
+
+    registry = tyro.constructors.ConstructorRegistry()
+    registry.primitive_rule(_number_rule)
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(kind, args=arguments, prog=program, description=description, registry=registry)
+    finally:
+        for line in re.sub(r"\x1b\[[0-9;]*m", "", complaint.getvalue()).splitlines():
+            say(line, error=True)
 
 
 def word_after(arguments: list[str], flag: str) -> str | None:

@@ -32,6 +32,7 @@ from warpgs.pipeline.train.strategies import mcmc
 from warpgs.runtime import interop
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.load_module import load_module
+from warpgs.runtime.terminal import say
 
 TILE = 16
 """Side of a tile in a fit [px]."""
@@ -124,10 +125,10 @@ def print_warming(devices: list[torch.device] | None = None) -> None:
         results.append(w)
         if w.compiled:
             blocks = "" if w.device == "cpu" else f" in blocks of {w.block}"
-            print(f"{w.device}: {w.kernel}{blocks}, {w.seconds:.1f} s", flush=True)
+            say(f"{w.device}: {w.kernel}{blocks}, {w.seconds:.1f} s")
     compiled, folder = [w for w in results if w.compiled], Path(wp.config.kernel_cache_dir)
     size = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
-    print(
+    say(
         f"{len(results)} modules: {len(compiled)} compiled, {len(results) - len(compiled)} were there, "
         f"{time.perf_counter() - began:.1f} s; {folder} holds {format_bytes(size)}"
     )

@@ -15,6 +15,7 @@ import numpy as np
 from warpgs.errors import ResourceError
 from warpgs.files import write_bytes
 from warpgs.runtime.folders import cache_home, private_folder
+from warpgs.runtime.terminal import say
 
 CODE = 1
 """Version of the code between image and maps; it counts up whenever the same inputs give other maps."""
@@ -32,7 +33,7 @@ def cache_folder() -> Path:
         return Path(own)
     home = cache_home()
     if home is None:
-        print("warpgs: there is no home folder, so maps are kept for this run alone; WARPGS_CACHE names one", file=sys.stderr)
+        say("warpgs: there is no home folder, so maps are kept for this run alone; WARPGS_CACHE names one", error=True)
         return private_folder() / "maps"
     return home / "warpgs" / "Cache" if sys.platform == "win32" else home / "warpgs"
 

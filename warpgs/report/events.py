@@ -7,8 +7,12 @@ import math
 from pathlib import Path
 from typing import BinaryIO
 
+from warpgs import schema
 from warpgs.errors import ResourceError
 from warpgs.files import write_bytes
+
+_SERIES = schema.mapping(schema.or_null(schema.real))
+_STEP = schema.fields({"step": schema.whole(0)})
 
 
 class EventLog:
@@ -77,17 +81,18 @@ class EventLog:
 def read_events(path: Path) -> list[dict]:
     """Return all events of a log in file order.
 
-    A line that is no object with a whole-numbered ``step`` is skipped, because a killed run may leave its last line
-    incomplete. Null is read as NaN, so that a series has a number at every step.
+    A line that is no object with a whole-numbered ``step`` and numbers alone is skipped, because a killed run may leave its
+    last line incomplete. Null is read as NaN, so that a series has a number at every step.
     """
     events = []
     for line in Path(path).read_bytes().splitlines():
         try:
-            event = json.loads(line)
-        except ValueError:
+            event = schema.parse(line)
+            _SERIES(event, "")
+            _STEP(event, "")
+        except schema.SchemaError:
             continue
-        if isinstance(event, dict) and isinstance(event.get("step"), int):
-            events.append({k: math.nan if v is None else v for k, v in event.items()})
+        events.append({k: math.nan if v is None else v for k, v in event.items()})
     return events
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 import time
 
+from warpgs.runtime.terminal import say
+
 PLAIN_INTERVAL = 10.0
 """Seconds between two plain lines."""
 SMOOTHING = 0.05
@@ -47,7 +49,7 @@ class Progress:
             self.display.update(self._panel())
             self.display.__exit__(*error)
         elif error[0] is None and self.step > self.first:
-            print(self._line(), flush=True)
+            say(self._line())
 
     def update(self, *, step: int, loss: float, psnr: float, count: int) -> None:
         """Show the numbers of one finished step."""
@@ -60,7 +62,7 @@ class Progress:
             self.display.update(self._panel())
         elif now - self.printed >= PLAIN_INTERVAL:
             self.printed = now
-            print(self._line(), flush=True)
+            say(self._line())
 
     def _times(self) -> tuple[float, float]:
         seconds = (time.perf_counter() - self.began) / max(1, self.step - self.first)

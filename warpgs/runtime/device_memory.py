@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import functools
-import sys
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, NamedTuple
+
+from warpgs.runtime.terminal import say
 
 if TYPE_CHECKING:
     import torch
@@ -18,8 +20,11 @@ OWN_CGROUPS = Path("/proc/self/cgroup")
 CGROUPS = Path("/sys/fs/cgroup")
 
 
-OUT_OF_MEMORY = ("out of memory", "can't allocate memory", "failed to allocate", "insufficient memory", "std::bad_alloc")
-"""Parts of the messages, in small letters, by which torch, Warp and OpenCV say that no memory is left."""
+NO_MEMORY = (
+    "out of memory", "can't allocate memory", "cannot allocate memory", "not enough memory", "insufficient memory",
+    "failed to allocate", "bad_alloc", "bad allocation", "unable to allocate",
+)  # fmt: skip
+"""Words of torch, Warp, OpenCV, ONNX Runtime, numpy and C++ where the CPU or a GPU has no memory left, in lower case."""
 
 
 class Memory(NamedTuple):
@@ -40,8 +45,14 @@ def available_bytes(device: torch.device) -> int:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether an error says that no memory is left: libraries raise it as errors of many classes."""
-    return isinstance(error, MemoryError) or any(words in str(error).lower() for words in OUT_OF_MEMORY)
+    """Return whether an error, or one that it came from, says that memory does not suffice."""
+    found: BaseException | None = error
+    while found is not None:
+        text = str(found).lower()
+        if isinstance(found, MemoryError) or getattr(found, "errno", None) == errno.ENOMEM or any(w in text for w in NO_MEMORY):
+            return True
+        found = found.__cause__
+    return False
 
 
 @functools.cache
@@ -119,10 +130,10 @@ def _machine_or_assumed() -> Memory:
 
 @functools.cache
 def _say_assumed() -> None:
-    print(
+    say(
         f"warpgs: this system does not say how much memory it has (psutil finds none, nor does a container set a limit); "
         f"{ASSUMED_BYTES / 2**30:.0f} GiB are assumed",
-        file=sys.stderr,
+        error=True,
     )
 
 

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from warpgs.errors import ResourceError
 from warpgs.runtime.folders import cache_home, private_folder
+from warpgs.runtime.terminal import say
 
 REMEDY = "Set WARP_CACHE_PATH to a folder of your own to keep compiled kernels"
 
@@ -39,10 +40,10 @@ def prepare_kernel_cache() -> KernelCache:
 
     chosen = choose_kernel_cache(warp.config.kernel_cache_dir)
     if chosen.refused:
-        print(
+        say(
             f"warpgs: {chosen.refused}; kernels are compiled into {chosen.folder} for this process alone, which takes a minute "
             f"or two. {REMEDY}",
-            file=sys.stderr,
+            error=True,
         )
     if chosen.refused or warp.config.kernel_cache_dir is None:
         warp.config.kernel_cache_dir = str(chosen.folder)

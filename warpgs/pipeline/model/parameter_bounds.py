@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from warpgs.kernels.sh import MAX_DEGREE
 from warpgs.pipeline.model.table import Column, Table
 
 FINEST = 12**-0.5
@@ -38,7 +39,17 @@ def pack(sh: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
 
 
 def unpack(packed: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
-    """Return the coefficients [N, K, 3] that `pack` stored, K that of the highest degree, zeros above each one's degree."""
+    """Return the coefficients [N, K, 3] that `pack` stored, K that of the highest degree, zeros above each one's degree.
+
+    Raises:
+        ValueError: The degrees are not whole numbers from 0 to 3, or others than those that the coefficients were packed with.
+    """
+    whole = degrees.ndim == 1 and not degrees.is_floating_point() and bool(((degrees >= 0) & (degrees <= MAX_DEGREE)).all())
+    count = 3 * int((degrees.long() + 1).square().sum()) if whole else -1
+    if packed.shape != (count,):
+        raise ValueError(
+            f"{list(packed.shape)} packed coefficients do not go with {list(degrees.shape)} degrees from 0 to {MAX_DEGREE}"
+        )
     highest = int(degrees.max()) if len(degrees) else 0
     sh, at = packed.new_zeros(len(degrees), (highest + 1) ** 2, 3), 0
     for d in range(highest + 1):

@@ -211,7 +211,7 @@ class Table:
         """Load what `state` returned.
 
         Raises:
-            DataError: Columns or parameters are missing, or there are others.
+            DataError: Columns or parameters are missing, there are others, or their shapes or types are others.
         """
         own, stored = set(self.state()), {n for n in state if n.partition(".")[0] in self._groups()}
         if own != stored:
@@ -219,6 +219,14 @@ class Table:
                 f"the stored table has other columns or parameters: {', '.join(sorted(own ^ stored))}; continue with the "
                 "code and the settings that the run was started with"
             )
+        rows = {state[n].shape[:1] for n in stored}
+        for name, own_tensor in self.state().items():
+            t = state[name]
+            if len(rows) > 1 or t.shape[1:] != own_tensor.shape[1:] or t.dtype != own_tensor.dtype:
+                raise DataError(
+                    f"the stored table does not fit together: {name} has shape {list(t.shape)} and type {t.dtype}, where "
+                    f"[N, {', '.join(map(str, own_tensor.shape[1:]))}] and {own_tensor.dtype} are needed, with one N for all"
+                )
         for group, tensors in self._groups().items():
             for name in tensors:
                 tensors[name] = state[f"{group}.{name}"].to(self.device).contiguous()

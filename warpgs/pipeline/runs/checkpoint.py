@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from warpgs import __version__
+from warpgs import __version__, schema
 from warpgs.errors import DataError, NotFiniteError
 from warpgs.files import write_bytes
 
@@ -108,4 +108,9 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, An
             f"{path}: this checkpoint is of warpgs {version}, in a format that warpgs {__version__} does not read. Open it "
             f"with warpgs {version}, or fit the scene again into a new --out"
         )
-    return tensors, json.loads(metadata["state"])
+    try:
+        state = schema.parse(metadata["state"])
+        schema.mapping(schema.anything)(state, "")
+    except (KeyError, schema.SchemaError) as e:
+        raise DataError(f"{path}: its state is not whole ({e}); fit again, or restore it") from e
+    return tensors, state

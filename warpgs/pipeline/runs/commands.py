@@ -13,6 +13,7 @@ from warpgs.io.splits import Split
 from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.runs.camera_paths import PATHS
+from warpgs.pipeline.runs.failed_step import findings, read_failed_step
 from warpgs.pipeline.runs.folder import StoredRun, open_run
 from warpgs.pipeline.runs.paths import FILM, render_path
 from warpgs.pipeline.runs.request import choose_device, read_scene
@@ -99,3 +100,14 @@ def export(folder: Path, target: Path) -> str:
     stored = open_run(folder, torch.device("cpu"))
     write_ply(target, drop_unused_sh(stored.gaussians()), stored.normalization)
     return f"{len(stored.gaussians()):,} Gaussians in {target}"
+
+
+def repeat_failed_step(path: Path, device_name: str) -> list[str]:
+    """Compute a step again whose loss was not finite; returns lines for the user on what it reads and computes.
+
+    Raises:
+        DataError: The file holds no such step.
+        ResourceError: The device is not there.
+    """
+    device, where = choose_device(device_name)
+    return [f"{path}, computed again {where}:", *findings(read_failed_step(path, device))]

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from warpgs.errors import NotFiniteError, UsageError, WarpgsError
+from warpgs.errors import DataError, NotFiniteError, UsageError, WarpgsError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.splits import Split
@@ -35,6 +33,8 @@ from warpgs.pipeline.train.trainer import StepReport, Trainer, run, train_views
 from warpgs.pipeline.train.warmup import background_warmup
 from warpgs.report.events import EventLog
 from warpgs.report.progress import Progress
+from warpgs.runtime.stop_signals import noted_signals
+from warpgs.runtime.terminal import say
 from warpgs.scene import Scene, View
 
 State = tuple[dict[str, torch.Tensor], dict[str, Any]]
@@ -85,7 +85,7 @@ class _Job:
     def say(self, line: str) -> None:
         """Print a line for the user, unless the fit is to be silent."""
         if self.verbose:
-            print(line)
+            say(line)
 
 
 def preset_config(config: FitConfig | str | None, device: torch.device) -> FitConfig:
@@ -157,7 +157,7 @@ def fit(
             job.config, note = within_budget(job.config, time_budget, job.train, job.device)
             job.notes.append(note)
         trainer, state, record = _prepare(job, out if resume else None)
-    except WarpgsError:
+    except (WarpgsError, KeyboardInterrupt):
         if out is not None and made:
             with contextlib.suppress(OSError):  # it hides nothing: the error above is raised
                 out.rmdir()  # nothing is in it yet
@@ -205,7 +205,10 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
     if job.out is not None and not resume:
         write_json(job.out / CONFIG, record)
     if state is not None:
-        trainer.load(*state)
+        try:
+            trainer.load(*state)
+        except DataError as e:
+            raise DataError(f"{job.out}/{TENSORS}: {e}") from e
         job.notes.append(f"continued from step {trainer.step}")
     _announce(job, trainer)
     setup = time.perf_counter() - job.began
@@ -266,31 +269,6 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
     }  # fmt: skip
 
 
-@contextlib.contextmanager
-def _stop_signals() -> Iterator[Callable[[], bool]]:
-    """Let Ctrl-C and SIGTERM end the fit after the step in progress; a second one ends it at once.
-
-    Gives a function that says whether one came. Elsewhere than in the main thread signals cannot be caught and act as ever.
-    """
-    came = False
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: came
-        return
-
-    def note(*_: object) -> None:
-        nonlocal came
-        came = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-    before = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: came
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 def _train(job: _Job, trainer: Trainer) -> None:
     """Take all remaining steps, with a log and checkpoints where there is a run folder."""
     out = job.out
@@ -323,7 +301,7 @@ def _train(job: _Job, trainer: Trainer) -> None:
                 job.on_step(r)
 
         try:
-            with _stop_signals() as stopped:
+            with noted_signals() as stopped:
                 run(trainer, on_step, save, stopped, restore)
         except NotFiniteError as e:
             if out is None or e.view is None:

@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from warpgs import __version__
+from warpgs import __version__, schema
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.io.splits import Split
 from warpgs.pipeline.model.parameter_bounds import unpack
-from warpgs.pipeline.runs.checkpoint import FORMAT, load_checkpoint
-from warpgs.pipeline.runs.model_file import FittedModel
+from warpgs.pipeline.runs.checkpoint import FORMAT, TENSORS, load_checkpoint
+from warpgs.pipeline.runs.model_file import FittedModel, checked_gaussians
 from warpgs.pipeline.runs.request import SceneRequest, choose_device
+from warpgs.pipeline.runs.schemas import MODEL_STATE, check_record
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.scene import Camera, Gaussians, Normalization, Scene
 
@@ -84,13 +85,13 @@ def read_record(folder: Path) -> dict[str, Any]:
     """Read config.json of a run folder, its format first.
 
     Raises:
-        DataError: The folder is no run, or another version of warpgs wrote it in a format that this one does not read; the
-            message names that version and the way out.
+        DataError: The folder is no run, its record is not whole, or another version of warpgs wrote it in a format that this
+            one does not read; the message names that version and the way out.
     """
     path = folder / CONFIG
     try:
-        record = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as e:
+        record = schema.read(path)
+    except (OSError, schema.SchemaError) as e:
         raise DataError(f"{path}: cannot be read ({e}); give a folder that `warpgs fit --out` filled") from e
     if not isinstance(record, dict) or "config" not in record:
         raise DataError(f"{path}: is no record of a fit; give a folder that `warpgs fit --out` filled")
@@ -101,6 +102,10 @@ def read_record(folder: Path) -> dict[str, Any]:
             f"{path}: this run is of warpgs {version}, in a format that warpgs {__version__} does not read. Open it with "
             f"warpgs {version}, or fit the scene again into a new --out; its point_cloud.ply stays readable"
         )
+    try:
+        check_record(record)
+    except schema.SchemaError as e:
+        raise DataError(f"{path}: is not whole, {e}; restore it, or fit the scene again into a new --out") from e
     return record
 
 
@@ -191,18 +196,30 @@ def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredR
     folder = Path(folder)
     where, _ = choose_device(device)
     record = read_record(folder)
-    try:
-        cameras = {n: Camera(**(c | {k: np.array(c[k]) for k in ("viewmat", "K")})) for n, c in record["cameras"].items()}
-        n = record["normalization"]
-        normalization = Normalization(np.array(n["offset"]), n["scale"])
-        train, test = tuple(record["train"]), tuple(record["test"])
-        red, green, blue = record["background"]
-        rule = record["config"]["rule"]
-    except (KeyError, TypeError, ValueError) as e:
-        raise DataError(f"{folder / CONFIG}: is not whole ({e!r} is missing or malformed); fit again, or restore it") from e
+    matrices = ("viewmat", "K")
+    cameras = {n: Camera(**(c | {k: np.array(c[k], np.float64) for k in matrices})) for n, c in record["cameras"].items()}
+    offset, scale = record["normalization"]["offset"], record["normalization"]["scale"]
+    red, green, blue = map(float, record["background"])
     tensors, state = load_checkpoint(folder)
-    if "params.sh_packed" in tensors:
-        tensors["params.sh"] = unpack(tensors["params.sh_packed"], tensors["degrees"])
-    gaussians = Gaussians(**{n: tensors[f"params.{n}"].to(where) for n in Gaussians.__dataclass_fields__})
-    background = (red, green, blue)
-    return StoredRun(gaussians, normalization, cameras, train, test, rule, background, state["step"], folder, record)
+    gaussians, step = _model_of(tensors, state, folder / TENSORS)
+    train, test, rule = tuple(record["train"]), tuple(record["test"]), record["config"]["rule"]
+    return StoredRun(
+        Gaussians(**{n: t.to(where) for n, t in gaussians.tensors().items()}),
+        Normalization(np.array(offset, np.float64), float(scale)),
+        cameras, train, test, rule, (red, green, blue), step, folder, record,
+    )  # fmt: skip
+
+
+def _model_of(tensors: dict[str, torch.Tensor], state: dict[str, Any], path: Path) -> tuple[Gaussians, int]:
+    """Return the Gaussians of a checkpoint and the number of steps done; DataError where the two are not in it."""
+    try:
+        MODEL_STATE(state, "")
+    except schema.SchemaError as e:
+        raise DataError(f"{path}: its state is not whole, {e}; restore it, or fit the scene again") from e
+    found = {n.removeprefix("params."): t for n, t in tensors.items() if n.startswith("params.")}
+    if "sh_packed" in found and "degrees" in tensors:
+        try:
+            found["sh"] = unpack(found.pop("sh_packed"), tensors["degrees"])
+        except ValueError as e:
+            raise DataError(f"{path}: is not whole, {e}; restore it, or fit the scene again") from e
+    return checked_gaussians(found, str(path)), state["step"]

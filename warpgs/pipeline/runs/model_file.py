@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from warpgs import __version__
+from warpgs import __version__, schema
 from warpgs.coordinates import checked_normalization, convert_camera, convert_gaussians
 from warpgs.errors import DataError, UsageError
 from warpgs.files import write_bytes
@@ -18,6 +19,8 @@ from warpgs.render.rasterize import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Normalization
 
 FORMAT = "warpgs-model-1"
+SH_COUNTS = (1, 4, 9, 16)
+"""Numbers of coefficients that a set of Gaussians may have."""
 
 
 @dataclass(frozen=True)
@@ -119,13 +122,45 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
         raise DataError(f"{path}: cannot be read ({e.strerror or e}); check the path and its permissions") from e
     except (SafetensorError, ValueError) as e:
         raise DataError(f"{path}: is damaged or no safetensors file ({e}); write it again with warpgs.save") from e
-    names = Gaussians.__dataclass_fields__
-    if header.get("format") != FORMAT or tensors.keys() != names.keys():
+    if header.get("format") != FORMAT or tensors.keys() != Gaussians.__dataclass_fields__.keys():
         raise DataError(f"{path}: is no model of format {FORMAT}; write it with warpgs.save, or read PLY with warpgs.read_ply")
     try:
-        found = Normalization(np.array(json.loads(header["offset"]), np.float64), float(header["scale"]))
+        offset = schema.parse(header["offset"])
+        schema.items(schema.number(), 3)(offset, "offset")
+        found = Normalization(np.array(offset, np.float64), float(header["scale"]))
         normalization = checked_normalization(found, units := header["units"], str(path))
     except (KeyError, ValueError, UsageError) as e:
         raise DataError(f"{path}: its header is damaged ({e}); write it again with warpgs.save") from e
-    gaussians = Gaussians(**{n: tensors[n].to(device) for n in names})
+    gaussians = checked_gaussians(tensors, str(path))
+    gaussians = Gaussians(**{n: t.to(device) for n, t in gaussians.tensors().items()})
     return Model(convert_gaussians(gaussians, normalization, units, "scene"), normalization)
+
+
+def checked_gaussians(tensors: Mapping[str, torch.Tensor], where: str) -> Gaussians:
+    """Return stored tensors as Gaussians.
+
+    Args:
+        tensors: Those of `Gaussians` by name, of any shape [...].
+        where: Path of their file, for messages.
+
+    Raises:
+        DataError: One is missing or not finite, or their shapes or types do not go together.
+    """
+    names = Gaussians.__dataclass_fields__
+    missing = [n for n in names if n not in tensors]
+    if missing:
+        raise DataError(f"{where}: lacks {', '.join(missing)}; restore it, or write it again")
+    count, kind, sh = len(tensors["means"].reshape(-1)) // 3, tensors["means"].dtype, tensors["sh"].shape
+    coefficients = sh[1] if len(sh) == 3 and sh[1] in SH_COUNTS else "K"
+    shapes = {"means": (count, 3), "quats": (count, 4), "log_scales": (count, 3), "logit_opacities": (count,)}
+    for name, shape in {**shapes, "sh": (count, coefficients, 3)}.items():
+        t = tensors[name]
+        if tuple(t.shape) != shape or t.dtype != kind or kind not in (torch.float32, torch.float64):
+            raise DataError(
+                f"{where}: {name} has shape {list(t.shape)} and type {t.dtype}, where {count} Gaussians have "
+                f"{str(list(shape)).replace(chr(39), '')} and one type of float32 and float64, with K of 1, 4, 9 or 16; "
+                "restore it, or write it again"
+            )
+        if not bool(torch.isfinite(t).all()):
+            raise DataError(f"{where}: {name} holds numbers that are not finite; restore it, or write it again")
+    return Gaussians(**{n: tensors[n] for n in names})

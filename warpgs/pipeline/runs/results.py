@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -199,9 +200,8 @@ def write_report(
     events = read_events(out / "metrics.jsonl")
     steps = [e["step"] for e in events]
     curves = [
-        curve("Training loss", steps, [e["loss"] for e in events]),
-        curve("Training PSNR", steps, [e["psnr"] for e in events], "dB"),
-        curve("Gaussians", steps, [e["count"] for e in events]),
+        curve(title, steps, [e.get(name, math.nan) for e in events], unit)
+        for title, name, unit in (("Training loss", "loss", ""), ("Training PSNR", "psnr", "dB"), ("Gaussians", "count", ""))
     ]
     keys = score_keys(metrics)
     table = [["view", *(LABELS.get(k, k) for k in keys), "pixels"]] + [

@@ -14,6 +14,7 @@ from warpgs.pipeline.study.ensure_run import ensure_run
 from warpgs.pipeline.study.study import FILES, SWITCHES, Place, Runs, StudyRequest, run_folder, scene_name, write_study
 from warpgs.pipeline.train.config import PRESETS, FitConfig
 from warpgs.pipeline.train.trainer import train_views
+from warpgs.runtime.terminal import say
 
 ABLATION_ROWS: dict[str, dict[str, bool]] = {"full": {}, **{f"no {name}": {name: False} for name in SWITCHES}}
 """Switches of each row of the ablation: all on, then each part off alone, last the whole sampling (not in the paper's)."""
@@ -72,14 +73,14 @@ def _run_all(request: StudyRequest, places: list[Place], device: torch.device, l
     for seed in range(request.seeds):
         for place in places:
             for name, config in request.variants.items():
-                print(f"[{len(runs) + 1}/{total}] {place.name}, {name}, seed {seed}")
+                say(f"[{len(runs) + 1}/{total}] {place.name}, {name}, seed {seed}")
                 fit = FitRequest(
                     place.request, run_folder(request, place.name, name, seed), dataclasses.replace(config, seed=seed),
                     request.device, lpips_weights=request.lpips_weights,
                 )  # fmt: skip
                 outcome = ensure_run(fit, place.fingerprint, place.split, device.type, lpips)
                 if outcome.state != "fitted":
-                    print(f"  {outcome.state}{': ' if outcome.note else ''}{outcome.note}")
+                    say(f"  {outcome.state}{': ' if outcome.note else ''}{outcome.note}")
                 runs[place.name, name, seed] = outcome
                 gc.collect()  # a fit and its recorded steps refer to each other: without this their device memory piles up
     return runs
@@ -104,11 +105,11 @@ def run_study(request: StudyRequest) -> list[str]:
         request.out.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise ResourceError(f"{request.out}: cannot be written ({e.strerror}); choose another --out") from e
-    print(f"{len(places)} scenes, {len(request.variants)} settings, {request.seeds} seeds, {where}")
+    say(f"{len(places)} scenes, {len(request.variants)} settings, {request.seeds} seeds, {where}")
     try:
         runs = _run_all(request, places, device, lpips)
     except KeyboardInterrupt:
-        print("the same command goes on from here: finished runs are kept, the half-finished one is continued")
+        say("the same command goes on from here: finished runs are kept, the half-finished one is continued")
         raise
     for name in request.variants:
         failed = [o.note for (_, v, _), o in runs.items() if v == name and o.metrics is None]

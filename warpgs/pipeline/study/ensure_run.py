@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from warpgs import __version__
+from warpgs import __version__, schema
 from warpgs.errors import DataError, UsageError, WarpgsError
 from warpgs.io.splits import Split
 from warpgs.pipeline.runs.commands import evaluate
 from warpgs.pipeline.runs.fit import fit_request
-from warpgs.pipeline.runs.folder import CONFIG
+from warpgs.pipeline.runs.folder import CONFIG, read_record
 from warpgs.pipeline.runs.request import FitRequest
+from warpgs.pipeline.runs.schemas import METRICS
 
 
 @dataclass(frozen=True)
@@ -28,13 +28,14 @@ class Outcome:
     """Note on this run for readers of the study; empty where nothing is special."""
 
 
-def _read(path: Path) -> dict[str, Any] | None:
-    """Read a JSON object; None where there is none or it is not whole."""
+def _scores(path: Path) -> dict[str, Any] | None:
+    """Read metrics.json or eval.json; None where there is none or it is not whole."""
     try:
-        value = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError):
+        value: dict[str, Any] = schema.read(path)
+        METRICS(value, "")
+    except (OSError, schema.SchemaError):
         return None
-    return value if isinstance(value, dict) else None
+    return value
 
 
 def _difference(record: dict[str, Any], request: FitRequest, fingerprint: str, split: Split, device: str) -> str:
@@ -61,12 +62,12 @@ def _set_aside(folder: Path) -> Path:
 
 def _with_lpips(metrics: dict[str, Any], folder: Path, request: FitRequest, variants: dict[str, str]) -> dict[str, Any]:
     """Return the scores of a finished run with LPIPS of the weights asked for, measured now where they are not there yet."""
-    for found in (metrics, _read(folder / "eval.json")):
+    for found in (metrics, _scores(folder / "eval.json")):
         if found and found.get("config_hash") == metrics["config_hash"] and variants.items() <= found["variants"].items():
             return metrics | {k: found[k] for k in ("test", "views", "variants")}
     evaluate(folder, request.device, request.lpips_weights)
-    found = json.loads((folder / "eval.json").read_text("utf-8"))
-    return metrics | {k: found[k] for k in ("test", "views", "variants")}
+    written = schema.read(folder / "eval.json")
+    return metrics | {k: written[k] for k in ("test", "views", "variants")}
 
 
 def ensure_run(request: FitRequest, fingerprint: str, split: Split, device: str, variants: dict[str, str]) -> Outcome:
@@ -86,11 +87,15 @@ def ensure_run(request: FitRequest, fingerprint: str, split: Split, device: str,
         The outcome. It holds the error of this one run, if any, so that the others can go on.
     """
     folder, note, state = request.out, "", "fitted"
-    record = _read(folder / CONFIG)
-    resume = False
+    resume, why = False, "is no run"
+    record = None
+    try:
+        record = read_record(folder) if (folder / CONFIG).exists() else None
+    except DataError as e:
+        why = f"cannot be used ({e})"
     if record is not None:
         gap = _difference(record, request, fingerprint, split, device)
-        metrics = _read(folder / "metrics.json")
+        metrics = _scores(folder / "metrics.json")
         if gap:
             note = f"the run that was there had another {gap}; moved to {_set_aside(folder).name} and done anew"
             state = "redone"
@@ -103,7 +108,7 @@ def ensure_run(request: FitRequest, fingerprint: str, split: Split, device: str,
         else:
             resume, state, note = True, "continued", "was half done and has been continued from its last checkpoint"
     elif folder.exists() and any(folder.iterdir()):
-        note = f"what was there is no run; moved to {_set_aside(folder).name} and done anew"
+        note = f"what was there {why}; moved to {_set_aside(folder).name} and done anew"
         state = "redone"
 
     def fit(go_on: bool) -> dict[str, Any]:

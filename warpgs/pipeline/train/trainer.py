@@ -32,6 +32,7 @@ from warpgs.pipeline.train.step import (
     eager_renderer,
     step,
 )
+from warpgs.pipeline.train.stored_state import check_state
 from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.views import Kind, TrainingView, half_size, stack_views
 from warpgs.runtime.byte_units import format_bytes
@@ -322,7 +323,12 @@ class Trainer:
         return tensors, plain
 
     def load(self, tensors: dict[str, torch.Tensor], plain: dict[str, Any]) -> None:
-        """Load what `state` returned, ``tensors`` of shape [...] by name."""
+        """Load what `state` returned, ``tensors`` of shape [...] by name.
+
+        Raises:
+            DataError: They are not what `state` returns.
+        """
+        check_state(tensors, plain, views=len(self.views), steps=self.config.steps, strategy=self.strategy.STATE)
         self.step, self.order = plain["step"], list(plain["order"])
         self.extent, self.notes = plain["extent"], plain["notes"]
         self.table.load(tensors)

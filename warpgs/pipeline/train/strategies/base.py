@@ -11,6 +11,7 @@ import torch
 from warpgs.pipeline.model.table import Column, DensityUpdate
 from warpgs.pipeline.train.schedule import sh_degree
 from warpgs.plugins import Registry
+from warpgs.schema import anything
 
 if TYPE_CHECKING:
     from warpgs.pipeline.train.config import FitConfig
@@ -34,6 +35,8 @@ class Strategy:
     """Name that it is registered by."""
     Config: ClassVar[type | None] = None
     """Frozen dataclass of its own settings, None for none. They become flags, grouped under the strategy's name."""
+    STATE: ClassVar[staticmethod[[Any, str], None]] = staticmethod(anything)
+    """Schema (`warpgs.schema`) of the plain values that `state` returns: `load` gets no others, whatever a file holds."""
 
     def __init__(self, trainer: Trainer):
         """Keep the trainer, whose table, views and settings the strategy works with; nothing is trained yet.

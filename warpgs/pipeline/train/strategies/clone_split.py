@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
+from warpgs import schema
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.table import Column, DensityUpdate
 from warpgs.pipeline.train.strategies.base import Strategy, register
@@ -228,6 +229,8 @@ class CloneSplit(Strategy):
         """Reset the statistics of gradients."""
         for name in ("grad_sum", "seen_count"):
             self.trainer.table.columns[name].zero_()
+
+    STATE = staticmethod(schema.fields({"was_reset": schema.flag}))
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict]:
         """Return no tensors, shape [...], and whether opacities were reset."""

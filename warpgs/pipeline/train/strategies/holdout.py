@@ -8,10 +8,12 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 
 import torch
 
+from warpgs import schema
+from warpgs.errors import DataError
 from warpgs.pipeline.metrics.psnr import masked_mse
 from warpgs.pipeline.model import compress
 from warpgs.pipeline.model.parameter_bounds import bound_columns, enforce_bounds, min_log_scale
@@ -29,7 +31,7 @@ from warpgs.pipeline.train.strategies.holdout_blocks import (
     only,
     sample_blocks,
 )
-from warpgs.pipeline.train.strategies.importance_sampling import MAX_VIEWS, ImportanceSampling
+from warpgs.pipeline.train.strategies.importance_sampling import EVENT, MAX_VIEWS, ImportanceSampling
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Gaussians
@@ -60,6 +62,18 @@ class Level:
     """The smaller of the two, which are both upper bounds of the gain by growth [dB]."""
     noise: float
     """Standard error of ``gain`` over the blocks [dB]."""
+
+
+_COUNT = schema.whole(0)
+_LEVEL = {f.name: _COUNT if f.name in ("step", "count") else schema.real for f in fields(Level)}
+STATE = schema.fields({
+    "was_reset": schema.flag, "events": schema.items(EVENT), "closed": schema.or_null(_COUNT), "why": schema.text,
+    "levels": schema.items(schema.fields(_LEVEL, others=False)), "growing": _COUNT,
+    "trims": schema.items(schema.fields({
+        "step": _COUNT, "before": schema.whole(1), "after": _COUNT, "psnr": schema.items(schema.real, 2),
+    })),
+})  # fmt: skip
+"""Schema of the plain values in a checkpoint."""
 
 
 @register("holdout")
@@ -323,6 +337,8 @@ class Holdout(ImportanceSampling):
             views = blocks[first : first + MAX_VIEWS]
             yield self.sample(step, views, dataclasses.replace(method, sampler=sampler)).change
 
+    STATE = staticmethod(STATE)
+
     def state(self):
         """Return the last errors of the blocks [B] and all measurements so far."""
         tensors, plain = super().state()
@@ -339,6 +355,11 @@ class Holdout(ImportanceSampling):
         self.closed, self.why, self.trims, self.growing = (plain[k] for k in ("closed", "why", "trims", "growing"))
         self.levels = [Level(**x) for x in plain["levels"]]
         self.before = tensors.get("holdout.before")
+        blocks = sum(map(len, self.blocks)) if self.measuring else 0
+        if self.before is not None and self.before.shape != (blocks,):
+            raise DataError(
+                f"the stored errors of the held-out blocks have shape {list(self.before.shape)}, not [{blocks}]; fit again"
+            )
         if self.closed is not None:
             self.trainer.views = self.whole
 

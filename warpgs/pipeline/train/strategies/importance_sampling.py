@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from warpgs import geometry
+from warpgs import geometry, schema
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.table import Column, DensityUpdate
 from warpgs.pipeline.train.strategies import importance as scoring
@@ -36,6 +36,9 @@ NOT_SAMPLED = -(2**30)
 """``created_step`` of Gaussians that were not sampled: the coarse layer."""
 MAX_VIEWS = 8
 """Largest number of views that one event samples in; chosen at random where there are more."""
+_COUNT = schema.whole(0)
+EVENT = schema.fields({"step": _COUNT, "added": _COUNT, "evicted": _COUNT, "quantiles": schema.items(schema.real)})
+"""Schema of what is stored of an event."""
 
 
 @dataclass(frozen=True)
@@ -342,6 +345,8 @@ class ImportanceSampling(CloneSplit):
             t.gaussians, self.fine, protected, views, method,
             step=step, capacity=capacity, options=options, generator=t.generator,
         )  # fmt: skip
+
+    STATE = staticmethod(schema.fields({"was_reset": schema.flag, "events": schema.items(EVENT)}))
 
     def state(self):
         """Return no tensors [...] of its own, and the events so far."""

@@ -1,0 +1,45 @@
+"""The last words of a command that failed, and its exit code."""
+
+from warpgs import __version__
+from warpgs.errors import ResourceError, UsageError
+from warpgs.plugins import own_frame
+from warpgs.runtime.terminal import say
+
+
+def report_no_memory(error: Exception) -> int:
+    """Print that no memory is left, in words that say what to do; return the exit code."""
+    reason = (str(error).strip() or "MemoryError").splitlines()[0].partition(" GPU ")[0].rstrip(".")
+    say(
+        f"warpgs: no memory is left ({reason[:200]}). Give the fit less with --memory-limit, fit smaller images with "
+        "--downscale, or end other programs; --resume continues from the last checkpoint",
+        error=True,
+    )
+    return ResourceError.exit_code
+
+
+def report_defect(error: Exception, arguments: list[str]) -> int:
+    """Keep the traceback for a bug report; the user sees one line. Returns the exit code."""
+    import tempfile
+    import traceback
+
+    details = f"warpgs {__version__} {' '.join(arguments)}\n\n{''.join(traceback.format_exception(error))}"
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="warpgs-error-", suffix=".txt", delete=False, encoding="utf-8", errors="backslashreplace"
+        ) as f:
+            f.write(details)
+        where = f"in {f.name}"
+    except OSError:  # no folder can be written
+        for line in details.splitlines():
+            say(line, error=True)
+        where = "above"
+    own = own_frame(error)
+    if own:
+        say(f"warpgs: {type(error).__name__}: {error} (in your own code, {own}; the details are {where})", error=True)
+        return UsageError.exit_code
+    say(
+        f"warpgs: internal error, {type(error).__name__}: {error}. This is a defect of warpgs; the details are {where}, "
+        "please report them",
+        error=True,
+    )
+    return 5

@@ -1,0 +1,94 @@
+"""Schemas of the JSON that a run folder holds: config.json, the values beside a checkpoint's tensors, metrics.json."""
+
+from __future__ import annotations
+
+from pathlib import PurePosixPath
+from typing import Any
+
+from warpgs.constants import RULES
+from warpgs.schema import (
+    Schema,
+    SchemaError,
+    fields,
+    flag,
+    items,
+    mapping,
+    number,
+    one_of,
+    or_null,
+    real,
+    text,
+    whole,
+)
+
+MAX_SIDE = 2**16
+"""Largest width and height of a stored camera [px], far above what any image has."""
+
+
+def _view_name(value: Any, place: str) -> None:
+    """Allow names of views: relative paths of files."""
+    text(value, place)
+    path = PurePosixPath(value)
+    if path.is_absolute() or path.name in ("", "..") or ".." in path.parts:
+        raise SchemaError(f"{place} must be the relative path of an image, not {value[:60]!r}")
+
+
+def _matrix(rows: int) -> Schema:
+    return items(items(number(), rows), rows)
+
+
+_CAMERA = fields(
+    {"viewmat": _matrix(4), "K": _matrix(3), "width": whole(1, MAX_SIDE), "height": whole(1, MAX_SIDE)},
+    {"model": text},
+    others=False,
+)
+_SCENE = fields(
+    {
+        "path": or_null(text), "split": or_null(text), "downscale": whole(1), "strict": flag, "allow_outside": flag,
+        "invert_masks": flag, "score_masks": or_null(text), "reader": or_null(text),
+    },
+    others=False,
+)  # fmt: skip
+_RECORD = fields(
+    {
+        "scene": _SCENE, "fingerprint": text, "train": items(_view_name), "test": items(_view_name), "notes": items(text),
+        "normalization": fields({"offset": items(number(), 3), "scale": number(above=0)}),
+        "background": items(number(), 3), "config_hash": text, "device": text, "versions": mapping(text),
+        "config": fields(
+            {"rule": one_of(*RULES), "seed": whole(0), "strategy": text, "loss_terms": items(fields({"name": text}))}
+        ),
+        "cameras": mapping(_CAMERA, _view_name),
+    },
+    {"scene_format": text, "pruned": fields({"source": text})},
+)  # fmt: skip
+
+
+def check_record(record: Any) -> None:
+    """Check the contents of config.json.
+
+    Raises:
+        SchemaError: They are not what a fit writes.
+    """
+    _RECORD(record, "")
+    if not record["train"]:
+        raise SchemaError("train must name a view")
+    for name in [*record["train"], *record["test"]]:
+        if name not in record["cameras"]:
+            raise SchemaError(f"cameras lacks the view {name[:60]!r}")
+
+
+MODEL_STATE = fields({"step": whole(0)})
+"""Schema of the plain values in a checkpoint that a model is read from."""
+METRICS = fields(
+    {
+        "test": mapping(or_null(real)), "train": mapping(or_null(real)),
+        "views": items(fields({"name": text, "psnr": or_null(real)})),
+        "variants": mapping(text), "config_hash": text, "steps": whole(0),
+        "protocol": fields({
+            "split": text, "training_views": whole(0), "held_out_views": whole(0), "ground_truth": text,
+            "resolution": items(text), "score_masks": whole(0),
+        }),
+    },
+    {"gaussians": whole(0), "seconds": fields({"total": number(0)})},
+)  # fmt: skip
+"""Schema of metrics.json and of eval.json."""

@@ -1,0 +1,44 @@
+"""The check of a stored state of a fit, before anything of it is used."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from warpgs.errors import DataError
+from warpgs.schema import Schema, SchemaError, anything, fields, items, mapping, number, text, whole
+
+
+def check_state(
+    tensors: Mapping[str, torch.Tensor], plain: dict[str, Any], *, views: int, steps: int, strategy: Schema
+) -> None:
+    """Check the parts of a stored state that do not go by row; `Table.load` checks those that do.
+
+    Args:
+        tensors: Tensors by name, of any shape [...].
+        plain: Plain values.
+        views: Number of training views.
+        steps: Number of steps of the fit.
+        strategy: Schema of the strategy's own values.
+
+    Raises:
+        DataError: Something is missing, or is not what a fit stores.
+    """
+    state = fields({
+        "step": whole(0, steps), "order": items(whole(0, views - 1)), "extent": number(above=0), "notes": items(text),
+        "strategy": mapping(anything),
+    })  # fmt: skip
+    try:
+        state(plain, "")
+        strategy(plain["strategy"], "strategy")
+    except SchemaError as e:
+        raise DataError(f"the stored state is not whole, {e}; restore it, or fit the scene again") from e
+    try:
+        torch.Generator().set_state(tensors["generator"])
+    except (KeyError, TypeError, RuntimeError) as e:
+        raise DataError(
+            "the stored state is not whole: generator, the state of the random numbers, is missing or damaged; restore it, or "
+            "fit the scene again"
+        ) from e

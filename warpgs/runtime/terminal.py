@@ -1,0 +1,41 @@
+"""Lines for people on the terminal: whatever a file, a folder or an image is called, they are text and nothing else."""
+
+from __future__ import annotations
+
+import sys
+import unicodedata
+
+HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+"""Categories of characters that move the cursor, turn the direction of text, end a line, or are half of one."""
+JOINERS = "\u200c\u200d"
+"""Characters of these categories that scripts and emoji need, and that change nothing but the letters beside them."""
+
+
+def printable(text: object) -> str:
+    """Return text with every character that a terminal would obey, such as ESC, written as its code."""
+    return "".join(
+        c.encode("unicode_escape").decode() if unicodedata.category(c) in HIDDEN and c not in JOINERS else c for c in str(text)
+    )
+
+
+def say(line: object = "", *, error: bool = False) -> None:
+    """Print one line at once: `printable`, and with codes for the letters that the terminal does not have.
+
+    Args:
+        line: The line.
+        error: Whether it goes to stderr, not to stdout.
+
+    Raises:
+        BrokenPipeError: Nobody reads any more.
+    """
+    stream = sys.stderr if error else sys.stdout
+    encoding = getattr(stream, "encoding", None) or "utf-8"
+    print(printable(line).encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
+
+
+def accept_all_letters() -> None:
+    """Let other libraries' output to stdout and stderr hold letters that the terminal does not have: as their codes."""
+    for stream in (sys.stdout, sys.stderr):
+        reconfigure = getattr(stream, "reconfigure", None)
+        if reconfigure is not None:
+            reconfigure(errors="backslashreplace")

@@ -1,0 +1,194 @@
+"""Schemas of JSON that anybody may have written: its size and depth are bounded, and every value is of the kind expected.
+
+A schema is a function of a value and of its place in the file. It returns nothing and raises `SchemaError` where the value is
+another than it may be.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+MAX_BYTES = 2**28
+"""Size of the largest text that is read [bytes]; config.json of a thousand views takes one MiB."""
+MAX_DEPTH = 50
+"""Number of lists and objects that may lie in each other: whoever walks through a value needs no guard of its own."""
+MAX_WHOLE = 2**63 - 1
+"""Largest whole number: that of 64 bits."""
+MAX_NUMBER = 1e300
+"""Largest number: no whole number beyond it becomes a float."""
+
+Schema = Callable[[Any, str], None]
+
+
+class SchemaError(ValueError):
+    """Text that is no JSON, or a value that its schema does not allow; the message names the place."""
+
+
+def parse(text: str | bytes) -> Any:
+    """Return the value of a JSON text.
+
+    Raises:
+        SchemaError: It is no JSON, longer than `MAX_BYTES` or deeper than `MAX_DEPTH`.
+    """
+    if len(text) > MAX_BYTES:
+        raise SchemaError(f"is larger than {MAX_BYTES / 2**20:.0f} MiB")
+    try:
+        value = json.loads(text)
+    except RecursionError as e:
+        raise SchemaError(f"has more than {MAX_DEPTH} lists and objects in each other") from e
+    except ValueError as e:
+        raise SchemaError(f"is no JSON: {e}") from e
+    level, depth = [value], 0
+    while level := [part for outer in level for part in _parts(outer)]:
+        depth += 1
+        if depth > MAX_DEPTH:
+            raise SchemaError(f"has more than {MAX_DEPTH} lists and objects in each other")
+    return value
+
+
+def _parts(value: Any) -> list[Any]:
+    if isinstance(value, dict):
+        return list(value.values())
+    return value if isinstance(value, list) else []
+
+
+def read(path: Path) -> Any:
+    """Return the value of a JSON file.
+
+    Raises:
+        OSError: It cannot be read.
+        SchemaError: It is no ordinary file, or `parse` refuses what it holds.
+    """
+    if path.exists() and not path.is_file():  # a pipe would never end
+        raise SchemaError("is no ordinary file")
+    with path.open("rb") as f:
+        return parse(f.read(MAX_BYTES + 1))
+
+
+def anything(value: Any, place: str) -> None:
+    """Allow every value."""
+
+
+def flag(value: Any, place: str) -> None:
+    """Allow true and false."""
+    if not isinstance(value, bool):
+        _refuse(value, place, "true or false")
+
+
+def text(value: Any, place: str) -> None:
+    """Allow text that can be a path: without a zero byte, and with no half of a character but those of undecodable names."""
+    if not isinstance(value, str):
+        _refuse(value, place, "text")
+    try:
+        if b"\0" in value.encode("utf-8", "surrogateescape"):
+            _refuse(value, place, "text without a zero byte")
+    except UnicodeEncodeError:
+        _refuse(value, place, "text of whole characters")
+
+
+def one_of(*values: Any) -> Schema:
+    """Return the schema of a value that is one of some, as JSON has it: 1 is not true."""
+
+    def check(value: Any, place: str) -> None:
+        if not any(value == v and type(value) is type(v) for v in values):
+            _refuse(value, place, f"one of {', '.join(map(str, values))}")
+
+    return check
+
+
+def whole(low: int = -MAX_WHOLE, high: int = MAX_WHOLE) -> Schema:
+    """Return the schema of whole numbers from ``low`` to ``high``."""
+
+    def check(value: Any, place: str) -> None:
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            _refuse(value, place, f"a whole number from {low} to {high}")
+
+    return check
+
+
+def real(value: Any, place: str) -> None:
+    """Allow every number, NaN and infinity too."""
+    plain = isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool) and abs(value) <= MAX_NUMBER)
+    if not plain:
+        _refuse(value, place, "a number")
+
+
+def number(low: float = -math.inf, above: float = -math.inf) -> Schema:
+    """Return the schema of finite numbers that are at least ``low`` and larger than ``above``."""
+
+    def check(value: Any, place: str) -> None:
+        sound = not isinstance(value, bool) and isinstance(value, (int, float)) and abs(value) <= MAX_NUMBER
+        if not (sound and value >= low and value > above):
+            bounds = f" of at least {low:g}" * (low > -math.inf) + f" above {above:g}" * (above > -math.inf)
+            _refuse(value, place, f"a finite number{bounds}")
+
+    return check
+
+
+def or_null(schema: Schema) -> Schema:
+    """Return the schema of what ``schema`` allows, and of null."""
+
+    def check(value: Any, place: str) -> None:
+        if value is not None:
+            schema(value, place)
+
+    return check
+
+
+def items(schema: Schema, count: int | None = None) -> Schema:
+    """Return the schema of lists, of ``count`` items where that is given, each as ``schema`` has it."""
+
+    def check(value: Any, place: str) -> None:
+        if not isinstance(value, list) or count not in (None, len(value)):
+            _refuse(value, place, "a list" if count is None else f"a list of {count}")
+        for i, item in enumerate(value):
+            schema(item, f"{place}[{i}]")
+
+    return check
+
+
+def mapping(schema: Schema, names: Schema = text) -> Schema:
+    """Return the schema of objects whose names are as ``names`` has it, and their values as ``schema``."""
+
+    def check(value: Any, place: str) -> None:
+        if not isinstance(value, dict):
+            _refuse(value, place, "an object")
+        for name, item in value.items():
+            names(name, f"a name in {place}")
+            schema(item, f"{place}.{name}")
+
+    return check
+
+
+def fields(needed: Mapping[str, Schema], more: Mapping[str, Schema] | None = None, *, others: bool = True) -> Schema:
+    """Return the schema of objects with certain names.
+
+    Args:
+        needed: Schema of each name that must be there.
+        more: Schema of each name that may be there.
+        others: Whether names beside these are allowed.
+    """
+    known = {**needed, **(more or {})}
+
+    def check(value: Any, place: str) -> None:
+        if not isinstance(value, dict):
+            _refuse(value, place, "an object")
+        for name in needed:
+            if name not in value:
+                raise SchemaError(f"{place}.{name}".lstrip(".") + " is missing")
+        for name, item in value.items():
+            if name in known:
+                known[name](item, f"{place}.{name}".lstrip("."))
+            elif not others:
+                raise SchemaError(f"{place}.{name[:40]}".lstrip(".") + " is unknown")
+
+    return check
+
+
+def _refuse(value: Any, place: str, wanted: str) -> None:
+    found = repr(value)[:60] if isinstance(value, (str, float, bool, type(None))) else type(value).__name__
+    raise SchemaError(f"{place[:100] or 'it'} must be {wanted}, not {found}")
