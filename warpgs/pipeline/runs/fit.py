@@ -13,14 +13,14 @@ from typing import Any
 
 import torch
 
-from warpgs.errors import UsageError, WarpgsError
+from warpgs.errors import UsageError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.splits import Split
 from warpgs.pipeline.metrics.lpips import Lpips, load_lpips
 from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
-from warpgs.pipeline.runs.folder import CONFIG, check_same, prepare_folder, read_record, record_of
+from warpgs.pipeline.runs.folder import CONFIG, check_checkpoint, check_same, read_record, record_of, run_folder
 from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device, choose_split, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line, write_report
@@ -138,29 +138,20 @@ def fit(
     out = None if out is None else Path(out)
     if resume and out is None:
         raise UsageError("resume needs the run folder that it continues: give out")
-    made = False
-    if out is not None:
-        made = prepare_folder(out, resume)
-        if resume:
+    with contextlib.nullcontext([]) if out is None else run_folder(out, resume) as held:
+        if out is not None and resume:
             read_record(out)  # a run of another version is refused before anything takes time
-    try:
         where = choose_device(device)
         began = time.perf_counter()
         lpips = None if lpips_weights is None else load_lpips(Path(lpips_weights), where[0])
         request, read, parts, found = _scene_of(scene, split)
-        job = _Job(
-            read, request, parts, preset_config(config, where[0]), *where, out, lpips, [*notes, *found], verbose, on_step, began
-        )
+        notes = (*notes, *held, *found)
+        job = _Job(read, request, parts, preset_config(config, where[0]), *where, out, lpips, [*notes], verbose, on_step, began)
         if time_budget is not None:
             job.config, note = within_budget(job.config, time_budget, job.train, job.device)
             job.notes.append(note)
         trainer, state, record = _prepare(job, out if resume else None)
-    except WarpgsError:
-        if out is not None and made:
-            with contextlib.suppress(OSError):  # it hides nothing: the error above is raised
-                out.rmdir()  # nothing is in it yet
-        raise
-    return _finish(job, trainer, state, record, resume)
+        return _finish(job, trainer, state, record, resume)
 
 
 def fit_request(request: FitRequest) -> FitResult:
@@ -187,9 +178,11 @@ def _prepare(job: _Job, resumed: Path | None) -> tuple[Trainer, State | None, di
     """Set up the trainer; returns it, the state to continue the run ``resumed`` from, if any, and the record of the run."""
     record, state = record_of(job.request, job.config, job.scene, job.split, job.notes, job.device), None
     if resumed is not None:
-        check_same(record, read_record(resumed), resumed)
+        stored = read_record(resumed)
+        check_same(record, stored, resumed)
         if (resumed / TENSORS).is_file():
             state = load_checkpoint(resumed)
+            check_checkpoint(state[1], stored, resumed)
     c = job.config
     with background_warmup(c, job.device) as ready:
         trainer = Trainer(job.train, job.scene.points, c, job.device, job.scene.background, ready=ready)
@@ -297,7 +290,8 @@ def _train(job: _Job, trainer: Trainer) -> None:
     def save(current: Trainer) -> None:
         if out is not None and log is not None:
             log.flush()
-            save_checkpoint(out, *current.state())
+            tensors, state = current.state()
+            save_checkpoint(out, tensors, state | {"fingerprint": job.scene.fingerprint, "train": job.split.train})
 
     with Progress(trainer.config.steps, trainer.step) if job.verbose else contextlib.nullcontext() as progress:
 
