@@ -14,6 +14,7 @@ from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.runs.camera_paths import PATHS
 from warpgs.pipeline.runs.folder import IMAGE_FOLDERS, StoredRun, open_run
+from warpgs.pipeline.runs.image_names import image_names, renaming_notes
 from warpgs.pipeline.runs.paths import FILM, render_path
 from warpgs.pipeline.runs.request import choose_device, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line
@@ -61,16 +62,17 @@ def evaluate(folder: Path, device_name: str, lpips_weights: Path | None = None, 
     scene, train, test = scene_of(stored, reader)
     request = stored.scene_request(reader)
     with hold_folder(folder, *IMAGE_FOLDERS) as notes:
-        metrics = evaluate_run(folder, stored.gaussians(), train, test, stored.rule, stored.background, lpips)
+        names = image_names(v.name for v in scene.views)
+        metrics = evaluate_run(folder, stored.gaussians(), train, test, stored.rule, stored.background, lpips, names=names)
         metrics |= {
             "protocol": protocol_of(scene, request.split, request.downscale, train, test),
             "config_hash": stored.record["config_hash"], "steps": stored.step,
         }  # fmt: skip
         write_json(folder / "eval.json", metrics)
     if not test:
-        return [*notes, f"no view is held out; training PSNR {metrics['train']['psnr']:.2f} dB"]
+        return [*notes, *renaming_notes(names), f"no view is held out; training PSNR {metrics['train']['psnr']:.2f} dB"]
     lines = [f"{r['name']}: PSNR {r['psnr']:.2f} dB, SSIM {r['ssim']:.4f} ({r['region']})" for r in metrics["views"]]
-    return [*notes, *lines, f"mean of {len(test)}: {score_line(metrics['test'])}"]
+    return [*notes, *renaming_notes(names), *lines, f"mean of {len(test)}: {score_line(metrics['test'])}"]
 
 
 def render(folder: Path, kind: str, out: Path | None, frames: int, fps: int, device_name: str) -> str:

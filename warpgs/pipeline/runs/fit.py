@@ -21,6 +21,7 @@ from warpgs.pipeline.metrics.lpips import Lpips, load_lpips
 from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.runs.folder import CONFIG, check_checkpoint, check_same, read_record, record_of, run_folder
+from warpgs.pipeline.runs.image_names import image_names, renaming_notes
 from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device, choose_split, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line, write_report
@@ -145,7 +146,7 @@ def fit(
         began = time.perf_counter()
         lpips = None if lpips_weights is None else load_lpips(Path(lpips_weights), where[0])
         request, read, parts, found = _scene_of(scene, split)
-        notes = (*notes, *held, *found)
+        notes = (*notes, *held, *found, *([] if out is None else renaming_notes(image_names(v.name for v in read.views))))
         job = _Job(read, request, parts, preset_config(config, where[0]), *where, out, lpips, [*notes], verbose, on_step, began)
         if time_budget is not None:
             job.config, note = within_budget(job.config, time_budget, job.train, job.device)
@@ -236,7 +237,10 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
     c, scene, train, test, gaussians = job.config, job.scene, job.train, job.test, trainer.gaussians
     on_cuda = job.device.type == "cuda"
     peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(job.device)} if on_cuda else {}
-    metrics = evaluate_run(job.out, gaussians, train, test, c.rule, scene.background, job.lpips, trainer.max_instances)
+    names = image_names(v.name for v in scene.views)
+    metrics = evaluate_run(
+        job.out, gaussians, train, test, c.rule, scene.background, job.lpips, trainer.max_instances, names=names
+    )
     rule = rule_report_of(
         gaussians,
         train,

@@ -13,8 +13,8 @@ from warpgs.coordinates import convert_camera
 from warpgs.errors import UsageError
 from warpgs.files import write_bytes
 from warpgs.pipeline.runs.camera_paths import PATHS, camera_path
+from warpgs.pipeline.runs.image_names import image_names
 from warpgs.pipeline.runs.model_file import FittedModel
-from warpgs.pipeline.runs.results import file_stem
 from warpgs.render.rasterize import rasterize
 from warpgs.report.film import write_mp4
 from warpgs.report.images import png
@@ -40,7 +40,8 @@ def _named_cameras(model: FittedModel, path: str, frames: int) -> list[tuple[str
     if path not in PATHS:
         raise UsageError(f"path {path!r} is not one of {', '.join(PATHS)}")
     if path == "views":
-        return [(file_stem(n), c) for n, c in model.cameras().items()]
+        names = image_names(model.scene_cameras)
+        return [(names[n], c) for n, c in model.cameras().items()]
     train = [model.cameras()[n] for n in model.train]
     cameras = camera_path(path, train, _median_depth(model.gaussians(), train), frames)
     return [(f"{i:04d}", c) for i, c in enumerate(cameras)]

@@ -11,8 +11,8 @@ from warpgs.errors import UsageError
 from warpgs.files import write_bytes
 from warpgs.pipeline.metrics.region import counted_region
 from warpgs.pipeline.model.init import InitConfig, consistent_depths, seen_points
+from warpgs.pipeline.runs.image_names import image_names, renaming_notes
 from warpgs.pipeline.runs.request import SceneRequest, read_scene
-from warpgs.pipeline.runs.results import file_stem
 from warpgs.pipeline.train.strategies.importance import ImportanceConfig, geometry_score, semantic_score
 from warpgs.priors.cache import cache_folder
 from warpgs.priors.view_prior import PriorConfig, view_priors
@@ -65,6 +65,7 @@ def show_priors(request: SceneRequest, config: PriorConfig, source: str, out: Pa
         raise UsageError(f"source {source!r} is not one of {', '.join(SOURCES)}")
     scene, split, notes = read_scene(request)
     views = [scene.view(name) for name in split.train]
+    names = image_names(v.name for v in scene.views)
     with hold_folder(out) as held:
         regions = [counted_region(v)[0] for v in views]
         depths = None
@@ -73,5 +74,5 @@ def show_priors(request: SceneRequest, config: PriorConfig, source: str, out: Pa
         cache = cache_folder()
         priors, found = view_priors(views, config, depths=lambda: depths, regions=regions, threads=threads, cache=cache)
         for view, prior in zip(views, priors):
-            write_bytes(out / f"{file_stem(view.name)}.png", png(prior_sheet(view, prior)))
-        return [*notes, *held, *found, f"{len(views)} sheets in {out}"]
+            write_bytes(out / f"{names[view.name]}.png", png(prior_sheet(view, prior)))
+        return [*notes, *held, *renaming_notes(names), *found, f"{len(views)} sheets in {out}"]
