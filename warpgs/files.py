@@ -147,7 +147,7 @@ def make_folder(folder: Path) -> bool:
         ResourceError: It cannot be made.
     """
     try:
-        made = not folder.exists()
+        made = not os.path.exists(folder)  # False for what Path.exists raises an error about
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise ResourceError(

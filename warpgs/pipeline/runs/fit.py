@@ -203,6 +203,7 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
     setup = time.perf_counter() - job.began
     with contextlib.nullcontext() if job.out is None else images_kept(trainer, list(job.split.train), job.out):
         _train(job, trainer)
+    _tell(job, trainer)  # of images that were written last
     training = time.perf_counter() - job.began - setup
     if job.out is not None:
         write_ply(job.out / "point_cloud.ply", drop_unused_sh(trainer.gaussians), job.scene.normalization)
@@ -304,10 +305,7 @@ def _train(job: _Job, trainer: Trainer) -> None:
                 progress.update(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count)
             if log is not None:
                 log.write(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=round(r.seconds, 6))
-            while trainer.messages:
-                job.notes.append(trainer.messages.pop(0))
-                trainer.notes.append(job.notes[-1])  # a continued run has them in its report, too
-                job.say(f"  {job.notes[-1]}")
+            _tell(job, trainer)
             if job.on_step is not None:
                 job.on_step(r)
 
@@ -317,6 +315,14 @@ def _train(job: _Job, trainer: Trainer) -> None:
         finally:
             if log is not None:
                 log.close()
+
+
+def _tell(job: _Job, trainer: Trainer) -> None:
+    """Print what the fit has to say, and keep it for the report."""
+    while trainer.messages:
+        job.notes.append(trainer.messages.pop(0))
+        trainer.notes.append(job.notes[-1])  # a continued run has them in its report, too
+        job.say(f"  {job.notes[-1]}")
 
 
 def _print_result(job: _Job, metrics: dict[str, Any]) -> None:

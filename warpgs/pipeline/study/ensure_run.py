@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -121,7 +122,7 @@ def _outcome(request: FitRequest, fingerprint: str, split: Split, device: str, v
             return Outcome("kept", scores)
         else:
             resume, state, note = True, "continued", "was half done and has been continued from its last checkpoint"
-    elif folder.exists() and not is_empty(folder):
+    elif os.path.exists(folder) and not is_empty(folder):
         note = f"what was there is no run; moved to {_set_aside(folder).name} and done anew"
         state = "redone"
 
