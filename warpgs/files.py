@@ -2,12 +2,104 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import os
-import threading
+import re
+import secrets
+import sys
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from warpgs.errors import ResourceError
+
+LOCK = ".warpgs.lock"
+"""Name of the file that a process holds while it writes into a folder."""
+OWN_NAMES = re.compile(r"\.warpgs-[0-9a-f]{16}\.tmp(\.mp4)?")
+"""Names of temporary files: short and of ASCII letters, so that they fit wherever the file itself does."""
+WINDOWS = sys.platform == "win32"
+PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)
+"""Waits before a replacement is tried again on Windows [s]: a virus scanner holds a new file open for about that long."""
+NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES)
+"""Errors of file systems that cannot sync a folder; what they keep after a power failure is theirs to say."""
+
+
+@contextlib.contextmanager
+def replacing(
+    path: Path, check: Callable[[Path], object] | None = None, *, size: int | None = None, suffix: str = ""
+) -> Iterator[Path]:
+    """Give the path of a temporary file beside ``path``; once the block has written it, it takes the place of ``path``.
+
+    It is synced to the disk and checked first, and the folder is synced after. Where anything fails, an error of the block
+    included, the temporary file goes and what was there before stays.
+
+    Args:
+        path: File to write or to replace.
+        check: Function that reads the temporary file back and raises where it is not whole.
+        size: Bytes that will be written, for the message of an error; None where nobody knows.
+        suffix: End of the temporary file's name, for libraries that take the format from it: none, or .mp4.
+
+    Raises:
+        ResourceError: The disk is full, the folder is not writable, or the old file is open in another program on Windows.
+    """
+    temporary = path.parent / f".warpgs-{secrets.token_hex(8)}.tmp{suffix}"
+    try:
+        yield temporary
+        with temporary.open("rb+") as f:
+            os.fsync(f.fileno())
+        if check is not None:
+            check(temporary)
+        _replace(temporary, path)
+    except OSError as e:
+        amount = "" if size is None else f"{size / 2**20:.1f} MiB "
+        raise ResourceError(
+            f"{path}: {amount}cannot be written ({e.strerror or e}); what was there before is untouched. {_remedy(e)}"
+        ) from e
+    finally:
+        with contextlib.suppress(OSError):  # it hides nothing: an error above goes on, and what is left over is ours by name
+            temporary.unlink(missing_ok=True)
+    sync_folder(path.parent)
+
+
+def _replace(temporary: Path, path: Path) -> None:
+    """Put a file in the place of another; on Windows, where no open file can be replaced, a few times."""
+    for pause in PAUSES if WINDOWS else ():
+        try:
+            os.replace(temporary, path)
+            return
+        except PermissionError:
+            time.sleep(pause)
+    os.replace(temporary, path)
+
+
+def _remedy(error: OSError) -> str:
+    if WINDOWS and isinstance(error, PermissionError):
+        return "Close the programs that have it open, or write elsewhere"
+    return "Free some disk space, or write elsewhere"
+
+
+def sync_folder(folder: Path) -> None:
+    """Have the disk keep the names in a folder through a power failure, where the system can: Windows has no such call.
+
+    Raises:
+        ResourceError: The disk fails.
+    """
+    if WINDOWS:
+        return
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+    except OSError as e:
+        if e.errno not in NO_FOLDER_SYNC:
+            raise ResourceError(
+                f"{folder}: was written into, but the disk does not confirm it ({e.strerror or e}); check the disk, and what "
+                "was written last"
+            ) from e
 
 
 def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:
@@ -16,20 +108,15 @@ def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:
     Raises:
         ResourceError: The disk is full or the folder not writable; what was there before is untouched.
     """
-    temporary = path.with_name(f"{path.name}.tmp.{os.getpid()}.{threading.get_ident()}")
-    try:
-        with temporary.open("wb") as f:
-            for chunk in chunks:
-                f.write(chunk)
-            f.flush()
-            os.fsync(f.fileno())
-        temporary.replace(path)
-    except OSError as e:
-        temporary.unlink(missing_ok=True)
-        raise ResourceError(
-            f"{path}: {sum(map(len, chunks)) / 2**20:.1f} MiB could not be written ({e.strerror}); what was there before is "
-            "untouched. Free some disk space, or write elsewhere"
-        ) from e
+    size = sum(map(len, chunks))
+
+    def check(temporary: Path) -> None:
+        if temporary.stat().st_size != size:
+            raise OSError(errno.EIO, f"{temporary.stat().st_size} of {size} bytes are there")
+
+    with replacing(path, check, size=size) as temporary, temporary.open("xb") as f:
+        for chunk in chunks:
+            f.write(chunk)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -51,3 +138,46 @@ def plain(value: object) -> object:
     if isinstance(value, (list, tuple)):
         return [plain(v) for v in value]
     return value
+
+
+def make_folder(folder: Path) -> bool:
+    """Make a folder, and those above it, where it is not there; return whether it was made.
+
+    Raises:
+        ResourceError: It cannot be made.
+    """
+    try:
+        made = not os.path.exists(folder)  # False for what Path.exists raises an error about
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise ResourceError(
+            f"{folder}: cannot be written, as the folder cannot be made ({e.strerror or e}); free some disk space, or choose "
+            "another folder"
+        ) from e
+    return made
+
+
+def is_empty(folder: Path) -> bool:
+    """Return whether a folder holds nothing but what an interrupted write or its lock left there.
+
+    Raises:
+        ResourceError: It cannot be looked into.
+    """
+    try:
+        return all(p.name == LOCK or OWN_NAMES.fullmatch(p.name) for p in folder.iterdir())
+    except OSError as e:
+        raise ResourceError(
+            f"{folder}: cannot be looked into ({e.strerror or e}); choose a folder that you may read and write"
+        ) from e
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files of writers that were killed; to be called by who holds the folder, as no other writes there.
+
+    One that cannot be removed stays: it is in nobody's way.
+    """
+    with contextlib.suppress(OSError):
+        for path in folder.iterdir():
+            if OWN_NAMES.fullmatch(path.name):
+                with contextlib.suppress(OSError):
+                    path.unlink()

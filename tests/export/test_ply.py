@@ -116,7 +116,7 @@ def test_a_failing_disk_leaves_the_old_file(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("warpgs.export.ply.os.fsync", full)
+    monkeypatch.setattr("warpgs.files.os.fsync", full)
     with pytest.raises(ResourceError, match="No space left"):
         write_ply(path, make(), Normalization())
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]

@@ -76,6 +76,6 @@ def test_mistakes_get_one_line(scene, tmp_path, capsys):
     assert "no ONNX model" in failure(capsys, 3, *show(scene, "--out", out, "--depth-model", tmp_path / "x.onnx"))
     assert "cannot be read" in failure(capsys, 3, *show(scene, "--out", out, "--segmentation-model", tmp_path / "none.onnx"))
     below = scene / "images" / "000.png" / "sheets"
-    assert "choose another --out" in failure(capsys, 4, *show(scene, "--out", below))
+    assert "choose another folder" in failure(capsys, 4, *show(scene, "--out", below))
     assert not out.exists() or not list(out.iterdir())
     assert main(["priors", "--help"]) == 0 and "priors export" in capsys.readouterr().out

@@ -156,26 +156,32 @@ def test_first_picture_outlives_a_continuation(run, tmp_path):
     assert straight == continued and len(straight) == 2
 
 
-def test_a_folder_that_cannot_be_made_is_said_before_the_first_step(tmp_path):
-    """A file stands where it should be."""
-    views = photos(3)
-    fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
-    (tmp_path / "sampling").write_text("in the way")
-    with pytest.raises(ResourceError, match="sampling: cannot be made"), images_kept(fit, NAMES, tmp_path):
-        pytest.fail("begun")
-
-
-@pytest.mark.parametrize("until", [CONFIG.steps, 10])
-def test_a_picture_that_cannot_be_written_is_said(tmp_path, monkeypatch, until):
-    """At the next event, or at the end of the block where there is none; the fit is left as it was."""
+@pytest.mark.parametrize("cause", ["folder", "disk"])
+def test_images_that_cannot_be_written_end_no_fit(tmp_path, monkeypatch, cause):
+    """A file stands where their folder should be, or the disk is full: said once, and the fit takes all its steps."""
 
     def full(path, data):
         raise ResourceError(f"{path.name}: no space left")
 
-    monkeypatch.setattr(sampling_report, "write_bytes", full)
+    if cause == "disk":
+        monkeypatch.setattr(sampling_report, "write_bytes", full)
+    else:
+        (tmp_path / "sampling").write_text("in the way")
     views = photos(3)
     fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
-    with pytest.raises(ResourceError, match="no space left"), images_kept(fit, NAMES, tmp_path):
-        while fit.step < until:
+    with images_kept(fit, NAMES, tmp_path):
+        while fit.step < CONFIG.steps:
             fit.advance()
-    assert fit.strategy.on_event is None and (fit.step == 10) == (until == 10)
+    assert fit.strategy.on_event is None and len(fit.messages) == 1
+    assert "the report lacks images of sampling events" in fit.messages[0]
+    assert ("no space left" if cause == "disk" else "cannot be made") in fit.messages[0]
+
+
+def test_an_error_of_ours_in_an_image_is_not_hidden(tmp_path, monkeypatch):
+    """Only what the disk does is a note."""
+    monkeypatch.setattr(sampling_report, "write_bytes", lambda path, data: 1 / 0)
+    views = photos(3)
+    fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
+    with pytest.raises(ZeroDivisionError), images_kept(fit, NAMES, tmp_path):
+        while fit.step < CONFIG.steps:
+            fit.advance()

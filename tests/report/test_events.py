@@ -73,7 +73,7 @@ def test_a_folder_that_is_not_there(tmp_path):
         EventLog(tmp_path / "no" / "metrics.jsonl")
 
 
-@pytest.mark.parametrize("stage", ["os.fsync", "Path.replace"])
+@pytest.mark.parametrize("stage", ["os.fsync", "os.replace"])
 def test_a_failing_write_leaves_the_old_file_alone(tmp_path, monkeypatch, stage):
     path = tmp_path / "a.json"
     write_json(path, {"old": 1})

@@ -1,4 +1,5 @@
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -96,6 +97,38 @@ def test_frames_of_two_sizes_are_refused(tmp_path):
     with pytest.raises(DataError, match="frame 1 is 32 x 32 px, the first 16 x 16 px"):
         write_mp4(tmp_path / "a.mp4", [np.zeros((16, 16, 3)), np.zeros((32, 32, 3))])
     assert not list(tmp_path.iterdir())
+
+
+def test_a_film_that_did_not_fit_on_the_disk_leaves_the_old_one(tmp_path):
+    """The encoder reports nothing when a write fails; a limit on the size of files stands for a full disk."""
+    resource = pytest.importorskip("resource", reason="Windows has no limit on the size of files")
+    path, noise = tmp_path / "a.mp4", np.random.default_rng(0).uniform(size=(20, 64, 64, 3))
+    write_mp4(path, np.zeros((3, 16, 16, 3)))
+    old, limits = path.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    try:
+        with pytest.raises(ResourceError, match=r"a\.mp4: cannot be written.* of 20 frames"):
+            write_mp4(path, noise)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_bytes() == old and list(tmp_path.iterdir()) == [path]
+    assert write_mp4(path, noise) == 20 and path.read_bytes() != old
+
+
+def test_an_encoder_that_drops_frames_is_noticed(tmp_path, monkeypatch):
+    """A frame that never reaches the file is missed when the film is read back."""
+    path, made = tmp_path / "a.mp4", cv2.VideoWriter
+    path.write_bytes(b"old")
+
+    def forgetful(*arguments):
+        writer, seen = made(*arguments), []
+        write = lambda frame: seen.append(1) or len(seen) == 2 or writer.write(frame)  # noqa: E731
+        return SimpleNamespace(isOpened=writer.isOpened, release=writer.release, write=write)
+
+    monkeypatch.setattr(cv2, "VideoWriter", forgetful)
+    with pytest.raises(ResourceError, match="3 of 4 frames"):
+        write_mp4(path, np.zeros((4, 16, 16, 3)))
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 
 def test_threads_may_write_one_file(tmp_path):

@@ -1,31 +1,31 @@
 """A module is compiled by one process while another that needs it waits; nothing is locked once it is loaded."""
 
-import errno
 import os
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
 import warp as wp
 
+from warpgs.errors import ResourceError
 from warpgs.runtime import interop, load_module
 
 ROOT = Path(__file__).parent.parent.parent
 OTHER = """
 import torch
 from tests.runtime.test_load_module import mark
+from warpgs.errors import ResourceError
 from warpgs.runtime import interop, load_module
 import warp
 def refuse(*_, **__): raise AssertionError("compiled a second time")
 warp._src.build.build_cpu = refuse
-acquire = load_module._acquire
-def note(file):
+lock = load_module.lock_descriptor
+def note(descriptor):
     print("waits", flush=True)
-    acquire(file)
-load_module._acquire = note
+    lock(descriptor)
+load_module.lock_descriptor = note
 seen = torch.zeros(3, dtype=torch.int32)
 interop.launch(mark, 3, [interop.view(seen, warp.int32)], torch.device("cpu"))
 print(seen.tolist())
@@ -72,24 +72,13 @@ def test_a_file_system_without_locks_is_no_obstacle(tmp_path, monkeypatch):
     def refuse(_):
         raise OSError(95, "not supported")
 
-    monkeypatch.setattr(load_module, "_acquire", refuse)
+    monkeypatch.setattr(load_module, "lock_descriptor", refuse)
     with load_module.exclusive(tmp_path / "lock"):
         pass
     with pytest.raises(OSError, match="of the body"), load_module.exclusive(tmp_path / "lock"):
         raise OSError("of the body")
 
 
-def test_windows_has_other_calls(tmp_path, monkeypatch):
-    """Its lock is asked for again where it gives up after ten seconds, and is on the first byte both times."""
-    calls = []
-
-    def locking(descriptor, mode, count):
-        calls.append((mode, os.lseek(descriptor, 0, os.SEEK_CUR), count))
-        if len(calls) == 1:
-            raise OSError(errno.EDEADLOCK, "given up")
-
-    monkeypatch.setattr(sys, "platform", "win32")
-    monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(locking=locking, LK_LOCK="lock", LK_UNLCK="unlock"))
-    with load_module.exclusive(tmp_path / "lock"):
-        assert calls == [("lock", 0, 1)] * 2
-    assert calls[2:] == [("unlock", 0, 1)]
+def test_a_lock_that_cannot_be_made_is_named_with_a_remedy(tmp_path):
+    with pytest.raises(ResourceError, match="WARP_CACHE_PATH"), load_module.exclusive(tmp_path / "no" / "lock"):
+        pytest.fail("held")

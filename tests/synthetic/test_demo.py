@@ -162,7 +162,7 @@ def test_a_file_in_the_way(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match="is a file"):
         demo.write_demo(tmp_path / "file", **SIZE)
-    with pytest.raises(ResourceError, match="cannot write"):
+    with pytest.raises(ResourceError, match="cannot be written"):
         demo.write_demo(tmp_path / "file" / "below", **SIZE)
 
 

@@ -255,20 +255,14 @@ def _video() -> Iterable[Finding]:
     """Encode a few frames for real: a build of OpenCV may accept the codec and still write nothing."""
     topic = "MP4 encoder"
     try:
-        import cv2
         import numpy as np
 
+        from warpgs.report.film import write_mp4
+
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "probe.mp4"
-            writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 10, (64, 64))
-            if writer.isOpened():
-                for level in (0, 128, 255):
-                    writer.write(np.full((64, 64, 3), level, np.uint8))
-            writer.release()
-            if path.is_file() and path.stat().st_size > 100:
-                yield Finding(topic, OK, "mp4v through OpenCV")
-                return
-        why = "OpenCV opens no mp4v writer"
+            write_mp4(Path(folder) / "probe.mp4", (np.full((64, 64, 3), level) for level in (0, 0.5, 1)), 10)
+        yield Finding(topic, OK, "mp4v through OpenCV")
+        return
     except Exception as e:
         why = _reason(e)
     remedy = "pip install --force-reinstall opencv-contrib-python-headless (its wheels bring the encoder)"

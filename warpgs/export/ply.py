@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import os
 import re
-import secrets
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
 from warpgs.coordinates import checked_normalization, convert_gaussians
-from warpgs.errors import DataError, ResourceError
+from warpgs.errors import DataError
+from warpgs.files import replacing
 from warpgs.scene import Gaussians, Normalization
 
 MAX_HEADER_BYTES = 65536
@@ -96,15 +93,10 @@ def write_ply(
         _refuse_non_finite(path, arrays)
 
     n, k = arrays["sh"].shape[:2]
-    try:
-        with _replacing(path) as file:
-            file.write(_header(n, 3 * (k - 1)))
-            for start in range(0, n, CHUNK_ROWS):
-                file.write(_rows({name: a[start : start + CHUNK_ROWS] for name, a in arrays.items()}).tobytes())
-    except OSError as e:
-        raise ResourceError(
-            f"{path}: cannot be written ({e.strerror or e}). Free some disk space, or name a folder you may write to."
-        ) from e
+    with replacing(path) as temporary, temporary.open("xb") as file:
+        file.write(_header(n, 3 * (k - 1)))
+        for start in range(0, n, CHUNK_ROWS):
+            file.write(_rows({name: a[start : start + CHUNK_ROWS] for name, a in arrays.items()}).tobytes())
 
 
 def read_ply(path: str | os.PathLike[str], normalization: Normalization | None = None, *, units: str = "file") -> Gaussians:
@@ -149,21 +141,6 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
     if len(rows) != vertex.count:
         raise _error(path, f"cut short: {vertex.count} Gaussians announced, {len(rows)} read")
     return convert_gaussians(_assemble(path, rows, rest), normalization, "file", units)
-
-
-@contextmanager
-def _replacing(path: Path) -> Iterator[BinaryIO]:
-    """Open a file that replaces ``path`` when the block ends without an error and is removed otherwise."""
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        with open(temporary, "xb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
 
 
 def _refuse_non_finite(path: Path, arrays: dict[str, np.ndarray]) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import tempfile
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -169,6 +171,19 @@ def build(request: ExportRequest) -> torch.nn.Module:
     return (_depth_alone(network) if request.model == "dpt" else network).eval()
 
 
+@contextlib.contextmanager
+def _temporary_folder() -> Iterator[Path]:
+    """Give a folder that is removed at the end of the block; ResourceError where the files in it cannot be written."""
+    try:
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+            yield Path(folder)
+    except OSError as e:
+        raise ResourceError(
+            f"temporary files cannot be written ({e.strerror or e}); free some disk space, or set TMPDIR (TEMP on Windows) to "
+            "another folder"
+        ) from e
+
+
 def _onnx_bytes(network: torch.nn.Module, image: torch.Tensor, output: str) -> bytes:
     import torch
 
@@ -180,9 +195,9 @@ def _onnx_bytes(network: torch.nn.Module, image: torch.Tensor, output: str) -> b
     before = exporter.level
     exporter.setLevel(logging.ERROR)
     try:
-        with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        with _temporary_folder() as folder, warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            path = Path(folder) / "network.onnx"
+            path = folder / "network.onnx"
             torch.onnx.export(
                 network, (image,), path, input_names=["image"], output_names=[output],
                 dynamo=True, external_data=False, verbose=False,
@@ -219,16 +234,23 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
     output = "disparity" if request.model == "dpt" else "scores"
     with torch.no_grad():
         wanted = network(image).numpy()
-        write_bytes(out, _onnx_bytes(network, image, output))
+        data = _onnx_bytes(network, image, output)
     mean, std = HALF if request.model == "dpt" else IMAGENET
     values = {"output": "disparity" if request.model == "dpt" else "classes", "mean": mean, "std": std}
-    write_text(side_file(out), json.dumps(values) + "\n")
-    found = open_network(out).run(image[0].permute(1, 2, 0).numpy())
+    description = json.dumps(values) + "\n"
+    with _temporary_folder() as folder:
+        trial = folder / "network.onnx"
+        write_bytes(trial, data)
+        write_text(side_file(trial), description)
+        found = open_network(trial).run(image[0].permute(1, 2, 0).numpy())
     difference = float(np.abs(found - wanted).max() / wanted.std())
     if not difference < MAX_DIFFERENCE:
         raise DataError(
-            f"{out}: onnxruntime and torch differ by {difference:.1e} standard deviations; try other versions of both"
+            f"{out}: not written, as onnxruntime and torch differ by {difference:.1e} standard deviations; try other "
+            "versions of both"
         )
+    write_bytes(out, data)
+    write_text(side_file(out), description)
     flag = "--depth-model" if request.model == "dpt" else "--segmentation-model"
     trained = "small and untrained, of no use but for tests; " if request.random_weights else ""
     return [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from pathlib import Path
 from typing import BinaryIO
 
@@ -16,7 +17,11 @@ _STEP = schema.fields({"step": schema.whole(0)})
 
 
 class EventLog:
-    """A log to which events are appended; a resumed fit first drops the events after its checkpoint."""
+    """A log to which events are appended; a resumed fit first drops the events after its checkpoint.
+
+    It is the one file that is not replaced as a whole: it grows by lines, and only at its end. What a killed fit leaves is
+    whole but for the last line, which readers skip and a resumed fit drops.
+    """
 
     _file: BinaryIO | None = None
 
@@ -57,13 +62,14 @@ class EventLog:
             raise self._failure(e) from e
 
     def flush(self) -> None:
-        """Hand everything written to the system, so that the log never lags behind a checkpoint.
+        """Have everything written kept by the disk, so that the log never lags behind a checkpoint.
 
         Raises:
             ResourceError: The disk does not take it.
         """
         try:
             self._file.flush()
+            os.fsync(self._file.fileno())
         except OSError as e:
             raise self._failure(e) from e
 

@@ -8,10 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError, ResourceError
+from warpgs.files import replacing
 
 
 def write_mp4(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
     """Write frames [H, W, 3] in [0, 1], all of one size, as an MPEG-4 film; odd sides lose a row or column.
+
+    The film is decoded before it takes the place of an older one: the encoder does not say that a disk was full.
 
     Returns:
         The number of frames.
@@ -20,33 +23,58 @@ def write_mp4(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
         DataError: There are no frames, or they differ in size.
         ResourceError: This OpenCV has no MPEG-4 encoder, or the file cannot be written.
     """
+    sizes: list[tuple[int, int]] = []
+
+    def check(film: Path) -> None:
+        found = _decoded_sizes(film)
+        if found != sizes:
+            raise ResourceError(
+                f"{path}: cannot be written; read back, {sum(f == s for f, s in zip(found, sizes))} of {len(sizes)} frames are "
+                "whole. The disk is full, or the encoder failed; what was there before is untouched. Free some disk space, or "
+                "write elsewhere"
+            )
+
+    with replacing(path, check, suffix=".mp4") as temporary:
+        _encode(path, temporary, frames, fps, sizes)
+    return len(sizes)
+
+
+def _encode(path: Path, temporary: Path, frames: Iterable[np.ndarray], fps: int, sizes: list[tuple[int, int]]) -> None:
+    """Write frames to a temporary file, and the size of each, [width, height], to a list."""
     import cv2
 
-    temporary = path.with_name(f"{path.stem}.tmp.mp4")
-    writer, count, size, whole = None, 0, None, False
+    writer = None
     try:
         for frame in frames:
             height, width = (s // 2 * 2 for s in frame.shape[:2])
             if writer is None:
-                size = (height, width)
                 writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter_fourcc(*"mp4v"), fps, (width, height))
                 if not writer.isOpened():
                     raise ResourceError(
                         f"{path}: cannot be written; the folder is not writable, or OpenCV lacks an MPEG-4 encoder"
                     )
+            sizes.append((width, height))
             # OpenCV drops a frame of another size without a word.
-            if (height, width) != size:
-                raise DataError(f"{path}: frame {count} is {width} x {height} px, the first {size[1]} x {size[0]} px")
+            if sizes[-1] != sizes[0]:
+                w, h = sizes[0]
+                raise DataError(f"{path}: frame {len(sizes) - 1} is {width} x {height} px, the first {w} x {h} px")
             pixels = np.round(np.clip(frame[:height, :width], 0, 1) * 255).astype(np.uint8)
             writer.write(np.ascontiguousarray(pixels[..., ::-1]))
-            count += 1
-        whole = True
     finally:
         if writer is not None:
             writer.release()
-        if not whole:
-            temporary.unlink(missing_ok=True)
-    if count == 0:
+    if not sizes:
         raise DataError(f"{path}: there are no frames to write")
-    temporary.replace(path)
-    return count
+
+
+def _decoded_sizes(path: Path) -> list[tuple[int, int]]:
+    """Return the size of each frame, [width, height], that can be decoded."""
+    import cv2
+
+    film, sizes = cv2.VideoCapture(str(path)), []
+    try:
+        while (read := film.read())[0]:
+            sizes.append((read[1].shape[1], read[1].shape[0]))
+    finally:
+        film.release()
+    return sizes

@@ -27,6 +27,8 @@ def _python(code: str, *arguments: str) -> tuple[bool, str]:
         done = run_python(code, *arguments, timeout=TIMEOUT, environment={"VTK_DEFAULT_OPENGL_WINDOW": "vtkEGLRenderWindow"})
     except subprocess.TimeoutExpired:
         return False, f"pyvista did not finish within {TIMEOUT} s"
+    except OSError as e:
+        return False, f"no process can be started for pyvista ({e.strerror or e})"
     if done.returncode == 0:
         return True, ""
     last = done.stderr.strip().splitlines()
@@ -120,13 +122,16 @@ def render_overview(
     frusta = {"train": _frusta(train, size), "test": _frusta(test, size)}
     core = points[((points >= low) & (points <= high)).all(1)]
     view = _framing(np.concatenate([core, *(f.reshape(-1, 3) for f in frusta.values())]), direction, up)
-    with tempfile.TemporaryDirectory() as folder:
-        source, target = (Path(folder).resolve() / name for name in ("scene.npz", "overview.png"))
-        np.savez(
-            source, points=points[inside].astype(np.float32),
-            colors=np.round(255 * np.clip(colors[inside], 0, 1)).astype(np.uint8), view=view, **frusta,
-        )  # fmt: skip
-        works, why = _python(RENDER_SCRIPT, str(source), str(target))
-        if works and target.is_file():
-            return target.read_bytes(), ""
+    try:
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+            source, target = (Path(folder).resolve() / name for name in ("scene.npz", "overview.png"))
+            np.savez(
+                source, points=points[inside].astype(np.float32),
+                colors=np.round(255 * np.clip(colors[inside], 0, 1)).astype(np.uint8), view=view, **frusta,
+            )  # fmt: skip
+            works, why = _python(RENDER_SCRIPT, str(source), str(target))
+            if works and target.is_file():
+                return target.read_bytes(), ""
+    except OSError as e:
+        return None, f"no overview image: temporary files cannot be written ({e.strerror or e}); free some disk space"
     return None, f"no overview image: {why}; {_remedy(why)}"

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import errno
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO
 
 import warp as wp
+from filelock import lock_descriptor, unlock_descriptor
+
+from warpgs.errors import ResourceError
+from warpgs.files import make_folder
+from warpgs.runtime.kernel_cache import REMEDY
 
 _LOADED: set[tuple[wp.Module, object, int]] = set()
 """Modules that this process has loaded, with the context of the device and the threads of a block."""
@@ -25,7 +27,7 @@ def load_module(module: wp.Module, device: wp.Device, block_dim: int):
     if key in _LOADED:  # Warp sees by its hash whether a kernel has joined the module since
         return module.load(device, block_dim=block_dim)
     locks = Path(wp.config.kernel_cache_dir) / "locks"
-    locks.mkdir(exist_ok=True, parents=True)
+    make_folder(locks)
     with exclusive(locks / f"{module.get_module_identifier(block_dim)}.{device.is_cuda:d}"):
         loaded = module.load(device, block_dim=block_dim)
     _LOADED.add(key)
@@ -38,39 +40,16 @@ def exclusive(path: Path) -> Iterator[None]:
 
     The system gives the file free when its holder ends, killed or not. A file system without locks is passed over: Warp puts a
     compiled module in place by renaming, so that two that compile it lose time and nothing else.
+
+    Raises:
+        ResourceError: The file cannot be opened.
     """
-    with path.open("ab") as file, contextlib.ExitStack() as held:
+    try:
+        file = path.open("ab")
+    except OSError as e:
+        raise ResourceError(f"{path}: cannot be opened ({e.strerror or e}). {REMEDY}") from e
+    with file, contextlib.ExitStack() as held:
         with contextlib.suppress(OSError):
-            _acquire(file)
-            held.callback(_release, file)
+            lock_descriptor(file.fileno())
+            held.callback(unlock_descriptor, file.fileno())
         yield
-
-
-def _acquire(file: IO[bytes]) -> None:
-    if sys.platform != "win32":
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_EX)
-        return
-    import msvcrt
-
-    file.seek(0)
-    while True:
-        try:
-            msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)
-            return
-        except OSError as e:  # it gives up after ten seconds
-            if e.errno != errno.EDEADLOCK:
-                raise
-
-
-def _release(file: IO[bytes]) -> None:
-    if sys.platform != "win32":
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_UN)
-        return
-    import msvcrt
-
-    file.seek(0)
-    msvcrt.locking(file.fileno(), msvcrt.LK_UNLCK, 1)

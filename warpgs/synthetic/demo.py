@@ -7,12 +7,15 @@ training image, nor their mean, resembles a held-out view pixel by pixel.
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
 
 from warpgs.errors import ResourceError, UsageError
+from warpgs.files import is_empty, make_folder, write_bytes
 from warpgs.geometry import matmul
+from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Camera
 from warpgs.synthetic import raycast
 
@@ -244,7 +247,7 @@ def _check(folder: Path, views: int, width: int, height: int) -> None:
     try:
         if folder.exists() and not folder.is_dir():
             raise UsageError(f"{folder} is a file; name a new or an empty folder for the demo")
-        if folder.exists() and any(folder.iterdir()):
+        if folder.exists() and not is_empty(folder):
             raise UsageError(f"{folder} is not empty, and the demo overwrites nothing; name a new or an empty folder")
     except OSError as e:
         raise ResourceError(f"cannot look into {folder} ({e.strerror or e}); name a folder that you may write to") from e
@@ -288,13 +291,11 @@ def write_demo(folder: Path, *, views: int = 24, width: int = 320, height: int =
     """
     folder = Path(folder)
     _check(folder, views, width, height)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)  # before the work: a folder that cannot be made is reported at once
+    with hold_folder(folder) as notes:  # before the work: a folder that cannot be made is reported at once
+        for note in notes:
+            print(f"warpgs: {note}", file=sys.stderr)
+        _check(folder, views, width, height)  # another process may have filled it before it was ours
         for path, content in _files(views, width, height, seed).items():
-            target = folder / path
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes(content)
-    except OSError as e:
-        why = e.strerror or e
-        raise ResourceError(f"cannot write the demo to {folder} ({why}); free some disk, or name another folder") from e
+            make_folder((folder / path).parent)
+            write_bytes(folder / path, content)
     return split_spec(views)

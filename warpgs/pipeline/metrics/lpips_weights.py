@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -135,7 +136,7 @@ def convert_lpips(backbone: Path, heads: Path, out: Path) -> list[str]:
     """
     from safetensors.torch import save
 
-    if out.exists():
+    if os.path.exists(out):
         raise UsageError(f"{out} exists already; choose another --out")
     head_state, head_hash = _read_state(heads)
     net = _net_of(head_state, heads)

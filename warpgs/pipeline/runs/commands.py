@@ -14,11 +14,13 @@ from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.runs.camera_paths import PATHS
 from warpgs.pipeline.runs.failed_step import findings, read_failed_step
-from warpgs.pipeline.runs.folder import StoredRun, open_run
+from warpgs.pipeline.runs.folder import IMAGE_FOLDERS, StoredRun, open_run
+from warpgs.pipeline.runs.image_names import image_names, renaming_notes
 from warpgs.pipeline.runs.paths import FILM, render_path
 from warpgs.pipeline.runs.request import choose_device, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line
 from warpgs.pipeline.train.trainer import train_views
+from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Scene, View
 
 
@@ -53,22 +55,25 @@ def evaluate(folder: Path, device_name: str, lpips_weights: Path | None = None, 
     Raises:
         DataError: The folder is no run, its scene is gone, the scene's data have changed since the fit, or the weights are
             no weights.
+        ResourceError: Another process writes into the folder, or it cannot be written.
     """
     device, _ = choose_device(device_name)
     lpips = None if lpips_weights is None else load_lpips(lpips_weights, device)
     stored = open_run(folder, device)
     scene, train, test = scene_of(stored, reader)
     request = stored.scene_request(reader)
-    metrics = evaluate_run(folder, stored.gaussians(), train, test, stored.rule, stored.background, lpips)
-    metrics |= {
-        "protocol": protocol_of(scene, request.split, request.downscale, train, test),
-        "config_hash": stored.record["config_hash"], "steps": stored.step,
-    }  # fmt: skip
-    write_json(folder / "eval.json", metrics)
+    with hold_folder(folder, *IMAGE_FOLDERS) as notes:
+        names = image_names(v.name for v in scene.views)
+        metrics = evaluate_run(folder, stored.gaussians(), train, test, stored.rule, stored.background, lpips, names=names)
+        metrics |= {
+            "protocol": protocol_of(scene, request.split, request.downscale, train, test),
+            "config_hash": stored.record["config_hash"], "steps": stored.step,
+        }  # fmt: skip
+        write_json(folder / "eval.json", metrics)
     if not test:
-        return [f"no view is held out; training PSNR {metrics['train']['psnr']:.2f} dB"]
+        return [*notes, *renaming_notes(names), f"no view is held out; training PSNR {metrics['train']['psnr']:.2f} dB"]
     lines = [f"{r['name']}: PSNR {r['psnr']:.2f} dB, SSIM {r['ssim']:.4f} ({r['region']})" for r in metrics["views"]]
-    return [*lines, f"mean of {len(test)}: {score_line(metrics['test'])}"]
+    return [*notes, *renaming_notes(names), *lines, f"mean of {len(test)}: {score_line(metrics['test'])}"]
 
 
 def render(folder: Path, kind: str, out: Path | None, frames: int, fps: int, device_name: str) -> str:

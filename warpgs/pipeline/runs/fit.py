@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from warpgs.errors import DataError, NotFiniteError, UsageError, WarpgsError
+from warpgs.errors import DataError, NotFiniteError, UsageError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.splits import Split
@@ -20,7 +20,8 @@ from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.runs.failed_step import FILE as FAILED
 from warpgs.pipeline.runs.failed_step import failed_step, save_failed_step
-from warpgs.pipeline.runs.folder import CONFIG, check_same, prepare_folder, read_record, record_of
+from warpgs.pipeline.runs.folder import CONFIG, check_checkpoint, check_same, read_record, record_of, run_folder
+from warpgs.pipeline.runs.image_names import image_names, renaming_notes
 from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device, choose_split, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line, write_report
@@ -140,29 +141,20 @@ def fit(
     out = None if out is None else Path(out)
     if resume and out is None:
         raise UsageError("resume needs the run folder that it continues: give out")
-    made = False
-    if out is not None:
-        made = prepare_folder(out, resume)
-        if resume:
+    with contextlib.nullcontext([]) if out is None else run_folder(out, resume) as held:
+        if out is not None and resume:
             read_record(out)  # a run of another version is refused before anything takes time
-    try:
         where = choose_device(device)
         began = time.perf_counter()
         lpips = None if lpips_weights is None else load_lpips(Path(lpips_weights), where[0])
         request, read, parts, found = _scene_of(scene, split)
-        job = _Job(
-            read, request, parts, preset_config(config, where[0]), *where, out, lpips, [*notes, *found], verbose, on_step, began
-        )
+        notes = (*notes, *held, *found, *([] if out is None else renaming_notes(image_names(v.name for v in read.views))))
+        job = _Job(read, request, parts, preset_config(config, where[0]), *where, out, lpips, [*notes], verbose, on_step, began)
         if time_budget is not None:
             job.config, note = within_budget(job.config, time_budget, job.train, job.device)
             job.notes.append(note)
         trainer, state, record = _prepare(job, out if resume else None)
-    except (WarpgsError, KeyboardInterrupt):
-        if out is not None and made:
-            with contextlib.suppress(OSError):  # it hides nothing: the error above is raised
-                out.rmdir()  # nothing is in it yet
-        raise
-    return _finish(job, trainer, state, record, resume)
+        return _finish(job, trainer, state, record, resume)
 
 
 def fit_request(request: FitRequest) -> FitResult:
@@ -189,9 +181,11 @@ def _prepare(job: _Job, resumed: Path | None) -> tuple[Trainer, State | None, di
     """Set up the trainer; returns it, the state to continue the run ``resumed`` from, if any, and the record of the run."""
     record, state = record_of(job.request, job.config, job.scene, job.split, job.notes, job.device), None
     if resumed is not None:
-        check_same(record, read_record(resumed), resumed)
+        stored = read_record(resumed)
+        check_same(record, stored, resumed)
         if (resumed / TENSORS).is_file():
             state = load_checkpoint(resumed)
+            check_checkpoint(state[1], stored, resumed)
     c = job.config
     with background_warmup(c, job.device) as ready:
         trainer = Trainer(job.train, job.scene.points, c, job.device, job.scene.background, ready=ready)
@@ -214,6 +208,7 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
     setup = time.perf_counter() - job.began
     with contextlib.nullcontext() if job.out is None else images_kept(trainer, list(job.split.train), job.out):
         _train(job, trainer)
+    _tell(job, trainer)  # of images that were written last
     training = time.perf_counter() - job.began - setup
     if job.out is not None:
         write_ply(job.out / "point_cloud.ply", drop_unused_sh(trainer.gaussians), job.scene.normalization)
@@ -248,7 +243,10 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
     c, scene, train, test, gaussians = job.config, job.scene, job.train, job.test, trainer.gaussians
     on_cuda = job.device.type == "cuda"
     peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(job.device)} if on_cuda else {}
-    metrics = evaluate_run(job.out, gaussians, train, test, c.rule, scene.background, job.lpips, trainer.max_instances)
+    names = image_names(v.name for v in scene.views)
+    metrics = evaluate_run(
+        job.out, gaussians, train, test, c.rule, scene.background, job.lpips, trainer.max_instances, names=names
+    )
     rule = rule_report_of(
         gaussians,
         train,
@@ -277,7 +275,8 @@ def _train(job: _Job, trainer: Trainer) -> None:
     def save(current: Trainer) -> None:
         if out is not None and log is not None:
             log.flush()
-            save_checkpoint(out, *current.state())
+            tensors, state = current.state()
+            save_checkpoint(out, tensors, state | {"fingerprint": job.scene.fingerprint, "train": job.split.train})
 
     def restore(current: Trainer) -> bool:
         if out is None or log is None or not (out / TENSORS).is_file():
@@ -293,10 +292,7 @@ def _train(job: _Job, trainer: Trainer) -> None:
                 progress.update(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count)
             if log is not None:
                 log.write(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=round(r.seconds, 6))
-            while trainer.messages:
-                job.notes.append(trainer.messages.pop(0))
-                trainer.notes.append(job.notes[-1])  # a continued run has them in its report, too
-                job.say(f"  {job.notes[-1]}")
+            _tell(job, trainer)
             if job.on_step is not None:
                 job.on_step(r)
 
@@ -317,6 +313,14 @@ def _train(job: _Job, trainer: Trainer) -> None:
         finally:
             if log is not None:
                 log.close()
+
+
+def _tell(job: _Job, trainer: Trainer) -> None:
+    """Print what the fit has to say, and keep it for the report."""
+    while trainer.messages:
+        job.notes.append(trainer.messages.pop(0))
+        trainer.notes.append(job.notes[-1])  # a continued run has them in its report, too
+        job.say(f"  {job.notes[-1]}")
 
 
 def _print_result(job: _Job, metrics: dict[str, Any]) -> None:

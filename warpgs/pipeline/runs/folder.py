@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import json
 import platform
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,8 @@ import numpy as np
 import torch
 
 from warpgs import __version__, schema
-from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.errors import DataError, UsageError
+from warpgs.files import is_empty, plain
 from warpgs.io.splits import Split
 from warpgs.pipeline.model.parameter_bounds import unpack
 from warpgs.pipeline.runs.checkpoint import FORMAT, TENSORS, load_checkpoint
@@ -21,9 +24,12 @@ from warpgs.pipeline.runs.model_file import FittedModel, checked_gaussians
 from warpgs.pipeline.runs.request import SceneRequest, choose_device
 from warpgs.pipeline.runs.schemas import MODEL_STATE, check_record
 from warpgs.pipeline.train.config import FitConfig
+from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Camera, Gaussians, Normalization, Scene
 
 CONFIG = "config.json"
+IMAGE_FOLDERS = ("renders", "depth", "sampling")
+"""Folders in a run folder with the images that its fit writes."""
 
 
 def versions() -> dict[str, str]:
@@ -38,28 +44,29 @@ def versions() -> dict[str, str]:
     return found
 
 
-def prepare_folder(out: Path, resume: bool) -> bool:
-    """Make a run folder, or check that one holds a run to continue; return whether the folder was made.
+@contextlib.contextmanager
+def run_folder(out: Path, resume: bool) -> Iterator[list[str]]:
+    """Hold a run folder for a fit: a new or an empty one, or one with a run to continue; gives notes for the user.
 
     Raises:
-        ResourceError: The folder cannot be written.
-        UsageError: The folder exists already, or holds no run to continue.
+        ResourceError: Another process writes into the folder, or it cannot be written.
+        UsageError: The folder holds something already, or no run to continue.
     """
-    if resume:
-        if not (out / CONFIG).is_file():
-            raise UsageError(f"--resume: {out} holds no {CONFIG}, so there is no run to continue; give a run's folder")
-        return False
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UsageError(f"{out} exists already; choose another --out, or continue that run with --resume")
-    made = not out.exists()
+    _check_folder(out, resume)
+    with hold_folder(out, *IMAGE_FOLDERS) as notes:
+        _check_folder(out, resume)  # another process may have filled it before it was ours
+        yield notes
+
+
+def _check_folder(out: Path, resume: bool) -> None:
+    """Raise a UsageError for a folder that holds no run to continue, or that must be new and is not."""
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".writable"
-        probe.touch()
-        probe.unlink()
+        if resume and not (out / CONFIG).is_file():
+            raise UsageError(f"--resume: {out} holds no {CONFIG}, so there is no run to continue; give a run's folder")
+        if not resume and out.exists() and not (out.is_dir() and is_empty(out)):
+            raise UsageError(f"{out} exists already; choose another --out, or continue that run with --resume")
     except OSError as e:
-        raise ResourceError(f"{out}: cannot be written ({e.strerror}); choose another --out") from e
-    return made
+        raise UsageError(f"{out}: cannot be looked into ({e.strerror or e}); choose another --out") from e
 
 
 def _camera_values(camera: Camera) -> dict[str, Any]:
@@ -131,6 +138,23 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
             raise UsageError(
                 f"--resume: {words.get(key, key)} differs from the run in {out}; give all flags that it was started "
                 "with, or a new --out"
+            )
+
+
+def check_checkpoint(state: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
+    """Check that a checkpoint is of the fit that config.json beside it records: same settings, data and training views.
+
+    Raises:
+        DataError: It is of another.
+    """
+    for key in ("config", "fingerprint", "train"):
+        found, wanted = plain(state.get(key)), stored.get(key)
+        if found != wanted:
+            if isinstance(found, dict) and isinstance(wanted, dict):
+                key = ", ".join(k for k in {**found, **wanted} if found.get(k) != wanted.get(k))
+            raise DataError(
+                f"--resume: {out / TENSORS} is of another fit than {CONFIG} beside it: {key} differs. Restore both from the "
+                "same run, or fit again into a new --out"
             )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -9,14 +10,15 @@ import numpy as np
 import torch
 
 from warpgs.coordinates import convert_camera
-from warpgs.errors import ResourceError, UsageError
+from warpgs.errors import UsageError
 from warpgs.files import write_bytes
 from warpgs.pipeline.runs.camera_paths import PATHS, camera_path
+from warpgs.pipeline.runs.image_names import image_names
 from warpgs.pipeline.runs.model_file import FittedModel
-from warpgs.pipeline.runs.results import file_stem
 from warpgs.render.rasterize import rasterize
 from warpgs.report.film import write_mp4
 from warpgs.report.images import png
+from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Camera, Gaussians
 
 FILM = "film.mp4"
@@ -38,7 +40,8 @@ def _named_cameras(model: FittedModel, path: str, frames: int) -> list[tuple[str
     if path not in PATHS:
         raise UsageError(f"path {path!r} is not one of {', '.join(PATHS)}")
     if path == "views":
-        return [(file_stem(n), c) for n, c in model.cameras().items()]
+        names = image_names(model.scene_cameras)
+        return [(names[n], c) for n, c in model.cameras().items()]
     train = [model.cameras()[n] for n in model.train]
     cameras = camera_path(path, train, _median_depth(model.gaussians(), train), frames)
     return [(f"{i:04d}", c) for i, c in enumerate(cameras)]
@@ -67,7 +70,7 @@ def render_path(
         The files written: a PNG for each camera in order, then the film, if any.
 
     Raises:
-        ResourceError: A file cannot be written.
+        ResourceError: A file cannot be written, or another process writes into the folder.
         UsageError: The path or the units are unknown, or there are no frames.
     """
     if isinstance(path, str):
@@ -77,10 +80,6 @@ def render_path(
     if not cameras:
         raise UsageError("there is no camera to render; give at least one")
     out, gaussians, options = Path(out), model.gaussians(), model.options()
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as e:
-        raise ResourceError(f"{out}: cannot be made ({e.strerror}); choose another folder") from e
     files = [out / f"{name}.png" for name, _ in cameras]
 
     def images() -> Iterator[np.ndarray]:
@@ -90,9 +89,12 @@ def render_path(
             write_bytes(file, png(image))
             yield image
 
-    if len({(c.width, c.height) for _, c in cameras}) > 1:
+    with hold_folder(out) as notes:
+        for note in notes:
+            print(f"warpgs: {note}", file=sys.stderr)
+        if len({(c.width, c.height) for _, c in cameras}) == 1:
+            write_mp4(out / FILM, images(), fps)
+            return [*files, out / FILM]
         for _ in images():
             pass
-        return files
-    write_mp4(out / FILM, images(), fps)
-    return [*files, out / FILM]
+    return files

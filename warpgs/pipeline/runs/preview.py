@@ -7,17 +7,18 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from warpgs.errors import ResourceError, UsageError
+from warpgs.errors import UsageError
 from warpgs.files import write_bytes
 from warpgs.pipeline.metrics.region import counted_region
 from warpgs.pipeline.model.init import InitConfig, consistent_depths, seen_points
+from warpgs.pipeline.runs.image_names import image_names, renaming_notes
 from warpgs.pipeline.runs.request import SceneRequest, read_scene
-from warpgs.pipeline.runs.results import file_stem
 from warpgs.pipeline.train.strategies.importance import ImportanceConfig, geometry_score, semantic_score
 from warpgs.priors.cache import cache_folder
 from warpgs.priors.view_prior import PriorConfig, view_priors
 from warpgs.report.contact_sheet import Tile, contact_sheet
 from warpgs.report.images import png
+from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Prior, View
 
 SOURCES = ("sweep", "flow")
@@ -57,22 +58,21 @@ def show_priors(request: SceneRequest, config: PriorConfig, source: str, out: Pa
 
     Raises:
         DataError: The scene or a network's file is not what it must be.
-        ResourceError: The folder cannot be written.
+        ResourceError: The folder cannot be written, or another process writes into it.
         UsageError: The source or the split is unknown.
     """
     if source not in SOURCES:
         raise UsageError(f"source {source!r} is not one of {', '.join(SOURCES)}")
     scene, split, notes = read_scene(request)
     views = [scene.view(name) for name in split.train]
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as e:
-        raise ResourceError(f"{out}: cannot be written ({e.strerror}); choose another --out") from e
-    regions = [counted_region(v)[0] for v in views]
-    depths = None
-    if config.depth_model is None and len(views) > 1:
-        depths = consistent_depths(views, seen_points(views, scene.points), InitConfig(source=source))
-    priors, found = view_priors(views, config, depths=lambda: depths, regions=regions, threads=threads, cache=cache_folder())
-    for view, prior in zip(views, priors):
-        write_bytes(out / f"{file_stem(view.name)}.png", png(prior_sheet(view, prior)))
-    return [*notes, *found, f"{len(views)} sheets in {out}"]
+    names = image_names(v.name for v in scene.views)
+    with hold_folder(out) as held:
+        regions = [counted_region(v)[0] for v in views]
+        depths = None
+        if config.depth_model is None and len(views) > 1:
+            depths = consistent_depths(views, seen_points(views, scene.points), InitConfig(source=source))
+        cache = cache_folder()
+        priors, found = view_priors(views, config, depths=lambda: depths, regions=regions, threads=threads, cache=cache)
+        for view, prior in zip(views, priors):
+            write_bytes(out / f"{names[view.name]}.png", png(prior_sheet(view, prior)))
+        return [*notes, *held, *renaming_notes(names), *found, f"{len(views)} sheets in {out}"]

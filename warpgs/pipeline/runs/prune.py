@@ -15,7 +15,7 @@ import torch
 
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.export.ply import write_ply
-from warpgs.files import write_json
+from warpgs.files import sync_folder, write_json
 from warpgs.pipeline.metrics.evaluate import render_view, to_8_bit
 from warpgs.pipeline.metrics.psnr import psnr
 from warpgs.pipeline.metrics.region import scored_region
@@ -45,16 +45,16 @@ def mean_psnr(gaussians: Gaussians, views: list[View], options: RasterizeOptions
 def _new_folder(folder: Path, out: Path | None) -> Path:
     """Return the folder to write; UsageError where it exists already, or cannot be made."""
     out = folder.with_name(f"{folder.resolve().name}-pruned") if out is None else out
-    if out.exists():
+    if os.path.exists(out):
         raise UsageError(f"{out} exists already; choose another --out")
-    if not out.parent.is_dir():
+    if not os.path.isdir(out.parent):
         raise UsageError(f"{out.parent} is no folder; make it first, or choose another --out")
     return out
 
 
 def _write(out: Path, record: dict[str, Any], made: compress.Pruned, step: int, normalization: Normalization) -> None:
     """Write the new run folder, whole or not at all."""
-    temporary = out.with_name(f".{out.name}.{secrets.token_hex(4)}.tmp")
+    temporary = out.parent / f".warpgs-{secrets.token_hex(8)}.tmp"
     tensors = {f"params.{n}": t for n, t in made.gaussians.tensors().items() if n != "sh"}
     tensors |= {"params.sh_packed": pack(made.gaussians.sh, made.degrees), "degrees": made.degrees}
     try:
@@ -63,6 +63,7 @@ def _write(out: Path, record: dict[str, Any], made: compress.Pruned, step: int, 
         save_checkpoint(temporary, tensors, {"step": step})
         write_ply(temporary / "point_cloud.ply", made.gaussians, normalization)
         os.rename(temporary, out)
+        sync_folder(out.parent)
     except OSError as e:
         raise ResourceError(f"{out}: cannot be written ({e.strerror or e}); choose another --out") from e
     finally:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from warpgs.files import write_bytes
+from warpgs.files import make_folder, write_bytes
 from warpgs.io.splits import Split
 from warpgs.kernels.sh import C0
 from warpgs.pipeline.metrics.evaluate import ViewMetrics, baselines, options_for, render_view, score, summarize, variants
 from warpgs.pipeline.metrics.lpips import Lpips
+from warpgs.pipeline.runs.image_names import image_names
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.report.curve import curve
 from warpgs.report.events import read_events
@@ -48,11 +49,6 @@ def score_line(scores: dict[str, float]) -> str:
     return f"PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f}{''.join(distances) or ', LPIPS not measured'}"
 
 
-def file_stem(name: str) -> str:
-    """Return a view's name as one file name without suffix."""
-    return str(PurePosixPath(name).with_suffix("")).replace("/", "_")
-
-
 def protocol_of(scene: Scene, spec: str | None, downscale: int, train: list[View], test: list[View]) -> dict[str, Any]:
     """Return the conditions in which scores must agree before they may be compared, for result files and the page."""
     sizes = sorted({(v.camera.width, v.camera.height) for v in test or train})
@@ -72,6 +68,8 @@ def evaluate_run(
     background: tuple[float, float, float],
     lpips: Lpips | None = None,
     max_instances: int | None = None,
+    *,
+    names: dict[str, str] | None = None,
 ) -> dict[str, Any]:
     """Score held-out and training views, and save a render and a depth map of each held-out view.
 
@@ -86,21 +84,23 @@ def evaluate_run(
         background: Colour behind the scene.
         lpips: Network for LPIPS, or None.
         max_instances: As in RasterizeOptions.
+        names: Names of image files by view, as `image_names` gives them for the whole scene; None for those of these views.
 
     Returns:
         Means over held-out and over training views, a row per held-out view, scores of baselines, and what each score is.
     """
     options = options_for(rule, background, gaussians, max_instances)
     if out is not None:
-        (out / "renders").mkdir(exist_ok=True)
-        (out / "depth").mkdir(exist_ok=True)
+        make_folder(out / "renders")
+        make_folder(out / "depth")
+    files = names or image_names(v.name for v in [*train, *test])
 
     def finish(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:
         if out is not None:
-            stem = file_stem(view.name)
+            name = f"{files[view.name]}.png"
             row = side_by_side([np.clip(image, 0, 1), view.image, error_map(image, view.image)])
-            write_bytes(out / "renders" / f"{stem}.png", png(row))
-            write_bytes(out / "depth" / f"{stem}.png", png(depth_map(depth, alpha)))
+            write_bytes(out / "renders" / name, png(row))
+            write_bytes(out / "depth" / name, png(depth_map(depth, alpha)))
         return score(view, image, lpips if test else None)
 
     def compare(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:

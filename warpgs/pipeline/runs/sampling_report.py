@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from warpgs.errors import ResourceError
-from warpgs.files import write_bytes
+from warpgs.files import make_folder, write_bytes
 from warpgs.pipeline.train.schedule import Phases
 from warpgs.pipeline.train.strategies.importance_sampling import Event, ImportanceSampling, MethodConfig, SampledView
 from warpgs.pipeline.train.strategies.sampler import SUPPORT
@@ -107,30 +107,30 @@ def _on_host(sampled: SampledView) -> SampledView:
 def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[None]:
     """Have a fit write images of some of its events into its run folder, ``sampling/STEP.png``, while it goes on.
 
-    A thread of its own makes them; the end of the block waits for it.
+    A thread of its own makes them; the end of the block waits for it. An image that cannot be written is none that a fit should
+    end for: ``fit.messages`` says it once.
 
     Args:
         fit: The fit, before its first step.
         names: Names of its training views.
         out: Run folder.
-
-    Raises:
-        ResourceError: The folder cannot be made; or an image could not be written, at the next event or the end of the block.
     """
     config, steps, strategy = fit.config.method, shown_steps(fit.phases), fit.strategy
     if not isinstance(strategy, ImportanceSampling) or not config.events:
         yield
         return
-    try:
-        (out / FOLDER).mkdir(exist_ok=True)
-    except OSError as e:
-        raise ResourceError(
-            f"{out / FOLDER}: cannot be made ({e.strerror}); free some disk space, or choose another --out"
-        ) from e
+
+    lost: list[int] = []
 
     def write(step: int, views: list[TrainingView], kept: list[SampledView]) -> None:
         sheets = [view_sheet(names[d.view], step, v, fit.disparities[d.view], d, config) for v, d in zip(views, kept)]
-        write_bytes(out / FOLDER / f"{step:06d}.png", png(np.concatenate(sheets)))
+        try:
+            make_folder(out / FOLDER)
+            write_bytes(out / FOLDER / f"{step:06d}.png", png(np.concatenate(sheets)))
+        except ResourceError as e:
+            if not lost:
+                fit.messages.append(f"the report lacks images of sampling events: {e}")
+            lost.append(step)
 
     with ThreadPoolExecutor(1) as thread:
         writing: list[Future[None]] = []

@@ -7,13 +7,14 @@ import gc
 
 import torch
 
-from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.errors import DataError, UsageError
 from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.runs.request import FitRequest, choose_device, read_scene
 from warpgs.pipeline.study.ensure_run import ensure_run
 from warpgs.pipeline.study.study import FILES, SWITCHES, Place, Runs, StudyRequest, run_folder, scene_name, write_study
 from warpgs.pipeline.train.config import PRESETS, FitConfig
 from warpgs.pipeline.train.trainer import train_views
+from warpgs.runtime.folder_lock import hold_folder
 from warpgs.runtime.terminal import say
 
 ABLATION_ROWS: dict[str, dict[str, bool]] = {"full": {}, **{f"no {name}": {name: False} for name in SWITCHES}}
@@ -96,24 +97,23 @@ def run_study(request: StudyRequest) -> list[str]:
 
     Raises:
         DataError: A scene cannot be read or holds out no view; the LPIPS weights are none; or every run of a variant failed.
-        ResourceError: The folder cannot be written, or the device is not there.
+        ResourceError: The folder cannot be written, another process writes into it, or the device is not there.
     """
     device, where = choose_device(request.device)
     lpips = {} if request.lpips_weights is None else load_lpips(request.lpips_weights, device).variants()
     places = _places(request)
-    try:
-        request.out.mkdir(parents=True, exist_ok=True)
-    except OSError as e:
-        raise ResourceError(f"{request.out}: cannot be written ({e.strerror}); choose another --out") from e
-    say(f"{len(places)} scenes, {len(request.variants)} settings, {request.seeds} seeds, {where}")
-    try:
-        runs = _run_all(request, places, device, lpips)
-    except KeyboardInterrupt:
-        say("the same command goes on from here: finished runs are kept, the half-finished one is continued")
-        raise
-    for name in request.variants:
-        failed = [o.note for (_, v, _), o in runs.items() if v == name and o.metrics is None]
-        if len(failed) == len(places) * request.seeds:
-            raise DataError(f"every run of {name} failed, so nothing can be compared; the first: {failed[0]}")
-    lines = write_study(request, runs, places, device, where.removeprefix("on "))
-    return [*lines, f"in {request.out}: {', '.join(FILES)}"]
+    with hold_folder(request.out) as notes:
+        for note in notes:
+            say(note)
+        say(f"{len(places)} scenes, {len(request.variants)} settings, {request.seeds} seeds, {where}")
+        try:
+            runs = _run_all(request, places, device, lpips)
+        except KeyboardInterrupt:
+            say("the same command goes on from here: finished runs are kept, the half-finished one is continued")
+            raise
+        for name in request.variants:
+            failed = [o.note for (_, v, _), o in runs.items() if v == name and o.metrics is None]
+            if len(failed) == len(places) * request.seeds:
+                raise DataError(f"every run of {name} failed, so nothing can be compared; the first: {failed[0]}")
+        lines = write_study(request, runs, places, device, where.removeprefix("on "))
+        return [*lines, f"in {request.out}: {', '.join(FILES)}"]

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from warpgs import __version__, schema
-from warpgs.errors import DataError, UsageError, WarpgsError
+from warpgs.errors import DataError, ResourceError, UsageError, WarpgsError
+from warpgs.files import is_empty
 from warpgs.io.splits import Split
 from warpgs.pipeline.runs.commands import evaluate
 from warpgs.pipeline.runs.fit import fit_request
 from warpgs.pipeline.runs.folder import CONFIG, read_record
 from warpgs.pipeline.runs.request import FitRequest
 from warpgs.pipeline.runs.schemas import METRICS
+from warpgs.runtime.folder_lock import hold_folder
 
 
 @dataclass(frozen=True)
@@ -52,11 +55,20 @@ def _difference(record: dict[str, Any], request: FitRequest, fingerprint: str, s
 
 
 def _set_aside(folder: Path) -> Path:
-    """Move a run that cannot be used out of the way; nothing is deleted."""
+    """Move a run that cannot be used out of the way; no result is deleted.
+
+    Raises:
+        ResourceError: Another process writes there, or the folder cannot be moved.
+    """
+    with hold_folder(folder):
+        pass  # nobody writes there; Windows moves no folder with an open file, so it is not held any longer
     number = 1
     while (target := folder.with_name(f"{folder.name}.old{number}")).exists():
         number += 1
-    folder.rename(target)
+    try:
+        folder.rename(target)
+    except OSError as e:
+        raise ResourceError(f"{folder}: cannot be moved to {target.name} ({e.strerror or e}); move it by hand") from e
     return target
 
 
@@ -86,6 +98,14 @@ def ensure_run(request: FitRequest, fingerprint: str, split: Split, device: str,
     Returns:
         The outcome. It holds the error of this one run, if any, so that the others can go on.
     """
+    try:
+        return _outcome(request, fingerprint, split, device, variants)
+    except WarpgsError as e:
+        return Outcome("failed", None, f"failed: {e}")
+
+
+def _outcome(request: FitRequest, fingerprint: str, split: Split, device: str, variants: dict[str, str]) -> Outcome:
+    """Return the outcome of `ensure_run`, or raise what keeps it from beginning."""
     folder, note, state = request.out, "", "fitted"
     resume, why = False, "is no run"
     record = None
@@ -107,7 +127,7 @@ def ensure_run(request: FitRequest, fingerprint: str, split: Split, device: str,
             return Outcome("kept", scores)
         else:
             resume, state, note = True, "continued", "was half done and has been continued from its last checkpoint"
-    elif folder.exists() and any(folder.iterdir()):
+    elif os.path.exists(folder) and not is_empty(folder):
         note = f"what was there {why}; moved to {_set_aside(folder).name} and done anew"
         state = "redone"
 

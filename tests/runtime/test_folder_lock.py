@@ -1,0 +1,122 @@
+"""One process at a time writes into a folder; who dies gives it free; whoever comes second is told whose it is."""
+
+import errno
+import os
+import platform
+import subprocess
+import sys
+
+import pytest
+
+from warpgs.errors import ResourceError
+from warpgs.files import LOCK, is_empty
+from warpgs.runtime import folder_lock
+from warpgs.runtime.folder_lock import hold_folder
+
+LEFT = ".warpgs-0123456789abcdef.tmp"
+HOLD = """
+import sys
+from pathlib import Path
+from warpgs.runtime.folder_lock import hold_folder
+with hold_folder(Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def refusal(folder) -> str:
+    """The error of a second holder."""
+    with pytest.raises(ResourceError) as e, hold_folder(folder):
+        pytest.fail("held twice")
+    return str(e.value)
+
+
+def test_a_second_holder_is_told_whose_the_folder_is(tmp_path, monkeypatch):
+    """Number, machine, time and command of the holder; both may hold it one after the other."""
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/warpgs", "fit", "my scene", *["x"] * 200])
+    with hold_folder(tmp_path) as notes:
+        said = refusal(tmp_path)
+        assert f"process {os.getpid()} on {platform.node()}, since 20" in said and "`warpgs fit 'my scene' x x" in said
+        assert "..." in said and len(said) < 600 and "choose another folder" in said and notes == []
+        assert is_empty(tmp_path)
+    assert not list(tmp_path.iterdir())
+    with hold_folder(tmp_path):
+        pass
+
+
+def test_a_lock_file_alone_holds_nothing(tmp_path):
+    """Its process is gone, and the number may be that of another one now, or come from another container."""
+    (tmp_path / LOCK).write_text(f'\n{{"process": {os.getpid()}, "host": "", "since": "", "command": ""}}')
+    (tmp_path / LEFT).write_text("half a file")
+    (tmp_path / "renders").mkdir()
+    (tmp_path / "renders" / LEFT).write_text("half an image")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / LEFT).write_text("of another holder")
+    with hold_folder(tmp_path, "renders", "depth"):
+        assert sorted(p.name for p in tmp_path.rglob("*")) == sorted([LOCK, "renders", "other", LEFT])
+    assert not (tmp_path / LOCK).exists()
+
+
+def test_a_lock_that_was_removed_meanwhile_is_taken_anew(tmp_path, monkeypatch):
+    """The last holder ends between our opening and our locking: what we have locked then is no longer in the folder."""
+    lock, calls = folder_lock.lock_descriptor, []
+
+    def late(descriptor, blocking):
+        calls.append(descriptor)
+        if len(calls) == 1:
+            (tmp_path / LOCK).unlink()
+        return lock(descriptor, blocking=blocking)
+
+    monkeypatch.setattr(folder_lock, "lock_descriptor", late)
+    with hold_folder(tmp_path):
+        assert len(calls) == 2 and (tmp_path / LOCK).is_file()
+        assert str(os.getpid()) in refusal(tmp_path)
+
+
+def test_a_file_system_without_locks_is_noted(tmp_path, monkeypatch):
+    """The work goes on, and nothing is removed that may be another's."""
+
+    def refuse(descriptor, blocking):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(folder_lock, "lock_descriptor", refuse)
+    (tmp_path / LEFT).write_text("perhaps being written")
+    with hold_folder(tmp_path) as notes:
+        assert len(notes) == 1 and "has no locks" in notes[0] and str(tmp_path) in notes[0]
+    assert (tmp_path / LEFT).is_file()
+
+
+def test_only_a_folder_made_here_is_removed_again(tmp_path):
+    """After an error, and while nothing is in it; a folder of the user's own stays, and the error is the one that came."""
+    own = tmp_path / "own"
+    own.mkdir()
+    for folder in (own, tmp_path / "made"):
+        with pytest.raises(ValueError, match="of the body"), hold_folder(folder):
+            raise ValueError("of the body")
+    with pytest.raises(ValueError, match="of the body"), hold_folder(tmp_path / "filled"):
+        (tmp_path / "filled" / "result").write_text("kept")
+        raise ValueError("of the body")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["filled", "own"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there a missing right is told by other means")
+@pytest.mark.parametrize("name", ["x" * 300, "file/below"])
+def test_a_folder_that_cannot_be_is_named(tmp_path, name):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ResourceError, match="choose another folder"), hold_folder(tmp_path / name):
+        pytest.fail("held")
+
+
+@pytest.mark.fault
+def test_a_killed_holder_gives_the_folder_free(tmp_path):
+    """As soon as it is gone, whatever it left."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", HOLD, str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment) as process:
+        assert process.stdout.readline() == "held\n"
+        assert f"process {process.pid} on" in refusal(tmp_path)
+        process.kill()
+        process.wait()
+        assert (tmp_path / LOCK).is_file()
+        with hold_folder(tmp_path):
+            assert str(os.getpid()) in refusal(tmp_path)

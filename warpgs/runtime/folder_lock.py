@@ -1,0 +1,134 @@
+"""Locks on folders: one process at a time writes into a run folder, and a second one is told whose it is."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import errno
+import json
+import os
+import platform
+import shlex
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from filelock import lock_descriptor
+
+from warpgs.errors import ResourceError
+from warpgs.files import LOCK, make_folder, remove_leftovers
+
+NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
+"""Errors of file systems without locks."""
+MOST_LETTERS = 200
+"""Length at which a command is cut short in a message."""
+
+
+@contextlib.contextmanager
+def hold_folder(folder: Path, *parts: str) -> Iterator[list[str]]:
+    """Hold a folder, which is made if it is not there, so that no other process writes into it meanwhile.
+
+    The system gives the lock free when its holder ends, killed or not, and keeps it for processes in other containers, too; who
+    holds it stands in the lock file. What killed writers left in the folder is removed. A folder that was made here and is
+    still empty when an error ends the block is removed as well; no other folder ever is.
+
+    Args:
+        folder: The folder.
+        parts: Folders in it that are written under the same lock.
+
+    Returns:
+        A note for the user where the file system has no locks; else nothing.
+
+    Raises:
+        ResourceError: Another process holds the folder, or it cannot be written.
+    """
+    made = make_folder(folder)
+    try:
+        with _held(folder) as locked:
+            for name in (".", *parts) if locked else ():
+                remove_leftovers(folder / name)
+            yield ([] if locked else [f"{folder}: its file system has no locks; start no second process that writes there"])
+    except BaseException:
+        if made:
+            with contextlib.suppress(OSError):  # it is not empty, or in use: it stays
+                folder.rmdir()
+        raise
+
+
+@contextlib.contextmanager
+def _held(folder: Path) -> Iterator[bool]:
+    """Hold the lock of a folder; gives whether there are locks."""
+    path = folder / LOCK
+    while True:
+        file = _open(path)
+        try:
+            locked = _lock(file, folder)
+            # its last holder may have removed it between our two calls: then others lock a new one
+            if not locked or os.fstat(file.fileno()).st_nlink:
+                break
+        except BaseException:
+            file.close()
+            raise
+        file.close()
+    try:
+        with contextlib.suppress(OSError):  # a full disk: the lock holds all the same
+            _sign(file)
+        yield locked
+    finally:
+        # Windows removes no open file; a system that does must remove it while the lock holds
+        if sys.platform == "win32":
+            file.close()
+        with contextlib.suppress(OSError):
+            path.unlink()
+        file.close()
+
+
+def _open(path: Path) -> BinaryIO:
+    """Open a lock file to read and write, made if it is not there."""
+    try:
+        return os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+b", buffering=0)
+    except OSError as e:
+        raise ResourceError(
+            f"{path.parent}: cannot be written, as its lock {path.name} cannot be opened ({e.strerror or e}); choose another "
+            "folder, or make this one writable"
+        ) from e
+
+
+def _lock(file: BinaryIO, folder: Path) -> bool:
+    """Lock an open file; return False where its file system has no locks.
+
+    Raises:
+        ResourceError: Another process holds it.
+    """
+    try:
+        if lock_descriptor(file.fileno(), blocking=False):
+            return True
+    except OSError as e:
+        if e.errno in NO_LOCKS:
+            return False
+        raise ResourceError(f"{folder}: cannot be locked ({e.strerror or e}); choose another folder") from e
+    raise ResourceError(
+        f"{folder}: {_holder(file)} is writing there. Wait until it has ended, or end it, or choose another folder"
+    )
+
+
+def _sign(file: BinaryIO) -> None:
+    """Write into a lock file who holds it; its first byte is what is locked on Windows, where no other may read that."""
+    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    now = datetime.datetime.now().astimezone().isoformat(" ", "seconds")
+    values = {"process": os.getpid(), "host": platform.node(), "since": now, "command": command}
+    file.truncate(0)
+    file.seek(0)
+    file.write(b"\n" + json.dumps(values).encode())
+
+
+def _holder(file: BinaryIO) -> str:
+    """Return in words who holds a lock file."""
+    try:
+        file.seek(1)
+        found = json.loads(file.read())
+        command = found["command"] if len(found["command"]) <= MOST_LETTERS else f"{found['command'][:MOST_LETTERS]}..."
+        return f"process {found['process']} on {found['host']}, since {found['since']}, `{command}`,"
+    except (OSError, ValueError, KeyError, TypeError):  # it has just been locked, and not been signed yet
+        return "another process"
