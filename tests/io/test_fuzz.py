@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tests.io import scenes
 from warpgs.errors import DataError, UsageError
 from warpgs.io import colmap, dtu, llff, middlebury, transforms
-from warpgs.io.images import decode
+from warpgs.io.decoding import decode
 from warpgs.io.load import load_scene
 from warpgs.io.splits import split_views
 

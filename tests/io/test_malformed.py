@@ -143,6 +143,28 @@ def test_impossible_distortion(tmp_path):
     refused(tmp_path, r"camera 1: distortion .*1e\+300")
 
 
+@pytest.mark.parametrize("k1", [1e-320, 5e-324, -1e-320, 1e-100])
+def test_distortion_next_to_nothing(k1, tmp_path):
+    scene = load_scene(scenes.write_colmap(tmp_path, model="SIMPLE_RADIAL", parameters=(20, 8, 6, k1)))
+    assert scene.views[0].mask is None
+    np.testing.assert_allclose(scene.views[0].image, scenes.image(0) / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize("focal", [1e-320, 1e-3, 1e300])
+def test_focal_lengths_of_no_camera(focal, tmp_path):
+    refused(scenes.write_colmap(tmp_path, parameters=(focal, 20, 8, 6)), r"camera 1: focal lengths .* calibrate again")
+
+
+@pytest.mark.parametrize("far", [1.7e308, -1.7e308, 1e30])
+def test_points_beyond_all_measure(far, tmp_path):
+    scenes.write_colmap(tmp_path)
+    path = tmp_path / "sparse" / "0" / "points3D.bin"
+    data = bytearray(path.read_bytes())
+    data[16:24] = struct.pack("<d", far)
+    path.write_bytes(data)
+    refused(tmp_path, r"1 of 3 points are not finite, or farther than 1e\+12 times the extent of the cameras; remove them")
+
+
 def test_no_points_are_a_note(tmp_path):
     scenes.write_colmap(tmp_path)
     path = tmp_path / "sparse" / "0" / "points3D.bin"
@@ -282,6 +304,21 @@ def test_json_numbers_that_are_none(number, tmp_path):
 def test_json_that_is_no_scene(text, tmp_path):
     (tmp_path / "transforms.json").write_bytes(text.encode("latin-1"))
     refused(tmp_path, r"transforms.json|0 usable views")
+
+
+NESTED = '{"a":' * 900 + "1" + "}" * 900
+
+
+@pytest.mark.parametrize("key", ["file_path", "mask_path", "transform_matrix", "fl_x", "camera_model", "ply_file_path", "x"])
+def test_json_that_is_nested_deep_or_huge(key, tmp_path, monkeypatch):
+    scenes.write_transforms(tmp_path)
+    path = tmp_path / "transforms.json"
+    text = path.read_text()
+    path.write_text(text.replace('"frames": [{', f'"{key}": {NESTED}, "frames": [{{"{key}": {NESTED}, ', 1))
+    refused(tmp_path, r"transforms.json: is nested deeper than 16 levels|transforms.json: cannot be read as JSON")
+    path.write_text(text)
+    monkeypatch.setattr("warpgs.io.transforms.MAX_BYTES", 100)
+    refused(tmp_path, r"transforms.json: has [\d,]+ bytes, more than the 100 of any real scene")
 
 
 def test_no_focal_length(tmp_path):

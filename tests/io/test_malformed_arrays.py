@@ -128,4 +128,4 @@ def test_corrupt_images_are_named(kind, tmp_path):
     scenes.WRITERS[kind](tmp_path)
     path = sorted(tmp_path.rglob("*.png"))[2]
     path.write_bytes(path.read_bytes()[:60])
-    refused(tmp_path, rf"{path.name}: the image cannot be decoded; it is empty, truncated or no image. Restore it")
+    refused(tmp_path, rf"{path.name}: the image cannot be decoded: it ends within a chunk. Restore it")

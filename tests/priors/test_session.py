@@ -84,31 +84,66 @@ def test_files_that_are_refused(tmp_path, name):
     assert path in str(e.value)
 
 
-def external(where: str) -> bytes:
-    """Return a model with a constant in a side file: as initializer, in a node's attribute, or in a branch of an If."""
+OUTSIDE = nw.external_tensor("k", (1,), "weights.bin")
+CONSTANT = nw.field(1, "value") + nw.field(5, OUTSIDE) + nw.field(20, 4)
+
+
+def placed(where: str) -> bytes:
+    """Return a model with a tensor of a side file in one of the places that a model has for tensors."""
     x, y = nw.value("x", (1, 3, "h", "w")), nw.value("y", (1, 3, "h", "w"))
-    outside = nw.external_tensor("k", (1,), "weights.bin")
-    add = nw.node("Add", ["x", "k"], ["y"])
+    add, constant = nw.node("Add", ["x", "k"], ["y"]), nw.node("Constant", [], ["k"], attributes=nw.field(5, CONSTANT))
+    inner = nw.graph([constant], [], [], [])
+    graph, more = nw.graph([add], [], [x], [y]), b""
+    own = nw.field(1, "Own") + nw.field(10, "own")
     if where == "initializer":
-        return nw.model(nw.graph([add], [outside], [x], [y]))
-    attribute = nw.field(5, nw.field(1, "value") + nw.field(5, outside) + nw.field(20, 4))
-    constant = nw.node("Constant", [], ["k"], attributes=attribute)
-    if where == "attribute":
-        return nw.model(nw.graph([constant, add], [], [x], [y]))
-    if where == "function":
-        own = nw.field(1, "Add") + nw.field(10, "own") + nw.field(7, constant)
-        return nw.model(nw.graph([add], [], [x], [y]), nw.field(25, own))
-    branch = nw.field(5, nw.field(1, "then_branch") + nw.field(6, nw.graph([constant, add], [], [], [y])) + nw.field(20, 5))
-    return nw.model(nw.graph([nw.node("If", ["c"], ["y"], attributes=branch)], [], [x], [y]))
+        graph = nw.graph([add], [OUTSIDE], [x], [y])
+    elif where == "attribute":
+        graph = nw.graph([constant, add], [], [x], [y])
+    elif where == "branch":
+        branch = nw.field(5, nw.field(1, "then_branch") + nw.field(6, inner) + nw.field(20, 5))
+        graph = nw.graph([nw.node("If", ["c"], ["y"], attributes=branch)], [], [x], [y])
+    elif where.startswith("sparse"):
+        graph += nw.field(15, nw.field(2 if where.endswith("indices") else 1, OUTSIDE))
+    elif where == "list of tensors":
+        graph = nw.graph([nw.node("Add", [], [], attributes=nw.field(5, nw.field(10, OUTSIDE))), add], [], [x], [y])
+    elif where == "function":
+        more = nw.field(25, own + nw.field(7, constant))
+    elif where == "default of a function":
+        more = nw.field(25, own + nw.field(11, CONSTANT))
+    elif where == "graph in a default of a function":
+        more = nw.field(25, own + nw.field(11, nw.field(1, "body") + nw.field(6, inner)))
+    else:
+        more = nw.field(20, nw.field({"first step of training": 1, "training": 2}[where], inner))
+    return nw.model(graph, more)
 
 
-@pytest.mark.parametrize("where", ["initializer", "attribute", "branch", "function"])
+@pytest.mark.parametrize(
+    "where",
+    [
+        "initializer", "attribute", "branch", "sparse values", "sparse indices", "list of tensors", "function",
+        "default of a function", "graph in a default of a function", "first step of training", "training",
+    ],
+)  # fmt: skip
 def test_weights_in_another_file_are_refused_though_it_exists(tmp_path, where, monkeypatch):
     np.ones(1, "<f4").tofile(tmp_path / "weights.bin")
     monkeypatch.chdir(tmp_path)  # onnxruntime would look for them here
-    path = nw.write(tmp_path / "m.onnx", external(where))
+    path = nw.write(tmp_path / "m.onnx", placed(where))
     with pytest.raises(DataError, match="weights of 'k' lie in another file"):
         open_network(path)
+
+
+def test_what_protobuf_would_read_otherwise_is_refused(tmp_path):
+    """A key of 33 bits stands for another field there, and of a text that is given twice the last holds."""
+    key = nw.varint((1 << 32) + (13 << 3 | 2))
+    entry = nw.field(1, "location") + nw.field(2, "weights.bin")
+    hidden = nw.field(1, 1) + nw.field(2, 1) + nw.field(8, "k") + key + nw.varint(len(entry)) + entry
+    x, y = nw.value("x", (1, 3, "h", "w")), nw.value("y", (1, 3, "h", "w"))
+    add = nw.node("Add", ["x", "k"], ["y"])
+    with pytest.raises(DataError, match="field number"):
+        open_network(nw.write(tmp_path / "m.onnx", nw.model(nw.graph([add], [hidden], [x], [y]))))
+    twice = add + nw.field(7, "ai.on") + nw.field(7, "nx")
+    with pytest.raises(DataError, match="nx::Add is not part of ONNX"):
+        open_network(nw.write(tmp_path / "m.onnx", nw.model(nw.graph([twice], [], [x], [y]))))
 
 
 def test_functions_that_travel_in_the_file_are_welcome(tmp_path):

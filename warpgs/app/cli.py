@@ -171,6 +171,7 @@ def _priors(arguments: list[str]) -> int:
 def _priors_show(arguments: list[str]) -> int:
     import tyro
 
+    from warpgs.io.decoding import MAX_PIXELS
     from warpgs.priors.view_prior import PriorConfig
 
     @dataclass(frozen=True)
@@ -183,6 +184,10 @@ def _priors_show(arguments: list[str]) -> int:
         """As for `warpgs fit`."""
         downscale: int = 1
         """Factor by which both image sides shrink."""
+        allow_outside: bool = False
+        """Let names and links of the scene lead to images and masks outside its folder."""
+        max_pixels: int = MAX_PIXELS
+        """Largest number of pixels that an image or a mask may have as stored."""
         threads: int = 0
         """CPU threads of the networks; 0 for as many as there are cores."""
         source: str = "sweep"
@@ -195,7 +200,8 @@ def _priors_show(arguments: list[str]) -> int:
 
     if a.threads < 0:
         raise UsageError(f"--threads must be 0 or more, not {a.threads}")
-    for line in show_priors(SceneRequest(str(a.scene), a.split, a.downscale), a.priors, a.source, a.out, a.threads):
+    scene = SceneRequest(str(a.scene), a.split, a.downscale, allow_outside=a.allow_outside, max_pixels=a.max_pixels)
+    for line in show_priors(scene, a.priors, a.source, a.out, a.threads):
         say(line)
     return 0
 

@@ -13,6 +13,7 @@ from typing import Annotated, Any
 
 from warpgs.app.flags import flags_of, parse_flags, settings_of, word_after
 from warpgs.errors import UsageError, WarpgsError
+from warpgs.io.decoding import MAX_PIXELS
 from warpgs.io.readers import READERS
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device
 from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESET_NOTES, PRESETS, FitConfig
@@ -51,9 +52,11 @@ def _request_type() -> type:
         strict: bool = False
         """A frame without an image file is an error."""
         allow_outside: bool = False
-        """Let transforms.json name files outside the scene folder."""
+        """Let names and links of the scene lead to images and masks outside its folder."""
         invert_masks: bool = False
         """White in a mask removes a pixel."""
+        max_pixels: int = MAX_PIXELS
+        """Largest number of pixels that an image or a mask may have as stored."""
         score_masks: Path | None = None
         """Folder of object masks for scoring, matched by image id; the scene's idrmasks where not given."""
         lpips_weights: Path | None = None
@@ -218,5 +221,7 @@ def fit(arguments: list[str], description: str) -> FitRequest:
         steps = "as many steps as the time allows" if a.time_budget else f"{config.steps} steps"
         say(f"preset {base.preset}, as usual on {kind}, {steps}; the time left stands in the line of progress")
     masks = None if a.score_masks is None else str(a.score_masks.resolve())
-    scene = SceneRequest(str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.invert_masks, masks, a.reader)
+    scene = SceneRequest(
+        str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.invert_masks, masks, a.reader, max_pixels=a.max_pixels
+    )
     return FitRequest(scene, a.out, config, a.device, a.resume, a.lpips_weights, a.time_budget, notes)

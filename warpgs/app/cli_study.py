@@ -15,6 +15,8 @@ def _flags() -> type:
     """The flags that `compare` and `ablate` share."""
     import tyro
 
+    from warpgs.io.decoding import MAX_PIXELS
+
     @dataclass(frozen=True, kw_only=True)
     class Study:
         scenes: tyro.conf.Positional[tuple[Path, ...]]
@@ -27,6 +29,10 @@ def _flags() -> type:
         """As in `warpgs fit`, for all scenes."""
         downscale: int = 1
         """Factor by which both image sides shrink."""
+        allow_outside: bool = False
+        """Let names and links of the scenes lead to images and masks outside their folders."""
+        max_pixels: int = MAX_PIXELS
+        """Largest number of pixels that an image or a mask may have as stored."""
         steps: int | None = None
         """Optimisation steps of every run; as in `warpgs fit` where not given."""
         device: str = "auto"
@@ -42,7 +48,8 @@ def _study(a, variants: dict, marks: dict) -> int:
     from warpgs.pipeline.study.compare import run_study
     from warpgs.pipeline.study.study import StudyRequest
 
-    scenes = tuple(SceneRequest(str(s), a.split, a.downscale) for s in a.scenes)
+    options = {"allow_outside": a.allow_outside, "max_pixels": a.max_pixels}
+    scenes = tuple(SceneRequest(str(s), a.split, a.downscale, **options) for s in a.scenes)
     for line in run_study(StudyRequest(scenes, variants, a.seeds, a.out, a.device, a.lpips_weights, marks)):
         say(line)
     return 0

@@ -14,8 +14,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.io.folders import ViewList, child, find_mask, has_folder, image_folder, pixel_source, view_name
-from warpgs.io.images import Lens, list_images, load_image
+from warpgs.io.folders import SceneFolder, ViewList, has_folder, view_name
+from warpgs.io.images import Lens, list_images
 from warpgs.io.poses import quat_rotation, rigid
 from warpgs.io.readers import Probe, Reader, ReadOptions, register
 from warpgs.scene import PointCloud, Scene, View
@@ -295,13 +295,13 @@ def model_folder(root: Path) -> Path | None:
     return next((f for f in partial if complete_kind(f)), partial[0] if partial else None)
 
 
-def _image_paths(images: Path, names: list[str], where: str, allow_outside: bool) -> tuple[dict[str, Path], str]:
+def _image_paths(scene: SceneFolder, images: Path, names: list[str], where: str) -> tuple[dict[str, Path], str]:
     """Return the image file by view name, and a note for the user (empty where nothing was chosen).
 
     Ready-made small folders often hold other suffixes (image_8/a.png for a.JPG) or names of their own (LLFF's image000.png);
     the former are matched by stem, the latter by sorted order where the counts agree.
     """
-    paths = {n: child(images, n, where, allow_outside=allow_outside) for n in names}
+    paths = {n: scene.child(images, n, where) for n in names}
     lost = [n for n in names if not paths[n].is_file()]
     if not lost or images.name == "images":
         return paths, ""
@@ -342,7 +342,8 @@ class ColmapReader(Reader):
             lacks = "cameras and images" if model is None else " and ".join(missing_parts(model))
             raise DataError(f"{model or folder}: the COLMAP reconstruction lacks {lacks}; copy the whole folder")
         poses = read_poses(model / f"images.{kind}")
-        views, notes = _read_views(folder, model, kind, poses, options)
+        scene = SceneFolder(folder, options)
+        views, notes = _read_views(scene, model, kind, poses)
         points_path, points = model / f"points3D.{kind}", None
         if not points_path.is_file():
             notes.append(f"{points_path.name} is missing, so there are no points to start from")
@@ -350,18 +351,16 @@ class ColmapReader(Reader):
             points = read_points(points_path, {n: view_name(p.name) for n, p in poses.items()})
             if len(points) == 0:
                 notes.append(f"{points_path.name} holds no points")
-        return self.scene(folder, views, notes, points=points, pixels=pixel_source(folder, options.downscale, by_folder=True))
+        return self.scene(folder, views, notes, points=points, pixels=scene.pixel_source(by_folder=True))
 
 
-def _read_views(
-    root: Path, model: Path, kind: str, poses: dict[int, Pose], options: ReadOptions
-) -> tuple[list[View], list[str]]:
+def _read_views(scene: SceneFolder, model: Path, kind: str, poses: dict[int, Pose]) -> tuple[list[View], list[str]]:
     """Return the views of a reconstruction in file coordinates, sorted by the names in the file, and notes."""
     lenses = read_cameras(model / f"cameras.{kind}")
     file = model / f"images.{kind}"
-    images, factor, note = image_folder(root, options.downscale)
+    images, factor, note = scene.images()
     notes = [note] if note else []
-    paths, note = _image_paths(images, [p.name for p in poses.values()], str(file), options.allow_outside)
+    paths, note = _image_paths(scene, images, [p.name for p in poses.values()], str(file))
     notes += [note] if note else []
     views = ViewList()
     for pose in sorted(poses.values(), key=lambda p: p.name):
@@ -372,8 +371,7 @@ def _read_views(
         viewmat[:3, :3] = quat_rotation(pose.quat, where)
         viewmat[:3, 3] = pose.translation
         path = paths[pose.name]
-        mask = find_mask(path, images, options.invert_masks)
-        loaded = load_image(path, lenses[pose.camera_id], downscale=factor, mask=mask)
+        loaded = scene.image(path, lenses[pose.camera_id], downscale=factor, mask=scene.find_mask(path, images))
         views.add(view_name(pose.name), rigid(viewmat, where), loaded)
     unposed = len(set(list_images(images)) - set(paths.values()))
     if unposed:

@@ -9,8 +9,8 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.geometry import matmul
-from warpgs.io.folders import ViewList, has_folder, pixel_source, read_mask, resampling_note
-from warpgs.io.images import Lens, list_images, load_image
+from warpgs.io.folders import SceneFolder, ViewList, has_folder, resampling_note
+from warpgs.io.images import Lens, list_images
 from warpgs.io.poses import rigid
 from warpgs.io.readers import Probe, Reader, ReadOptions, register
 from warpgs.scene import Scene
@@ -112,7 +112,7 @@ class DTUReader(Reader):
                 f"{path}: has {cameras} cameras, but {images} holds {len(files)} images. They are matched in sorted order, so "
                 "the counts must agree: restore the set"
             )
-        masks, views = _masks(folder, files), ViewList()
+        scene, masks, views = SceneFolder(folder, options), _masks(folder, files), ViewList()
         for i, file in enumerate(files):
             name = file.relative_to(images).as_posix()
             where = f"{path}, image {name!r}"
@@ -121,12 +121,11 @@ class DTUReader(Reader):
                 raise DataError(f"{where}: world_mat_{i} is missing; copy the archive again")
             K, viewmat = decompose(matmul(world, scale)[:3], where)
             K[:2, 2] += 0.5  # the archives count pixels from the centre of the first one
-            loaded = load_image(
+            loaded = scene.image(
                 file,
                 lambda width, height: Lens(K, width, height).checked(where),  # noqa: B023 - called before the next round
-                downscale=options.downscale,
-                mask=read_mask(masks[file], options.invert_masks) if file in masks else None,
+                mask=scene.mask(masks[file]) if file in masks else None,
             )
             views.add(name, viewmat, loaded)
         notes = resampling_note(options.downscale) + views.notes()
-        return self.scene(folder, views.views, notes, pixels=pixel_source(folder, options.downscale, by_folder=False))
+        return self.scene(folder, views.views, notes, pixels=scene.pixel_source(by_folder=False))

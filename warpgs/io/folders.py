@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import posixpath
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.io.images import LoadedImage, decode, list_images
+from warpgs.io.decoding import MAX_PIXELS, decode
+from warpgs.io.images import Lens, LoadedImage, list_images, load_image
+from warpgs.io.readers import ReadOptions
 from warpgs.scene import Camera, View
 
 MAX_NAME_LENGTH = 4096
@@ -47,7 +51,7 @@ def child(folder: Path, name: object, where: str, *, root: Path | None = None, a
     path = folder / name
     if "\\" in name and not path.is_file():
         path = folder / name.replace("\\", "/")  # written on Windows
-    if not allow_outside and not path.resolve().is_relative_to((root or folder).resolve()):
+    if not allow_outside and not _is_below(path, root or folder):
         raise DataError(f"{where}: {name!r} leads out of the scene folder; move the file inside, or pass --allow-outside")
     return path
 
@@ -68,35 +72,97 @@ def view_name_of(path: Path, root: Path) -> str:
     return view_name(plain[len(base) + 1 :] if Path(plain).is_relative_to(base) else plain)
 
 
-def read_mask(path: Path, invert: bool) -> np.ndarray:
-    """Return a mask file as bool [H, W]: white keeps a pixel; ``invert`` turns that round. DataError where unreadable."""
-    return (decode(path)[0][..., 0] > 0.5) != invert
+class SceneFolder:
+    """A scene folder and the wishes it is read with: readers open all images and masks of a scene through it."""
 
+    def __init__(self, root: Path, options: ReadOptions):
+        self.root, self.options = root, options
 
-def find_mask(image: Path, images_root: Path, invert: bool, folder: Path | None = None) -> np.ndarray | None:
-    """Return the mask [H, W] of an image, None where it has none.
+    def inside(self, path: Path) -> Path:
+        """Return a path after a check that no link on it leads out of the scene folder, unless that is allowed.
 
-    It lies in ``folder``, by default `masks` beside the image folder: same name as .png, name plus .png, or same name.
-    """
-    folder = folder or images_root.parent / "masks"
-    if not image.is_relative_to(images_root) or not folder.is_dir():
+        Raises:
+            DataError: It leads out.
+        """
+        if not (self.options.allow_outside or _is_below(path, self.root)):
+            raise DataError(
+                f"{path}: a link leads out of the scene folder; put the files inside of it, or pass --allow-outside"
+            )
+        return path
+
+    def child(self, folder: Path, name: object, where: str, *, root: Path | None = None) -> Path:
+        """Return the path of a file that the scene names, as the function `child` does."""
+        return child(folder, name, where, root=root, allow_outside=self.options.allow_outside)
+
+    def image(
+        self,
+        path: Path,
+        lens: Lens | Callable[[int, int], Lens],
+        *,
+        downscale: int | None = None,
+        mask: np.ndarray | None = None,
+        background: tuple[float, float, float] | None = None,
+    ) -> LoadedImage:
+        """Load an image of the scene as `load_image` does; ``downscale`` takes the place of the user's where given."""
+        return load_image(
+            self.inside(path), lens, downscale=downscale or self.options.downscale, mask=mask, background=background,
+            max_pixels=self.options.max_pixels,
+        )  # fmt: skip
+
+    def mask(self, path: Path) -> np.ndarray:
+        """Return a mask file of the scene as bool [H, W]: True keeps a pixel."""
+        return read_mask(self.inside(path), self.options.invert_masks, self.options.max_pixels)
+
+    def find_mask(self, image: Path, images_root: Path, folder: Path | None = None) -> np.ndarray | None:
+        """Return the mask [H, W] of an image, None where it has none.
+
+        It lies in ``folder``, by default `masks` beside the image folder: same name as .png, name plus .png, or same name.
+        """
+        folder = folder or images_root.parent / "masks"
+        if not image.is_relative_to(images_root) or not folder.is_dir():
+            return None
+        relative = image.relative_to(images_root)
+        for candidate in (folder / relative.with_suffix(".png"), folder / f"{relative.as_posix()}.png", folder / relative):
+            if candidate.is_file():
+                return self.mask(candidate)
         return None
-    relative = image.relative_to(images_root)
-    for candidate in (folder / relative.with_suffix(".png"), folder / f"{relative.as_posix()}.png", folder / relative):
-        if candidate.is_file():
-            return read_mask(candidate, invert)
-    return None
+
+    def images(self, base: str = "images") -> tuple[Path, int, str]:
+        """Choose the image folder: the ready-made `images_N` of the factor, else the full one, to be resampled.
+
+        Returns:
+            The folder, the factor left to resample by, and a note for the user (empty where nothing was chosen).
+
+        Raises:
+            DataError: There is no image folder, or it is a link that leads out of the scene folder.
+        """
+        folder, factor, note = _image_folder(self.root, self.options.downscale, base)
+        return self.inside(folder), factor, note
+
+    def pixel_source(self, by_folder: bool) -> str:
+        """Return the source of a scene's pixels, for result files: the folder, and "as stored" or the factor of resampling.
+
+        Args:
+            by_folder: The format takes a ready-made `images_N` (`images`); others always read what the scene names.
+        """
+        name, factor = "images", self.options.downscale
+        if by_folder:
+            folder, factor, _ = self.images()
+            name = folder.name
+        return f"{name} area-resampled by {factor}" if factor > 1 else f"{name} as stored"
 
 
-def image_folder(root: Path, downscale: int, base: str = "images") -> tuple[Path, int, str]:
-    """Choose the image folder for a downscale factor: the ready-made `images_N`, else the full one, resampled.
+def read_mask(path: Path, invert: bool, max_pixels: int = MAX_PIXELS) -> np.ndarray:
+    """Return a mask file as bool [H, W]: white keeps a pixel; ``invert`` turns that round. DataError where unreadable."""
+    return (decode(path, max_pixels)[0][..., 0] > 0.5) != invert
 
-    Returns:
-        The folder, the factor left to resample by, and a note for the user (empty where nothing was chosen).
 
-    Raises:
-        DataError: There is no image folder.
-    """
+def _is_below(path: Path, root: Path) -> bool:
+    """Return True where a path lies below ``root``, links followed; a link that leads round in circles is where it lies."""
+    return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root))
+
+
+def _image_folder(root: Path, downscale: int, base: str) -> tuple[Path, int, str]:
     ready = root / f"{base}_{downscale}"
     if downscale > 1 and ready.is_dir() and list_images(ready):
         return ready, 1, f"images taken from {ready.name}"
@@ -109,21 +175,6 @@ def image_folder(root: Path, downscale: int, base: str = "images") -> tuple[Path
     largest = others[min(others)]
     how = f", area-resampled by {downscale}" if downscale > 1 else ""
     return largest, downscale, f"there is no full-size folder '{base}': images taken from {largest.name}{how}"
-
-
-def pixel_source(root: Path, downscale: int, by_folder: bool) -> str:
-    """Return the source of a scene's pixels, for result files: the folder, and "as stored" or the factor of resampling.
-
-    Args:
-        root: The scene folder.
-        downscale: Factor by which both sides shrink.
-        by_folder: The format takes a ready-made `images_N` (`image_folder`); others always read what the scene names.
-    """
-    name, factor = "images", downscale
-    if by_folder:
-        folder, factor, _ = image_folder(root, downscale)
-        name = folder.name
-    return f"{name} area-resampled by {factor}" if factor > 1 else f"{name} as stored"
 
 
 def resampling_note(downscale: int) -> list[str]:

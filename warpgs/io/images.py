@@ -1,7 +1,8 @@
-"""Images and masks: decoding, orientation, undistortion and resizing, with intrinsics that follow."""
+"""Images: orientation, undistortion and resizing, with intrinsics that follow."""
 
 from __future__ import annotations
 
+import io
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,17 +11,19 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError, UsageError
+from warpgs.io.decoding import MAX_PIXELS, decode, format_of, read_image_file
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 EXIF_ORIENTATION = 0x0112
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-MAX_DEFLATE_RATIO = 1032
-"""Largest ratio of unpacked to packed bytes of a deflate stream (zlib's technical notes)."""
 MIN_SIDE = 4
 """Smallest shorter side of an image [px]; below it there is nothing to fit."""
 MAX_INTRINSIC = 1e9
+MIN_FOCAL = 1e-3
+"""Smallest focal length in sides of the image, a field of view of 179.9 degrees."""
 MAX_DISTORTION = 1e4
 """Largest distortion coefficient; beyond it, or an intrinsic beyond `MAX_INTRINSIC` [px], a file is taken for broken."""
+MIN_FOLD = 1e-9
+"""Inverse of a squared radius; a lens that folds back farther out does so beyond any image."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +50,11 @@ class Lens:
         f, c = self.K[[0, 1], [0, 1]], self.K[:2, 2]
         if not (1 <= self.width <= MAX_INTRINSIC and 1 <= self.height <= MAX_INTRINSIC):
             raise DataError(f"{where}: the camera's image size {self.width} x {self.height} px is impossible; fix the file")
-        if not ((f > 0) & (f < MAX_INTRINSIC)).all():
-            raise DataError(f"{where}: focal lengths {f.tolist()} px must be positive and finite; calibrate again")
+        if not ((f >= MIN_FOCAL * np.array([self.width, self.height])) & (f < MAX_INTRINSIC)).all():
+            raise DataError(
+                f"{where}: focal lengths {f.tolist()} px must be positive, finite and at least {MIN_FOCAL} of the sides; "
+                "calibrate again"
+            )
         if not (np.abs(c) < MAX_INTRINSIC).all():
             raise DataError(f"{where}: the principal point {c.tolist()} px is not finite; calibrate again")
         if not (np.abs(self.distortion) < MAX_DISTORTION).all():
@@ -77,77 +83,17 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(files, key=lambda p: p.relative_to(folder).as_posix())
 
 
-def _png_is_plausible(data: np.ndarray) -> bool:
-    """Return False where the header or chunk lengths of a PNG do not fit its size; True for any other file.
-
-    OpenCV reserves the memory that they announce, gigabytes for a few damaged bytes, before it notices.
-    """
-    if data[:8].tobytes() != PNG_SIGNATURE:
-        return True
-    at, whole = 8, False
-    while not whole and at + 12 <= data.size:
-        length, kind = struct.unpack(">I4s", data[at : at + 8].tobytes())
-        at, whole = at + 12 + length, kind == b"IEND"
-    if not whole or at > data.size or data.size < 26:
-        return False
-    width, height, depth, color = struct.unpack(">IIBB", data[16:26].tobytes())
-    channels = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(color, 4)
-    return height * (width * channels * depth // 8 + 1) <= MAX_DEFLATE_RATIO * data.size
-
-
-def decode(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Decode an image file as stored, without rotation by its EXIF tag.
-
-    Gray, palette, 8- and 16-bit images and straight alpha are understood.
-
-    Returns:
-        Colours in [0, 1], float32, shape [H, W, 3]; and alpha in [0, 1], float32, shape [H, W], or None.
-
-    Raises:
-        DataError: The file is missing, empty, truncated or no image.
-    """
-    import cv2
-
-    if not path.is_file():
-        raise DataError(f"{path}: the image file is missing; restore it, or remove its camera from the scene")
-    try:
-        data = np.fromfile(path, np.uint8)  # not cv2.imread: that fails on non-ASCII paths on some systems
-        # IMREAD_UNCHANGED also leaves the EXIF orientation alone: the camera, not the tag, says how the raster lies
-        raw = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size and _png_is_plausible(data) else None
-    except OSError as e:
-        raise DataError(f"{path}: the image cannot be read ({e.strerror}); fix its permissions or copy it again") from e
-    except cv2.error:
-        raw = None
-    if raw is None:
-        raise DataError(f"{path}: the image cannot be decoded; it is empty, truncated or no image. Restore it from its source")
-    if raw.dtype == np.uint8:
-        values = raw.astype(np.float32) / 255
-    elif raw.dtype == np.uint16:
-        values = raw.astype(np.float32) / 65535
-    elif raw.dtype == np.float32:
-        values = np.clip(raw, 0, 1)
-        if not np.isfinite(raw).all():
-            raise DataError(f"{path}: some pixels are not finite; save it as 8- or 16-bit PNG")
-    else:
-        raise DataError(f"{path}: pixels of type {raw.dtype} are not supported; save it as 8- or 16-bit PNG")
-    if values.ndim == 2:
-        values = values[..., None]
-    channels = values.shape[2]
-    if channels > 4:
-        raise DataError(f"{path}: has {channels} channels; save it as gray, RGB or RGBA")
-    alpha = values[..., -1] if channels in (2, 4) else None
-    color = np.repeat(values[..., :1], 3, axis=2) if channels <= 2 else values[..., 2::-1]
-    return np.ascontiguousarray(color), alpha
-
-
 def exif_orientation(path: Path) -> int:
     """Return the EXIF orientation, 1 to 8; 1 where the file has none."""
     from PIL import Image, UnidentifiedImageError
 
+    data = read_image_file(path)
+    Image.init()
     try:
-        with Image.open(path) as image:
+        # not Image.open, which has a limit of its own on the number of pixels
+        with Image.OPEN[format_of(data)[0]][0](io.BytesIO(data), str(path)) as image:
             value = image.getexif().get(EXIF_ORIENTATION, 1)
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError):
+    except (OSError, UnidentifiedImageError, SyntaxError, ValueError, KeyError, TypeError, struct.error):
         return 1  # decode() has the last word on whether the file is an image
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
@@ -177,9 +123,11 @@ def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
 def _fold_radius2(distortion: tuple[float, ...]) -> float:
     """Return the squared radius in the image plane beyond which the radial polynomial turns back; inf where it never does."""
     k1, k2, k3 = distortion[0], distortion[1], distortion[4] if len(distortion) > 4 else 0.0
-    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+    # roots of 1 + 3 k1 x + 5 k2 x^2 + 7 k3 x^3 through u = 1 / x, whose first coefficient is never small
+    roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
     real = roots[np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots.real))].real
-    return float(min(real[real > 0], default=np.inf))
+    largest = float(max(real, default=0.0))
+    return 1 / largest if largest > MIN_FOLD else np.inf
 
 
 def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
@@ -252,6 +200,7 @@ def load_image(
     downscale: int = 1,
     mask: np.ndarray | None = None,
     background: tuple[float, float, float] | None = None,
+    max_pixels: int = MAX_PIXELS,
 ) -> LoadedImage:
     """Decode an image, set it upright if its camera says so, undo distortion, and resample.
 
@@ -262,6 +211,7 @@ def load_image(
         downscale: Factor by which both sides shrink (area resampling).
         mask: True where a pixel counts, [H, W] at the size of the file or of the same aspect.
         background: Colour in [0, 1] behind transparent pixels; None turns transparency into the mask instead.
+        max_pixels: Largest number of pixels that the file may have.
 
     Returns:
         The image with intrinsics for its final size.
@@ -270,7 +220,7 @@ def load_image(
         DataError: The file cannot be decoded, its size does not fit its camera or its mask, or no pixel counts.
         UsageError: ``downscale`` leaves next to nothing.
     """
-    image, alpha = decode(path)
+    image, alpha = decode(path, max_pixels)
     stored, done = image.shape[:2], []
     if not isinstance(lens, Lens):
         lens = lens(stored[1], stored[0])

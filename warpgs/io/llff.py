@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.io.folders import ViewList, find_mask, has_folder, image_folder, pixel_source
-from warpgs.io.images import Lens, list_images, load_image
+from warpgs.io.folders import SceneFolder, ViewList, has_folder
+from warpgs.io.images import Lens, list_images
 from warpgs.io.poses import from_camera_to_world
 from warpgs.io.readers import Probe, Reader, ReadOptions, register
 from warpgs.scene import Scene
@@ -52,7 +52,8 @@ class LLFFReader(Reader):
         """See `Reader.read`."""
         path = folder / FILE
         rows = read_rows(path)
-        images, factor, note = image_folder(folder, options.downscale)
+        scene = SceneFolder(folder, options)
+        images, factor, note = scene.images()
         files = list_images(images)
         if len(files) != len(rows):
             raise DataError(
@@ -70,8 +71,7 @@ class LLFFReader(Reader):
             lens = Lens(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), int(width), int(height))
             # columns: down, right, back, centre
             pose = np.stack([matrix[:, 1], matrix[:, 0], -matrix[:, 2], matrix[:, 3]], axis=1)
-            mask = find_mask(file, images, options.invert_masks)
-            loaded = load_image(file, lens.checked(where), downscale=factor, mask=mask)
+            loaded = scene.image(file, lens.checked(where), downscale=factor, mask=scene.find_mask(file, images))
             views.add(name, from_camera_to_world(pose, where, opengl=False), loaded)
         notes = ([note] if note else []) + views.notes()
-        return self.scene(folder, views.views, notes, pixels=pixel_source(folder, options.downscale, by_folder=True))
+        return self.scene(folder, views.views, notes, pixels=scene.pixel_source(by_folder=True))

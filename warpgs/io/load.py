@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError, UsageError
+from warpgs.io.decoding import MAX_PIXELS
+from warpgs.io.folders import SceneFolder
 from warpgs.io.normalize import fingerprint, normalization_of, normalize_points, normalize_view
 from warpgs.io.poses import rigid
 from warpgs.io.readers import Reader, ReadOptions, all_readers, find_reader
@@ -24,6 +26,7 @@ def load_scene(
     allow_outside: bool = False,
     invert_masks: bool = False,
     score_masks: str | Path | None = None,
+    max_pixels: int = MAX_PIXELS,
 ) -> Scene:
     """Read a scene folder of any supported format.
 
@@ -36,24 +39,26 @@ def load_scene(
             ``module:Class`` or ``path/to/file.py:Class``. None asks every built-in reader whether the folder has its format.
         downscale: Factor by which both image sides shrink; a ready-made folder `images_N` is used where there is one.
         strict: A frame without an image file is an error instead of a note.
-        allow_outside: Let the scene name image files outside its folder.
+        allow_outside: Let names and links of the scene lead to images and masks outside its folder.
         invert_masks: White in a mask file removes a pixel instead of keeping it.
         score_masks: Folder with object masks for scoring, matched by image id; None for `idrmasks` in the scene folder where
             there is one.
+        max_pixels: Largest number of pixels that an image or a mask may have as stored.
 
     Returns:
         The scene.
 
     Raises:
         DataError: Anything in the folder is missing or malformed; the message names file, reason and remedy.
-        UsageError: ``downscale`` is below 1, or there is no such reader.
+        ResourceError: There is not enough memory to decode an image.
+        UsageError: ``downscale`` or ``max_pixels`` is below 1, or there is no such reader.
     """
-    options = ReadOptions(downscale, strict, allow_outside, invert_masks)
+    options = ReadOptions(downscale, strict, allow_outside, invert_masks, max_pixels)
     root = Path(path)
     try:
         _check_folder(root)
         chosen, notes = detect(root) if reader is None else (_accepted(root, find_reader(reader)), [])
-        return _finished(root, chosen, chosen.read(root, options), notes, score_masks)
+        return _finished(root, chosen, chosen.read(root, options), notes, score_masks, options)
     except OSError as e:
         # folders without permission, names too long for the file system, disks that fail
         raise DataError(f"{e.filename or root}: cannot be read ({e.strerror or e}); fix its permissions or copy it") from e
@@ -100,7 +105,9 @@ def _accepted(root: Path, reader: Reader) -> Reader:
     return reader
 
 
-def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], score_masks: str | Path | None) -> Scene:
+def _finished(
+    root: Path, reader: Reader, scene: Scene, notes: list[str], score_masks: str | Path | None, options: ReadOptions
+) -> Scene:
     """Return a scene as read from files, checked, sorted, in scene coordinates, with score masks and fingerprint."""
     if not isinstance(scene, Scene) or scene.normalization.scale != 1 or scene.normalization.offset.any():
         raise UsageError(f"the reader {reader.name} must return a Scene in file coordinates, without a Normalization; fix it")
@@ -115,9 +122,11 @@ def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], score_
     n: Normalization = normalization_of(views, points)
     views = [normalize_view(v, n) for v in sorted(views, key=lambda v: v.name)]
     if points is not None:
-        points = normalize_points(points, n)
+        points = normalize_points(points, n, str(root))
     if score_masks is not None or (root / FOLDER).is_dir():
-        views, note = add_score_masks(views, Path(score_masks) if score_masks is not None else root / FOLDER)
+        # a folder that the user names is its own bound, that of the scene must not lead out of it
+        masks, bound = (root / FOLDER, root) if score_masks is None else (Path(score_masks), Path(score_masks))
+        views, note = add_score_masks(views, masks, SceneFolder(bound, replace(options, invert_masks=False)))
         more = (*more, note)
     return replace(
         scene,

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.io.folders import ViewList, child, find_mask, pixel_source, resampling_note, view_name
-from warpgs.io.images import Lens, load_image
+from warpgs.io.folders import SceneFolder, ViewList, resampling_note, view_name
+from warpgs.io.images import Lens
 from warpgs.io.poses import rigid
 from warpgs.io.readers import Probe, Reader, ReadOptions, register
 from warpgs.scene import Scene
@@ -73,19 +73,18 @@ class MiddleburyReader(Reader):
         """See `Reader.read`."""
         path, *others = files_of(folder)
         notes = [f"cameras taken from {path.name}; {', '.join(p.name for p in others)} passed over"] if others else []
-        views = ViewList()
+        scene, views = SceneFolder(folder, options), ViewList()
         for number, name, values in read_rows(path):
             where = f"{path}, line {number}, image {name!r}"
             K, viewmat = _intrinsics(values[:9].reshape(3, 3).copy(), where), np.eye(4)
             viewmat[:3, :3], viewmat[:3, 3] = values[9:18].reshape(3, 3), values[18:21]
             viewmat = rigid(viewmat, where)
-            file = child(folder, name, where, allow_outside=options.allow_outside)
-            loaded = load_image(
+            file = scene.child(folder, name, where)
+            loaded = scene.image(
                 file,
                 lambda width, height: Lens(K, width, height).checked(where),  # noqa: B023 - called before the next round
-                downscale=options.downscale,
-                mask=find_mask(file, folder, options.invert_masks, folder / "masks"),
+                mask=scene.find_mask(file, folder, folder / "masks"),
             )
             views.add(view_name(name), viewmat, loaded)
         notes += resampling_note(options.downscale) + views.notes()
-        return self.scene(folder, views.views, notes, pixels=pixel_source(folder, options.downscale, by_folder=False))
+        return self.scene(folder, views.views, notes, pixels=scene.pixel_source(by_folder=False))

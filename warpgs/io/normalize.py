@@ -13,8 +13,8 @@ from warpgs.scene import Normalization, PointCloud, View
 
 MIN_EXTENT = 1e-9
 """Extent of a camera set [file units] below which all cameras count as one place."""
-MAX_CENTER = 1e12
-"""Largest coordinate of a camera centre [file units]; beyond it squares lose digits and the file is taken for broken."""
+MAX_COORDINATE = 1e12
+"""Largest coordinate of a camera centre [file units] and of a point [u]; beyond it a file is taken for broken."""
 
 
 def normalization_of(views: list[View], points: PointCloud | None) -> Normalization:
@@ -27,19 +27,20 @@ def normalization_of(views: list[View], points: PointCloud | None) -> Normalizat
     """
     centers = np.array([v.camera.center for v in views])
     far = np.abs(centers).max(axis=1)
-    if not (far < MAX_CENTER).all():
+    if not (far < MAX_COORDINATE).all():
         worst = int(np.argmax(far))
         raise DataError(
-            f"image {views[worst].name!r}: its camera centre {centers[worst].tolist()} is beyond {MAX_CENTER:.0e} units, so "
-            "the scene cannot be scaled; estimate its pose again, or remove the image"
+            f"image {views[worst].name!r}: its camera centre {centers[worst].tolist()} is beyond {MAX_COORDINATE:.0e} units, "
+            "so the scene cannot be scaled; estimate its pose again, or remove the image"
         )
     offset = centers.mean(0)
     extent = 1.1 * float(np.linalg.norm(centers - offset, axis=1).max())
     if extent < MIN_EXTENT:
         extent = 1.0
         if points is not None and len(points):
-            median = float(np.median(np.abs(points.points - offset).max(axis=1)))
-            extent = median if MIN_EXTENT < median < MAX_CENTER else 1.0
+            with np.errstate(over="ignore"):
+                median = float(np.median(np.abs(points.points - offset).max(axis=1)))
+            extent = median if MIN_EXTENT < median < MAX_COORDINATE else 1.0
     return Normalization(offset, 1 / extent)
 
 
@@ -50,9 +51,21 @@ def normalize_view(view: View, n: Normalization) -> View:
     return replace(view, camera=replace(view.camera, viewmat=viewmat))
 
 
-def normalize_points(points: PointCloud, n: Normalization) -> PointCloud:
-    """Return the points in scene coordinates (float64)."""
-    return replace(points, points=n.scale * (points.points - n.offset))
+def normalize_points(points: PointCloud, n: Normalization, where: str) -> PointCloud:
+    """Return the points in scene coordinates (float64).
+
+    Raises:
+        DataError: A point is not finite or absurdly far away; the message begins with ``where``.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        moved = n.scale * (points.points - n.offset)
+    far = int((~(np.abs(moved) < MAX_COORDINATE).all(axis=1)).sum())
+    if far:
+        raise DataError(
+            f"{where}: {far} of {len(moved)} points are not finite, or farther than {MAX_COORDINATE:.0e} times the extent of "
+            "the cameras; remove them, or reconstruct again"
+        )
+    return replace(points, points=moved)
 
 
 def fingerprint(views: list[View]) -> str:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from warpgs.errors import UsageError
+from warpgs.io.decoding import MAX_PIXELS
 from warpgs.plugins import Registry
 from warpgs.scene import Scene, View
 
@@ -25,13 +26,17 @@ class ReadOptions:
     strict: bool = False
     """A frame without an image file is an error instead of a note."""
     allow_outside: bool = False
-    """The scene may name image files outside its folder."""
+    """Names and links of the scene may lead to images and masks outside its folder."""
     invert_masks: bool = False
     """White in a mask file removes a pixel instead of keeping it."""
+    max_pixels: int = MAX_PIXELS
+    """Largest number of pixels that an image or a mask may have."""
 
     def __post_init__(self) -> None:
         if isinstance(self.downscale, bool) or not isinstance(self.downscale, int) or self.downscale < 1:
             raise UsageError(f"--downscale must be a whole number of at least 1, not {self.downscale!r}")
+        if isinstance(self.max_pixels, bool) or not isinstance(self.max_pixels, int) or self.max_pixels < 1:
+            raise UsageError(f"--max-pixels must be a whole number of at least 1, not {self.max_pixels!r}")
 
 
 @dataclass(frozen=True)

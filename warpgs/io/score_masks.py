@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.io.folders import read_mask
+from warpgs.io.folders import SceneFolder
 from warpgs.io.image_ids import image_ids, named_by_dtu
 from warpgs.io.images import list_images
 from warpgs.scene import View
@@ -43,7 +43,7 @@ def _fit(path: Path, mask: np.ndarray, view: View) -> np.ndarray:
     return mask
 
 
-def add_score_masks(views: list[View], folder: Path) -> tuple[list[View], str]:
+def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tuple[list[View], str]:
     """Give every view its object mask, matched by image id and never by sorted order.
 
     The masks lie in ``folder`` or in its subfolder `mask`, named by id counted from 0 (000.png, 001.png, ...); the images
@@ -52,6 +52,7 @@ def add_score_masks(views: list[View], folder: Path) -> tuple[list[View], str]:
     Args:
         views: The scene's views, at their final size.
         folder: The folder with the masks; white keeps a pixel.
+        scene: What opens them.
 
     Returns:
         The views with ``score_mask`` set, and a note for the user.
@@ -83,5 +84,5 @@ def add_score_masks(views: list[View], folder: Path) -> tuple[list[View], str]:
             f"{folder}: the images start with 1 ({views[ids.index(1)].name}), the masks with 0, so it cannot be known "
             "whether they are off by one; rename the images so that they count from 0, or remove mask 0"
         )
-    done = [replace(v, score_mask=_fit(masks[i], read_mask(masks[i], False), v)) for i, v in zip(ids, views)]
+    done = [replace(v, score_mask=_fit(masks[i], scene.mask(masks[i]), v)) for i, v in zip(ids, views)]
     return done, f"scores count the pixels of the masks in {folder}, matched by image id; the fit sees every pixel"

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.io.folders import ViewList, child, find_mask, pixel_source, read_mask, resampling_note, view_name_of
-from warpgs.io.images import SUFFIXES, Lens, load_image
+from warpgs.io.folders import SceneFolder, ViewList, resampling_note, view_name_of
+from warpgs.io.images import SUFFIXES, Lens
 from warpgs.io.poses import from_camera_to_world
 from warpgs.io.readers import Probe, Reader, ReadOptions, register
 from warpgs.scene import Scene
@@ -21,6 +21,10 @@ MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 UNSUPPORTED_TERMS = ("k4", "k5", "k6", "is_fisheye", "fisheye_crop_radius")
 """Keys of lens models that the five distortion terms of OpenCV cannot express."""
 WHITE = (1.0, 1.0, 1.0)
+MAX_BYTES = 32 * 2**20
+"""Largest file [bytes]; ten thousand frames take some ten million."""
+MAX_DEPTH = 16
+"""Largest depth of lists and objects within each other; real files have six."""
 
 
 def files_of(root: Path) -> list[Path]:
@@ -38,16 +42,31 @@ def _reject_constant(name: str):
     raise ValueError(f"{name} is not a number that a camera can have")
 
 
+def _check_depth(values: object, path: Path) -> None:
+    """Check that lists and objects are not nested too deep for the text of an error to name their values."""
+    level = [values]
+    for _ in range(MAX_DEPTH):
+        containers = [v for v in level if isinstance(v, (dict, list))]
+        level = [v for c in containers for v in (c.values() if isinstance(c, dict) else c)]
+        if not level:
+            return
+    raise DataError(f"{path}: is nested deeper than {MAX_DEPTH} levels, so it is no transforms file; write it again")
+
+
 def read_json(path: Path) -> dict:
     """Return the parsed file with its list of frames.
 
     Raises:
-        DataError: The file is malformed, or holds NaN or Infinity.
+        DataError: The file is malformed, too large or nested too deep, or holds NaN or Infinity.
     """
     try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise DataError(f"{path}: has {size:,} bytes, more than the {MAX_BYTES:,} of any real scene; write it again")
         values = json.loads(path.read_bytes().decode("utf-8-sig"), parse_constant=_reject_constant)
     except (OSError, ValueError, RecursionError) as e:
         raise DataError(f"{path}: cannot be read as JSON ({e}); write it again") from e
+    _check_depth(values, path)
     if not isinstance(values, dict) or not isinstance(values.get("frames"), list):
         raise DataError(f"{path}: has no list 'frames', so it is no transforms file; write it again")
     return values
@@ -127,7 +146,7 @@ class _Reading:
     """State of a scene that is read frame by frame."""
 
     root: Path
-    options: ReadOptions
+    scene: SceneFolder
     background: tuple[float, float, float] | None
     views: ViewList = field(default_factory=ViewList)
     missing: list[str] = field(default_factory=list)
@@ -135,7 +154,7 @@ class _Reading:
     total: int = 0
 
     def child(self, folder: Path, name: object, where: str) -> Path:
-        return child(folder, name, where, root=self.root, allow_outside=self.options.allow_outside)
+        return self.scene.child(folder, name, where, root=self.root)
 
     def image_path(self, folder: Path, name: object, where: str) -> Path:
         """Return the image file of a frame; Blender leaves the suffix out."""
@@ -147,8 +166,8 @@ class _Reading:
 
     def mask(self, file: Path, frame: dict, path: Path, where: str) -> np.ndarray | None:
         if frame.get("mask_path"):
-            return read_mask(self.child(file.parent, frame["mask_path"], f"{where}, mask"), self.options.invert_masks)
-        return find_mask(path, self.root / "images", self.options.invert_masks)
+            return self.scene.mask(self.child(file.parent, frame["mask_path"], f"{where}, mask"))
+        return self.scene.find_mask(path, self.root / "images")
 
     def frame(self, file: Path, shared: dict, number: int, frame: object) -> None:
         where = f"{file}, frame {number}"
@@ -163,10 +182,9 @@ class _Reading:
         self.outside += name.startswith("outside/")
         where = f"{where} ({name})"
         viewmat = from_camera_to_world(_matrix(frame, where), where, opengl=True)
-        loaded = load_image(
+        loaded = self.scene.image(
             path,
             lambda width, height: lens_of(frame, shared, width, height, where),
-            downscale=self.options.downscale,
             mask=self.mask(file, frame, path, where),
             background=self.background,
         )
@@ -192,7 +210,7 @@ class TransformsReader(Reader):
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""
         background = WHITE if is_blender(folder) else None
-        reading = _Reading(folder, options, background)
+        reading = _Reading(folder, SceneFolder(folder, options), background)
         notes = []
         for file in files_of(folder):
             shared = read_json(file)
@@ -214,5 +232,5 @@ class TransformsReader(Reader):
             reading.views.views,
             notes,
             background=background or (0.0, 0.0, 0.0),
-            pixels=pixel_source(folder, options.downscale, by_folder=False),
+            pixels=reading.scene.pixel_source(by_folder=False),
         )

@@ -15,13 +15,16 @@ DOMAINS = ("", "ai.onnx", "ai.onnx.ml", "com.microsoft")
 MAX_NESTING = 32
 """Largest depth of graphs within graphs (If, Loop, Scan) that is accepted."""
 
-MODEL_GRAPH, MODEL_OPSET, MODEL_FUNCTION = 7, 8, 25
+MODEL_GRAPH, MODEL_OPSET, MODEL_TRAINING, MODEL_FUNCTION = 7, 8, 20, 25
+TRAINING_GRAPHS = (1, 2)
 GRAPH_NODE, GRAPH_INITIALIZER, GRAPH_SPARSE = 1, 5, 15
-FUNCTION_NAME, FUNCTION_NODE, FUNCTION_DOMAIN = 1, 7, 10
+FUNCTION_NAME, FUNCTION_NODE, FUNCTION_DOMAIN, FUNCTION_ATTRIBUTE = 1, 7, 10, 11
 NODE_TYPE, NODE_ATTRIBUTE, NODE_DOMAIN = 4, 5, 7
 ATTRIBUTE_TENSORS, ATTRIBUTE_GRAPHS, ATTRIBUTE_SPARSE = (5, 10), (6, 11), (22, 23)
 SPARSE_TENSORS = (1, 2)
 TENSOR_NAME, TENSOR_EXTERNAL, TENSOR_LOCATION = 8, 13, 14
+MAX_FIELD = 2**29 - 1
+"""Largest field number of protobuf; its parser drops the higher bits, so that a larger one would stand for another field."""
 
 Message = list[tuple[int, "int | memoryview"]]
 
@@ -51,8 +54,8 @@ def _message(data: memoryview) -> Message:
             if not 0 <= length <= len(data) - at:
                 raise ValueError(f"a field of wire type {wire} runs over the end")
             value, at = data[at : at + length], at + length
-        if number == 0:
-            raise ValueError("field number 0")
+        if not 0 < number <= MAX_FIELD:
+            raise ValueError(f"field number {number}")
         fields.append((number, value))
     return fields
 
@@ -62,7 +65,9 @@ def _parts(message: Message, *numbers: int) -> Iterator[Message]:
 
 
 def _text(message: Message, number: int) -> str:
-    return "".join(bytes(v).decode("utf-8", "replace") for n, v in message if n == number and isinstance(v, memoryview))
+    """Return the text of a field, the last where it stands there twice, as protobuf has it; empty where there is none."""
+    texts = [v for n, v in message if n == number and isinstance(v, memoryview)]
+    return bytes(texts[-1]).decode("utf-8", "replace") if texts else ""
 
 
 class _Walk:
@@ -85,13 +90,21 @@ class _Walk:
                 f"{self.path}: the operator {domain}::{kind} is not part of ONNX and would need foreign code to run. "
                 "Export the model with standard operators"
             )
-        for attribute in _parts(node, NODE_ATTRIBUTE):
+        self.attributes(node, NODE_ATTRIBUTE, depth)
+
+    def attributes(self, message: Message, number: int, depth: int) -> None:
+        for attribute in _parts(message, number):
             for tensor in _parts(attribute, *ATTRIBUTE_TENSORS):
                 self.tensor(tensor)
             for sparse in _parts(attribute, *ATTRIBUTE_SPARSE):
                 self.sparse(sparse)
             for graph in _parts(attribute, *ATTRIBUTE_GRAPHS):
                 self.graph(graph, depth + 1)
+
+    def function(self, function: Message) -> None:
+        self.attributes(function, FUNCTION_ATTRIBUTE, 0)
+        for node in _parts(function, FUNCTION_NODE):
+            self.node(node, 0)
 
     def sparse(self, sparse: Message) -> None:
         for tensor in _parts(sparse, *SPARSE_TENSORS):
@@ -127,8 +140,10 @@ def check_onnx(data: bytes, path: Path) -> None:
         walk = _Walk(path, {(_text(f, FUNCTION_DOMAIN), _text(f, FUNCTION_NAME)) for f in functions})
         walk.graph(graphs[0])
         for function in functions:
-            for node in _parts(function, FUNCTION_NODE):
-                walk.node(node, 0)
+            walk.function(function)
+        for training in _parts(model, MODEL_TRAINING):
+            for graph in _parts(training, *TRAINING_GRAPHS):
+                walk.graph(graph)
     except (ValueError, IndexError) as e:
         raise DataError(
             f"{path}: this is no ONNX model ({e}); give a file that `torch.onnx.export` or a like tool wrote"

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from warpgs.errors import ResourceError, UsageError
+from warpgs.io.decoding import MAX_PIXELS
 from warpgs.io.load import load_scene
 from warpgs.io.splits import Split, coincident_views, default_split, split_views
 from warpgs.pipeline.train.config import FitConfig
@@ -27,13 +28,15 @@ class SceneRequest:
     strict: bool = False
     """A frame without an image file is an error."""
     allow_outside: bool = False
-    """The scene may name image files outside its folder."""
+    """Names and links of the scene may lead to images and masks outside its folder."""
     invert_masks: bool = False
     """White in a mask removes a pixel."""
     score_masks: str | None = None
     """Folder of object masks for scoring, matched by image id; None for the scene's own `idrmasks`, if any."""
     reader: str | None = None
     """Name of the reader, ``module:Class`` or ``path/to/file.py:Class``; None to ask every built-in reader."""
+    max_pixels: int = MAX_PIXELS
+    """Largest number of pixels that an image or a mask may have as stored."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +116,7 @@ def read_scene(request: SceneRequest) -> tuple[Scene, Split, list[str]]:
     scene = load_scene(
         request.path, reader=request.reader, downscale=request.downscale, strict=request.strict,
         allow_outside=request.allow_outside, invert_masks=request.invert_masks, score_masks=request.score_masks,
+        max_pixels=request.max_pixels,
     )  # fmt: skip
     split, notes = choose_split(scene, request.split)
     return scene, split, [*scene.notes, *notes]

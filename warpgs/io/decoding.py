@@ -1,0 +1,129 @@
+"""Decoding of image files: the header first, then whether the file is whole, then the pixels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from warpgs.errors import DataError, ResourceError
+from warpgs.io.image_formats import bmp, jpeg, png, tiff, webp
+
+MAX_PIXELS = 100_000_000
+"""Largest number of pixels of an image where the user names none; decoded, it takes 1.2 GB."""
+BYTES_PER_PIXEL = 28
+"""Most memory that decoding takes per pixel [bytes]: the raster with 16 bits and 4 channels, as float32, and as RGB."""
+FORMATS: tuple[tuple[bytes, str, ModuleType], ...] = (
+    (b"\xff\xd8\xff", "JPEG", jpeg),
+    (png.SIGNATURE, "PNG", png),
+    (b"BM", "BMP", bmp),
+    (b"II*\0", "TIFF", tiff),
+    (b"MM\0*", "TIFF", tiff),
+    (b"II+\0", "TIFF", tiff),
+    (b"MM\0+", "TIFF", tiff),
+    (b"RIFF", "WEBP", webp),
+)
+"""First bytes, name as Pillow has it, and module of each format that is read."""
+
+
+def format_of(data: bytes) -> tuple[str, ModuleType]:
+    """Return name and module of the format of an image file, by its first bytes; ValueError where it is none."""
+    for start, name, module in FORMATS:
+        if data.startswith(start):
+            return name, module
+    raise ValueError("it is no JPEG, PNG, BMP, TIFF or WebP file" if data else "it is empty")
+
+
+def read_image_file(path: Path) -> bytes:
+    """Return the bytes of an image file.
+
+    Raises:
+        DataError: It is missing or cannot be read.
+    """
+    if not path.is_file():
+        what = "is a link that leads to no file" if path.is_symlink() else "the image file is missing"
+        raise DataError(f"{path}: {what}; restore it, or remove its camera from the scene")
+    try:
+        return path.read_bytes()
+    except OSError as e:
+        raise DataError(f"{path}: the image cannot be read ({e.strerror}); fix its permissions or copy it again") from e
+
+
+def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
+    """Return the pixels as stored, [H, W] or [H, W, C] with colours in BGR order, of any type that OpenCV has."""
+    import cv2
+
+    pixels = 0
+    try:
+        _, module = format_of(data)
+        width, height = module.size(data)
+        pixels = width * height
+        if pixels > max_pixels:
+            raise DataError(
+                f"{path}: the image is {width} x {height} px, more than the limit of {max_pixels:,} pixels; shrink it, or "
+                f"raise the limit with --max-pixels {pixels}, which takes {BYTES_PER_PIXEL * pixels / 2**30:.1f} GiB to decode"
+            )
+        if not pixels:
+            raise ValueError(f"it has {width} x {height} px")
+        raster: np.ndarray | None = None
+        if module is jpeg:
+            raster = jpeg.decode(data)
+        else:
+            module.check(data)
+        if raster is None:
+            # IMREAD_UNCHANGED also leaves the EXIF orientation alone: the camera, not the tag, says how the raster lies
+            raster = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if raster is None or raster.shape[:2] != (height, width):
+            raise ValueError("OpenCV cannot read it")
+    except (ValueError, cv2.error) as e:
+        if isinstance(e, cv2.error) and e.code == cv2.Error.StsNoMem:
+            raise ResourceError(_too_large(path, pixels)) from e
+        reason = "OpenCV cannot read it" if isinstance(e, cv2.error) else str(e)
+        raise DataError(
+            f"{path}: the image cannot be decoded: {reason}. Restore it from its source; if it looks right, save it as PNG"
+        ) from e
+    except MemoryError as e:
+        raise ResourceError(_too_large(path, pixels)) from e
+    return raster
+
+
+def _too_large(path: Path, pixels: int) -> str:
+    needed = BYTES_PER_PIXEL * pixels / 2**30
+    return f"{path}: {needed:.1f} GiB to decode the image are not free; shrink it, or end other programs"
+
+
+def decode(path: Path, max_pixels: int = MAX_PIXELS) -> tuple[np.ndarray, np.ndarray | None]:
+    """Decode an image file as stored, without rotation by its EXIF tag.
+
+    Gray, palette, 8- and 16-bit images and straight alpha are understood.
+
+    Args:
+        path: A JPEG, PNG, BMP, TIFF or WebP file, whatever its suffix.
+        max_pixels: Largest number of pixels that its header may announce.
+
+    Returns:
+        Colours in [0, 1], float32, shape [H, W, 3]; and alpha in [0, 1], float32, shape [H, W], or None.
+
+    Raises:
+        DataError: The file is missing, no such image, too large, or damaged as far as its format lets one see it.
+        ResourceError: There is not enough memory for it.
+    """
+    raw = _raster(path, read_image_file(path), max_pixels)
+    if raw.dtype in (np.uint8, np.uint16):
+        values = raw.astype(np.float32)
+        values /= np.iinfo(raw.dtype).max
+    elif raw.dtype == np.float32:
+        values = np.clip(raw, 0, 1)
+        if not np.isfinite(raw).all():
+            raise DataError(f"{path}: some pixels are not finite; save it as 8- or 16-bit PNG")
+    else:
+        raise DataError(f"{path}: pixels of type {raw.dtype} are not supported; save it as 8- or 16-bit PNG")
+    if values.ndim == 2:
+        values = values[..., None]
+    channels = values.shape[2]
+    if channels > 4:
+        raise DataError(f"{path}: has {channels} channels; save it as gray, RGB or RGBA")
+    alpha = np.ascontiguousarray(values[..., -1]) if channels in (2, 4) else None
+    color = np.repeat(values[..., :1], 3, axis=2) if channels <= 2 else values[..., 2::-1]
+    return np.ascontiguousarray(color), alpha

@@ -1,0 +1,89 @@
+"""PNG: the checksum of every chunk, and that of the compressed pixels, whose number must be what the header says."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+
+SIGNATURE = b"\x89PNG\r\n\x1a\n"
+CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
+"""Channels by type of colour."""
+DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
+"""Bits per sample that a type of colour may have."""
+PASSES = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
+"""First column, first row and steps of the passes of an interlaced image."""
+PIECE = 1 << 20
+"""Bytes unpacked at a time."""
+
+
+def _header(data: bytes) -> tuple[int, int, int, int, int]:
+    """Return width, height, bits per sample, type of colour and 1 for an interlaced image."""
+    if len(data) < 33 or data[12:16] != b"IHDR":
+        raise ValueError("it has no header")
+    width, height, depth, color, packing, filtering, interlaced = struct.unpack_from(">IIBBBBB", data, 16)
+    if depth not in DEPTHS.get(color, ()) or packing or filtering or interlaced > 1:
+        raise ValueError("its header is broken")
+    return width, height, depth, color, interlaced
+
+
+def size(data: bytes) -> tuple[int, int]:
+    """Return width and height [px]."""
+    return _header(data)[:2]
+
+
+def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
+    """Yield kind and contents of each chunk up to the last; each is checked against its checksum."""
+    at, view, kind = len(SIGNATURE), memoryview(data), b""
+    while kind != b"IEND":
+        if at + 12 > len(data):
+            raise ValueError("it ends early")
+        length, kind = struct.unpack_from(">I4s", data, at)
+        end = at + 8 + length
+        if end + 4 > len(data):
+            raise ValueError("it ends within a chunk")
+        if zlib.crc32(view[at + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
+            raise ValueError(f"the checksum of its part {kind.decode('ascii', 'replace')} does not match")
+        yield kind, view[at + 8 : end]
+        at = end + 4
+
+
+def _raw_size(width: int, height: int, bits: int, interlaced: int) -> int:
+    """Return the number of bytes of the unpacked rows, each with its filter byte."""
+    total = 0
+    for x, y, step_x, step_y in PASSES if interlaced else ((0, 0, 1, 1),):
+        columns, rows = -(-max(width - x, 0) // step_x), -(-max(height - y, 0) // step_y)
+        total += rows * (1 + (columns * bits + 7) // 8) if columns else 0
+    return total
+
+
+def unpacked_size(pieces: Iterator[memoryview], limit: int) -> int:
+    """Return the number of bytes in a zlib stream whose checksum matches.
+
+    Args:
+        pieces: The stream, in order.
+        limit: Number of bytes beyond which nothing more is unpacked.
+    """
+    stream, total = zlib.decompressobj(), 0
+    try:
+        for piece in pieces:
+            left: bytes | memoryview = piece
+            while left and total <= limit and not stream.eof:
+                total += len(stream.decompress(left, PIECE))
+                left = stream.unconsumed_tail
+        while not stream.eof and total <= limit and (more := stream.decompress(b"", PIECE)):
+            total += len(more)
+    except zlib.error as e:
+        raise ValueError(f"its compressed pixels are damaged ({e})") from e
+    if total <= limit and not stream.eof:
+        raise ValueError("its compressed pixels end early")
+    return total
+
+
+def check(data: bytes) -> None:
+    """Check all checksums, and that the pixels are as many as the header says."""
+    width, height, depth, color, interlaced = _header(data)
+    chunks = list(_chunks(data))
+    expected = _raw_size(width, height, depth * CHANNELS[color], interlaced)
+    if unpacked_size((body for kind, body in chunks if kind == b"IDAT"), expected) != expected:
+        raise ValueError("it holds another number of pixels than its header says")

@@ -1,0 +1,47 @@
+"""WebP: chunks must fill the length that the file announces. Lossy WebP has no checksum: damage inside of it is not seen."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+
+PIXELS = (b"VP8 ", b"VP8L", b"ANMF")
+"""Chunks that hold pixels: lossy, lossless, a frame of an animation."""
+
+
+def _chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Yield kind and the first ten bytes of each chunk."""
+    if len(data) < 20 or data[8:12] != b"WEBP":
+        raise ValueError("it is no WebP file")
+    end, at = 8 + struct.unpack_from("<I", data, 4)[0], 12
+    if end > len(data):
+        raise ValueError(f"it ends early: it has {len(data)} bytes and announces {end}")
+    while at < end:
+        if at + 8 > end:
+            raise ValueError("it ends within a chunk")
+        kind, length = struct.unpack_from("<4sI", data, at)
+        if at + 8 + length > end:
+            raise ValueError("it ends within a chunk")
+        yield kind, data[at + 8 : at + 8 + min(length, 10)]
+        at += 8 + length + length % 2
+
+
+def size(data: bytes) -> tuple[int, int]:
+    """Return width and height [px]."""
+    kind, body = next(_chunks(data))
+    if len(body) >= 10 and kind == b"VP8X":
+        width, height = (int.from_bytes(body[i : i + 3], "little") + 1 for i in (4, 7))
+    elif len(body) >= 10 and kind == b"VP8 " and body[3:6] == b"\x9d\x01\x2a":
+        width, height = (v & 0x3FFF for v in struct.unpack_from("<HH", body, 6))
+    elif len(body) >= 5 and kind == b"VP8L" and body[0] == 0x2F:
+        bits = int.from_bytes(body[1:5], "little")
+        width, height = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    else:
+        raise ValueError("its header is broken")
+    return width, height
+
+
+def check(data: bytes) -> None:
+    """Check that all chunks are whole."""
+    if not any(kind in PIXELS for kind, _ in _chunks(data)):
+        raise ValueError("it holds no pixels")
