@@ -47,6 +47,7 @@ _SCENE = fields(
         "path": or_null(text), "split": or_null(text), "downscale": whole(1), "strict": flag, "allow_outside": flag,
         "invert_masks": flag, "score_masks": or_null(text), "reader": or_null(text),
     },
+    {"max_pixels": whole(1)},
     others=False,
 )  # fmt: skip
 _RECORD = fields(
