@@ -53,7 +53,7 @@ def replacing(
             check(temporary)
         _replace(temporary, path)
     except OSError as e:
-        amount = "" if size is None else f"{size / 2**20:.1f} MiB "
+        amount = "" if size is None else f"{size / 2**20:.1f} MiB " if size >= 2**20 else f"{size:,} bytes "
         raise ResourceError(
             f"{path}: {amount}cannot be written ({e.strerror or e}); what was there before is untouched. {_remedy(e)}"
         ) from e

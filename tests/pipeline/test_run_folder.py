@@ -71,7 +71,7 @@ def test_whatever_writes_into_a_run_waits_for_nobody(folder, tmp_path, capsys):
         for words in (
             ["eval", str(run), *cpu],
             ["render", str(run), *cpu],
-            ["compare", scene, "--out", str(run), "--presets", "3dgs,mcmc", "--split", "every:4", *cpu],
+            ["compare", scene, "--out", str(run), "--presets", "3dgs,fsgs", "--steps", "1", "--split", "every:4", *cpu],
             ["priors", "show", scene, "--out", str(tmp_path / "priors"), "--split", "every:4"],
         ):
             assert main(words) == 4, words

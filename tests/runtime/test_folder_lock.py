@@ -40,8 +40,9 @@ def test_a_second_holder_is_told_whose_the_folder_is(tmp_path, monkeypatch):
         assert "..." in said and len(said) < 600 and "choose another folder" in said and notes == []
         assert is_empty(tmp_path)
     assert not list(tmp_path.iterdir())
+    monkeypatch.setattr(sys, "argv", ["/lib/warpgs/__main__.py", "eval"])
     with hold_folder(tmp_path):
-        pass
+        assert "`warpgs eval`" in refusal(tmp_path)
 
 
 def test_a_lock_file_alone_holds_nothing(tmp_path):

@@ -115,7 +115,9 @@ def _lock(file: BinaryIO, folder: Path) -> bool:
 
 def _sign(file: BinaryIO) -> None:
     """Write into a lock file who holds it; its first byte is what is locked on Windows, where no other may read that."""
-    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    program = Path(sys.argv[0])
+    name = program.parent.name if program.name == "__main__.py" else program.name  # of `python -m warpgs`
+    command = shlex.join([name, *sys.argv[1:]])
     now = datetime.datetime.now().astimezone().isoformat(" ", "seconds")
     values = {"process": os.getpid(), "host": platform.node(), "since": now, "command": command}
     file.truncate(0)

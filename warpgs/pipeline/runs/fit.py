@@ -141,7 +141,10 @@ def fit(
     out = None if out is None else Path(out)
     if resume and out is None:
         raise UsageError("resume needs the run folder that it continues: give out")
-    with contextlib.nullcontext([]) if out is None else run_folder(out, resume) as held:
+    folder: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
+    if out is not None:
+        folder = run_folder(out, resume)
+    with folder as held:
         if out is not None and resume:
             read_record(out)  # a run of another version is refused before anything takes time
         where = choose_device(device)
