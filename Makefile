@@ -15,11 +15,17 @@ OUT ?= runs/demo
 
 .PHONY: demo install lint types docs test test-slow test-fault test-browser test-audit test-cuda clean
 
-$(VENV)/installed: pyproject.toml constraints.txt
+# LOCKED=1: only files whose hashes stand in requirements.lock; else, from wherever pip is told, the versions of constraints.txt
+$(VENV)/installed: pyproject.toml constraints.txt requirements.lock
 	$(PYTHON) -m venv $(VENV)
+ifdef LOCKED
+	$(BIN)/python -m pip install --quiet --require-hashes --no-deps --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+else
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+endif
 	touch $@
 
 install: $(VENV)/installed

@@ -1,5 +1,6 @@
 """The commands as a user types them: results, exit codes, and one line for every mistake."""
 
+import errno
 import json
 import os
 import stat
@@ -189,9 +190,16 @@ def test_output_below_a_file(scene, capsys):
 
 
 CUDA_FULL = "CUDA out of memory. Tried to allocate 48.00 MiB. GPU 0 has a total capacity of 139.80 GiB."
+CPU_FULL = "[enforce fail at alloc_cpu.cpp:127] . DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes."
+NO_MEMORY = [
+    RuntimeError(CUDA_FULL), MemoryError(), RuntimeError(CPU_FULL), RuntimeError("std::bad_alloc"), OSError(errno.ENOMEM, "no"),
+    RuntimeError("[enforce fail at ..] DefaultCPUAllocator: not enough memory: you tried to allocate 9 bytes."),
+    RuntimeError("OpenCV(5.0.0) alloc.cpp:73: error: (-4:Insufficient memory) Failed to allocate 9 bytes"),
+    RuntimeError("bad allocation"), RuntimeError("Failed to allocate 9 bytes on device 'cpu'"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("error", [RuntimeError(CUDA_FULL), MemoryError()], ids=["CUDA", "Python"])
+@pytest.mark.parametrize("error", NO_MEMORY, ids=[str(e)[-20:] for e in NO_MEMORY])
 def test_no_memory_left_is_no_defect(error, capsys, monkeypatch):
     """Where memory runs out, one line says so and how to need less."""
 
@@ -201,6 +209,38 @@ def test_no_memory_left_is_no_defect(error, capsys, monkeypatch):
     monkeypatch.setattr("warpgs.pipeline.runs.commands.export", full)
     line = failure(capsys, 4, "export", "run", "--to", "x.ply")
     assert "--memory-limit" in line and "--resume" in line and "total capacity" not in line
+
+
+@pytest.mark.parametrize("ask", [lambda: torch.empty(2**60), lambda: np.zeros((2**30, 2**24)), lambda: bytearray(2**62)])
+def test_what_libraries_say_where_the_cpu_has_no_memory(ask, capsys, monkeypatch):
+    """Their own words, which may change with their versions: more than any machine has is asked for."""
+    monkeypatch.setattr("warpgs.pipeline.runs.commands.export", lambda *_: ask())
+    assert "--memory-limit" in failure(capsys, 4, "export", "run", "--to", "x.ply")
+
+
+NUMBERS = ["inf", "nan", "1e400", "9" * 400, "", "٣", "0x10", "-1", "1e-400000"]
+FIT_FLAGS = ("--steps", "--init.opacity", "--downscale", "--threads", "--time-budget", "--memory-limit")
+FLAGS = [
+    *(pytest.param("fit scene --out run --device cpu", f, marks=pytest.mark.fault) for f in FIT_FLAGS),
+    ("render run", "--frames"), ("render run", "--fps"), ("prune run", "--keep-psnr"), ("compare scene --out c", "--seeds"),
+    *(("demo d", f) for f in ("--views", "--width", "--height", "--seed")), ("priors show scene --out s", "--threads"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("command", "flag"), FLAGS)
+def test_numbers_at_their_extremes(tmp_path, capsys, monkeypatch, command, flag):
+    """Not finite, beyond every range, negative, empty, in other digits: exit code 2, words, and nothing is made."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene").mkdir()
+    for number in NUMBERS:
+        try:
+            code = main([*command.split(), f"{flag}={number}"])
+        except SystemExit as e:
+            code = e.code
+        text = capsys.readouterr().err
+        allowed = (2, 3) if flag == "--downscale" and number == "-1" else (2,)
+        assert code in allowed and text and "Traceback" not in text, (flag, number, code, text)
+    assert [p.name for p in tmp_path.iterdir()] == ["scene"]
 
 
 def test_defects_are_called_defects(tmp_path, capsys, monkeypatch):

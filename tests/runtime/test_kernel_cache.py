@@ -110,7 +110,7 @@ def test_a_sound_folder_is_used(monkeypatch, tmp_path):
 
 
 @POSIX
-@pytest.mark.parametrize("where", ["cache", "cache/1.0", "cache/1.0/wp_x", "."])
+@pytest.mark.parametrize("where", ["cache", "cache/1.0", "cache/1.0/wp_x", "cache/1.0/wp_x/x.o", "."])
 def test_a_folder_that_others_can_write_to_is_refused(monkeypatch, tmp_path, where):
     """They could plant a kernel, which would run as this user: in the cache, a version of it, a module, or in place of it."""
     cache = tmp_path / "cache"
@@ -148,6 +148,34 @@ def test_groups_links_and_owners(monkeypatch, tmp_path):
         assert "other users" in chosen(monkeypatch, cache)[1]
 
 
+@POSIX
+@pytest.mark.parametrize(("planted", "refused"), [(".", True), ("cache", True), ("cache/1.0/wp_x/x.o", True), (None, False)])
+def test_what_another_user_owns_is_refused(monkeypatch, tmp_path, planted, refused):
+    """A folder above the cache, the cache, or a kernel planted in it: its owner can change it, whatever its mode says."""
+    cache = tmp_path / "cache"
+    (cache / "1.0" / "wp_x").mkdir(parents=True)
+    (cache / "1.0" / "wp_x" / "x.o").write_bytes(b"")
+    cache.chmod(0o755)
+    stranger = tmp_path / planted if planted else None
+    for name in ("stat", "lstat"):
+        look = getattr(Path, name)
+
+        def owned(path, look=look, **how):
+            found = look(path, **how)
+            return os.stat_result([*found[:4], 54321, *found[5:]]) if stranger is not None and path == stranger else found
+
+        monkeypatch.setattr(Path, name, owned)
+    folder, why = chosen(monkeypatch, cache)
+    assert (folder != cache.resolve()) == refused == ("other users can write to" in why)
+
+
+def test_where_files_have_no_owners_nothing_is_refused(monkeypatch, tmp_path):
+    """As on Windows, where the folder of a user's caches is private and mode bits say nothing."""
+    monkeypatch.delattr(os, "getuid", raising=False)
+    tmp_path.chmod(0o777)
+    assert chosen(monkeypatch, tmp_path / "cache") == ((tmp_path / "cache").resolve(), "")
+
+
 def test_no_folder_is_ever_called_tilde(monkeypatch, tmp_path):
     """A ~ that nobody has replaced means the home folder; where that is not known, nothing is made."""
     monkeypatch.chdir(tmp_path)
@@ -162,6 +190,12 @@ def test_no_folder_is_ever_called_tilde(monkeypatch, tmp_path):
         monkeypatch.delenv("WARP_CACHE_PATH")
         monkeypatch.delenv("LOCALAPPDATA", raising=False)
         assert folders.cache_home() is None and "no home" in choose_kernel_cache().refused
+    from warpgs.priors.cache import cache_folder
+
+    for name in ("HOME", "USERPROFILE"):
+        monkeypatch.setenv(name, str(tmp_path / "home"))
+    monkeypatch.setenv("WARPGS_CACHE", "~/maps")  # of another cache, that of the networks' maps
+    assert cache_folder() == tmp_path / "home" / "maps"
     assert {p.name for p in tmp_path.iterdir()} == {"home"}
 
 

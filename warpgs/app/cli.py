@@ -9,6 +9,7 @@ from pathlib import Path
 
 from warpgs import __version__
 from warpgs.app.failures import report_defect, report_no_memory
+from warpgs.app.flags import MAX_THREADS, check_range, parse_flags
 from warpgs.errors import UsageError, WarpgsError
 from warpgs.runtime.device_memory import is_out_of_memory
 from warpgs.runtime.stop_signals import ignored_signals, interrupting_signals
@@ -54,8 +55,6 @@ def _importing():
 
 
 def _parse(kind: type, name: str, arguments: list[str]):
-    from warpgs.app.flags import parse_flags
-
     return parse_flags(kind, arguments, f"warpgs {name}", COMMANDS[name.split(maxsplit=1)[0]])
 
 
@@ -110,6 +109,8 @@ def _render(arguments: list[str]) -> int:
         """auto, cpu or cuda."""
 
     a = _parse(Render, "render", arguments)
+    check_range("--frames", a.frames, 1, 1_000_000)
+    check_range("--fps", a.fps, 1, 1000)
     from warpgs.pipeline.runs.commands import render
 
     say(render(a.run, a.path, a.out, a.frames, a.fps, a.device))
@@ -198,8 +199,7 @@ def _priors_show(arguments: list[str]) -> int:
     from warpgs.pipeline.runs.preview import show_priors
     from warpgs.pipeline.runs.request import SceneRequest
 
-    if a.threads < 0:
-        raise UsageError(f"--threads must be 0 or more, not {a.threads}")
+    check_range("--threads", a.threads, 0, MAX_THREADS)
     scene = SceneRequest(str(a.scene), a.split, a.downscale, allow_outside=a.allow_outside, max_pixels=a.max_pixels)
     for line in show_priors(scene, a.priors, a.source, a.out, a.threads):
         say(line)
@@ -242,6 +242,10 @@ def _demo(arguments: list[str]) -> int:
         """Decides the textures."""
 
     a = _parse(Demo, "demo", arguments)
+    check_range("--views", a.views, 8, 10_000)
+    check_range("--width", a.width, 8, 8192)
+    check_range("--height", a.height, 8, 8192)
+    check_range("--seed", a.seed, 0, 2**31 - 1)
     from warpgs.synthetic.demo import write_demo
 
     split = write_demo(a.folder, views=a.views, width=a.width, height=a.height, seed=a.seed)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from warpgs.app.flags import flags_of, parse_flags, settings_of, word_after
+from warpgs.app.flags import MAX_THREADS, check_range, flags_of, parse_flags, settings_of, word_after
 from warpgs.errors import UsageError, WarpgsError
 from warpgs.io.decoding import MAX_PIXELS
 from warpgs.io.readers import READERS
@@ -212,8 +212,7 @@ def fit(arguments: list[str], description: str) -> FitRequest:
     a: Any = parse_flags(_flags(base, terms), arguments, "warpgs fit", f"{description}\n\n{_presets()}")
     if a.reader is not None:
         _load(READERS, a.reader)
-    if a.threads < 0:
-        raise UsageError(f"--threads must be 0 or more, not {a.threads}")
+    check_range("--threads", a.threads, 0, MAX_THREADS)
     if a.threads:
         set_threads(a.threads)
     config, notes = _chosen(a, arguments, _config(a, base, terms))

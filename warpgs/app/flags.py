@@ -12,6 +12,7 @@ import typing
 from collections.abc import Mapping
 from typing import Annotated, Any, TypeVar
 
+from warpgs.errors import UsageError
 from warpgs.runtime.terminal import say
 
 Settings = TypeVar("Settings")
@@ -75,6 +76,8 @@ def settings_of(kind: type[Settings], flags: Any) -> Settings:
 
 MAX_WHOLE = 2**63 - 1
 """Largest whole number that a flag takes: that of 64 bits."""
+MAX_THREADS = 4096
+"""Most threads that a flag takes."""
 MAX_NUMBER = 3e38
 """Largest number that a flag takes: about that of float32, in which everything is computed."""
 
@@ -134,6 +137,16 @@ def parse_flags(kind: type, arguments: list[str], program: str, description: str
     finally:
         for line in re.sub(r"\x1b\[[0-9;]*m", "", complaint.getvalue()).splitlines():
             say(line, error=True)
+
+
+def check_range(flag: str, value: float, low: float, high: float) -> None:
+    """Check the number of a flag.
+
+    Raises:
+        UsageError: It is below ``low`` or above ``high``.
+    """
+    if not low <= value <= high:
+        raise UsageError(f"{flag} must be a number from {low:,} to {high:,}, not {value}")
 
 
 def word_after(arguments: list[str], flag: str) -> str | None:

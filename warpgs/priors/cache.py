@@ -27,10 +27,14 @@ def cache_folder() -> Path:
     Where the user has no home folder it is a private folder of this process, and a line on stderr says so.
 
     Raises:
-        ResourceError: There is no home folder, and no folder for temporary files either.
+        ResourceError: There is no home folder, and no folder for temporary files either; or WARPGS_CACHE lies in one that is
+            not known.
     """
     if own := os.environ.get("WARPGS_CACHE"):
-        return Path(own)
+        asked = Path(os.path.expanduser(own))  # as a shell does, but not within quotes
+        if own.startswith("~") and not asked.is_absolute():
+            raise ResourceError(f"WARPGS_CACHE: {own} lies in a home folder that is not known; give the whole path")
+        return asked
     home = cache_home()
     if home is None:
         say("warpgs: there is no home folder, so maps are kept for this run alone; WARPGS_CACHE names one", error=True)

@@ -14,16 +14,16 @@ def parse_bytes(text: str) -> int:
     """Return a size such as 2GiB, 512 MB or 1.5GiB in bytes.
 
     Raises:
-        UsageError: The text is no such size, or less than a byte.
+        UsageError: The text is no such size, less than a byte, or more than 64 bits can count.
     """
-    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?|\.\d+)\s*([A-Za-z]+)\s*", text)
+    found = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?|\.[0-9]+)\s*([A-Za-z]+)\s*", text)
     units = {u.lower(): b for u, b in UNITS.items()}
     if not found or found[2].lower() not in units:
-        raise UsageError(f"memory limit {text!r} is no size: give a number and a unit of {', '.join(UNITS)}, such as 2GiB")
-    size = int(float(found[1]) * units[found[2].lower()])
-    if size < 1:
-        raise UsageError(f"memory limit {text!r} must be at least one byte")
-    return size
+        raise UsageError(f"memory limit {text[:40]!r} is no size: give a number and a unit of {', '.join(UNITS)}, such as 2GiB")
+    size = float(found[1]) * units[found[2].lower()]
+    if not 1 <= size < 2**63:
+        raise UsageError(f"memory limit {text[:40]!r} must be at least one byte and less than 2^63")
+    return int(size)
 
 
 def format_bytes(size: float) -> str:

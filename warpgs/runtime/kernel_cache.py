@@ -101,35 +101,37 @@ def _fault(folder: Path) -> str:
 
 
 def _open_to_others(folder: Path) -> Path | None:
-    """Return what another user could change in a cache: a folder above, it, or one in it; None where nobody can.
+    """Return what another user could change in a cache: a folder above, it, or what is in it; None where nobody can.
 
-    On Windows nothing is looked at: mode bits say nothing there, and the folder of a user's caches is private. A folder that
-    root owns is trusted, as root may do anything.
+    On Windows nothing is looked at: mode bits say nothing there, and the folder of a user's caches is private. Root is trusted,
+    as root may do anything, and so is who owns the whole file system.
     """
     if not hasattr(os, "getuid"):
         return None
-    for above in folder.parents:
-        mode = above.stat().st_mode
-        if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
+    trusted = {os.getuid(), 0, Path(folder.anchor).stat().st_uid}
+    for above in folder.parents:  # whoever can write there can put another folder in the place of this one
+        found = above.stat()
+        sticky = found.st_mode & stat.S_ISVTX  # as /tmp: others cannot move what is not theirs
+        if found.st_uid not in trusted or (_writable_by_others(found, trusted) and not sticky):
             return above
-    if _writable_by_others(folder.stat()):
+    if _writable_by_others(folder.stat(), trusted):
         return folder
     if not folder.stat().st_mode & (stat.S_IXGRP | stat.S_IXOTH):
         return None  # others do not even get in
-    # its versions, and the modules in them
-    for pattern in ("*", "*/*"):
+    # its versions, the modules in them, and their files
+    for pattern in ("*", "*/*", "*/*/*"):
         for path in folder.glob(pattern):
             try:
                 found = path.lstat()
             except FileNotFoundError:  # another process has put its new module in place
                 continue
-            if stat.S_ISLNK(found.st_mode) or _writable_by_others(found):
+            if stat.S_ISLNK(found.st_mode) or _writable_by_others(found, trusted):
                 return path
     return None
 
 
-def _writable_by_others(found: os.stat_result) -> bool:
-    if found.st_uid not in (os.getuid(), 0) or found.st_mode & stat.S_IWOTH:
+def _writable_by_others(found: os.stat_result, trusted: set[int]) -> bool:
+    if found.st_uid not in trusted or found.st_mode & stat.S_IWOTH:
         return True
     return bool(found.st_mode & stat.S_IWGRP) and not _is_own_group(found.st_gid)
 

@@ -63,6 +63,6 @@ def noted_signals() -> Iterator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def ignored_signals() -> Iterator[None]:
-    """Ignore signals while the body says the last words of a program that they end already."""
+    """Let signals pass while the body says the last words of a program that they end already."""
     with _handled(signal.SIG_IGN):
         yield

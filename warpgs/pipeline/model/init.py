@@ -70,7 +70,7 @@ class InitConfig:
     def __post_init__(self):
         if self.source not in SOURCES:
             raise UsageError(f"init source {self.source!r} is not one of {', '.join(SOURCES)}")
-        for name in ("merge_px", "fill_px"):
+        for name in ("merge_px", "fill_px", "sweep_up_to"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise UsageError(f"init {name.replace('_', '-')} must be 0 or more, not {getattr(self, name)}")
         if self.flow_range not in RANGES:

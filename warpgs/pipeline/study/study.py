@@ -30,6 +30,8 @@ SWITCHES = {
     "pm": "PM", "events": "Events",
 }  # fmt: skip
 """Parts of the method that can be switched off, with the headings of the paper's ablation table."""
+MAX_SEEDS = 1000
+"""Most runs of a setting on a scene."""
 FIGURE_ROWS = 3
 """Rows of the figure for a single scene; two scenes get two rows each, more scenes one each."""
 FILES = ("table.md", "table.csv", "table.tex", "runs.csv", "plot.svg", "figure.png", "study.json")
@@ -56,8 +58,8 @@ class StudyRequest:
     """Check marks of each variant in the order of `SWITCHES`; empty for a comparison of presets."""
 
     def __post_init__(self) -> None:
-        if not self.seeds >= 1:
-            raise UsageError(f"--seeds must be at least 1, not {self.seeds}")
+        if not 1 <= self.seeds <= MAX_SEEDS:
+            raise UsageError(f"--seeds must be a number from 1 to {MAX_SEEDS}, not {self.seeds}")
         if len(self.variants) < 2:
             raise UsageError(f"a comparison needs at least two settings, not {', '.join(self.variants) or 'none'}")
         names = [scene_name(s) for s in self.scenes]

@@ -220,6 +220,12 @@ class DepthCorrelation(LossTerm):
     until: float = 0.95
     """Fraction of the steps, from the first, that have the term."""
 
+    def __post_init__(self) -> None:
+        if not (0 <= self.weight <= 1e9 and 0 <= self.until <= 1):
+            raise UsageError(
+                f"depth-correlation: weight {self.weight} must lie between 0 and 1e9, and until {self.until} between 0 and 1"
+            )
+
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
         """Return the disparity of the view's prior, shape [H, W]."""
         assert prior is not None  # `needs_priors`

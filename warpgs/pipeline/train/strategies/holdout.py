@@ -350,7 +350,11 @@ class Holdout(ImportanceSampling):
         }  # fmt: skip
 
     def load(self, tensors, plain):
-        """Load what `state` returned, ``tensors`` of shape [...] by name; once growth has ended, whole views are trained on."""
+        """Load what `state` returned, ``tensors`` of shape [...] by name; once growth has ended, whole views are trained on.
+
+        Raises:
+            DataError: The errors of the blocks are not of these blocks.
+        """
         super().load(tensors, plain)
         self.closed, self.why, self.trims, self.growing = (plain[k] for k in ("closed", "why", "trims", "growing"))
         self.levels = [Level(**x) for x in plain["levels"]]
