@@ -119,7 +119,7 @@ def _finished(
             "Add images with cameras"
         )
     _check_views(root, views)
-    n: Normalization = normalization_of(views, points)
+    n: Normalization = normalization_of(views, points, str(root))
     views = [normalize_view(v, n) for v in sorted(views, key=lambda v: v.name)]
     if points is not None:
         points = normalize_points(points, n, str(root))

@@ -17,21 +17,21 @@ MAX_COORDINATE = 1e12
 """Largest coordinate of a camera centre [file units] and of a point [u]; beyond it a file is taken for broken."""
 
 
-def normalization_of(views: list[View], points: PointCloud | None) -> Normalization:
+def normalization_of(views: list[View], points: PointCloud | None, where: str) -> Normalization:
     """Return the similarity that puts the mean camera centre at the origin and the farthest camera at 1 / 1.1.
 
     Where all cameras stand in one place, the points' median distance becomes 1; without points the scale stays.
 
     Raises:
-        DataError: A camera centre is absurdly far away; the message names the image.
+        DataError: A camera centre is absurdly far away; the message begins with ``where`` and names the image.
     """
     centers = np.array([v.camera.center for v in views])
     far = np.abs(centers).max(axis=1)
     if not (far < MAX_COORDINATE).all():
         worst = int(np.argmax(far))
         raise DataError(
-            f"image {views[worst].name!r}: its camera centre {centers[worst].tolist()} is beyond {MAX_COORDINATE:.0e} units, "
-            "so the scene cannot be scaled; estimate its pose again, or remove the image"
+            f"{where}, image {views[worst].name!r}: its camera centre {centers[worst].tolist()} is beyond "
+            f"{MAX_COORDINATE:.0e} units, so the scene cannot be scaled; estimate its pose again, or remove the image"
         )
     offset = centers.mean(0)
     extent = 1.1 * float(np.linalg.norm(centers - offset, axis=1).max())

@@ -196,4 +196,6 @@ def read_lpips(path: Path) -> tuple[Net, dict[str, torch.Tensor], dict[str, str]
     for name, shape in net.shapes().items():
         if name not in tensors or tuple(tensors[name].shape) != shape:
             raise DataError(f"{path}: lacks {name} of shape {list(shape)}; make it anew with `warpgs convert-lpips`")
+        if tensors[name].dtype != torch.float32 or not bool(torch.isfinite(tensors[name]).all()):
+            raise DataError(f"{path}: {name} holds no finite float32 numbers; make it anew with `warpgs convert-lpips`")
     return net, tensors, {**metadata, "sha256": hashlib.sha256(data).hexdigest()}

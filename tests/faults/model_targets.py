@@ -1,0 +1,294 @@
+"""Files of models and run folders for the fuzzer: Gaussians, networks, weights, flow, checkpoints and their records."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tests.faults.mutations import Change, damage, json_value, number, text_line, text_number
+from tests.faults.targets import Target, not_finite, register
+from tests.io import scenes
+from tests.priors import networks as nw
+from warpgs.export import ply
+from warpgs.files import write_json
+from warpgs.io.load import load_scene
+from warpgs.io.splits import Split
+from warpgs.pipeline.metrics import lpips_weights
+from warpgs.pipeline.runs import checkpoint, folder, model_file
+from warpgs.pipeline.runs.request import SceneRequest
+from warpgs.pipeline.train.config import PRESETS
+from warpgs.priors import flow, onnx_file, preprocess
+from warpgs.scene import Gaussians, Normalization
+
+
+def gaussians(count: int = 3) -> Gaussians:
+    generator = torch.Generator().manual_seed(0)
+    shapes = {
+        "means": (count, 3),
+        "quats": (count, 4),
+        "log_scales": (count, 3),
+        "logit_opacities": (count,),
+        "sh": (count, 4, 3),
+    }
+    return Gaussians(**{n: torch.randn(s, generator=generator) for n, s in shapes.items()})
+
+
+def nonsense(g: Gaussians) -> str:
+    return not_finite(**{n: t.numpy() for n, t in g.tensors().items()})
+
+
+# ---- PLY -------------------------------------------------------------------------------------------------------------
+
+
+def ply_header(change: Change) -> Change:
+    """Return the change of a PLY file's header alone."""
+
+    def changed(data: bytes, rng: np.random.Generator) -> bytes:
+        head, end, body = data.partition(b"end_header\n")
+        return change(head, rng) + end + body
+
+    return changed
+
+
+def ply_body(data: bytes, rng: np.random.Generator) -> bytes:
+    head, end, body = data.partition(b"end_header\n")
+    return head + end + number(body, rng)
+
+
+def ply_files(root: Path) -> list[Path]:
+    ply.write_ply(root / "a.ply", gaussians(), Normalization())
+    text = (root / "a.ply").read_bytes()
+    more = b"element face 2\nproperty uchar material\nelement vertex"
+    before = text.replace(b"element vertex", more, 1).replace(b"end_header\n", b"end_header\n\1\2", 1)
+    (root / "b.ply").write_bytes(
+        before.replace(b"\nend_header", b"\nelement tail 1\nproperty list uchar int x\nend_header") + bytes(1)
+    )
+    return [root / "a.ply", root / "b.ply"]
+
+
+PLY = (ply.read_ply, ply._parse_header, ply._locate_vertices, ply._check_properties, ply._assemble, ply._error)
+PLY_CHANGES = (ply_header(text_number), ply_header(text_line), ply_body, ply_body)
+register(Target("ply", ply_files, lambda root, path: ply.read_ply(path), PLY, PLY_CHANGES, nonsense=nonsense))
+
+# ---- safetensors -----------------------------------------------------------------------------------------------------
+
+
+def tensors_header(data: bytes, rng: np.random.Generator) -> bytes:
+    """Change the JSON header of a safetensors file; its length stays right."""
+    length = int.from_bytes(data[:8], "little")
+    head, body = data[8 : 8 + length], data[8 + length :]
+    try:
+        header = json.loads(head)
+        inner = header.get("__metadata__")
+    except (ValueError, AttributeError):
+        return data
+    if inner and rng.random() < 0.7:
+        key = sorted(inner)[int(rng.integers(len(inner)))]
+        value = str(inner[key]).encode()
+        change = (json_value, text_number, damage)[int(rng.integers(3))]
+        header["__metadata__"] = inner | {key: change(value, rng).decode("utf-8", "replace")}
+        head = json.dumps(header).encode()
+    else:
+        head = json_value(head, rng)
+    head += b" " * (-len(head) % 8)
+    return struct.pack("<Q", len(head)) + head + body
+
+
+def tensors_body(data: bytes, rng: np.random.Generator) -> bytes:
+    start = 8 + int.from_bytes(data[:8], "little")
+    return data[:start] + number(data[start:], rng)
+
+
+def with_digest(data: bytes) -> bytes:
+    return data[:-32] + hashlib.sha256(data[:-32]).digest()
+
+
+def within_digest(change: Change) -> Change:
+    return lambda data, rng: (lambda body: body + hashlib.sha256(body).digest())(change(data[:-32], rng))
+
+
+def model_files(root: Path) -> list[Path]:
+    model_file.save(root / "m.safetensors", gaussians(), Normalization(np.array([1.0, 2, 3]), 0.5))
+    return [root / "m.safetensors"]
+
+
+register(
+    Target(
+        "model file", model_files, lambda root, path: model_file.load(path).scene_gaussians, (model_file.load,),
+        (tensors_header, tensors_body), nonsense=nonsense,
+    )
+)  # fmt: skip
+
+
+def checkpoints(root: Path) -> list[Path]:
+    state = {"step": 7, "random": [1, 2, 3], "rates": {"means": 0.1}}
+    return [checkpoint.save_checkpoint(root, {f"params.{n}": t for n, t in gaussians().tensors().items()}, state)]
+
+
+def checkpoint_nonsense(loaded: tuple) -> str:
+    tensors, state = loaded
+    sound = isinstance(state, dict) and all(isinstance(t, torch.Tensor) for t in tensors.values())
+    return "" if sound else "the state is no table"
+
+
+CHECKPOINT_CHANGES = tuple(within_digest(c) for c in (tensors_header, tensors_header, tensors_body, damage))
+register(
+    Target(
+        "checkpoint", checkpoints, lambda root, path: checkpoint.load_checkpoint(root), (checkpoint.load_checkpoint,),
+        CHECKPOINT_CHANGES, with_digest, checkpoint_nonsense,
+    )
+)  # fmt: skip
+
+SMALL = lpips_weights.Net("small", "a small network", (("conv", 0, 3, 4, 3, 1, 1), lpips_weights.TAP), 3, "")
+
+
+def lpips_files(root: Path) -> list[Path]:
+    from safetensors.torch import save
+
+    lpips_weights.NETS["small"] = SMALL  # the real ones have millions of weights
+    tensors = {n: torch.ones(s) for n, s in SMALL.shapes().items()}
+    metadata = {"format": lpips_weights.FORMAT, "net": "small", "version": "0.1", "backbone_sha256": "1", "heads_sha256": "2"}
+    (root / "w.safetensors").write_bytes(save(tensors, metadata))
+    return [root / "w.safetensors"]
+
+
+def lpips_nonsense(loaded: tuple) -> str:
+    net, tensors, header = loaded
+    if any(tuple(tensors[n].shape) != s for n, s in net.shapes().items()) or not isinstance(header["sha256"], str):
+        return "a tensor has another shape"
+    return not_finite(**{n: tensors[n].float().numpy() for n in net.shapes()})
+
+
+register(
+    Target(
+        "LPIPS weights", lpips_files, lambda root, path: lpips_weights.read_lpips(path), (lpips_weights.read_lpips,),
+        (tensors_header, tensors_body), nonsense=lpips_nonsense,
+    )
+)  # fmt: skip
+
+# ---- networks and flow -----------------------------------------------------------------------------------------------
+
+
+def onnx_files(root: Path) -> list[Path]:
+    relu = nw.node("Relu", ["x"], ["y"])
+    x, y = nw.value("x", (1, 3, 8, 8)), nw.value("y", (1, 3, 8, 8))
+    inner = nw.graph([relu], [nw.tensor("k", np.ones(2))], [], [y])
+    value = nw.field(1, "value") + nw.field(5, nw.tensor("v", np.ones(2))) + nw.field(6, inner)
+    value += nw.field(22, nw.field(1, nw.tensor("s", np.ones(1))))
+    own = nw.field(1, "Own") + nw.field(10, "own") + nw.field(7, relu) + nw.field(11, value)
+    nodes = [nw.node("Own", ["x"], ["y"], "own"), nw.node("If", ["x"], ["y"], attributes=nw.field(5, value))]
+    graph = nw.graph(nodes, [], [x], [y]) + nw.field(15, nw.field(1, nw.tensor("s", np.ones(1))))
+    whole = nw.model(graph, nw.field(25, own) + nw.field(20, nw.field(1, inner)))
+    files = {"a": whole, "b": nw.linear(np.eye(3), np.zeros(3)), "c": nw.linear(np.eye(3), np.zeros(3), layout="nhwc")}
+    foreign = nw.graph([nw.node("Run", ["x"], ["y"], "evil")], [nw.external_tensor("k", (1,), "w")], [x], [y])
+    for name, data in (files | {"d": nw.model(foreign)}).items():
+        (root / f"{name}.onnx").write_bytes(data)
+    return [root / f"{name}.onnx" for name in (*files, "d")]
+
+
+def onnx_field(data: bytes, rng: np.random.Generator) -> bytes:
+    """Change, remove or repeat a field at any depth; lengths around it stay right."""
+    try:
+        fields = onnx_file._message(memoryview(data))
+    except (ValueError, IndexError):
+        return data
+    if not fields:
+        return data
+    i, kind = int(rng.integers(len(fields))), int(rng.integers(8))
+    value = fields[i][1]
+    values = [value]
+    if isinstance(value, int):
+        values = [(int(rng.integers(4)), value + 1, 2**32 + 1)[int(rng.integers(3))]] if kind < 4 else [value]
+    elif kind < 5:
+        values = [onnx_field(bytes(value), rng)]
+    elif kind == 5:
+        values = [number(bytes(value), rng)]
+    elif kind == 6:
+        values = [value, value]
+    else:
+        values = []
+    out = b""
+    for j, (n, v) in enumerate(fields):
+        for part in values if j == i else [v]:
+            out += nw.field(n, part if isinstance(part, int) else bytes(part))
+    return out
+
+
+def check_onnx(root: Path, path: Path) -> bytes:
+    data = path.read_bytes() if path.is_file() else b""
+    onnx_file.check_onnx(data, path)
+    return data
+
+
+register(Target("onnx", onnx_files, check_onnx, (onnx_file,), (onnx_field, onnx_field, onnx_field)))
+
+
+def flo_files(root: Path) -> list[Path]:
+    values = np.random.default_rng(0).normal(size=(5, 4, 2)).astype("<f4")
+    (root / "a.flo").write_bytes(flow.FLO_MAGIC.tobytes() + struct.pack("<ii", 4, 5) + values.tobytes())
+    return [root / "a.flo"]
+
+
+def flo_nonsense(found: np.ndarray) -> str:
+    return "" if found.ndim == 3 and found.dtype == np.float32 and not np.isinf(found).any() else "no flow"
+
+
+def flo_number(data: bytes, rng: np.random.Generator) -> bytes:
+    return data[:12] + number(data[12:], rng)
+
+
+register(
+    Target("flow", flo_files, lambda root, path: flow.read_flo(path), (flow.read_flo,), (flo_number,), nonsense=flo_nonsense)
+)
+
+
+def side_files(root: Path) -> list[Path]:
+    values = {"size": 518, "multiple": 14, "mean": [0.5, 0.4, 0.3], "std": [0.2, 0.2, 0.2], "output": "depth"}
+    (root / "m.onnx.json").write_text(json.dumps(values), "utf-8")
+    return [root / "m.onnx.json"]
+
+
+def side_nonsense(values: dict) -> str:
+    return "" if isinstance(values, dict) and set(values) <= set(preprocess.KEYS) else "no description"
+
+
+SIDE = (preprocess.read_side_file, preprocess.check_value, preprocess._numbers, preprocess._whole)
+register(
+    Target(
+        "description of a network", side_files, lambda root, path: preprocess.read_side_file(root / "m.onnx"), SIDE,
+        (json_value, json_value, text_number), nonsense=side_nonsense,
+    )
+)  # fmt: skip
+
+
+# ---- run folders -----------------------------------------------------------------------------------------------------
+
+
+def run_files(root: Path) -> list[Path]:
+    scene = load_scene(scenes.write_colmap(root / "scene"))
+    names = tuple(v.name for v in scene.views)
+    request, split = SceneRequest(str(root / "scene")), Split(names[1:], names[:1])
+    record = folder.record_of(request, PRESETS["quick"], scene, split, ["a note"], torch.device("cpu"))
+    write_json(root / folder.CONFIG, record)
+    checkpoints(root)
+    return [root / folder.CONFIG]
+
+
+def run_nonsense(run: folder.StoredRun) -> str:
+    cameras = run.scene_cameras.values()
+    bad = [not_finite(viewmat=c.viewmat, K=c.K) for c in cameras] + [not_finite(offset=run.normalization.offset)]
+    whole = all(c.viewmat.shape == (4, 4) and c.K.shape == (3, 3) and min(c.width, c.height) > 0 for c in cameras)
+    return "".join(bad) or ("" if whole else "a camera is none")
+
+
+register(
+    Target(
+        "run record", run_files, lambda root, path: folder.open_run(root, "cpu"), (folder.read_record, folder.open_run),
+        (json_value, json_value, text_number), nonsense=run_nonsense,
+    )
+)  # fmt: skip

@@ -1,0 +1,165 @@
+"""Damage and changes of files: bytes at random, numbers in text and in bytes, JSON values; repeatable by their generator."""
+
+import json
+import re
+import struct
+from collections.abc import Callable
+
+import numpy as np
+
+Change = Callable[[bytes, np.random.Generator], bytes]
+
+NUMBER = re.compile(rb"-?\d+\.?\d*(?:[eE][-+]?\d+)?")
+WORDS = (
+    b"0", b"-1", b"1", b"2", b"nan", b"inf", b"-inf", b"1e308", b"1e-320", b"1e400", b"-0.0", b"4294967296", b"1e12", b"1e20",
+    b"9223372036854775808", b"99999999999999999999999999", b"0x10", b"1_0", b"", b"x", b"\xff", b"\0", b"7", b"1e5",
+)  # fmt: skip
+WHOLE = (0, 1, -1, 2, 7, 127, 255, 256, 32767, 65535, 65536, 2**31 - 1, 2**31, 2**32 - 1, 2**62, 2**63, 2**64 - 1)
+REAL = (0.0, -0.0, 1.0, np.nan, np.inf, -np.inf, 1.7e308, 1e-320, 5e-324, 1e20, -1e12, 1e38, 3.5e38)
+VALUES = (
+    None, True, False, 0, -1, 1, 7, 2**63, 10**400, 1e308, 1e-320, -0.0, float("nan"), float("inf"), "", "x", "\ud800", "../x",
+    "a\0b", "/", [], {}, [[]], [1, 2], {"a": 1}, "x" * 5000, [[1.0, 2.0, 3.0]],
+)  # fmt: skip
+
+
+def _pick(rng: np.random.Generator, values):
+    return values[int(rng.integers(len(values)))]
+
+
+def _cut(data: bytes, rng: np.random.Generator) -> tuple[int, int]:
+    """Return begin and end of a part, mostly a short one."""
+    begin = int(rng.integers(len(data) + 1))
+    longest = len(data) - begin
+    return begin, begin + min(longest, int(rng.integers(1, 9) if rng.random() < 0.7 else rng.integers(longest + 1)))
+
+
+def flip(data: bytes, rng: np.random.Generator) -> bytes:
+    out = bytearray(data)
+    for _ in range(int(rng.integers(1, 5))):
+        if out:
+            out[int(rng.integers(len(out)))] ^= 1 << int(rng.integers(8))
+    return bytes(out)
+
+
+def fill(data: bytes, rng: np.random.Generator) -> bytes:
+    begin, end = _cut(data, rng)
+    return data[:begin] + _pick(rng, (b"\0", b"\xff", b"A")) * (end - begin) + data[end:]
+
+
+def truncate(data: bytes, rng: np.random.Generator) -> bytes:
+    return data[: int(rng.integers(len(data) + 1))]
+
+
+def remove(data: bytes, rng: np.random.Generator) -> bytes:
+    begin, end = _cut(data, rng)
+    return data[:begin] + data[end:]
+
+
+def splice(data: bytes, rng: np.random.Generator) -> bytes:
+    """Copy a part to another place, over what is there or between."""
+    begin, end = _cut(data, rng)
+    at = int(rng.integers(len(data) + 1))
+    return data[:at] + data[begin:end] + data[at + (end - begin) * int(rng.integers(2)) :]
+
+
+def append(data: bytes, rng: np.random.Generator) -> bytes:
+    return data + rng.bytes(int(rng.integers(1, 40)))
+
+
+def number(data: bytes, rng: np.random.Generator) -> bytes:
+    """Replace a number in bytes, or move a real one by a ten thousandth."""
+    layout = _pick(rng, ("<d", ">d", "<f", ">f", "<i", ">i", "<I", ">I", "<H", ">H", "<Q", "<q", "B"))
+    size = struct.calcsize(layout)
+    if len(data) < size:
+        return data
+    at = int(rng.integers(len(data) - size + 1))
+    if rng.random() < 0.5:
+        at = at // size * size
+    (value,) = struct.unpack_from(layout, data, at)
+    if layout[-1] in "df":
+        new = value * (1 + 1e-4 * rng.standard_normal()) if rng.random() < 0.5 else _pick(rng, REAL)
+        with np.errstate(over="ignore"):
+            packed = np.array(new, layout[0] + ("f8" if layout[-1] == "d" else "f4")).tobytes()
+    else:
+        new = value + int(rng.integers(-2, 3)) if rng.random() < 0.5 else _pick(rng, WHOLE)
+        packed = (new % 256**size).to_bytes(size, "big" if layout[0] == ">" else "little")
+    return data[:at] + packed + data[at + size :]
+
+
+PLAIN: tuple[Change, ...] = (flip, fill, truncate, remove, splice, append, number)
+
+
+def damage(data: bytes, rng: np.random.Generator) -> bytes:
+    """Apply one to three plain changes."""
+    for _ in range(1 + int(rng.integers(3)) // 2 * int(rng.integers(1, 3))):
+        data = _pick(rng, PLAIN)(data, rng)
+    return data
+
+
+def text_number(data: bytes, rng: np.random.Generator) -> bytes:
+    """Replace a number in a text, or move it by a hundred thousandth."""
+    found = list(NUMBER.finditer(data))
+    if not found:
+        return data
+    match = _pick(rng, found)
+    word = _pick(rng, WORDS)
+    if rng.random() < 0.5 and b"." in match[0]:
+        word = repr(float(match[0]) * (1 + 1e-5 * float(rng.standard_normal()))).encode()
+    return data[: match.start()] + word + data[match.end() :]
+
+
+def text_line(data: bytes, rng: np.random.Generator) -> bytes:
+    """Remove, repeat or exchange lines, or words of a line."""
+    glue = _pick(rng, (b"\n", b"\n", b" "))
+    parts = data.split(glue)
+    a, b = int(rng.integers(len(parts))), int(rng.integers(len(parts)))
+    kind = int(rng.integers(4))
+    if kind == 0:
+        del parts[a]
+    elif kind == 1:
+        parts.insert(b, parts[a])
+    elif kind == 2:
+        parts[a], parts[b] = parts[b], parts[a]
+    else:
+        parts[a] = _pick(rng, (b"", b"#", b"# a comment", parts[a] + b" 1", b"\r"))
+    return glue.join(parts)
+
+
+def _places(value, found: list) -> list:
+    """Return pairs (container, key) of everything in a JSON value."""
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, inner in items:
+        found.append((value, key))
+        _places(inner, found)
+    return found
+
+
+def json_value(data: bytes, rng: np.random.Generator) -> bytes:
+    """Replace, remove, repeat, move a little or wrap a value of a JSON text."""
+    try:
+        whole = json.loads(data)
+    except ValueError:
+        return data
+    places = _places(whole, [])
+    if not places:
+        return data
+    container, key = _pick(rng, places)
+    kind = int(rng.integers(6))
+    value = container[key]
+    if kind == 0:
+        del container[key]
+    elif kind == 1 and isinstance(container, list):
+        container.append(value)
+    elif kind == 2:
+        for _ in range(_pick(rng, (1, 3, 40, 400))):
+            value = [value]
+        container[key] = value
+    elif kind <= 4 and isinstance(value, float):
+        container[key] = value * (1 + 1e-5 * float(rng.standard_normal()))
+    else:
+        other, name = _pick(rng, places)
+        container[key] = _pick(rng, (*VALUES, other[name]))
+    try:
+        return json.dumps(whole).encode()
+    except (ValueError, RecursionError):  # the value was put into itself
+        return data

@@ -1,0 +1,139 @@
+"""Scene folders of every format, with masks, for the fuzzer."""
+
+from __future__ import annotations
+
+import functools
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from tests.faults.mutations import Change, json_value, text_line, text_number
+from tests.faults.targets import Target, not_finite, register
+from tests.io import scenes
+from warpgs.io import colmap, dtu, llff, load, middlebury, transforms
+from warpgs.scene import Scene
+
+MAX_PIXELS = 10_000
+
+
+def read_scene(folder: Path, path: Path) -> Scene:
+    """Read the scene that the changed file belongs to; small images are asked of the one whose folder says so."""
+    root = folder / path.relative_to(folder).parts[0]
+    return load.load_scene(root, max_pixels=MAX_PIXELS, downscale=2 if "small" in root.name else 1)
+
+
+def nonsense(scene: Scene) -> str:
+    """Say what no caller of `load_scene` should have to check."""
+    for v in scene.views:
+        K, R = v.camera.K, v.camera.viewmat[:3, :3]
+        if bad := not_finite(viewmat=v.camera.viewmat, K=K, image=v.image):
+            return bad
+        if not (K[0, 0] > 0 and K[1, 1] > 0 and np.abs(R @ R.T - np.eye(3)).max() < 1e-9 and np.linalg.det(R) > 0):
+            return "a camera is none"
+        if not (v.image.min() >= 0 and v.image.max() <= 1 and v.image.shape == (v.camera.height, v.camera.width, 3)):
+            return "an image is none"
+        if any(m is not None and (m.shape != v.image.shape[:2] or not m.any()) for m in (v.mask, v.score_mask)):
+            return "a mask is none"
+    points = scene.points
+    if points is not None:
+        if bad := not_finite(points=points.points.astype(np.float32), colors=points.colors):
+            return bad
+        if len(points.tracks) != len(points.points) or np.abs(points.points).max(initial=0) > 1e13:
+            return "points are none"
+    n = scene.normalization
+    return not_finite(offset=n.offset, scale=np.array(n.scale))
+
+
+def matrices_changed(data: bytes, rng: np.random.Generator) -> bytes:
+    """Change a .npy or .npz file through numpy: a number, the shape, the type, or the set of arrays."""
+    try:
+        with io.BytesIO(data) as f:
+            loaded = np.load(f, allow_pickle=False)
+            arrays = {"": loaded} if isinstance(loaded, np.ndarray) else {k: loaded[k] for k in loaded.files}
+    except Exception:  # not whole: another change came first
+        return data
+    key = list(arrays)[int(rng.integers(len(arrays)))]
+    array, kind = arrays[key].copy(), int(rng.integers(8))
+    if kind <= 3 and array.size and array.dtype.kind == "f":
+        at = int(rng.integers(array.size))
+        values = (array.flat[at] * (1 + 1e-5 * rng.standard_normal()), *(0, 1, -1, np.nan, np.inf, 1e300, 1e-320, 1e12, 5e-324))
+        array.flat[at] = values[0 if rng.random() < 0.5 else int(rng.integers(len(values)))]
+    elif kind == 4 and array.ndim:
+        array = (array[:-1], array[None], array.T, np.concatenate([array, array]))[int(rng.integers(4))]
+    elif kind == 5:
+        array = array.astype(("f4", "i8", "u1", "c16", "S3", "?")[int(rng.integers(6))])
+    elif kind == 6 and key:
+        del arrays[key]
+    elif kind == 7 and key:
+        arrays[key + "0"] = array
+    if key in arrays:
+        arrays[key] = array
+    out = io.BytesIO()
+    if "" in arrays:
+        np.save(out, arrays[""])
+    else:
+        np.savez(out, **arrays)
+    return out.getvalue()
+
+
+def add(name: str, writers: dict[str, Callable[[Path], object]], parser: tuple, changes: tuple[Change, ...]) -> None:
+    """Register a format: writers of its variants by the folder of each, whose files but images are changed."""
+
+    def prepare(folder: Path) -> list[Path]:
+        for key, write in writers.items():
+            write(folder / key)
+        return sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix not in (".png", ".bmp"))
+
+    register(Target(name, prepare, read_scene, parser, changes, nonsense=nonsense))
+
+
+def write_frames(root: Path) -> Path:
+    """Write a transforms scene with what a frame may have."""
+    content = scenes.transforms_json(k1=0.01, camera_model="OPENCV", ply_file_path="x.ply")
+    content["frames"][1] |= {"fl_x": 21.0, "cx": 8.5, "mask_path": "masks/photo2.png", "w": 16}
+    content["frames"][3] |= {"file_path": "images/photo3"}
+    content["frames"].append({"file_path": "images/gone.png", "transform_matrix": scenes.opengl(0)})
+    for i in (1, 2):
+        scenes.save(root / "masks" / f"photo{i}.png", np.tile(np.array([0, 255], np.uint8).repeat(8), (12, 1)))
+    return scenes.write_transforms(root, content)
+
+
+def write_dtu(root: Path) -> Path:
+    scenes.save(root / "mask" / "003.png", np.tile(np.array([0, 255], np.uint8).repeat(8), (12, 1)))
+    return scenes.write_dtu(root)
+
+
+def write_small(root: Path, names: tuple[str, ...]) -> None:
+    """Write a reconstruction with a ready-made folder of small images, which have names of their own."""
+    scenes.write_colmap_txt(root)
+    scenes.save_images(root / "images_2", names, 8, 6)
+
+
+def radial(writer, model: str, *terms: float) -> Callable[[Path], object]:
+    return functools.partial(writer, model=model, parameters=(20, *((20,) if model == "OPENCV" else ()), 8, 6, *terms))
+
+
+TEXT = (text_number, text_number, text_line)
+COLMAP = {
+    "bin": radial(scenes.write_colmap, "OPENCV", 0.01, 0.001, 0.001, 0.001), "txt": scenes.write_colmap_txt,
+    "radial": radial(scenes.write_colmap_txt, "SIMPLE_RADIAL", 0.01),
+    "small stems": functools.partial(write_small, names=tuple(f"photo{i}.bmp" for i in range(scenes.VIEWS))),
+    "small order": functools.partial(write_small, names=tuple(f"image{i}.bmp" for i in range(scenes.VIEWS))),
+}  # fmt: skip
+FRAMES = {"own": write_frames, "ngp": scenes.write_ngp, "blender": scenes.write_blender}
+add("colmap", COLMAP, (colmap,), TEXT)
+add("transforms", FRAMES, (transforms,), (json_value, json_value, text_number))
+add("llff", {"a": scenes.write_llff}, (llff,), (matrices_changed,))
+add("dtu", {"a": write_dtu}, (dtu,), (matrices_changed,))
+add("middlebury", {"a": scenes.write_middlebury}, (middlebury,), TEXT)
+
+
+def write_masked(folder: Path) -> list[Path]:
+    root = scenes.write_colmap(folder / "a")
+    half = np.tile(np.array([0, 255], np.uint8).repeat(8), (12, 1))
+    for i in range(scenes.VIEWS):
+        scenes.save(root / "idrmasks" / f"{i:03d}.png", half)
+        scenes.save(root / "masks" / f"photo{i}.png", half)
+    return [*sorted((root / "masks").iterdir()), *sorted((root / "idrmasks").iterdir())]

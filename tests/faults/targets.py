@@ -1,0 +1,90 @@
+"""Registry of readers under test: what a reader reads, what may be changed in it, and what it must never return."""
+
+from __future__ import annotations
+
+import inspect
+import types
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tests.faults.mutations import Change
+
+MEMORY = 64 * 2**20
+"""Memory that a reader may take whatever the file [bytes]: buffers of libraries, and images within the limit of pixels."""
+MEMORY_PER_BYTE = 60
+"""Memory that a reader may take per byte of the file: parsed JSON and lists of numbers are the largest."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A reader of foreign files."""
+
+    name: str
+    prepare: Callable[[Path], list[Path]]
+    """Write valid files to a folder and return those to change, one at a time."""
+    read: Callable[[Path, Path], object]
+    """Read, from the folder and the changed file, and return what was read."""
+    parser: tuple[object, ...]
+    """Modules, functions and classes whose lines count as the parser's."""
+    changes: tuple[Change, ...] = ()
+    """Changes that know the format; plain damage comes by itself."""
+    repair: Callable[[bytes], bytes] | None = None
+    """Makes checksums right, so that changes get past them."""
+    nonsense: Callable[[object], str] = lambda result: ""
+    """Says what of a result is nonsense; empty where nothing is."""
+    unexplained: Callable[[bytes, bytes, object, object], str] = lambda before, after, good, found: ""
+    """Says what of a result plain damage does not explain: bytes before and after, results of both; empty where nothing."""
+
+
+TARGETS: dict[str, Target] = {}
+
+
+def register(target: Target) -> Target:
+    """Add a reader; a module that does so is imported by `all_targets`."""
+    assert target.name not in TARGETS
+    TARGETS[target.name] = target
+    return target
+
+
+def all_targets() -> dict[str, Target]:
+    """Return every registered reader by name."""
+    from tests.faults import image_targets, model_targets, scene_targets  # noqa: F401 - they register
+
+    return TARGETS
+
+
+def _codes(thing: object) -> Iterator[types.CodeType]:
+    if isinstance(thing, types.ModuleType):
+        own = (v for v in vars(thing).values() if getattr(v, "__module__", None) == thing.__name__)
+        for value in own:
+            yield from _codes(value)
+    elif isinstance(thing, type):
+        for value in vars(thing).values():
+            yield from _codes(getattr(value, "__func__", getattr(value, "fget", value)))
+    elif callable(thing) and hasattr(inner := getattr(thing, "__wrapped__", thing), "__code__"):
+        yield inner.__code__
+    elif isinstance(thing, types.CodeType):
+        yield thing
+
+
+def parser_lines(target: Target) -> dict[str, set[int]]:
+    """Return the numbers of the lines that can run in a reader's parser, by file."""
+    lines: dict[str, set[int]] = {}
+    names = {inspect.getfile(inspect.unwrap(p)) for p in target.parser}
+    stack = [code for part in target.parser for code in _codes(part)]
+    while stack:
+        code = stack.pop()
+        stack += [c for c in code.co_consts if isinstance(c, types.CodeType)]
+        if code.co_filename not in names:  # generated, as of dataclasses
+            continue
+        found = {line for _, _, line in code.co_lines() if line is not None}
+        lines.setdefault(code.co_filename, set()).update(found - {code.co_firstlineno} if len(found) > 1 else found)
+    return lines
+
+
+def not_finite(**arrays: np.ndarray | None) -> str:
+    """Return the names of arrays that hold a NaN or an infinity."""
+    return ", ".join(f"{n} not finite" for n, a in arrays.items() if a is not None and not np.isfinite(a).all())
