@@ -149,7 +149,7 @@ WRITERS = {
 }  # fmt: skip
 """Functions of other modules that write to a path they are given."""
 ELSEWHERE = {
-    ("app/cli.py", "NamedTemporaryFile"): "details of a defect, in the folder for temporary files",
+    ("app/failures.py", "NamedTemporaryFile"): "details of a defect, in the folder for temporary files",
     ("report/film.py", "VideoWriter"): "into the temporary file of `replacing`, which decodes it",
     ("report/overview.py", "savez"): "into a temporary folder",
     ("report/sheet.py", "save"): "Pillow, into memory",

@@ -123,8 +123,8 @@ def standing(kind: str) -> list[View]:
 def test_cameras_without_extent(device, kind, source):
     """The extent, which rates and thresholds are shares of, stays positive; no Gaussian is pruned for being too large."""
     views = standing(kind)
-    n = normalization_of(views, seeds())
-    points = normalize_points(seeds(), n)
+    n = normalization_of(views, seeds(), "here")
+    points = normalize_points(seeds(), n, "here")
     assert 0 < n.scale < math.inf
     views = [normalize_view(v, n) for v in views]
     density = DensityConfig(start=1, every=1, stop_fraction=1.0)

@@ -126,7 +126,7 @@ def test_a_full_device_is_noticed_and_the_fit_goes_on():
     torch.cuda.empty_cache()
     free, _ = torch.cuda.mem_get_info(CUDA)
     with wp.ScopedMempool(f"cuda:{CUDA.index}", False):
-        taken = wp.empty(free - 300 * 2**20, dtype=wp.uint8, device=f"cuda:{CUDA.index}")
+        taken = wp.empty((free // 2**20 - 300, 2**20), dtype=wp.uint8, device=f"cuda:{CUDA.index}")
     try:
         seen = finished(fit, states)
     finally:

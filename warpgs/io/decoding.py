@@ -28,7 +28,11 @@ FORMATS: tuple[tuple[bytes, str, ModuleType], ...] = (
 
 
 def format_of(data: bytes) -> tuple[str, ModuleType]:
-    """Return name and module of the format of an image file, by its first bytes; ValueError where it is none."""
+    """Return name and module of the format of an image file, by its first bytes.
+
+    Raises:
+        ValueError: It is none.
+    """
     for start, name, module in FORMATS:
         if data.startswith(start):
             return name, module

@@ -103,7 +103,7 @@ class SceneFolder:
         mask: np.ndarray | None = None,
         background: tuple[float, float, float] | None = None,
     ) -> LoadedImage:
-        """Load an image of the scene as `load_image` does; ``downscale`` takes the place of the user's where given."""
+        """Load an image of the scene as `load_image` does; ``mask`` is [H, W], ``downscale`` may differ from the user's."""
         return load_image(
             self.inside(path), lens, downscale=downscale or self.options.downscale, mask=mask, background=background,
             max_pixels=self.options.max_pixels,

@@ -7,7 +7,6 @@ training image, nor their mean, resembles a held-out view pixel by pixel.
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from warpgs.errors import ResourceError, UsageError
 from warpgs.files import is_empty, make_folder, write_bytes
 from warpgs.geometry import matmul
 from warpgs.runtime.folder_lock import hold_folder
+from warpgs.runtime.terminal import say
 from warpgs.scene import Camera
 from warpgs.synthetic import raycast
 
@@ -293,7 +293,7 @@ def write_demo(folder: Path, *, views: int = 24, width: int = 320, height: int =
     _check(folder, views, width, height)
     with hold_folder(folder) as notes:  # before the work: a folder that cannot be made is reported at once
         for note in notes:
-            print(f"warpgs: {note}", file=sys.stderr)
+            say(f"warpgs: {note}", error=True)
         _check(folder, views, width, height)  # another process may have filled it before it was ours
         for path, content in _files(views, width, height, seed).items():
             make_folder((folder / path).parent)

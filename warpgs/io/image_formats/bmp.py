@@ -28,7 +28,11 @@ def size(data: bytes) -> tuple[int, int]:
 
 
 def check(data: bytes) -> None:
-    """Check that the file holds all rows."""
+    """Check that the file holds all rows.
+
+    Raises:
+        ValueError: It does not, or its pixels are compressed.
+    """
     width, height, bits, stored, start = _header(data)
     if stored != RAW and stored not in MASKED:
         raise ValueError("its pixels are compressed, which leaves damage unseen; save it as PNG")

@@ -18,7 +18,7 @@ SOI, EOI, SOS = 0xD8, 0xD9, 0xDA
 LONE = (0x01, *range(0xD0, 0xD8))
 """Markers without a length."""
 NEXT_MARKER = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
-"""What ends the coded data of a scan: any marker but a restart."""
+"""End of the coded data of a scan: any marker but a restart."""
 COEFFICIENTS = 64
 
 
@@ -61,7 +61,11 @@ def _frame(marker: int, body: bytes) -> tuple[int, int, tuple[int, ...]]:
 
 
 def size(data: bytes) -> tuple[int, int]:
-    """Return width and height [px]."""
+    """Return width and height [px].
+
+    Raises:
+        ValueError: It has no frame header.
+    """
     for marker, body in _segments(data):
         if marker in SOF + OTHER_SOF:
             return _frame(marker, body)[:2]

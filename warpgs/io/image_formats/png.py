@@ -63,6 +63,9 @@ def unpacked_size(pieces: Iterator[memoryview], limit: int) -> int:
     Args:
         pieces: The stream, in order.
         limit: Number of bytes beyond which nothing more is unpacked.
+
+    Raises:
+        ValueError: The stream is damaged or ends early.
     """
     stream, total = zlib.decompressobj(), 0
     try:
@@ -81,7 +84,11 @@ def unpacked_size(pieces: Iterator[memoryview], limit: int) -> int:
 
 
 def check(data: bytes) -> None:
-    """Check all checksums, and that the pixels are as many as the header says."""
+    """Check all checksums, and that the pixels are as many as the header says.
+
+    Raises:
+        ValueError: They are not.
+    """
     width, height, depth, color, interlaced = _header(data)
     chunks = list(_chunks(data))
     expected = _raw_size(width, height, depth * CHANNELS[color], interlaced)

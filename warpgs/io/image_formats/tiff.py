@@ -114,7 +114,11 @@ def _check_by_pillow(data: bytes) -> None:
 
 
 def check(data: bytes) -> None:
-    """Check that all strips or tiles are there, do not overlap, and unpack to as many bytes as they must."""
+    """Check that all strips or tiles are there, do not overlap, and unpack to as many bytes as they must.
+
+    Raises:
+        ValueError: They do not, or their compression leaves damage unseen.
+    """
     image = _Image(_tags(data))
     pieces = image.pieces()
     end = 0

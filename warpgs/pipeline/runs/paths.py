@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from warpgs.render.rasterize import rasterize
 from warpgs.report.film import write_mp4
 from warpgs.report.images import png
 from warpgs.runtime.folder_lock import hold_folder
+from warpgs.runtime.terminal import say
 from warpgs.scene import Camera, Gaussians
 
 FILM = "film.mp4"
@@ -91,7 +91,7 @@ def render_path(
 
     with hold_folder(out) as notes:
         for note in notes:
-            print(f"warpgs: {note}", file=sys.stderr)
+            say(f"warpgs: {note}", error=True)
         if len({(c.width, c.height) for _, c in cameras}) == 1:
             write_mp4(out / FILM, images(), fps)
             return [*files, out / FILM]
