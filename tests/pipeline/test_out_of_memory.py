@@ -1,13 +1,16 @@
 """A step that runs out of memory is tried once more with less, and what cannot go on is saved."""
 
 import copy
+import dataclasses
 
+import numpy as np
 import pytest
 import torch
+import warp as wp
 
 from tests.pipeline.test_trainer import BUSY, fitted
 from tests.scenes import photos, seeds
-from warpgs.errors import OutOfMemoryError
+from warpgs.errors import OutOfMemoryError, ResourceError
 from warpgs.pipeline.train import trainer as trainer_module
 from warpgs.pipeline.train.trainer import Trainer, run
 
@@ -116,21 +119,70 @@ def test_other_errors_pass(monkeypatch):
         finished(fit, [])
 
 
+class OtherProgram:
+    """A program beside the fit, which takes memory of the device and gives it back."""
+
+    def __init__(self):
+        self.held = None
+
+    def take_all_but(self, mib: int):
+        """Leave at most so many MiB free, beside what torch holds."""
+        torch.cuda.empty_cache()
+        free, _ = torch.cuda.mem_get_info(CUDA)
+        with wp.ScopedMempool("cuda:0", False):  # memory of a pool would not be given back at once
+            self.held = wp.empty((max(1, free // 2**20 - mib), 2**20), dtype=wp.uint8, device="cuda:0")
+
+    def give_back(self):
+        self.held = None
+
+
 @pytest.mark.cuda
 def test_a_full_device_is_noticed_and_the_fit_goes_on():
-    """Another program takes all but a little of the device's memory; steps go on in chunks, and end as they should."""
-    import warp as wp
-
-    fit, states = Trainer(photos(4, 1600, 1200), seeds(), BUSY, CUDA), []
+    """Steps go on in chunks, one by one, and end as they should."""
+    fit, states, other = Trainer(photos(4, 1600, 1200), seeds(), BUSY, CUDA), [], OtherProgram()
     fit.advance()
-    torch.cuda.empty_cache()
-    free, _ = torch.cuda.mem_get_info(CUDA)
-    with wp.ScopedMempool(f"cuda:{CUDA.index}", False):
-        taken = wp.empty((free // 2**20 - 300, 2**20), dtype=wp.uint8, device=f"cuda:{CUDA.index}")
-    try:
-        seen = finished(fit, states)
-    finally:
-        del taken
+    other.take_all_but(300)
+    seen = finished(fit, states)
     assert seen == list(range(2, 61))
     assert any("none was left" in m for m in fit.messages), fit.messages
+    assert all(bool(torch.isfinite(t).all()) for t in fit.gaussians.tensors().values())
+
+
+@pytest.mark.cuda
+def test_2000_steps_beside_a_program_that_comes_and_goes():
+    """All but 8 MiB to 1 GiB is taken for half of each 100 steps. The fit goes on, or ends with class 4 and is continued from
+    what it saved; each of the 2000 steps is reported, and the end is finite.
+    """
+    density = dataclasses.replace(BUSY.density, every=25, stop_fraction=0.9)
+    config = dataclasses.replace(BUSY, steps=2000, density=density, max_gaussians=30_000)
+    random, other, states, seen, ended, said = np.random.default_rng(0), OtherProgram(), [], set(), 0, []
+
+    def on_step(report):
+        seen.add(report.step)
+        if report.step % 50 == 0:
+            states[:] = [saved(fit)]
+            other.give_back()
+            if report.step % 100 == 50:
+                other.take_all_but(int(2 ** random.uniform(3, 10)))
+
+    def restore(_):
+        fit.load(*states[-1])
+        return True
+
+    fit = Trainer(photos(4, 1200, 900), seeds(), config, CUDA)
+    states.append(saved(fit))
+    while fit.step < config.steps:
+        try:
+            run(fit, on_step, lambda f: states.append(saved(f)), lambda: False, restore)
+        except ResourceError as e:
+            assert e.exit_code == 4
+            ended += 1
+            other.give_back()
+            said += fit.messages
+            fit = Trainer(photos(4, 1200, 900), seeds(), config, CUDA)  # as --resume does
+            fit.load(*states[-1])
+    said += fit.messages
+    print(f"ended {ended} times with class 4, went on {len(said)} times")
+    assert ended + len(said) > 0
+    assert seen == set(range(1, 2001))
     assert all(bool(torch.isfinite(t).all()) for t in fit.gaussians.tensors().values())
