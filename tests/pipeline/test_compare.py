@@ -274,7 +274,7 @@ def test_command_ablates(scene, tmp_path, capsys, monkeypatch):
 
 def test_requests_that_make_no_sense(scene, tmp_path):
     """Found out before anything is fitted."""
-    with pytest.raises(UsageError, match="--seeds must be at least 1"):
+    with pytest.raises(UsageError, match="--seeds must be a number from 1 to 1000"):
         StudyRequest((scene,), {"a": A, "b": B}, 0, tmp_path)
     with pytest.raises(UsageError, match="at least two settings"):
         StudyRequest((scene,), {"a": A}, 2, tmp_path)
