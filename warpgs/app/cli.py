@@ -307,8 +307,7 @@ def main(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as e:
-        words = ("out of memory", "allocate memory", "insufficient memory")  # of torch on CUDA and on a CPU, and of OpenCV
-        ran_out = isinstance(e, MemoryError) or any(w in str(e).lower() for w in words)
+        ran_out = isinstance(e, MemoryError) or "out of memory" in str(e).lower()
         return _out_of_memory(e) if ran_out else _internal_error(e, arguments)
 
 
