@@ -29,8 +29,8 @@ import numpy as np
 import warpgs
 from warpgs.errors import DataError
 from warpgs.geometry import look_at
-from warpgs.io.folders import ViewList, child, view_name
-from warpgs.io.images import Lens, load_image
+from warpgs.io.folders import SceneFolder, ViewList, view_name
+from warpgs.io.images import Lens
 from warpgs.io.readers import Probe, Reader, ReadOptions
 from warpgs.report.images import png
 from warpgs.scene import Scene
@@ -54,15 +54,14 @@ class ShotsReader(Reader):
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """Return the scene in file coordinates; DataError names the line that cannot be understood."""
         path = folder / "shots.csv"
-        views = ViewList()
+        scene, views = SceneFolder(folder, options), ViewList()
         with path.open(newline="", encoding="utf-8") as file:
             for number, row in enumerate(csv.reader(file), 1):
                 where = f"{path}, line {number}"
                 name, position, target, focal = parse(row, where)
-                image = load_image(
-                    child(folder, name, where, allow_outside=options.allow_outside),
+                image = scene.image(
+                    scene.child(folder, name, where),
                     lambda width, height: centred_lens(focal, width, height).checked(where),  # noqa: B023 - called at once
-                    downscale=options.downscale,
                 )
                 views.add(view_name(name), look_at(position, target, UP), image)
         return self.scene(folder, views.views, views.notes())

@@ -119,12 +119,14 @@ def _differ(a: object, b: object) -> bool:
 class Worker:
     """One reader with its valid files, in a process of its own."""
 
-    def __init__(self, target: Target, seed: int, folder: Path):
-        self.target, self.seed, self.folder = target, seed, folder
+    def __init__(self, target: Target, seed: int, folder: Path, limit: float = 0):
+        """Write the valid files; ``limit`` bounds the time of an input [s] after `_bound_process`, 0 does not."""
+        self.target, self.seed, self.folder, self.limit = target, seed, folder, limit
         self.paths = target.prepare(folder)
         self.bytes = {p: p.read_bytes() for p in self.paths}
         self.good = {p: self._read_valid(p) for p in self.paths}
         self.tally = Tally(target.name)
+        assert any(g is not None for g in self.good.values()), f"{target.name}: every valid file is refused"
 
     @classmethod
     def check(cls, target: Target, seed: int) -> None:
@@ -165,7 +167,7 @@ class Worker:
         tally, before, began = self.tally, _largest_memory(), time.perf_counter()
         tally.inputs += 1
         try:
-            _alarm(LIMIT)
+            _alarm(self.limit)
             found = self.target.read(self.folder, path)
             _alarm(0)
             tally.accepted += 1
@@ -211,7 +213,7 @@ def work(name: str, seed: int, first: int, last: int, current, results) -> None:
     cover = coverage.Coverage(data_file=None, include=list(lines), config_file=False)
     with tempfile.TemporaryDirectory() as folder:
         cover.start()
-        worker = Worker(target, seed, Path(os.path.realpath(folder)))
+        worker = Worker(target, seed, Path(os.path.realpath(folder)), LIMIT)
         for index in range(first, last):
             current.value = index
             worker.run(index)

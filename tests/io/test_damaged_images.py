@@ -232,19 +232,12 @@ def announcing(kind: str, width: int, height: int) -> bytes:
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF", "BMP", "WEBP"])
 def test_the_header_alone_decides_what_is_too_large(kind, tmp_path):
     width, height = (30000, 30000) if kind != "WEBP" else (16000, 16000)
-    refused(tmp_path, announcing(kind, width, height), rf"is {width} x {height} px, more than the limit of 100,000,000")
+    refused(
+        tmp_path,
+        announcing(kind, width, height),
+        rf"is {width} x {height} px, more than the limit of 100,000,000 .*--max-pixels {width * height}, which",
+    )
     refused(tmp_path, announcing(kind, 0, 64), "decoded")
-
-
-def test_a_png_that_unpacks_to_much(tmp_path):
-    """420 kB that unpack to what their header says."""
-    packer = zlib.compressobj()
-    row = bytes(12001)
-    body = b"".join(packer.compress(row) for _ in range(12000)) + packer.flush()
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 12000, 12000, 8, 0, 0, 0, 0))
-    data = b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", body) + chunk(b"IEND", b"")
-    assert len(data) < 1e6
-    refused(tmp_path, data, r"is 12000 x 12000 px, more than the limit .*--max-pixels 144000000, which takes 3.8 GiB")
 
 
 def test_the_limit_holds_for_images_masks_and_score_masks(tmp_path):

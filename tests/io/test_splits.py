@@ -4,6 +4,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tests.io import scenes
 from warpgs.errors import DataError, UsageError
@@ -205,3 +207,14 @@ def test_coincident_views_are_views_from_one_place():
         scene = SimpleNamespace(views=tuple(views))
         assert coincident_views(scene, Split(("b", "c", "e"), ("a", "d"))) == [("a", "b"), ("d", "c")]
         assert coincident_views(scene, Split(("c", "d", "e"), ("a", "b"))) == []
+
+
+@given(spec=st.text(max_size=30) | st.from_regex(r"(llff|dtu|blender|every|train=|test=):?[0-9a-z./;=,]*", fullmatch=True))
+@settings(max_examples=2 * settings.default.max_examples, deadline=None, derandomize=True)
+def test_any_text_is_a_split_or_refused(spec):
+    scene = scene_of(scenes.NAMES)
+    try:
+        split = split_views(scene, spec)
+    except (DataError, UsageError):
+        return
+    assert set(split.train).isdisjoint(split.test) and set(split.train) | set(split.test) <= set(scenes.NAMES)

@@ -17,7 +17,8 @@ OTHER_SOF = (0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF)
 SOI, EOI, SOS = 0xD8, 0xD9, 0xDA
 LONE = (0x01, *range(0xD0, 0xD8))
 """Markers without a length."""
-NEXT_MARKER = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
+MARKER = re.compile(rb"\xff+([^\xff])")
+NEXT_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 """End of the coded data of a scan: any marker but a restart."""
 COEFFICIENTS = 64
 
@@ -26,7 +27,7 @@ def _segments(data: bytes) -> Iterator[tuple[int, bytes]]:
     """Yield marker and contents of each segment up to the end of the image; coded data is skipped."""
     at = 2
     while True:
-        found = re.compile(rb"\xff+([^\xff])").match(data, at)
+        found = MARKER.match(data, at)
         if found is None:
             raise ValueError("it ends early" if at >= len(data) - 1 else f"there is no marker at byte {at}")
         marker, at = found[1][0], found.end()
