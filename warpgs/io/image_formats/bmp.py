@@ -23,12 +23,20 @@ def _header(data: bytes) -> tuple[int, int, int, int, int]:
 
 
 def size(data: bytes) -> tuple[int, int]:
-    """Return width and height [px]."""
+    """Return width and height [px].
+
+    Raises:
+        ValueError: The header is broken.
+    """
     return _header(data)[:2]
 
 
 def check(data: bytes) -> None:
-    """Check that the file holds all rows."""
+    """Check that the file holds all rows.
+
+    Raises:
+        ValueError: It does not, or they are compressed.
+    """
     width, height, bits, stored, start = _header(data)
     if stored != RAW and stored not in MASKED:
         raise ValueError("its pixels are compressed, which leaves damage unseen; save it as PNG")

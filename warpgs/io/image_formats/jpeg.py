@@ -19,7 +19,7 @@ LONE = (0x01, *range(0xD0, 0xD8))
 """Markers without a length."""
 MARKER = re.compile(rb"\xff+([^\xff])")
 NEXT_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
-"""What ends the coded data of a scan: any marker but a restart."""
+"""End of the coded data of a scan: any marker but a restart."""
 COEFFICIENTS = 64
 
 
@@ -62,7 +62,11 @@ def _frame(marker: int, body: bytes) -> tuple[int, int, tuple[int, ...]]:
 
 
 def size(data: bytes) -> tuple[int, int]:
-    """Return width and height [px]."""
+    """Return width and height [px].
+
+    Raises:
+        ValueError: The header is broken, or of a kind that is not read.
+    """
     for marker, body in _segments(data):
         if marker in SOF + OTHER_SOF:
             return _frame(marker, body)[:2]
@@ -94,7 +98,8 @@ def _check_scans(data: bytes) -> None:
 def decode(data: bytes) -> np.ndarray | None:
     """Return all pixels, uint8, [H, W, 3] in BGR or [H, W, 1] for gray; None where OpenCV must convert them (CMYK).
 
-    All coded data must be there, and decode without a warning of libjpeg-turbo's.
+    Raises:
+        ValueError: Coded data is missing, or libjpeg-turbo warns of it.
     """
     import simplejpeg
 

@@ -28,7 +28,11 @@ def _header(data: bytes) -> tuple[int, int, int, int, int]:
 
 
 def size(data: bytes) -> tuple[int, int]:
-    """Return width and height [px]."""
+    """Return width and height [px].
+
+    Raises:
+        ValueError: The header is broken.
+    """
     return _header(data)[:2]
 
 
@@ -63,6 +67,9 @@ def unpacked_size(pieces: Iterator[memoryview], limit: int) -> int:
     Args:
         pieces: The stream, in order.
         limit: Number of bytes beyond which nothing more is unpacked.
+
+    Raises:
+        ValueError: The stream is damaged or ends early.
     """
     stream, total = zlib.decompressobj(), 0
     try:
@@ -81,7 +88,11 @@ def unpacked_size(pieces: Iterator[memoryview], limit: int) -> int:
 
 
 def check(data: bytes) -> None:
-    """Check all checksums, and that the pixels are as many as the header says."""
+    """Check all checksums, and that the pixels are as many as the header says.
+
+    Raises:
+        ValueError: They are not, or a checksum does not match.
+    """
     width, height, depth, color, interlaced = _header(data)
     chunks = list(_chunks(data))
     expected = _raw_size(width, height, depth * CHANNELS[color], interlaced)

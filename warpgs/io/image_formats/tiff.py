@@ -89,7 +89,11 @@ class _Image:
 
 
 def size(data: bytes) -> tuple[int, int]:
-    """Return width and height [px] of the first image."""
+    """Return width and height [px] of the first image.
+
+    Raises:
+        ValueError: The header is broken.
+    """
     image = _Image(_tags(data))
     return image.one(WIDTH), image.one(HEIGHT)
 
@@ -114,7 +118,11 @@ def _check_by_pillow(data: bytes) -> None:
 
 
 def check(data: bytes) -> None:
-    """Check that all strips or tiles are there, do not overlap, and unpack to as many bytes as they must."""
+    """Check that all strips or tiles are there, do not overlap, and unpack to as many bytes as they must.
+
+    Raises:
+        ValueError: They do not, or a checksum does not match.
+    """
     image = _Image(_tags(data))
     pieces = image.pieces()
     end = 0

@@ -27,7 +27,11 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def size(data: bytes) -> tuple[int, int]:
-    """Return width and height [px]."""
+    """Return width and height [px].
+
+    Raises:
+        ValueError: The header is broken.
+    """
     kind, body = next(_chunks(data))
     if len(body) >= 10 and kind == b"VP8X":
         width, height = (int.from_bytes(body[i : i + 3], "little") + 1 for i in (4, 7))
@@ -42,6 +46,10 @@ def size(data: bytes) -> tuple[int, int]:
 
 
 def check(data: bytes) -> None:
-    """Check that all chunks are whole."""
+    """Check that all chunks are whole.
+
+    Raises:
+        ValueError: One is not, or there are no pixels.
+    """
     if not any(kind in PIXELS for kind, _ in _chunks(data)):
         raise ValueError("it holds no pixels")
