@@ -7,6 +7,7 @@ One input again: `python -m tests.faults.fuzz --reader png --first 1234 --inputs
 from __future__ import annotations
 
 import argparse
+import contextlib
 import multiprocessing
 import os
 import shutil
@@ -66,12 +67,18 @@ class Hang(BaseException):
     """An input takes longer than `LIMIT`."""
 
 
-def _largest_memory() -> int:
-    try:
-        import resource
-    except ImportError:  # Windows
+def _memory(key: str) -> int:
+    """Return a size of this process by its name in Linux [bytes]; 0 on other systems."""
+    if sys.platform != "linux":
         return 0
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(key))
+    return 1024 * int(line.split()[1])
+
+
+def _reset_peak() -> None:
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError):  # then growth beyond the largest before is seen, and no other
+            Path("/proc/self/clear_refs").write_text("5")
 
 
 def _bound_process() -> None:
@@ -164,7 +171,8 @@ class Worker:
         from warpgs.errors import ResourceError, WarpgsError
 
         path, data, plain = self.put(index)
-        tally, before, began = self.tally, _largest_memory(), time.perf_counter()
+        _reset_peak()
+        tally, before, began = self.tally, _memory("VmHWM"), time.perf_counter()
         tally.inputs += 1
         try:
             _alarm(self.limit)
@@ -187,7 +195,7 @@ class Worker:
             _alarm(0)
             tally.slowest = max(tally.slowest, time.perf_counter() - began)
             self.restore(path)
-        grown = _largest_memory() - before
+        grown = _memory("VmHWM") - before
         tally.memory = max(tally.memory, grown)
         if grown > MEMORY + MEMORY_PER_BYTE * len(data):
             tally.fail("memory", index, f"takes {grown / 2**20:.0f} MiB for a file of {len(data):,} bytes")

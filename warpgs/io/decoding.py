@@ -12,8 +12,8 @@ from warpgs.io.image_formats import bmp, jpeg, png, tiff, webp
 
 MAX_PIXELS = 100_000_000
 """Largest number of pixels of an image where the user names none; decoded, it takes 1.2 GB."""
-BYTES_PER_PIXEL = 28
-"""Most memory that decoding takes per pixel [bytes]: the raster with 16 bits and 4 channels, as float32, and as RGB."""
+BYTES_PER_PIXEL = 32
+"""Most memory that decoding takes per pixel [bytes]: four channels as float32, and the colours and alpha made of them."""
 FORMATS: tuple[tuple[bytes, str, ModuleType], ...] = (
     (b"\xff\xd8\xff", "JPEG", jpeg),
     (png.SIGNATURE, "PNG", png),
@@ -31,7 +31,7 @@ def format_of(data: bytes) -> tuple[str, ModuleType]:
     """Return name and module of the format of an image file, by its first bytes.
 
     Raises:
-        ValueError: It is none.
+        ValueError: It is none of them.
     """
     for start, name, module in FORMATS:
         if data.startswith(start):
@@ -123,6 +123,7 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS) -> tuple[np.ndarray, np.nda
             raise DataError(f"{path}: some pixels are not finite; save it as 8- or 16-bit PNG")
     else:
         raise DataError(f"{path}: pixels of type {raw.dtype} are not supported; save it as 8- or 16-bit PNG")
+    del raw  # not to be held beside its copies
     if values.ndim == 2:
         values = values[..., None]
     channels = values.shape[2]

@@ -103,7 +103,21 @@ class SceneFolder:
         mask: np.ndarray | None = None,
         background: tuple[float, float, float] | None = None,
     ) -> LoadedImage:
-        """Load an image of the scene as `load_image` does; ``mask`` is [H, W], ``downscale`` may differ from the user's."""
+        """Load an image of the scene as `load_image` does.
+
+        Args:
+            path: The image file.
+            lens: Its intrinsics, or a function that makes them from width and height [px].
+            downscale: Factor by which both sides shrink, where a ready-made folder leaves another than the user's.
+            mask: True where a pixel counts, shape [H, W].
+            background: Colour in [0, 1] behind transparent pixels.
+
+        Returns:
+            The image, float32, shape [H, W, 3], with intrinsics for its size.
+
+        Raises:
+            DataError: It lies outside, or `load_image` refuses it.
+        """
         return load_image(
             self.inside(path), lens, downscale=downscale or self.options.downscale, mask=mask, background=background,
             max_pixels=self.options.max_pixels,

@@ -23,7 +23,11 @@ def _header(data: bytes) -> tuple[int, int, int, int, int]:
 
 
 def size(data: bytes) -> tuple[int, int]:
-    """Return width and height [px]."""
+    """Return width and height [px].
+
+    Raises:
+        ValueError: The header is broken.
+    """
     return _header(data)[:2]
 
 
@@ -31,7 +35,7 @@ def check(data: bytes) -> None:
     """Check that the file holds all rows.
 
     Raises:
-        ValueError: It does not, or its pixels are compressed.
+        ValueError: It does not, or they are compressed.
     """
     width, height, bits, stored, start = _header(data)
     if stored != RAW and stored not in MASKED:

@@ -65,7 +65,7 @@ def size(data: bytes) -> tuple[int, int]:
     """Return width and height [px].
 
     Raises:
-        ValueError: It has no frame header.
+        ValueError: The header is broken, or of a kind that is not read.
     """
     for marker, body in _segments(data):
         if marker in SOF + OTHER_SOF:
@@ -98,7 +98,8 @@ def _check_scans(data: bytes) -> None:
 def decode(data: bytes) -> np.ndarray | None:
     """Return all pixels, uint8, [H, W, 3] in BGR or [H, W, 1] for gray; None where OpenCV must convert them (CMYK).
 
-    All coded data must be there, and decode without a warning of libjpeg-turbo's.
+    Raises:
+        ValueError: Coded data is missing, or libjpeg-turbo warns of it.
     """
     import simplejpeg
 

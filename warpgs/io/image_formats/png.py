@@ -28,7 +28,11 @@ def _header(data: bytes) -> tuple[int, int, int, int, int]:
 
 
 def size(data: bytes) -> tuple[int, int]:
-    """Return width and height [px]."""
+    """Return width and height [px].
+
+    Raises:
+        ValueError: The header is broken.
+    """
     return _header(data)[:2]
 
 
@@ -87,7 +91,7 @@ def check(data: bytes) -> None:
     """Check all checksums, and that the pixels are as many as the header says.
 
     Raises:
-        ValueError: They are not.
+        ValueError: They are not, or a checksum does not match.
     """
     width, height, depth, color, interlaced = _header(data)
     chunks = list(_chunks(data))

@@ -89,7 +89,11 @@ class _Image:
 
 
 def size(data: bytes) -> tuple[int, int]:
-    """Return width and height [px] of the first image."""
+    """Return width and height [px] of the first image.
+
+    Raises:
+        ValueError: The header is broken.
+    """
     image = _Image(_tags(data))
     return image.one(WIDTH), image.one(HEIGHT)
 
@@ -117,7 +121,7 @@ def check(data: bytes) -> None:
     """Check that all strips or tiles are there, do not overlap, and unpack to as many bytes as they must.
 
     Raises:
-        ValueError: They do not, or their compression leaves damage unseen.
+        ValueError: They do not, or a checksum does not match.
     """
     image = _Image(_tags(data))
     pieces = image.pieces()

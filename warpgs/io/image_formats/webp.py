@@ -30,7 +30,7 @@ def size(data: bytes) -> tuple[int, int]:
     """Return width and height [px].
 
     Raises:
-        ValueError: Its header is broken.
+        ValueError: The header is broken.
     """
     kind, body = next(_chunks(data))
     if len(body) >= 10 and kind == b"VP8X":
@@ -49,7 +49,7 @@ def check(data: bytes) -> None:
     """Check that all chunks are whole.
 
     Raises:
-        ValueError: They are not, or there are no pixels.
+        ValueError: One is not, or there are no pixels.
     """
     if not any(kind in PIXELS for kind, _ in _chunks(data)):
         raise ValueError("it holds no pixels")
