@@ -8,6 +8,7 @@ import json
 import os
 import re
 import secrets
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -18,7 +19,7 @@ from warpgs.errors import ResourceError
 LOCK = ".warpgs.lock"
 """Name of the file that a process holds while it writes into a folder."""
 OWN_NAMES = re.compile(r"\.warpgs-[0-9a-f]{16}\.tmp(\.mp4)?")
-"""Names of temporary files: short and of ASCII letters, so that they fit wherever the file itself does."""
+"""Names of temporary files and folders: short and of ASCII letters, so that they fit wherever the file itself does."""
 WINDOWS = sys.platform == "win32"
 PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Waits before a replacement is tried again on Windows [s]: a virus scanner holds a new file open for about that long."""
@@ -172,12 +173,15 @@ def is_empty(folder: Path) -> bool:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files of writers that were killed; to be called by who holds the folder, as no other writes there.
+    """Remove temporary files and folders of writers that were killed; for who holds the folder, as no other writes there.
 
     One that cannot be removed stays: it is in nobody's way.
     """
     with contextlib.suppress(OSError):
         for path in folder.iterdir():
             if OWN_NAMES.fullmatch(path.name):
-                with contextlib.suppress(OSError):
-                    path.unlink()
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    with contextlib.suppress(OSError):
+                        path.unlink()
