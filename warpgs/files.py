@@ -39,7 +39,7 @@ def replacing(
     Args:
         path: File to write or to replace.
         check: Function that reads the temporary file back and raises where it is not whole.
-        size: Bytes that will be written, for the message of an error; None where nobody knows.
+        size: Bytes that will be written, which must be there at the end; None where nobody knows.
         suffix: End of the temporary file's name, for libraries that take the format from it: none, or .mp4.
 
     Raises:
@@ -50,6 +50,8 @@ def replacing(
         yield temporary
         with temporary.open("rb+") as f:
             os.fsync(f.fileno())
+        if size is not None and (found := temporary.stat().st_size) != size:  # some file systems report no error
+            raise OSError(errno.EIO, f"{found} of {size} bytes are there")
         if check is not None:
             check(temporary)
         _replace(temporary, path)
@@ -109,13 +111,7 @@ def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:
     Raises:
         ResourceError: The disk is full or the folder not writable; what was there before is untouched.
     """
-    size = sum(map(len, chunks))
-
-    def check(temporary: Path) -> None:
-        if temporary.stat().st_size != size:
-            raise OSError(errno.EIO, f"{temporary.stat().st_size} of {size} bytes are there")
-
-    with replacing(path, check, size=size) as temporary, temporary.open("xb") as f:
+    with replacing(path, size=sum(map(len, chunks))) as temporary, temporary.open("xb") as f:
         for chunk in chunks:
             f.write(chunk)
 

@@ -37,6 +37,8 @@ class Call:
     """File that a replacement moves."""
     half: Callable[[], int] | None = None
     """For a write: makes half of it, and returns how many bytes that is."""
+    size: int = 0
+    """Bytes of a write."""
 
 
 class _Calls:
@@ -72,7 +74,8 @@ class _Raw(io.FileIO):
 
     def write(self, data: Any) -> int:
         view = memoryview(data).cast("B")
-        made = self.calls.note("write", self.where, half=lambda: super(_Raw, self).write(view[: len(view) // 2]))
+        write = super().write
+        made = self.calls.note("write", self.where, half=lambda: write(view[: (len(view) + 1) // 2]), size=len(view))
         return super().write(view) if made is None else made
 
     def truncate(self, size: int | None = None) -> int:

@@ -26,8 +26,14 @@ STEPS, FRAMES, VIEWS = 60, 4, 8
 HALF_WAY = 33
 """Step at which the run is interrupted that the other commands start from; its checkpoint is of step 30."""
 COMMANDS = ("fit", "resume", "render", "export", "prune", "eval")
-SAME_BYTES = {".ply", ".png", ".mp4", ".safetensors"}
+SAME_BYTES = (".ply", ".png", ".mp4", ".safetensors")
 """Suffixes of files that are the same whenever they are written again; the others hold times and places."""
+
+OWN = {
+    "fit": ("run/",), "resume": ("run/",), "eval": ("run/eval.json", "run/renders/", "run/depth/"), "render": ("film/",),
+    "prune": ("run-pruned/",), "export": ("a.ply",),
+}  # fmt: skip
+"""Beginnings of the paths that a command writes."""
 
 
 def words_of(command: str, scene: Path, work: Path) -> list[str]:
