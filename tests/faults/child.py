@@ -2,12 +2,13 @@
 
 Arguments: the folder whose calls are numbered; the number of the call, 0 for none; the file for the calls; then the words of
 the commands, those of one command after those of another with a ``+`` between. Each command numbers its calls anew, and
-only the last one is killed.
+only the last one is killed. ``keep A B`` copies a folder.
 """
 
 import hashlib
 import itertools
 import os
+import shutil
 import sys
 from pathlib import Path
 
@@ -21,6 +22,9 @@ def run(root: Path, at: int, trace: Path, commands: list[list[str]]) -> int:
     results.render_overview = lambda *_: (None, "no overview image: this is a test")
     with trace.open("wb", buffering=0) as log:
         for words in commands:
+            if words[0] == "keep":
+                shutil.copytree(*words[1:])
+                continue
             log.write(f"command {words[0]}\n".encode())
             last = words is commands[-1]
 

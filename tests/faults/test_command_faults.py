@@ -17,7 +17,7 @@ from warpgs.errors import ResourceError
 pytestmark = pytest.mark.fault
 COUNT = int(os.environ.get("WARPGS_KILLS", "0")) // 2
 COMMANDS = ("fit", "fit", "fit", "resume", "resume", "render", "eval", "prune", "export", "export")
-CASES = [(COMMANDS[i % len(COMMANDS)], i) for i in range(COUNT)] or [("fit", 0), ("eval", 6), ("prune", 7)]
+CASES = [(COMMANDS[i % len(COMMANDS)], i) for i in range(COUNT)] or [("render", 5), ("eval", 6), ("prune", 7)]
 
 
 def drawn(reference: Reference, command: str, index: int) -> tuple[int, Fault]:

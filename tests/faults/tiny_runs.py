@@ -83,6 +83,7 @@ def child(work: Path, *commands: list[str], kill_at: int = 0) -> Done:
     for line in trace.read_text("utf-8").splitlines() if trace.is_file() else []:
         if line.startswith("command "):
             name = line.removeprefix("command ")
+            calls[name] = []  # of a command that ran twice, the second time counts
         else:
             kind, path, digest = line.split("\t")
             calls[name].append((kind, Path(path).as_posix(), digest))
@@ -168,26 +169,21 @@ def build_reference(folder: Path) -> None:
     def words(command: str) -> list[str]:
         return words_of(command, scene, work)
 
-    def keep(name: str) -> None:
-        shutil.copytree(work, folder / name)
+    def keep(name: str) -> list[str]:
+        return ["keep", str(work), str(folder / name)]
 
-    kept = {}
     work.mkdir()
-    calls = {"fit": succeeded(child(work, words("fit"))).calls["fit"]}
-    kept["fit"] = digests(work)
+    alone = succeeded(child(work, words("fit"))).calls["fit"]
+    after = {"fit": digests(work)}
     shutil.rmtree(work)
     work.mkdir()
-    at = [i for i, call in enumerate(calls["fit"], 1) if call[0] == "step"][HALF_WAY - 1]
-    assert child(work, words("fit"), kill_at=at).code not in (0, 1, 2, 3, 4, 5)
-    # older results of the same commands: what they replace must not get lost
-    succeeded(child(work, words("render"), words("export"), words("eval")))
+    at = [i for i, call in enumerate(alone, 1) if call[0] == "step"][HALF_WAY - 1]
+    assert child(work, words("fit"), kill_at=at).code not in range(6)
     (work / "other.txt").write_text("the user's own")
-    keep("interrupted")
-    calls["resume"] = succeeded(child(work, words("resume"))).calls["fit"]
-    kept["resume"] = digests(work)
-    keep("finished")
-    last = ("render", "export", "prune", "eval")
-    done = succeeded(child(work, *(words(c) for c in last)))
-    calls |= {c: done.calls[c] for c in last}
-    kept |= {c: digests(work) for c in last}
-    (folder / "reference.json").write_text(json.dumps({"calls": calls, "after": kept}))
+    # older results of the same commands: what they replace must not get lost
+    older = [words("render"), words("export"), words("eval"), keep("interrupted")]
+    last = [words(c) for c in ("render", "export", "prune", "eval")]
+    done = succeeded(child(work, *older, words("resume"), keep("finished"), *last))
+    after |= {"resume": digests(folder / "finished")} | {w[0]: digests(work) for w in last}
+    calls = done.calls | {"fit": alone, "resume": done.calls["fit"]}
+    (folder / "reference.json").write_text(json.dumps({"calls": calls, "after": after}))
