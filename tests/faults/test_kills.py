@@ -116,3 +116,11 @@ def test_calls_are_seen(reference):
     for command, calls in reference.calls.items():
         replaced = {path for kind, path, _ in calls if kind == "replace"}
         assert sum(kind == "fsync" for kind, _, _ in calls) >= len(replaced) > 0, command
+
+
+def test_a_checkpoint_comes_after_the_images_of_events_before_it(reference):
+    """A fit that goes on from it does not write them."""
+    placed = [Path(path).name for kind, path, _ in reference.calls["fit"] if kind == "replace"]
+    checkpoints = [i for i, name in enumerate(placed) if name == "checkpoint.safetensors"]
+    for event in (n for n in placed if n.startswith("0000")):
+        assert placed.index(event) < checkpoints[int(event[:6]) // 10], placed

@@ -12,8 +12,7 @@ import sys
 import pytest
 
 from tests.faults.tiny_runs import Reference, check_whole, digests, environment, leftovers, words_of
-from warpgs.export.ply import write_ply
-from warpgs.pipeline.runs.folder import open_run
+from warpgs.pipeline.runs.commands import export
 
 pytestmark = pytest.mark.fault
 RACES = max(1, int(os.environ.get("WARPGS_KILLS", "0")) // 10)
@@ -91,9 +90,7 @@ def check_one_run(work, seed: int) -> None:
     check_whole(work, ended=True)
     record, metrics = (json.loads((run / n).read_text("utf-8")) for n in ("config.json", "metrics.json"))
     assert record["config"]["seed"] == metrics["seed"] == seed and record["config_hash"] == metrics["config_hash"]
-    stored = open_run(run, "cpu")
-    write_ply(work / "of_checkpoint.ply", stored.gaussians(), stored.normalization)
-    assert len(stored.gaussians()) == metrics["gaussians"]
+    export(run, work / "of_checkpoint.ply")
     assert (work / "of_checkpoint.ply").read_bytes() == (run / "point_cloud.ply").read_bytes()
     last = json.loads((run / "metrics.jsonl").read_bytes().splitlines()[-1])
     assert last["count"] == metrics["gaussians"]
