@@ -1,6 +1,7 @@
 """A file appears whole or not at all, however its writing ends, and nothing in the package writes any other way."""
 
 import ast
+import contextlib
 import errno
 import os
 import subprocess
@@ -132,6 +133,18 @@ def test_a_folder_with_nothing_but_our_own_leftovers_is_empty(tmp_path):
         (tmp_path / name).unlink()
     with pytest.raises(ResourceError, match="cannot be looked into"):
         is_empty(tmp_path / "none")
+
+
+def test_leftovers_are_files_and_folders_under_our_own_names(tmp_path):
+    """A folder that was being filled goes with all in it; a link goes, and not what it leads to."""
+    (tmp_path / LEFT).mkdir()
+    (tmp_path / LEFT / "config.json").touch()
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "kept").touch()
+    with contextlib.suppress(OSError):  # Windows may have no links
+        (tmp_path / LEFT.replace("0", "1")).symlink_to("own", target_is_directory=True)
+    remove_leftovers(tmp_path)
+    assert [p.name for p in tmp_path.rglob("*")] == ["own", "kept"]
 
 
 def test_a_folder_that_cannot_be_made(tmp_path):

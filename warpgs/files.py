@@ -8,6 +8,7 @@ import json
 import os
 import re
 import secrets
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -18,7 +19,7 @@ from warpgs.errors import ResourceError
 LOCK = ".warpgs.lock"
 """Name of the file that a process holds while it writes into a folder."""
 OWN_NAMES = re.compile(r"\.warpgs-[0-9a-f]{16}\.tmp(\.mp4)?")
-"""Names of temporary files: short and of ASCII letters, so that they fit wherever the file itself does."""
+"""Names of temporary files and folders: short and of ASCII letters, so that they fit wherever the file itself does."""
 WINDOWS = sys.platform == "win32"
 PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Waits before a replacement is tried again on Windows [s]: a virus scanner holds a new file open for about that long."""
@@ -38,7 +39,7 @@ def replacing(
     Args:
         path: File to write or to replace.
         check: Function that reads the temporary file back and raises where it is not whole.
-        size: Bytes that will be written, for the message of an error; None where nobody knows.
+        size: Bytes that will be written, which must be there at the end; None where nobody knows.
         suffix: End of the temporary file's name, for libraries that take the format from it: none, or .mp4.
 
     Raises:
@@ -49,6 +50,8 @@ def replacing(
         yield temporary
         with temporary.open("rb+") as f:
             os.fsync(f.fileno())
+        if size is not None and (found := temporary.stat().st_size) != size:  # some file systems report no error
+            raise OSError(errno.EIO, f"{found} of {size} bytes are there")
         if check is not None:
             check(temporary)
         _replace(temporary, path)
@@ -108,13 +111,7 @@ def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:
     Raises:
         ResourceError: The disk is full or the folder not writable; what was there before is untouched.
     """
-    size = sum(map(len, chunks))
-
-    def check(temporary: Path) -> None:
-        if temporary.stat().st_size != size:
-            raise OSError(errno.EIO, f"{temporary.stat().st_size} of {size} bytes are there")
-
-    with replacing(path, check, size=size) as temporary, temporary.open("xb") as f:
+    with replacing(path, size=sum(map(len, chunks))) as temporary, temporary.open("xb") as f:
         for chunk in chunks:
             f.write(chunk)
 
@@ -172,12 +169,15 @@ def is_empty(folder: Path) -> bool:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files of writers that were killed; to be called by who holds the folder, as no other writes there.
+    """Remove temporary files and folders of writers that were killed; for who holds the folder, as no other writes there.
 
     One that cannot be removed stays: it is in nobody's way.
     """
     with contextlib.suppress(OSError):
         for path in folder.iterdir():
             if OWN_NAMES.fullmatch(path.name):
-                with contextlib.suppress(OSError):
-                    path.unlink()
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    with contextlib.suppress(OSError):
+                        path.unlink()

@@ -1,3 +1,4 @@
+import os
 import struct
 
 import numpy as np
@@ -118,6 +119,16 @@ def test_a_failing_disk_leaves_the_old_file(tmp_path, monkeypatch):
 
     monkeypatch.setattr("warpgs.files.os.fsync", full)
     with pytest.raises(ResourceError, match="No space left"):
+        write_ply(path, make(), Normalization())
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_that_comes_out_short_takes_no_place(tmp_path, monkeypatch):
+    """Some file systems report no error: then the size tells."""
+    path = tmp_path / "a.ply"
+    path.write_bytes(b"old")
+    monkeypatch.setattr("warpgs.files.os.fsync", lambda descriptor: os.truncate(descriptor, 400))
+    with pytest.raises(ResourceError, match="400 of .* bytes are there"):
         write_ply(path, make(), Normalization())
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 

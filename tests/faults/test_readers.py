@@ -6,6 +6,7 @@ import pytest
 
 from tests.faults.fuzz import Worker, fuzz, missed, table
 from tests.faults.targets import all_targets, parser_lines
+from warpgs.pipeline.metrics import lpips_weights
 
 INPUTS = int(os.environ.get("FUZZ", "2000"))
 ENOUGH = 50_000
@@ -14,7 +15,8 @@ NAMES = sorted(all_targets())
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_few_damaged_files(name, tmp_path):
+def test_a_few_damaged_files(name, tmp_path, monkeypatch):
+    monkeypatch.setattr(lpips_weights, "NETS", dict(lpips_weights.NETS))  # the reader of weights is given a small network
     worker = Worker(all_targets()[name], seed=1, folder=tmp_path)
     for index in range(12):
         worker.run(index)

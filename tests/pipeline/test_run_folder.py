@@ -71,6 +71,8 @@ def test_whatever_writes_into_a_run_waits_for_nobody(folder, tmp_path, capsys):
         for words in (
             ["eval", str(run), *cpu],
             ["render", str(run), *cpu],
+            ["export", str(run), "--to", str(run / "a.ply")],
+            ["prune", str(run), "--keep-psnr", "3", "--out", str(run / "pruned"), *cpu],
             ["compare", scene, "--out", str(run), "--presets", "3dgs,fsgs", "--steps", "1", "--split", "every:4", *cpu],
             ["priors", "show", scene, "--out", str(tmp_path / "priors"), "--split", "every:4"],
         ):
@@ -80,6 +82,18 @@ def test_whatever_writes_into_a_run_waits_for_nobody(folder, tmp_path, capsys):
         assert warpgs.open_run(run, "cpu").step == 2
     shutil.rmtree(run / "path-views", ignore_errors=True)
     assert contents(run) == before
+
+
+def test_export_and_prune_remove_what_killed_ones_left(folder, tmp_path):
+    """Files and folders under temporary names; the user's own stay."""
+    run, cpu = str(folder / "run"), ["--device", "cpu"]
+    for words in (["export", run, "--to", str(tmp_path / "a.ply")], ["prune", run, "--out", str(tmp_path / "b"), *cpu]):
+        (tmp_path / LEFT).mkdir()
+        (tmp_path / LEFT / "config.json").touch()
+        (tmp_path / LEFT.replace("0", "1")).touch()
+        (tmp_path / "own.tmp").touch()
+        assert main(words) == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.ply", "b", "own.tmp"]
 
 
 def test_a_study_leaves_a_run_in_progress_alone(folder, tmp_path):

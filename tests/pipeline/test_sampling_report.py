@@ -144,9 +144,11 @@ def test_first_picture_outlives_a_continuation(run, tmp_path):
         fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
         if begin is not None:
             fit.load(*begin)
-        with images_kept(fit, NAMES, tmp_path):
+        with images_kept(fit, NAMES, tmp_path) as images_written:
             while fit.step < until:
                 fit.advance()
+            images_written()
+            assert len(list((tmp_path / "sampling").glob("*.png"))) == (1 if begin is None else 2)
         return fit
 
     save_checkpoint(tmp_path, *go_on(10).state())

@@ -130,7 +130,8 @@ def _export(arguments: list[str]) -> int:
     a = _parse(Export, "export", arguments)
     from warpgs.pipeline.runs.commands import export
 
-    say(export(a.run, a.to))
+    for line in export(a.run, a.to):
+        say(line)
     return 0
 
 

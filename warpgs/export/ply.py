@@ -93,8 +93,9 @@ def write_ply(
         _refuse_non_finite(path, arrays)
 
     n, k = arrays["sh"].shape[:2]
-    with replacing(path) as temporary, temporary.open("xb") as file:
-        file.write(_header(n, 3 * (k - 1)))
+    header = _header(n, 3 * (k - 1))
+    with replacing(path, size=len(header) + 4 * n * (14 + 3 * k)) as temporary, temporary.open("xb") as file:
+        file.write(header)
         for start in range(0, n, CHUNK_ROWS):
             file.write(_rows({name: a[start : start + CHUNK_ROWS] for name, a in arrays.items()}).tobytes())
 

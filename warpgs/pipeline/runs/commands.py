@@ -93,18 +93,20 @@ def render(folder: Path, kind: str, out: Path | None, frames: int, fps: int, dev
     return f"{len(files) + 1} images in {out}; no film, since the views differ in size"
 
 
-def export(folder: Path, target: Path) -> str:
-    """Write a run's Gaussians to a file, in the units of the scene's files; returns a line for the user.
+def export(folder: Path, target: Path) -> list[str]:
+    """Write a run's Gaussians to a file, in the units of the scene's files; returns lines for the user.
 
     Raises:
         DataError: The folder is no run.
+        ResourceError: Another process writes into the file's folder, or it cannot be written.
         UsageError: The suffix is not supported.
     """
     if target.suffix.lower() != ".ply":
         raise UsageError(f"{target}: format {target.suffix or '(none)'} is not supported; use .ply")
     stored = open_run(folder, torch.device("cpu"))
-    write_ply(target, drop_unused_sh(stored.gaussians()), stored.normalization)
-    return f"{len(stored.gaussians()):,} Gaussians in {target}"
+    with hold_folder(target.parent) as notes:
+        write_ply(target, drop_unused_sh(stored.gaussians()), stored.normalization)
+    return [*notes, f"{len(stored.gaussians()):,} Gaussians in {target}"]
 
 
 def repeat_failed_step(path: Path, device_name: str) -> list[str]:

@@ -209,8 +209,9 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
         job.notes.append(f"continued from step {trainer.step}")
     _announce(job, trainer)
     setup = time.perf_counter() - job.began
-    with contextlib.nullcontext() if job.out is None else images_kept(trainer, list(job.split.train), job.out):
-        _train(job, trainer)
+    nothing = contextlib.nullcontext(lambda: None)
+    with nothing if job.out is None else images_kept(trainer, list(job.split.train), job.out) as images_written:
+        _train(job, trainer, images_written)
     _tell(job, trainer)  # of images that were written last
     training = time.perf_counter() - job.began - setup
     if job.out is not None:
@@ -270,14 +271,15 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
     }  # fmt: skip
 
 
-def _train(job: _Job, trainer: Trainer) -> None:
-    """Take all remaining steps, with a log and checkpoints where there is a run folder."""
+def _train(job: _Job, trainer: Trainer, images_written: Callable[[], None]) -> None:
+    """Take all remaining steps, with a log and checkpoints where there is a run folder; images come before a checkpoint."""
     out = job.out
     log = None if out is None else EventLog(out / "metrics.jsonl", trainer.step)
 
     def save(current: Trainer) -> None:
         if out is not None and log is not None:
             log.flush()
+            images_written()
             tensors, state = current.state()
             save_checkpoint(out, tensors, state | {"fingerprint": job.scene.fingerprint, "train": job.split.train})
 

@@ -28,6 +28,7 @@ from warpgs.pipeline.runs.request import choose_device
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.runtime.byte_units import format_bytes
+from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Gaussians, Normalization, View
 
 
@@ -52,22 +53,25 @@ def _new_folder(folder: Path, out: Path | None) -> Path:
     return out
 
 
-def _write(out: Path, record: dict[str, Any], made: compress.Pruned, step: int, normalization: Normalization) -> None:
-    """Write the new run folder, whole or not at all."""
+def _write(out: Path, record: dict[str, Any], made: compress.Pruned, step: int, normalization: Normalization) -> list[str]:
+    """Write the new run folder, whole or not at all; returns notes for the user."""
     temporary = out.parent / f".warpgs-{secrets.token_hex(8)}.tmp"
     tensors = {f"params.{n}": t for n, t in made.gaussians.tensors().items() if n != "sh"}
     tensors |= {"params.sh_packed": pack(made.gaussians.sh, made.degrees), "degrees": made.degrees}
-    try:
-        temporary.mkdir()
-        write_json(temporary / CONFIG, record)
-        save_checkpoint(temporary, tensors, {"step": step})
-        write_ply(temporary / "point_cloud.ply", made.gaussians, normalization)
-        os.rename(temporary, out)
-        sync_folder(out.parent)
-    except OSError as e:
-        raise ResourceError(f"{out}: cannot be written ({e.strerror or e}); choose another --out") from e
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    with hold_folder(out.parent) as notes:
+        _new_folder(out, out)  # another process may have made it before the folder above was ours
+        try:
+            temporary.mkdir()
+            write_json(temporary / CONFIG, record)
+            save_checkpoint(temporary, tensors, {"step": step})
+            write_ply(temporary / "point_cloud.ply", made.gaussians, normalization)
+            os.rename(temporary, out)
+            sync_folder(out.parent)
+        except OSError as e:
+            raise ResourceError(f"{out}: cannot be written ({e.strerror or e}); choose another --out") from e
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+    return notes
 
 
 def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str, reader: str | None = None) -> list[str]:
@@ -108,8 +112,9 @@ def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str, re
         "mean_degree": [float(d.double().mean()) for d in (degrees, made.degrees)],
         "train_psnr": scores[0], "test_psnr": scores[1] if test else None,
     }  # fmt: skip
-    _write(out, stored.record | {"pruned": figures}, made, stored.step, stored.normalization)
+    notes = _write(out, stored.record | {"pruned": figures}, made, stored.step, stored.normalization)
     lines = [
+        *notes,
         f"{len(before):,} -> {len(made.degrees):,} Gaussians, mean SH degree {figures['mean_degree'][0]:.2f} -> "
         f"{figures['mean_degree'][1]:.2f}",
         f"{format_bytes(sizes[0])} -> {format_bytes(sizes[1])} uncompressed, {sizes[0] / sizes[1]:.2f} times smaller",

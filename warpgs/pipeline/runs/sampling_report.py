@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -104,11 +104,12 @@ def _on_host(sampled: SampledView) -> SampledView:
 
 
 @contextlib.contextmanager
-def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[None]:
+def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[[], None]]:
     """Have a fit write images of some of its events into its run folder, ``sampling/STEP.png``, while it goes on.
 
-    A thread of its own makes them; the end of the block waits for it. An image that cannot be written is none that a fit should
-    end for: ``fit.messages`` says it once.
+    A thread of its own makes them. The end of the block waits for it, and so does the function that it gives, which is to be
+    called before a checkpoint: a fit that goes on from there does not write the images of events before it. An image that
+    cannot be written is none that a fit should end for: ``fit.messages`` says it once.
 
     Args:
         fit: The fit, before its first step.
@@ -116,11 +117,16 @@ def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[None]:
         out: Run folder.
     """
     config, steps, strategy = fit.config.method, shown_steps(fit.phases), fit.strategy
-    if not isinstance(strategy, ImportanceSampling) or not config.events:
-        yield
-        return
-
     lost: list[int] = []
+    writing: list[Future[None]] = []
+
+    def written() -> None:
+        for sheet in writing:
+            sheet.result()  # or what went wrong
+
+    if not isinstance(strategy, ImportanceSampling) or not config.events:
+        yield written
+        return
 
     def write(step: int, views: list[TrainingView], kept: list[SampledView]) -> None:
         sheets = [view_sheet(names[d.view], step, v, fit.disparities[d.view], d, config) for v, d in zip(views, kept)]
@@ -133,7 +139,6 @@ def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[None]:
             lost.append(step)
 
     with ThreadPoolExecutor(1) as thread:
-        writing: list[Future[None]] = []
 
         def on_event(step: int, event: Event) -> None:
             for sheet in writing:
@@ -147,11 +152,10 @@ def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[None]:
 
         strategy.on_event = on_event
         try:
-            yield
+            yield written
         finally:
             strategy.on_event = None
-    for sheet in writing:
-        sheet.result()
+    written()
 
 
 def event_figures(fit: Trainer) -> dict[str, Any]:

@@ -169,10 +169,10 @@ class Trainer:
 
     def _no_memory(self, error: Exception) -> OutOfMemoryError:
         """Return the error for a step that ran out of memory; where none of its batch was taken, its views come again."""
-        intact = self.chosen is not None and int(self.buffers.counter) == 0
-        if intact:
-            self.order += reversed(self.chosen)
-        self.chosen = None
+        chosen, self.chosen = self.chosen, None
+        intact = chosen is not None and int(self.buffers.counter) == 0
+        if chosen is not None and intact:
+            self.order += reversed(chosen)
         reason = (str(error).strip() or type(error).__name__).splitlines()[0].partition(" GPU ")[0].rstrip(".")
         return OutOfMemoryError(
             f"no memory is left for step {self.step + 1} ({reason}). Give the fit less with --memory-limit, fit smaller images "

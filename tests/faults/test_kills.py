@@ -1,0 +1,126 @@
+"""Commands that die before one of their calls: nothing is lost, nothing is half, and the next command goes on from there.
+
+A process kills itself before a call of a known number, so that no clock decides where it dies. `make test-fault` kills two
+commands; WARPGS_KILLS=200 spreads that many kills over all of them, those between the opening of a file and its
+replacement first. The kind of call that each kill came before is a property of its test in pytest's --junit-xml.
+"""
+
+import os
+import random
+from pathlib import Path
+
+import pytest
+from filelock import lock_descriptor
+
+from tests.faults.tiny_runs import (
+    COMMANDS,
+    OWN,
+    SAME_BYTES,
+    Done,
+    Reference,
+    check_whole,
+    child,
+    digests,
+    is_temporary,
+    leftovers,
+    succeeded,
+    words_of,
+)
+from warpgs.files import LOCK, OWN_NAMES
+
+pytestmark = pytest.mark.fault
+KILLS = int(os.environ.get("WARPGS_KILLS", "0"))
+SHARES = {"fit": 0.45, "resume": 0.26, "eval": 0.1, "render": 0.09, "prune": 0.06, "export": 0.04}
+"""Parts of all kills by command, as their numbers of calls are to one another, but for the short ones, which get more."""
+CASES = [(c, i) for c in COMMANDS for i in range(round(SHARES[c] * KILLS))] or [("fit", 0), ("prune", 0)]
+
+
+def chosen(calls: list[tuple[str, str, str]], count: int) -> list[int]:
+    """Return numbers of calls to die before: two in three while a temporary file is there, the others anywhere; each once."""
+    inside, there = [], set()
+    for number, (kind, path, _) in enumerate(calls, 1):
+        if there:
+            inside.append(number)
+        if OWN_NAMES.fullmatch(Path(path).name):
+            {"open": there.add, "mkdir": there.add, "unlink": there.discard}.get(kind, lambda _: None)(path)
+    draw = random.Random(0)
+    draw.shuffle(inside)
+    taken = inside[: (2 * count + 2) // 3]
+    others = [n for n in range(1, len(calls) + 1) if n not in taken]
+    draw.shuffle(others)
+    return taken + others[: count - len(taken)]
+
+
+def check_after_kill(reference: Reference, command: str, work: Path, before: dict[str, str]) -> None:
+    """Look at what a killed command left: all that was there before, as it was or as the command makes it, and all whole."""
+    check_whole(work, ended=False)
+    now = digests(work)
+    assert before.keys() <= now.keys(), "lost"
+    made = {digest for _, _, digest in reference.calls[command]} | set(reference.after[command].values())
+    for path, digest in now.items():
+        if is_temporary(path):
+            continue
+        if not path.startswith(OWN[command]):
+            assert digest == before[path], f"{path} is not of this command"
+        elif path.endswith(SAME_BYTES):
+            assert digest == before.get(path) or digest in made, f"{path} is neither the old file nor the new one"
+
+
+def go_on(reference: Reference, command: str, work: Path) -> Done:
+    """Run the command that a user would run next."""
+    if command == "fit" and (work / "run" / "config.json").is_file():
+        command = "resume"
+    if command == "prune" and (work / "run-pruned").is_dir():
+        pruned, to = work / "run-pruned", work / "b.ply"  # it would be refused a second time
+        done = child(work, ["export", str(pruned), "--to", str(to)])
+        to.unlink()
+        return done
+    return child(work, words_of(command, reference.scene, work))
+
+
+@pytest.mark.parametrize("command, index", CASES)
+def test_nothing_is_lost_or_half_after_a_kill(reference, tmp_path, record_property, command, index):
+    work = tmp_path / "work"
+    reference.before(command, work)
+    before, calls = digests(work), reference.calls[command]
+    numbers = chosen(calls, sum(c == command for c, _ in CASES))
+    if index >= len(numbers):
+        pytest.skip(f"{command} has {len(calls)} calls, and each has its kill")
+    done = child(work, words_of(command, reference.scene, work), kill_at=numbers[index])
+    assert done.code not in range(6), done.said
+    (made,) = done.calls.values()
+    assert len(made) == numbers[index]
+    record_property("killed", f"{command} {made[-1][0]}")
+    check_after_kill(reference, command, work, before)
+    for path in work.rglob(LOCK):
+        with path.open("r+b") as file:
+            assert lock_descriptor(file.fileno(), blocking=False), f"{path} is still held"
+
+    succeeded(go_on(reference, command, work))
+    assert leftovers(work) == []
+    check_whole(work, ended=True)
+    now, wanted = digests(work), reference.after[command]
+    assert {p for p in now if p.startswith(OWN[command])} == {p for p in wanted if p.startswith(OWN[command])}
+    for path, digest in now.items():
+        if not path.startswith(OWN[command]):
+            assert digest == before[path], path
+        elif path.endswith(SAME_BYTES):
+            assert digest == wanted[path], path
+
+
+def test_calls_are_seen(reference):
+    """A kind of call that a command is known to make and that is not numbered would never be killed at."""
+    kinds = {c: {kind for kind, _, _ in calls} for c, calls in reference.calls.items()}
+    assert kinds["fit"] >= {"open", "write", "fsync", "replace", "unlink", "mkdir", "lock", "truncate", "step"}
+    assert all(k >= {"open", "write", "fsync", "replace", "unlink"} for k in kinds.values())
+    for command, calls in reference.calls.items():
+        replaced = {path for kind, path, _ in calls if kind == "replace"}
+        assert sum(kind == "fsync" for kind, _, _ in calls) >= len(replaced) > 0, command
+
+
+def test_a_checkpoint_comes_after_the_images_of_events_before_it(reference):
+    """A fit that goes on from it does not write them."""
+    placed = [Path(path).name for kind, path, _ in reference.calls["fit"] if kind == "replace"]
+    checkpoints = [i for i, name in enumerate(placed) if name == "checkpoint.safetensors"]
+    for event in (n for n in placed if n.startswith("0000")):
+        assert placed.index(event) < checkpoints[int(event[:6]) // 10], placed

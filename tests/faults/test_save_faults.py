@@ -1,0 +1,245 @@
+"""A fault at every call of every way of saving: an error of ours, nothing lost, nothing left over, and the next time it works.
+
+Every call is numbered once; then each fails in turn, in each of the ways below, and the same is saved again without a fault.
+"""
+
+import errno
+import os
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.faults.calls import Call, numbered
+from tests.faults.tiny_runs import SAME_BYTES, digests, is_temporary
+from warpgs.errors import ResourceError
+from warpgs.export.ply import write_ply
+from warpgs.files import write_json
+from warpgs.pipeline.model.compress import Pruned
+from warpgs.pipeline.runs import model_file
+from warpgs.pipeline.runs.checkpoint import save_checkpoint
+from warpgs.pipeline.runs.commands import evaluate, export
+from warpgs.pipeline.runs.failed_step import save_failed_step
+from warpgs.pipeline.runs.folder import StoredRun, open_run
+from warpgs.pipeline.runs.paths import render_path
+from warpgs.pipeline.runs.prune import _write
+from warpgs.report.events import EventLog
+from warpgs.report.film import write_mp4
+from warpgs.runtime.folder_lock import hold_folder
+
+pytestmark = pytest.mark.fault
+MANY = int(os.environ.get("WARPGS_KILLS", "0")) >= 100
+ERRORS = (errno.ENOSPC, errno.EIO, errno.EACCES, errno.EDQUOT)
+REMEDY = re.compile(r"[Ff]ree some disk space|[Cc]hoose another|choose a folder|check the disk|[Ww]rite elsewhere")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One way in which a call fails: an error, an interruption, or half a write, which the file system tells or not."""
+
+    name: str
+    error: int = 0
+
+    def __call__(self, call: Call) -> int | None:
+        if self.error:
+            raise OSError(self.error, os.strerror(self.error), str(call.path))
+        if self.name == "interrupt":
+            raise KeyboardInterrupt
+        if call.half is None:
+            return None
+        half = call.half()
+        return half if self.name == "short" else call.size
+
+
+FAULTS = [Fault(errno.errorcode[e], e) for e in ERRORS] + [Fault(n) for n in ("interrupt", "short", "lost")]
+
+
+@dataclass(frozen=True)
+class Saved:
+    """What is saved: a model in two states, of which one is there before."""
+
+    run: StoredRun
+    folder: Path
+    number: int
+    """0 for what is there before, 1 for what takes its place."""
+
+    @property
+    def gaussians(self):
+        g = self.run.gaussians()
+        return replace(g, means=g.means + self.number)
+
+
+def save_log(s: Saved) -> None:
+    """Every part of a log's life: opened anew, written, flushed, shortened, closed."""
+    log = EventLog(s.folder / "metrics.jsonl")
+    try:
+        for step in range(1, 4):
+            log.write(step=step, loss=0.5 + s.number)
+        log.flush()
+        log.rewind(2)
+        log.write(step=3, loss=0.25 + s.number)
+    finally:
+        log.close()
+
+
+def save_film(s: Saved) -> None:
+    write_mp4(s.folder / "film.mp4", (np.full((36, 48, 3), (i + s.number) / 8, np.float32) for i in range(4)))
+
+
+def save_path(s: Saved) -> None:
+    cameras = [s.run.scene_cameras[n] for n in sorted(s.run.scene_cameras)[s.number : s.number + 2]]
+    render_path(s.run, cameras, out=s.folder / "film")
+
+
+def save_pruned(s: Saved) -> None:
+    """Into a folder that must not be there yet."""
+    if not s.number:
+        return
+    if (s.folder / "pruned").exists():  # then the next command is another one
+        with hold_folder(s.folder):
+            return
+    g = s.gaussians
+    made = Pruned(g, torch.zeros(len(g), dtype=torch.int32), torch.arange(len(g)))
+    _write(s.folder / "pruned", s.run.record, made, s.run.step, s.run.normalization)
+
+
+def save_held(s: Saved) -> None:
+    with hold_folder(s.folder / "a" / "b", "renders"):
+        write_json(s.folder / "a" / "b" / "c.json", {"number": s.number})
+
+
+def save_export(s: Saved) -> None:
+    """Of a run beside, so that it is what is there before and after."""
+    if not s.number:
+        write_ply(s.folder / "a.ply", s.gaussians, s.run.normalization, units="file")
+    else:
+        export(s.run.folder, s.folder / "a.ply")
+
+
+def save_scores(s: Saved) -> None:
+    """In a run of its own."""
+    if not s.number:
+        shutil.copytree(s.run.folder, s.folder / "run")
+    else:
+        evaluate(s.folder / "run", "cpu")
+
+
+WAYS: dict[str, Callable[[Saved], object]] = {
+    "json": lambda s: write_json(s.folder / "a.json", {"number": [s.number] * 100}),
+    "ply": lambda s: write_ply(s.folder / "a.ply", s.gaussians, s.run.normalization),
+    "checkpoint": lambda s: save_checkpoint(s.folder, s.gaussians.tensors(), {"step": s.number}),
+    "failed_step": lambda s: save_failed_step(s.folder / "f.safetensors", (s.gaussians.tensors(), {"step": s.number})),
+    "model": lambda s: model_file.save(s.folder / "a.model", s.gaussians, s.run.normalization),
+    "log": save_log,
+    "film": save_film,
+    "path": save_path,
+    "pruned": save_pruned,
+    "held": save_held,
+    "export": save_export,
+    "scores": save_scores,
+}
+
+
+def calls_of(save: Callable[[Saved], object], state: Saved) -> list[Call]:
+    """Return the calls that saving makes when none fails."""
+    calls: list[Call] = []
+    with numbered(state.folder, calls.append):
+        save(state)
+    return calls
+
+
+def failing(save: Callable[[Saved], object], state: Saved, number: int, fault: Fault) -> tuple[str, Call | None]:
+    """Save with a fault at one call; returns how it ended, and the call."""
+    hit: list[Call] = []
+
+    def before(call: Call) -> int | None:
+        if call.number != number:
+            return None
+        hit.append(call)
+        return fault(call)
+
+    try:
+        with numbered(state.folder, before):
+            save(state)
+    except ResourceError as e:
+        assert REMEDY.search(str(e)) and str(state.folder) in str(e), str(e)
+        return "refused", hit[0]
+    except KeyboardInterrupt:
+        assert fault.name == "interrupt"
+        return "interrupted", hit[0]
+    return "saved", hit[0] if hit else None
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_fault_at_every_call(reference, tmp_path, record_property, way):
+    save = WAYS[way]
+    run = open_run(reference.folder / "finished" / "run", "cpu")
+    old, new, work = (tmp_path / n for n in ("old", "new", "work"))
+    for folder, numbers in ((old, (0,)), (new, (0, 1))):
+        folder.mkdir()
+        for number in numbers:
+            save(Saved(run, folder, number))
+    shutil.copytree(old, work)
+    calls = calls_of(save, Saved(run, work, 1))
+    assert_saved(work, new)
+    faults = [(n, f) for n, c in enumerate(calls, 1) for f in FAULTS if can_be(f, c)]
+    if way == "scores" and not MANY:
+        faults = faults[:: len(faults) // 8]  # each takes a whole scoring
+    for number, fault in faults:
+        shutil.rmtree(work)
+        shutil.copytree(old, work)
+        state = Saved(run, work, 1)
+        ended, call = failing(save, state, number, fault)
+        what = f"{way}: {fault.name} at call {number}, {call and call.kind} {call and call.path.name}: {ended}"
+        check_after_fault(way, call, ended, work, old, new, what)
+        save(state)
+        assert_saved(work, new, what)
+    record_property("faults", f"{way} {len(faults)} of {len(calls)} calls")
+
+
+def can_be(fault: Fault, call: Call) -> bool:
+    """Return whether a call can fail so; nobody can tell what a file system lost of a log, which ends where it ends."""
+    if call.kind == "step":
+        return False
+    if fault.name == "lost":
+        return call.kind == "write" and call.path.name != "metrics.jsonl"
+    return call.kind == "write" or fault.name != "short"
+
+
+def check_after_fault(way: str, call: Call | None, ended: str, work: Path, old: Path, new: Path, what: str) -> None:
+    """Everything is as before or as it is to be; only a temporary file whose removal failed may be left."""
+    if ended == "saved":
+        assert_saved(work, new, what, left=call is not None and call.kind == "unlink")
+        return
+    now, was, wanted = digests(work), digests(old), digests(new)
+    left = [p for p in now if is_temporary(p)]
+    # a lock file that is not ours may be another's
+    assert not left or (call.kind in ("unlink", "lock") and len(left) == 1), f"{what}: {left}"
+    kept = [p for p in now if p not in left]
+    if way == "log":  # it grows by lines
+        lines = (work / "metrics.jsonl").read_bytes().split(b"\n")
+        assert all(line.startswith(b'{"step"') and line.endswith(b"}") for line in lines[:-1]), what
+        return
+    assert was.keys() <= set(kept), f"{what}: lost"
+    for path in kept:
+        if path.endswith(SAME_BYTES):
+            assert now[path] in (was.get(path), wanted.get(path)), f"{what}: {path}"
+
+
+def assert_saved(work: Path, new: Path, what: str = "", left: bool = False) -> None:
+    """All is there, and nothing else, but for a temporary file whose removal failed."""
+    now, wanted = digests(work), digests(new)
+    if left:
+        now = {p: d for p, d in now.items() if not is_temporary(p)}
+    assert now.keys() == wanted.keys(), what
+    for path in now:
+        if path.endswith(SAME_BYTES) or path == "metrics.jsonl":
+            assert now[path] == wanted[path], f"{what}: {path}"
+        elif path == "a.model":  # its header has no order
+            found = [model_file.load(f / path).gaussians().means for f in (work, new)]
+            assert torch.equal(*found), what

@@ -1,0 +1,189 @@
+"""Commands on a scene of 48 x 36 px, what they write when nobody interrupts them, and whether what is there is whole."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from warpgs.export.ply import read_ply
+from warpgs.files import LOCK, OWN_NAMES
+from warpgs.pipeline.runs.checkpoint import load_checkpoint
+from warpgs.report.film import _decoded_sizes
+from warpgs.synthetic.demo import split_spec, write_demo
+
+ROOT = Path(__file__).parent.parent.parent
+STEPS, FRAMES, VIEWS = 60, 4, 8
+HALF_WAY = 33
+"""Step at which the run is interrupted that the other commands start from; its checkpoint is of step 30."""
+COMMANDS = ("fit", "resume", "render", "export", "prune", "eval")
+SAME_BYTES = (".ply", ".png", ".mp4", ".safetensors")
+"""Suffixes of files that are the same whenever they are written again; the others hold times and places."""
+
+OWN = {
+    "fit": ("run/",), "resume": ("run/",), "eval": ("run/eval.json", "run/renders/", "run/depth/"), "render": ("film/",),
+    "prune": ("run-pruned/",), "export": ("a.ply",),
+}  # fmt: skip
+"""Beginnings of the paths that a command writes."""
+
+
+def words_of(command: str, scene: Path, work: Path) -> list[str]:
+    """Return the command line of a command that works in a folder."""
+    run, cpu = str(work / "run"), ["--device", "cpu"]
+    fit = [
+        "fit", str(scene), "--out", run, "--split", split_spec(VIEWS), "--steps", str(STEPS), "--preset", "quick",
+        "--checkpoint-every", "10", "--checkpoint-seconds", "0", "--threads", "1", *cpu,
+    ]  # fmt: skip
+    return {
+        "fit": fit,
+        "resume": [*fit, "--resume"],
+        "render": ["render", run, "--path", "orbit", "--frames", str(FRAMES), "--out", str(work / "film"), *cpu],
+        "export": ["export", run, "--to", str(work / "a.ply")],
+        "prune": ["prune", run, "--keep-psnr", "3", *cpu],
+        "eval": ["eval", run, *cpu],
+    }[command]
+
+
+def environment() -> dict[str, str]:
+    """Return the environment of a process that runs our commands."""
+    return os.environ | {
+        "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": "", "PYTHONUTF8": "1",
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Done:
+    """An ended process, and the calls that it made."""
+
+    code: int
+    said: str
+    calls: dict[str, list[tuple[str, str, str]]]
+    """By command: kind of each call, its path from the folder, and the SHA-256 of what a replacement puts there."""
+
+
+def child(work: Path, *commands: list[str], kill_at: int = 0) -> Done:
+    """Run commands in one process, which kills itself before a call of the last one, where that is not 0."""
+    trace = work.with_name(f"{work.name}.calls")
+    words = [str(work), str(kill_at), str(trace), *commands[0], *(w for c in commands[1:] for w in ("+", *c))]
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "tests.faults.child", *words], env=environment(), capture_output=True, text=True,
+        check=False, encoding="utf-8",
+    )  # fmt: skip
+    calls: dict[str, list[tuple[str, str, str]]] = defaultdict(list)
+    for line in trace.read_text("utf-8").splitlines() if trace.is_file() else []:
+        if line.startswith("command "):
+            name = line.removeprefix("command ")
+            calls[name] = []  # of a command that ran twice, the second time counts
+        else:
+            kind, path, digest = line.split("\t")
+            calls[name].append((kind, Path(path).as_posix(), digest))
+    return Done(done.returncode, done.stdout + done.stderr, calls)
+
+
+def succeeded(done: Done) -> Done:
+    """Return a process that ended well."""
+    assert done.code == 0, done.said
+    return done
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """Return the SHA-256 of every file below a folder."""
+    paths = sorted(p for p in folder.rglob("*") if p.is_file())
+    return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in paths}
+
+
+def is_temporary(path: str) -> bool:
+    """Return whether only an interrupted command may leave a path: one of a temporary name, or a lock."""
+    return any(p == LOCK or OWN_NAMES.fullmatch(p) for p in path.split("/"))
+
+
+def leftovers(folder: Path) -> list[str]:
+    """Return what only an interrupted command may leave."""
+    return [p for p in (p.relative_to(folder).as_posix() for p in folder.rglob("*")) if is_temporary(p)]
+
+
+def check_whole(folder: Path, *, ended: bool) -> None:
+    """Read every file back that has a name of its own; a log may lack the end of its last line where it has not ended."""
+    for path in folder.rglob("*"):
+        if path.is_dir() or path.suffix == ".txt" or is_temporary(path.relative_to(folder).as_posix()):
+            continue
+        if path.suffix == ".json":
+            json.loads(path.read_text("utf-8"))
+        elif path.suffix == ".jsonl":
+            check_log(path, ended)
+        elif path.suffix == ".png":
+            assert cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED) is not None, path
+        elif path.suffix == ".mp4":
+            assert _decoded_sizes(path) == [(48, 36)] * FRAMES, path
+        elif path.suffix == ".ply":
+            assert len(read_ply(path)), path
+        elif path.suffix == ".safetensors":
+            load_checkpoint(path.parent)
+        else:
+            assert path.suffix == ".html" and path.read_text("utf-8").rstrip().endswith("</html>"), path
+
+
+def check_log(path: Path, ended: bool) -> None:
+    """Read metrics.jsonl: one line a step, none missing or twice, all of them where the fit has ended."""
+    lines = path.read_bytes().split(b"\n")
+    last = lines.pop()
+    assert not (ended and last), path
+    steps = [json.loads(line)["step"] for line in lines]
+    assert steps == list(range(1, len(steps) + 1)) and (not ended or len(steps) == STEPS), path
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The commands as they end when nobody interrupts them."""
+
+    folder: Path
+    scene: Path
+    calls: dict[str, list[tuple[str, str, str]]]
+    """Calls of each command, as in `Done`."""
+    after: dict[str, dict[str, str]]
+    """Files after each command, by path, and their SHA-256."""
+
+    def before(self, command: str, work: Path) -> None:
+        """Make the folder that a command starts from."""
+        work.mkdir()
+        start = {"fit": None, "resume": "interrupted"}.get(command, "finished")
+        if start is not None:
+            shutil.copytree(self.folder / start, work, dirs_exist_ok=True)
+
+
+def build_reference(folder: Path) -> None:
+    """Run every command once, and keep what there was before and after it."""
+    scene, work = folder / "scene", folder / "work"
+    write_demo(scene, views=VIEWS, width=48, height=36)
+
+    def words(command: str) -> list[str]:
+        return words_of(command, scene, work)
+
+    def keep(name: str) -> list[str]:
+        return ["keep", str(work), str(folder / name)]
+
+    work.mkdir()
+    alone = succeeded(child(work, words("fit"))).calls["fit"]
+    after = {"fit": digests(work)}
+    shutil.rmtree(work)
+    work.mkdir()
+    at = [i for i, call in enumerate(alone, 1) if call[0] == "step"][HALF_WAY - 1]
+    assert child(work, words("fit"), kill_at=at).code not in range(6)
+    (work / "other.txt").write_text("the user's own")
+    # older results of the same commands: what they replace must not get lost
+    older = [words("render"), words("export"), words("eval"), keep("interrupted")]
+    last = [words(c) for c in ("render", "export", "prune", "eval")]
+    done = succeeded(child(work, *older, words("resume"), keep("finished"), *last))
+    after |= {"resume": digests(folder / "finished")} | {w[0]: digests(work) for w in last}
+    calls = done.calls | {"fit": alone, "resume": done.calls["fit"]}
+    (folder / "reference.json").write_text(json.dumps({"calls": calls, "after": after}))
