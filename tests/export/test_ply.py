@@ -128,7 +128,7 @@ def test_a_file_that_comes_out_short_takes_no_place(tmp_path, monkeypatch):
     path = tmp_path / "a.ply"
     path.write_bytes(b"old")
     monkeypatch.setattr("warpgs.files.os.fsync", lambda descriptor: os.truncate(descriptor, 400))
-    with pytest.raises(ResourceError, match="400 of .* bytes are there"):
+    with pytest.raises(ResourceError, match=r"400 of .* bytes are there"):
         write_ply(path, make(), Normalization())
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
