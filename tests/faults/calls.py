@@ -59,11 +59,10 @@ class _Calls:
         return full if full.startswith(self.root + os.sep) or full == self.root else None
 
     def note(self, kind: str, path: str, **more: Any) -> int | None:
-        """Hand on a call that is about to be made."""
+        """Hand on a call that is about to be made, one at a time."""
         with self.lock:
             self.count += 1
-            number = self.count
-        return self.before(Call(number, kind, Path(path), **more))
+            return self.before(Call(self.count, kind, Path(path), **more))
 
 
 class _Raw(io.FileIO):

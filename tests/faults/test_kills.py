@@ -2,7 +2,7 @@
 
 A process kills itself before a call of a known number, so that no clock decides where it dies. `make test-fault` kills two
 commands; WARPGS_KILLS=200 spreads that many kills over all of them, those between the opening of a file and its
-replacement first. The kind of call that each kill came before is a property of its test in pytest's --junit-xml.
+removal first. What each kill came before is a property of its test in pytest's `--junit-xml` (`-o junit_family=xunit1`).
 """
 
 import os
