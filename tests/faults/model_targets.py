@@ -87,7 +87,7 @@ def tensors_header(data: bytes, rng: np.random.Generator) -> bytes:
         inner = header.get("__metadata__")
     except (ValueError, AttributeError):
         return data
-    if inner and rng.random() < 0.7:
+    if isinstance(inner, dict) and inner and rng.random() < 0.7:
         key = sorted(inner)[int(rng.integers(len(inner)))]
         value = str(inner[key]).encode()
         change = (json_value, text_number, damage)[int(rng.integers(3))]
@@ -97,6 +97,14 @@ def tensors_header(data: bytes, rng: np.random.Generator) -> bytes:
         head = json_value(head, rng)
     head += b" " * (-len(head) % 8)
     return struct.pack("<Q", len(head)) + head + body
+
+
+def in_order(data: bytes) -> bytes:
+    """Return a safetensors file with its header in alphabetical order, which the library leaves to chance."""
+    length = int.from_bytes(data[:8], "little")
+    head = json.dumps(json.loads(data[8 : 8 + length]), sort_keys=True).encode()
+    head += b" " * (-len(head) % 8)
+    return struct.pack("<Q", len(head)) + head + data[8 + length :]
 
 
 def tensors_body(data: bytes, rng: np.random.Generator) -> bytes:
@@ -113,8 +121,10 @@ def within_digest(change: Change) -> Change:
 
 
 def model_files(root: Path) -> list[Path]:
-    model_file.save(root / "m.safetensors", gaussians(), Normalization(np.array([1.0, 2, 3]), 0.5))
-    return [root / "m.safetensors"]
+    path = root / "m.safetensors"
+    model_file.save(path, gaussians(), Normalization(np.array([1.0, 2, 3]), 0.5))
+    path.write_bytes(in_order(path.read_bytes()))
+    return [path]
 
 
 register(
@@ -153,7 +163,7 @@ def lpips_files(root: Path) -> list[Path]:
     lpips_weights.NETS["small"] = SMALL  # the real ones have millions of weights
     tensors = {n: torch.ones(s) for n, s in SMALL.shapes().items()}
     metadata = {"format": lpips_weights.FORMAT, "net": "small", "version": "0.1", "backbone_sha256": "1", "heads_sha256": "2"}
-    (root / "w.safetensors").write_bytes(save(tensors, metadata))
+    (root / "w.safetensors").write_bytes(in_order(save(tensors, metadata)))
     return [root / "w.safetensors"]
 
 
@@ -274,6 +284,7 @@ def run_files(root: Path) -> list[Path]:
     names = tuple(v.name for v in scene.views)
     request, split = SceneRequest(str(root / "scene")), Split(names[1:], names[:1])
     record = folder.record_of(request, PRESETS["quick"], scene, split, ["a note"], torch.device("cpu"))
+    record["scene"]["path"], record["versions"] = "/scene", {"warpgs": "0.2.0"}  # the same on every machine
     write_json(root / folder.CONFIG, record)
     checkpoints(root)
     return [root / folder.CONFIG]

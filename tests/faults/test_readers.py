@@ -36,11 +36,12 @@ def test_many_damaged_files(name, capfd):
         assert len(tally.lines) >= 0.9 * sum(map(len, parser_lines(all_targets()[name]).values())), missed(tally)
 
 
-def test_the_same_seed_gives_the_same_inputs(tmp_path):
+@pytest.mark.parametrize("name", ["png", "model file", "run record"])
+def test_the_same_seed_gives_the_same_inputs(name, tmp_path):
     written = []
     for folder in (tmp_path / "a", tmp_path / "b"):
         folder.mkdir()
-        worker = Worker(all_targets()["png"], seed=3, folder=folder)
+        worker = Worker(all_targets()[name], seed=3, folder=folder)
         written.append([worker.put(i)[1] for i in range(9)])
     assert written[0] == written[1] and len(set(written[0])) > 5
 

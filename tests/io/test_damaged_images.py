@@ -173,6 +173,7 @@ def test_a_png_that_lacks_a_part_or_whose_pixels_have_another_checksum(tmp_path)
 def test_a_bmp_or_webp_that_is_shorter_than_its_header_says(tmp_path):
     for kind in ("BMP", "WEBP"):
         refused(tmp_path, encoded(kind)[:-9], "it ends early")
+    refused(tmp_path, b"RIFF" + struct.pack("<I", 4) + b"WEBP" + bytes(8), "its header is broken")
     data = bytearray(encoded("BMP"))
     data[22:26] = struct.pack("<i", 80)
     refused(tmp_path, bytes(data), "it ends early")

@@ -201,6 +201,24 @@ def test_bad_weights_are_named(weights, tmp_path):
         load_lpips(bad, cpu)
 
 
+def test_headers_without_entries_and_numbers_that_are_none(tmp_path, monkeypatch):
+    from safetensors.torch import save_file
+
+    from warpgs.pipeline.metrics import lpips_weights
+
+    bad, text = tmp_path / "bad.safetensors", b'{"__metadata__":null}   '
+    bad.write_bytes(len(text).to_bytes(8, "little") + text)
+    with pytest.raises(DataError, match="holds no LPIPS weights"):
+        lpips_weights.read_lpips(bad)
+    net = lpips_weights.Net("vgg", "small", (("conv", 0, 3, 4, 3, 1, 1), ("tap",)), 3, "")
+    monkeypatch.setitem(lpips_weights.NETS, "vgg", net)
+    for value in (torch.tensor(float("nan")), torch.tensor(1, dtype=torch.int32)):
+        tensors = {n: value.expand(s).contiguous() for n, s in net.shapes().items()}
+        save_file(tensors, bad, {"format": "warpgs-lpips-1", "net": "vgg"})
+        with pytest.raises(DataError, match=r"features.0.weight holds no finite float32 numbers"):
+            lpips_weights.read_lpips(bad)
+
+
 def test_known_nets_are_complete():
     """Both nets have five taps, and the channels of the published heads."""
     assert {n: net.channels for n, net in NETS.items()} == CHANNELS

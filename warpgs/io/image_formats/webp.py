@@ -32,7 +32,7 @@ def size(data: bytes) -> tuple[int, int]:
     Raises:
         ValueError: The header is broken.
     """
-    kind, body = next(_chunks(data))
+    kind, body = next(_chunks(data), (b"", b""))
     if len(body) >= 10 and kind == b"VP8X":
         width, height = (int.from_bytes(body[i : i + 3], "little") + 1 for i in (4, 7))
     elif len(body) >= 10 and kind == b"VP8 " and body[3:6] == b"\x9d\x01\x2a":

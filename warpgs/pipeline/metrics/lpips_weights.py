@@ -187,7 +187,7 @@ def read_lpips(path: Path) -> tuple[Net, dict[str, torch.Tensor], dict[str, str]
     data = path.read_bytes()
     try:
         tensors = load(data)
-        metadata = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__", {})
+        metadata = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__") or {}
     except (SafetensorError, ValueError) as e:
         raise DataError(f"{path}: is damaged or no safetensors file ({e}); make it anew with `warpgs convert-lpips`") from e
     if metadata.get("format") != FORMAT or metadata.get("net") not in NETS:
