@@ -53,16 +53,18 @@ def test_a_command_with_a_fault(reference, tmp_path, capfd, record_property, com
     record_property("fault", f"{command} {fault.name} {hit[0].kind if hit else 'none'}")
     assert code in (0, ResourceError.exit_code, *([130] if fault.name == "interrupt" else [])), what
     assert "defect" not in said and "Traceback" not in said and (code != 4 or REMEDY.search(said)), what
-    check_after_fault(reference, command, work, before, hit[0].kind if hit else "", code, what)
+    # the checkpoints of a fit that lacks an image of an event hold a note on it
+    same = tuple(s for s in SAME_BYTES if s != ".safetensors" or not hit or "sampling" not in hit[0].path.parts)
+    check_after_fault(reference, command, work, before, hit[0].kind if hit else "", code, same, what)
 
     again = "resume" if command == "fit" and (work / "run" / "config.json").is_file() else command
     if command == "prune" and (work / "run-pruned").exists():
         return
     assert main(words_of(again, reference.scene, work)) == 0, what
-    check_result(reference, command, work, before, what)
+    check_result(reference, command, work, before, same, what)
 
 
-def check_after_fault(reference, command, work, before, kind, code, what) -> None:
+def check_after_fault(reference, command, work, before, kind, code, same, what) -> None:
     """Nothing is lost or half; only a file whose removal failed is left over, or a lock file that may be another's."""
     check_whole(work, ended=False)
     now = digests(work)
@@ -73,13 +75,13 @@ def check_after_fault(reference, command, work, before, kind, code, what) -> Non
     for path in now.keys() - set(left):
         if not path.startswith(OWN[command]):
             assert now[path] == before[path], f"{path}; {what}"
-        elif path.endswith(SAME_BYTES):
+        elif path.endswith(same):
             assert now[path] == before.get(path) or now[path] in made, f"{path}; {what}"
     if code == 0 and kind != "unlink":
-        check_result(reference, command, work, before, what)
+        check_result(reference, command, work, before, same, what)
 
 
-def check_result(reference, command, work, before, what) -> None:
+def check_result(reference, command, work, before, same, what) -> None:
     """The command's results are there, and nothing else has changed."""
     assert leftovers(work) == [], what
     check_whole(work, ended=True)
@@ -89,5 +91,5 @@ def check_result(reference, command, work, before, what) -> None:
     for path, digest in now.items():
         if not path.startswith(OWN[command]):
             assert digest == before[path], f"{path}; {what}"
-        elif path.endswith(SAME_BYTES):
+        elif path.endswith(same):
             assert digest == wanted[path], f"{path}; {what}"

@@ -189,7 +189,7 @@ def test_a_fault_at_every_call(reference, tmp_path, record_property, way):
     assert_saved(work, new)
     faults = [(n, f) for n, c in enumerate(calls, 1) for f in FAULTS if can_be(f, c)]
     if way == "scores" and not MANY:
-        faults = faults[:: len(faults) // 8]  # each takes a whole scoring
+        faults = faults[:: len(faults) // 4]  # each takes a whole scoring
     for number, fault in faults:
         shutil.rmtree(work)
         shutil.copytree(old, work)

@@ -8,13 +8,13 @@ import os
 import shutil
 import subprocess
 import sys
-from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from tests.faults.child import run
 from warpgs.export.ply import read_ply
 from warpgs.files import LOCK, OWN_NAMES
 from warpgs.pipeline.runs.checkpoint import load_checkpoint
@@ -79,7 +79,18 @@ def child(work: Path, *commands: list[str], kill_at: int = 0) -> Done:
         [sys.executable, "-P", "-m", "tests.faults.child", *words], env=environment(), capture_output=True, text=True,
         check=False, encoding="utf-8",
     )  # fmt: skip
-    calls: dict[str, list[tuple[str, str, str]]] = defaultdict(list)
+    return Done(done.returncode, done.stdout + done.stderr, calls_in(trace))
+
+
+def here(work: Path, *commands: list[str]) -> Done:
+    """Run commands in this process, which has imported what they need."""
+    trace = work.with_name(f"{work.name}.calls")
+    return Done(run(work, 0, trace, list(commands)), "its output was printed", calls_in(trace))
+
+
+def calls_in(trace: Path) -> dict[str, list[tuple[str, str, str]]]:
+    """Read the calls that a process has noted, by command."""
+    calls: dict[str, list[tuple[str, str, str]]] = {}
     for line in trace.read_text("utf-8").splitlines() if trace.is_file() else []:
         if line.startswith("command "):
             name = line.removeprefix("command ")
@@ -87,7 +98,7 @@ def child(work: Path, *commands: list[str], kill_at: int = 0) -> Done:
         else:
             kind, path, digest = line.split("\t")
             calls[name].append((kind, Path(path).as_posix(), digest))
-    return Done(done.returncode, done.stdout + done.stderr, calls)
+    return calls
 
 
 def succeeded(done: Done) -> Done:
@@ -173,7 +184,7 @@ def build_reference(folder: Path) -> None:
         return ["keep", str(work), str(folder / name)]
 
     work.mkdir()
-    alone = succeeded(child(work, words("fit"))).calls["fit"]
+    alone = succeeded(here(work, words("fit"))).calls["fit"]
     after = {"fit": digests(work)}
     shutil.rmtree(work)
     work.mkdir()
@@ -183,7 +194,7 @@ def build_reference(folder: Path) -> None:
     # older results of the same commands: what they replace must not get lost
     older = [words("render"), words("export"), words("eval"), keep("interrupted")]
     last = [words(c) for c in ("render", "export", "prune", "eval")]
-    done = succeeded(child(work, *older, words("resume"), keep("finished"), *last))
+    done = succeeded(here(work, *older, words("resume"), keep("finished"), *last))
     after |= {"resume": digests(folder / "finished")} | {w[0]: digests(work) for w in last}
     calls = done.calls | {"fit": alone, "resume": done.calls["fit"]}
     (folder / "reference.json").write_text(json.dumps({"calls": calls, "after": after}))
