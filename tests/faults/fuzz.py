@@ -170,9 +170,14 @@ class Worker:
     def run(self, index: int) -> None:
         from warpgs.errors import ResourceError, WarpgsError
 
-        path, data, plain = self.put(index)
+        tally = self.tally
+        try:
+            path, data, plain = self.put(index)
+        except Exception as e:  # of the fuzzer itself: nothing was read
+            tally.fail("no input", index, repr(e))
+            return
         _reset_peak()
-        tally, before, began = self.tally, _memory("VmHWM"), time.perf_counter()
+        before, began = _memory("VmHWM"), time.perf_counter()
         tally.inputs += 1
         try:
             _alarm(self.limit)

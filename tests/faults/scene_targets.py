@@ -62,7 +62,7 @@ def matrices_changed(data: bytes, rng: np.random.Generator) -> bytes:
         array.flat[at] = values[0 if rng.random() < 0.5 else int(rng.integers(len(values)))]
     elif kind == 4 and array.ndim:
         array = (array[:-1], array[None], array.T, np.concatenate([array, array]))[int(rng.integers(4))]
-    elif kind == 5:
+    elif kind == 5 and array.dtype.kind != "S":  # text is no number
         array = array.astype(("f4", "i8", "u1", "c16", "S3", "?")[int(rng.integers(6))])
     elif kind == 6 and key:
         del arrays[key]
