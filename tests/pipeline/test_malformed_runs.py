@@ -251,6 +251,18 @@ def test_tensors_that_no_fit_can_go_on_from(made, run, capsys, name, change):
     assert error.count("\n") == 1 and TENSORS in error
 
 
+def test_files_whose_header_says_nothing(run, tmp_path):
+    """The entry for words in a safetensors header is there and null; safetensors itself reads such a file."""
+    text = json.dumps({"__metadata__": None, "a": {"dtype": "U8", "shape": [1], "data_offsets": [0, 1]}}).encode()
+    body = len(text).to_bytes(8, "little") + text + b"\0"
+    (run / TENSORS).write_bytes(body + hashlib.sha256(body).digest())
+    (tmp_path / "m.safetensors").write_bytes(body)
+    with pytest.raises(DataError, match=TENSORS):
+        load_checkpoint(run)
+    with pytest.raises(DataError, match=r"m\.safetensors"):
+        load_model(tmp_path / "m.safetensors")
+
+
 def test_a_log_without_what_the_report_shows(made, run):
     """A step without a loss leaves a gap in the curve; lines that are no events are no part of it."""
     lines = [

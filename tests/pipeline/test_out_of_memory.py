@@ -86,6 +86,16 @@ def test_a_step_that_fails_twice_ends_the_fit_and_is_saved(monkeypatch):
     assert same(again, reference)
 
 
+def test_where_not_even_the_smallest_step_fits_the_state_is_saved(monkeypatch):
+    """Nothing is free when the step is to be tried again."""
+    fit, states = fitted(BUSY, 0), []
+    failing(monkeypatch, trainer_module, "step", {26})
+    monkeypatch.setattr(trainer_module, "available_bytes", lambda _: 0)
+    with pytest.raises(ResourceError, match="smallest step needs") as found:
+        finished(fit, states)
+    assert found.value.exit_code == 4 and states[-1][1]["step"] == 25
+
+
 @pytest.mark.parametrize(("calls", "ends"), [({2}, False), ({2, 3}, True)])
 def test_a_change_of_the_set_starts_from_the_last_saved_state(monkeypatch, calls, ends):
     """Half a change is nothing to go on from: steps since the last save are taken again; a second lack there ends the fit."""
@@ -146,6 +156,22 @@ def test_a_full_device_is_noticed_and_the_fit_goes_on():
     assert seen == list(range(2, 61))
     assert any("none was left" in m for m in fit.messages), fit.messages
     assert all(bool(torch.isfinite(t).all()) for t in fit.gaussians.tensors().values())
+
+
+@pytest.mark.cuda
+def test_a_device_without_memory_ends_the_fit_which_goes_on_later():
+    """Class 4 with the state saved; once the other program has ended, a fit continued from it comes to its end."""
+    fit, states, other = Trainer(photos(4, 1600, 1200), seeds(), BUSY, CUDA), [], OtherProgram()
+    states.append(saved(fit))
+    other.take_all_but(2)
+    with pytest.raises(ResourceError) as found:
+        finished(fit, states)
+    assert found.value.exit_code == 4
+    other.give_back()
+    again = Trainer(photos(4, 1600, 1200), seeds(), BUSY, CUDA)
+    again.load(*states[-1])
+    finished(again, [])
+    assert all(bool(torch.isfinite(t).all()) for t in again.gaussians.tensors().values())
 
 
 @pytest.mark.cuda

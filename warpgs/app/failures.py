@@ -3,17 +3,13 @@
 from warpgs import __version__
 from warpgs.errors import ResourceError, UsageError
 from warpgs.plugins import own_frame
+from warpgs.runtime.device_memory import no_memory_message
 from warpgs.runtime.terminal import say
 
 
 def report_no_memory(error: Exception) -> int:
     """Print that no memory is left, in words that say what to do; return the exit code."""
-    reason = (str(error).strip() or "MemoryError").splitlines()[0].partition(" GPU ")[0].rstrip(".")
-    say(
-        f"warpgs: no memory is left ({reason[:200]}). Give the fit less with --memory-limit, fit smaller images with "
-        "--downscale, or end other programs; --resume continues from the last checkpoint",
-        error=True,
-    )
+    say(f"warpgs: {no_memory_message(error)}", error=True)
     return ResourceError.exit_code
 
 

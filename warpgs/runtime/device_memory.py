@@ -55,6 +55,15 @@ def is_out_of_memory(error: BaseException) -> bool:
     return False
 
 
+def no_memory_message(error: BaseException, purpose: str = "") -> str:
+    """Return the sentence for an error that says so, with what helps; ``purpose`` may say what for, as " for step 3"."""
+    reason = (str(error).strip() or type(error).__name__).splitlines()[0].partition(" GPU ")[0].rstrip(".")
+    return (
+        f"no memory is left{purpose} ({reason[:200]}). Give the fit less with --memory-limit, fit smaller images with "
+        "--downscale, or end other programs; --resume continues from the last checkpoint"
+    )
+
+
 @functools.cache
 def installed_bytes(device: torch.device) -> int:
     """Return the memory of a device [bytes], on a CPU no more than its container may use; asked for once."""

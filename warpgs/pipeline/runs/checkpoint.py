@@ -99,7 +99,7 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, An
     try:
         tensors = load(body)
         length = int.from_bytes(body[:8], "little")
-        metadata = json.loads(body[8 : 8 + length])["__metadata__"]
+        metadata = json.loads(body[8 : 8 + length])["__metadata__"] or {}
     except (SafetensorError, KeyError, ValueError) as e:
         raise DataError(f"{path} is not a warpgs checkpoint ({e})") from e
     if metadata.get("format") != str(FORMAT):

@@ -117,7 +117,7 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
     try:
         data = path.read_bytes()
         tensors = from_bytes(data)
-        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__", {})
+        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__") or {}
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({e.strerror or e}); check the path and its permissions") from e
     except (SafetensorError, ValueError) as e:

@@ -36,7 +36,7 @@ from warpgs.pipeline.train.stored_state import check_state
 from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.views import Kind, TrainingView, half_size, stack_views
 from warpgs.runtime.byte_units import format_bytes
-from warpgs.runtime.device_memory import available_bytes, is_out_of_memory
+from warpgs.runtime.device_memory import available_bytes, is_out_of_memory, no_memory_message
 from warpgs.scene import Gaussians, PointCloud, Prior, Scene, View
 
 
@@ -168,16 +168,12 @@ class Trainer:
             raise self._no_memory(e) from e
 
     def _no_memory(self, error: Exception) -> OutOfMemoryError:
-        """Return the error for a step that ran out of memory; where none of its batch was taken, its views come again."""
+        """Return the error for a step that found no memory; where none of its batch was taken, its views come again."""
         chosen, self.chosen = self.chosen, None
         intact = chosen is not None and int(self.buffers.counter) == 0
         if chosen is not None and intact:
             self.order += reversed(chosen)
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0].partition(" GPU ")[0].rstrip(".")
-        return OutOfMemoryError(
-            f"no memory is left for step {self.step + 1} ({reason}). Give the fit less with --memory-limit, fit smaller images "
-            "with --downscale, or end other programs; --resume continues from the last checkpoint", intact,
-        )  # fmt: skip
+        return OutOfMemoryError(no_memory_message(error, f" for step {self.step + 1}"), intact)
 
     def spare_memory(self) -> None:
         """Give back memory that is not in use, and take steps one by one from here on, in chunks that fit into what is free.
@@ -196,6 +192,10 @@ class Trainer:
             self.set_views(self.views)
         except UsageError as e:
             raise ResourceError(str(e)) from e
+        except (MemoryError, RuntimeError) as e:
+            if not is_out_of_memory(e):
+                raise
+            raise self._no_memory(e) from e
         self.messages.append(
             f"memory: none was left for step {self.step + 1}; steps are taken one by one from here on, within "
             f"{format_bytes(self.memory_limit)}"
@@ -377,11 +377,14 @@ def run(
             failure.__cause__ = failure.__context__ = None
         if failure is not None:
             again, ran_out = trainer.step > ran_out, trainer.step
-            if failure.intact and not again:
-                save(trainer)
-            if not again or not (failure.intact or restore(trainer)):
-                raise failure
-            trainer.spare_memory()
+            try:
+                if not again or not (failure.intact or restore(trainer)):
+                    raise failure
+                trainer.spare_memory()
+            except ResourceError:
+                if failure.intact:
+                    save(trainer)
+                raise
             continue
         for report in reports:
             on_step(report)
