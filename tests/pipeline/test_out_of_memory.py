@@ -133,17 +133,21 @@ class OtherProgram:
     """A program beside the fit, which takes memory of the device and gives it back."""
 
     def __init__(self):
-        self.held = None
+        self.held = []
 
     def take_all_but(self, mib: int):
         """Leave at most so many MiB free, beside what torch holds."""
         torch.cuda.empty_cache()
-        free, _ = torch.cuda.mem_get_info(CUDA)
         with wp.ScopedMempool("cuda:0", False):  # memory of a pool would not be given back at once
-            self.held = wp.empty((max(1, free // 2**20 - mib), 2**20), dtype=wp.uint8, device="cuda:0")
+            for piece in (2**15, 2**12, 2**9, 2**6, 2**3, 2):  # no device gives all of its memory in one piece
+                while torch.cuda.mem_get_info(CUDA)[0] // 2**20 >= mib + piece:
+                    try:
+                        self.held.append(wp.empty((piece, 2**20), dtype=wp.uint8, device="cuda:0"))
+                    except RuntimeError:
+                        break
 
     def give_back(self):
-        self.held = None
+        self.held = []
 
 
 @pytest.mark.cuda
