@@ -116,9 +116,8 @@ def evaluate_run(
     rows, train_rows = found[: len(test)], found[-len(train) :]
     return {
         "test": summarize(rows), "train": summarize(train_rows),
-        "views": [r.row() for r in rows],
+        "views": [r.row() for r in rows], "variants": variants(lpips),
         "baselines": baselines(train, test) if test else {},
-        "variants": variants(lpips),
     }  # fmt: skip
 
 

@@ -59,6 +59,9 @@ class StepReport:
 class Trainer:
     """The state of one fit: everything that changes from step to step, and nothing else."""
 
+    chosen: list[int] | None = None
+    """Views of the steps that are being taken; None where none is."""
+
     def __init__(
         self, train: list[View], points: PointCloud | None, config: FitConfig, device: torch.device,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0), priors: list[Prior] | None = None,
@@ -103,8 +106,6 @@ class Trainer:
         """Bytes that steps may take, None for no limit; and whether they may be captured (`spare_memory`)."""
         self.order: list[int] = []
         """Views that are still to come before any comes again, the next one last."""
-        self.chosen: list[int] | None = None
-        """Views of the steps that are being taken; None where none is."""
 
         self.strategy = find_strategy(config.strategy)(self)
         self.table = Table.of_gaussians(initial_gaussians(cloud, config.init, self.extent, device), self.strategy.columns())
@@ -115,8 +116,7 @@ class Trainer:
         self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(first)))
         seed = config.seed if self.dropout > 0 else None
         self.learned = Learned(self.table, self.view_table, self.strategy, seed)
-        graphs = StepGraphs(self.learned, self.buffers, config.rule, self.background) if device.type == "cuda" else None
-        self.graphs = graphs
+        self.graphs = StepGraphs(self.learned, self.buffers, config.rule, self.background) if device.type == "cuda" else None
         self.layout: Layout
         self.max_instances: int | None = None
         views, self.disparities = prepared_views(train, made, config, self.terms, device)
