@@ -92,18 +92,19 @@ def test_a_folder_that_cannot_be_written_is_done_without(tmp_path):
 
 
 def test_where_the_cache_lies(monkeypatch, tmp_path):
-    monkeypatch.setattr(Path, "home", lambda: Path("/home/u"))
+    home, system = tmp_path / "home", tmp_path / "system"
+    monkeypatch.setattr(Path, "home", lambda: home)
     for name in ("WARPGS_CACHE", "XDG_CACHE_HOME", "LOCALAPPDATA"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
-    assert cache_folder() == Path("/home/u/.cache/warpgs")
+    assert cache_folder() == home / ".cache" / "warpgs"
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")
-    assert cache_folder() == Path("/home/u/.cache/warpgs")
-    monkeypatch.setenv("XDG_CACHE_HOME", "/var/c")
-    assert cache_folder() == Path("/var/c/warpgs")
+    assert cache_folder() == home / ".cache" / "warpgs"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(system))
+    assert cache_folder() == system / "warpgs"
     monkeypatch.setattr(sys, "platform", "darwin")
-    assert cache_folder() == Path("/home/u/Library/Caches/warpgs")
+    assert cache_folder() == home / "Library" / "Caches" / "warpgs"
     monkeypatch.setattr(sys, "platform", "win32")
-    assert cache_folder() == Path("/home/u/AppData/Local/warpgs/Cache")
+    assert cache_folder() == home / "AppData" / "Local" / "warpgs" / "Cache"
     monkeypatch.setenv("WARPGS_CACHE", str(tmp_path))
     assert cache_folder() == tmp_path

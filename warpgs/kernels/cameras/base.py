@@ -37,8 +37,11 @@ class CameraModel:
         gradients of position and intrinsics from those of the two rows, of the pixel and of ``position[2]``.
         ``Gradients`` is a struct with ``v_position`` (vec3) and ``v_K`` (mat33). Where ``point`` equals ``pixel``, J
         moves with the position; else it does not.
+
+        Raises:
+            TypeError: The class does not define it.
         """
-        raise NotImplementedError
+        raise TypeError("a camera model must define make_functions(real); warpgs/kernels/cameras/pinhole.py is an example")
 
 
 CAMERA_MODELS = Registry("camera model", CameraModel, "warpgs.kernels.cameras")
