@@ -42,12 +42,21 @@ def parse(text: str | bytes) -> Any:
         raise SchemaError(f"has more than {MAX_DEPTH} lists and objects in each other") from e
     except ValueError as e:
         raise SchemaError(f"is no JSON: {e}") from e
+    check_depth(value, MAX_DEPTH)
+    return value
+
+
+def check_depth(value: Any, most: int) -> None:
+    """Check that at most so many lists and objects lie in each other, without a call for each.
+
+    Raises:
+        SchemaError: There are more.
+    """
     level, depth = [value], 0
     while level := [part for outer in level for part in _parts(outer)]:
         depth += 1
-        if depth > MAX_DEPTH:
-            raise SchemaError(f"has more than {MAX_DEPTH} lists and objects in each other")
-    return value
+        if depth > most:
+            raise SchemaError(f"has more than {most} lists and objects in each other")
 
 
 def _parts(value: Any) -> list[Any]:

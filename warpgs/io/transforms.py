@@ -15,6 +15,7 @@ from warpgs.io.images import SUFFIXES, Lens
 from warpgs.io.poses import from_camera_to_world
 from warpgs.io.readers import Probe, Reader, ReadOptions, register
 from warpgs.scene import Scene
+from warpgs.schema import SchemaError, check_depth
 
 BLENDER_FILES = tuple(f"transforms_{split}.json" for split in ("train", "val", "test"))
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
@@ -42,17 +43,6 @@ def _reject_constant(name: str):
     raise ValueError(f"{name} is not a number that a camera can have")
 
 
-def _check_depth(values: object, path: Path) -> None:
-    """Check that lists and objects are not nested too deep for the text of an error to name their values."""
-    level = [values]
-    for _ in range(MAX_DEPTH):
-        containers = [v for v in level if isinstance(v, (dict, list))]
-        level = [v for c in containers for v in (c.values() if isinstance(c, dict) else c)]
-        if not level:
-            return
-    raise DataError(f"{path}: is nested deeper than {MAX_DEPTH} levels, so it is no transforms file; write it again")
-
-
 def read_json(path: Path) -> dict:
     """Return the parsed file with its list of frames.
 
@@ -66,7 +56,10 @@ def read_json(path: Path) -> dict:
         values = json.loads(path.read_bytes().decode("utf-8-sig"), parse_constant=_reject_constant)
     except (OSError, ValueError, RecursionError) as e:
         raise DataError(f"{path}: cannot be read as JSON ({e}); write it again") from e
-    _check_depth(values, path)
+    try:
+        check_depth(values, MAX_DEPTH)
+    except SchemaError as e:  # or the text of an error could not name its values
+        raise DataError(f"{path}: is nested deeper than {MAX_DEPTH} levels, so it is no transforms file; write it again") from e
     if not isinstance(values, dict) or not isinstance(values.get("frames"), list):
         raise DataError(f"{path}: has no list 'frames', so it is no transforms file; write it again")
     return values
