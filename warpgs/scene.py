@@ -57,6 +57,9 @@ class View:
     """True where the pixel counts, bool, shape [H, W]; None where every pixel counts."""
     score_mask: np.ndarray | None = None
     """True where a render is scored, bool, shape [H, W]; the fit does not see it. None where ``mask`` decides both."""
+    alpha: np.ndarray | None = None
+    """Opacity of what was photographed, in [0, 1], float32, shape [H, W]; ``image`` shows it over the scene's background. None
+    where the image is opaque."""
 
 
 @dataclass(frozen=True)
