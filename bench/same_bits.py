@@ -39,7 +39,8 @@ from warpgs.pipeline.train.config import PRESETS, FitConfig
 from warpgs.pipeline.train.loss import Target
 from warpgs.pipeline.train.step import total_loss
 from warpgs.pipeline.train.strategies.base import find_strategy
-from warpgs.pipeline.train.trainer import Trainer, train_views
+from warpgs.pipeline.train.loop import train_views
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.priors.matches import triangulate_matches
 from warpgs.priors.semantics import classical_maps
 from warpgs.render.rasterize import RasterizeOptions, rasterize

@@ -15,7 +15,8 @@ from warpgs.pipeline.train.loss import LossConfig, built_in_terms
 from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.step import MAX_BATCH, Learned, StepBuffers, StepGraphs, StepPlan, eager_renderer, step
 from warpgs.pipeline.train.strategies.base import Strategy
-from warpgs.pipeline.train.trainer import Trainer, run
+from warpgs.pipeline.train.loop import run
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import ViewStack
 from warpgs.scene import Camera, Gaussians, PointCloud, View
 

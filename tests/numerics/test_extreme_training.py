@@ -31,7 +31,8 @@ from warpgs.pipeline.train.strategies.holdout_blocks import HoldoutConfig
 from warpgs.pipeline.train.strategies.importance import ImportanceConfig, normalized
 from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig, ProtectConfig
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig, geometry_gate, sample_pixels
-from warpgs.pipeline.train.trainer import Trainer, run
+from warpgs.pipeline.train.loop import run
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Normalization, PointCloud, View
 

@@ -12,7 +12,8 @@ from tests.pipeline.test_trainer import BUSY, fitted
 from tests.scenes import photos, seeds
 from warpgs.errors import OutOfMemoryError, ResourceError
 from warpgs.pipeline.train import trainer as trainer_module
-from warpgs.pipeline.train.trainer import Trainer, run
+from warpgs.pipeline.train.loop import run
+from warpgs.pipeline.train.trainer import Trainer
 
 CPU = torch.device("cpu")
 CUDA = torch.device("cuda", 0)

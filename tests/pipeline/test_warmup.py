@@ -16,7 +16,8 @@ from warpgs.pipeline.train import warmup as warmups
 from warpgs.pipeline.train.config import PRESETS
 from warpgs.pipeline.train.setup import prepare
 from warpgs.pipeline.train.strategies.importance_sampling import ImportanceSampling
-from warpgs.pipeline.train.trainer import Trainer, run
+from warpgs.pipeline.train.loop import run
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.warmup import POINTS, STEPS, background_warmup, warm_up
 from warpgs.scene import ViewDepth
 

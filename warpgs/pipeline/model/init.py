@@ -50,8 +50,8 @@ class InitConfig:
     """First opacity, in (0, 1)."""
     scale_factor: float = 1.0
     """First width of a Gaussian, as a multiple of the distance to its neighbours, in [0.001, 10]."""
-    max_sh_degree: int = 3
-    """Spherical-harmonics degree stored, 0 to 3."""
+    max_sh_degree: int | None = 3
+    """Spherical-harmonics degree stored, 0 to 3. None: by the number of views."""
     near_views: int = 4
     """sweep, flow: nearest other views that each view is matched with."""
     merge_px: float = 4.0
@@ -80,7 +80,7 @@ class InitConfig:
             raise UsageError(f"init scale-factor {self.scale_factor} must lie between 0.001 and 10")
         if not 0 < self.opacity < 1:
             raise UsageError(f"init opacity {self.opacity} must lie between 0 and 1")
-        if not 0 <= self.max_sh_degree <= MAX_DEGREE:
+        if self.max_sh_degree is not None and not 0 <= self.max_sh_degree <= MAX_DEGREE:
             raise UsageError(f"init max sh degree {self.max_sh_degree} must lie between 0 and {MAX_DEGREE}")
         if self.random_count < 1:
             raise UsageError(f"init random count {self.random_count} must be at least 1")
@@ -329,6 +329,7 @@ def initial_gaussians(cloud: PointCloud, config: InitConfig, extent: float, devi
     # in float64: float32's roots and logarithms have other last digits on other processors (MKL)
     distances = mean_square_distances(points).double().sqrt()
     scales = config.scale_factor * distances.clamp(1e-6 * extent, 0.1 * extent)
+    assert config.max_sh_degree is not None  # `settings_by_views` has chosen
     sh = points.new_zeros(count, coefficient_count(config.max_sh_degree), 3)
     sh[:, 0] = (colors - 0.5) / C0
     quats = points.new_zeros(count, 4)

@@ -19,7 +19,7 @@ from warpgs.pipeline.runs.image_names import image_names, renaming_notes
 from warpgs.pipeline.runs.paths import FILM, render_path
 from warpgs.pipeline.runs.request import choose_device, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line
-from warpgs.pipeline.train.trainer import train_views
+from warpgs.pipeline.train.loop import train_views
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Scene, View
 

@@ -27,10 +27,12 @@ from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line, write_report
 from warpgs.pipeline.runs.rule_report import rule_report_of
 from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, sampling_report_of
+from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.complexity import complexity_figures, complexity_summary
 from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESETS, FitConfig
+from warpgs.pipeline.train.loop import run, train_views
 from warpgs.pipeline.train.time_budget import within_budget
-from warpgs.pipeline.train.trainer import StepReport, Trainer, run, train_views
+from warpgs.pipeline.train.trainer import StepReport, Trainer
 from warpgs.pipeline.train.warmup import background_warmup
 from warpgs.report.events import EventLog
 from warpgs.report.progress import Progress
@@ -89,15 +91,15 @@ class _Job:
             say(line)
 
 
-def preset_config(config: FitConfig | str | None, device: torch.device) -> FitConfig:
-    """Return the settings for a preset's name, for settings themselves, or for None: the usual preset of the device's kind.
+def preset_config(config: FitConfig | str | None) -> FitConfig:
+    """Return the settings for a preset's name, for settings themselves, or for None: the default preset.
 
     Raises:
         UsageError: There is no such preset.
     """
     if isinstance(config, FitConfig):
         return config
-    name = DEFAULT_PRESET[device.type] if config is None else config
+    name = DEFAULT_PRESET if config is None else config
     if name not in PRESETS:
         raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
     return PRESETS[name]
@@ -123,7 +125,7 @@ def fit(
 
     Args:
         scene: A scene, its folder, or a folder with the options it is read with.
-        config: Settings, the name of a preset, or None for the usual preset of the device's kind.
+        config: Settings, the name of a preset, or None for the default one.
         split: Views to fit and to hold out, as in `warpgs fit --split`; None for the default of the scene's format.
         out: Run folder to fill with configuration, log, checkpoints, PLY, images, scores and report; None to write nothing.
         device: auto, cpu, cuda, or one of torch's.
@@ -152,10 +154,12 @@ def fit(
         lpips = None if lpips_weights is None else load_lpips(Path(lpips_weights), where[0])
         request, read, parts, found = _scene_of(scene, split)
         notes = (*notes, *held, *found, *([] if out is None else renaming_notes(image_names(v.name for v in read.views))))
-        job = _Job(read, request, parts, preset_config(config, where[0]), *where, out, lpips, [*notes], verbose, on_step, began)
+        job = _Job(read, request, parts, preset_config(config), *where, out, lpips, [*notes], verbose, on_step, began)
         if time_budget is not None:
             job.config, note = within_budget(job.config, time_budget, job.train, job.device)
             job.notes.append(note)
+        job.config, chosen = settings_by_views(job.config, job.train, job.device.type)
+        job.notes += chosen
         trainer, state, record = _prepare(job, out if resume else None)
         return _finish(job, trainer, state, record, resume)
 

@@ -16,6 +16,7 @@ from warpgs.kernels.step_buffers import NOT_FINITE
 from warpgs.pipeline.metrics.psnr import psnr_of
 from warpgs.pipeline.model.init import initial_gaussians, scene_extent
 from warpgs.pipeline.model.table import Table
+from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import built_in_terms, collect
 from warpgs.pipeline.train.memory_plan import Layout, layout_of, most_instances, plan
@@ -37,7 +38,7 @@ from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.views import Kind, TrainingView, half_size, stack_views
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.device_memory import available_bytes, is_out_of_memory, no_memory_message
-from warpgs.scene import Gaussians, PointCloud, Prior, Scene, View
+from warpgs.scene import Gaussians, PointCloud, Prior, View
 
 
 @dataclass(frozen=True)
@@ -85,10 +86,11 @@ class Trainer:
         """
         if not train:
             raise DataError("there is no training view; name at least one in --split")
+        config, chosen = settings_by_views(config, train, device.type)
         self.config, self.device = config, device
         self.generator = torch.Generator().manual_seed(config.seed)
         made = prepare(train, points, config, np.random.default_rng(config.seed), device, priors, ready)
-        self.notes: list[str] = made.notes
+        self.notes: list[str] = [*chosen, *made.notes]
         """Sentences on what was chosen for the user before the first step."""
         self.messages: list[str] = []
         """Sentences for the user that were not shown yet."""
@@ -133,9 +135,19 @@ class Trainer:
         """Number of Gaussians that the settings and the memory limit allow."""
         return min(self.config.max_gaussians, self.memory.cap)
 
+    @property
+    def steps(self) -> int:
+        """Steps of the fit: those of the settings, or fewer once phase 3 began early."""
+        return self.phases.steps
+
     def progress(self, step: int) -> float:
         """Return the fraction of the fit that is done before a step, in [0, 1]."""
-        return (step - 1) / max(1, self.config.steps - 1)
+        return self.phases.progress(step)
+
+    def end_growth(self) -> None:
+        """Begin phase 3 after the step that was just taken, where it is not there yet."""
+        if self.step < self.phases.stable_start < self.config.steps:
+            self.phases = self.phases.stable_from(self.step)
 
     def plan_of(self, step: int) -> StepPlan:
         """Return the plan of a step, counted from 1."""
@@ -207,7 +219,7 @@ class Trainer:
         plan, count = self.plan_of(first), 1
         if self.layout.graphs:
             while (
-                count < min(limit, MAX_BATCH, self.config.steps - self.step)
+                count < min(limit, MAX_BATCH, self.steps - self.step)
                 and self.plan_of(first + count) == plan
                 and not self.strategy.due(first + count - 1)
             ):
@@ -319,6 +331,7 @@ class Trainer:
         plain = {
             "step": self.step, "order": self.order, "extent": self.extent, "notes": self.notes,
             "config": self.config.to_json(), "strategy": strategy,
+            "stable_start": self.phases.stable_start, "steps": self.steps,
         }  # fmt: skip
         return tensors, plain
 
@@ -330,68 +343,10 @@ class Trainer:
         """
         check_state(tensors, plain, views=len(self.views), steps=self.config.steps, strategy=self.strategy.STATE)
         self.step, self.order = plain["step"], list(plain["order"])
+        self.phases = dataclasses.replace(self.phases, stable_start=plain["stable_start"], steps=plain["steps"])
         self.extent, self.notes = plain["extent"], plain["notes"]
         self.table.load(tensors)
         self.view_table.load({n.removeprefix("views."): t for n, t in tensors.items() if n.startswith("views.")})
         self.strategy.load(tensors, plain["strategy"])
         self.set_views(self.views)
         self.generator.set_state(tensors["generator"])
-
-
-def train_views(scene: Scene, names: tuple[str, ...]) -> list[View]:
-    """Return the named views of a scene, in the order named."""
-    return [scene.view(n) for n in names]
-
-
-def run(
-    trainer: Trainer,
-    on_step: Callable[[StepReport], None],
-    save: Callable[[Trainer], None],
-    stopped: Callable[[], bool],
-    restore: Callable[[Trainer], bool] = lambda _: False,
-) -> None:
-    """Take all remaining steps, reporting each and saving now and then and at the end.
-
-    A step that runs out of memory is tried once more with less (`Trainer.spare_memory`), from the last saved state where the
-    set of Gaussians was being changed.
-
-    Args:
-        trainer: The fit.
-        on_step: Called after each step.
-        save: Saves the state.
-        stopped: Whether to end after a step.
-        restore: Loads the state that was saved last; returns False where there is none.
-
-    Raises:
-        NotFiniteError: The loss or, when it is to be saved, a number of the state is not finite; nothing of it is saved.
-        OutOfMemoryError: A step ran out of memory twice; the state before it is saved where it is whole.
-        KeyboardInterrupt: ``stopped`` returned True after a step; the state after it is saved.
-    """
-    every, saved, ran_out = trainer.config.checkpoint_every, time.monotonic(), -1
-    while trainer.step < trainer.config.steps:
-        reports, failure = [], None
-        try:
-            reports = trainer.advance(every - trainer.step % every)
-        except OutOfMemoryError as e:
-            failure = e.with_traceback(None)  # whose frames hold tensors
-            failure.__cause__ = failure.__context__ = None
-        if failure is not None:
-            again, ran_out = trainer.step > ran_out, trainer.step
-            try:
-                if not again or not (failure.intact or restore(trainer)):
-                    raise failure
-                trainer.spare_memory()
-            except ResourceError:
-                if failure.intact:
-                    save(trainer)
-                raise
-            continue
-        for report in reports:
-            on_step(report)
-        stop = stopped()
-        due = trainer.step % every == 0 and time.monotonic() - saved >= trainer.config.checkpoint_seconds
-        if stop or due or trainer.step == trainer.config.steps:
-            save(trainer)
-            saved = time.monotonic()
-        if stop:
-            raise KeyboardInterrupt

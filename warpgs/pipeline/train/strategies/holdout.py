@@ -172,7 +172,7 @@ class Holdout(ImportanceSampling):
         c = self.trainer.config.holdout
         if self.closed is None or not c.trim_db > 0:
             return False
-        rest = self.trainer.config.steps - self.closed
+        rest = self.trainer.steps - self.closed
         return step in {self.closed + round(k * rest / c.trims) for k in range(1, c.trims + 1)}
 
     def due(self, step: int) -> bool:
@@ -251,6 +251,11 @@ class Holdout(ImportanceSampling):
                     self.why = f"no Gaussian came with level {len(self.levels)}: the capacity is used up, or nothing is to add"
                 yield from self._close(step)
                 return
+            lately = sum(x.fall for x in self.levels[-2:])
+            if len(self.levels) > 1 and lately < c.stop_db:
+                self.why = f"the held-out blocks gained {lately:+.3f} dB in the last two levels, less than {c.stop_db:g} dB"
+                yield from self._close(step)
+                return
             if step == self.marks[-1]:
                 self.why = f"its time was up: level {len(self.levels)} still gained {least.mean:+.3f} dB"
                 yield from self._close(step)
@@ -262,6 +267,8 @@ class Holdout(ImportanceSampling):
         """End growth: lower the degrees that held-out blocks do not need, and train on all pixels from here on."""
         t, c = self.trainer, self.trainer.config.holdout
         self.closed = step
+        if c.stop_db > 0:
+            t.end_growth()
         yield from map(self._of_level, self._catch_up(step))
         self._observe()
         if c.degrees:
@@ -294,7 +301,7 @@ class Holdout(ImportanceSampling):
         """
         c = self.trainer.config.holdout
         over = psnr - c.enough_db
-        if step == self.trainer.config.steps:
+        if step == self.trainer.steps:
             return c.trim_db + max(over, 0.0)
         fraction = 1 + over / NEAR
         if not fraction > 0:

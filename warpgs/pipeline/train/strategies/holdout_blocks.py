@@ -35,12 +35,15 @@ class HoldoutConfig:
 
     fraction: float = 0.03
     """Fraction of the pixels that is held out until growth ends."""
-    levels: int = 4
+    levels: int = 8
     """Number of levels of growth, of equal length; after each its gain is measured."""
     noise: float = 1.0
     """Standard errors of the mean gain over the blocks that count as its noise."""
     least_db: float = 0.02
     """Gain of a level, its noise added, below which growth ends early [dB]."""
+    stop_db: float = 0.05
+    """Gain of the last two levels together, by growth and training, below which growth ends early [dB]. Where the fit has
+    phases the third begins then, so that the fit ends earlier, too; 0 for the planned number of steps."""
     degrees: bool = True
     """Lower degrees: each Gaussian keeps only the harmonics that its views can resolve and the held-out blocks need."""
     keep_db: float = 0.1
@@ -62,7 +65,7 @@ class HoldoutConfig:
             raise UsageError(f"holdout fraction {self.fraction} must lie above 0 and be at most 0.5")
         if self.levels < 1 or self.trims < 1:
             raise UsageError(f"holdout: levels {self.levels} and trims {self.trims} must be at least 1")
-        for name in ("noise", "least_db", "keep_db", "trim_db", "enough_db"):
+        for name in ("noise", "least_db", "stop_db", "keep_db", "trim_db", "enough_db"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise UsageError(f"holdout {name.replace('_', '-')} must be 0 or more and finite, not {getattr(self, name)}")
 
