@@ -1,0 +1,39 @@
+"""The matching costs of a plane sweep as OpenCV's warps and blurs give them, and the best plane in numpy."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from warpgs.priors.sweep_planes import NEUTRAL_COST, NOISE, gray_of, plane_homography
+from warpgs.scene import View
+
+
+def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, window: int) -> np.ndarray:
+    """Return the disagreement of views at D inverse depths [1/u], in [0, 1], float32, shape [D, H, W]."""
+    size, box = (view.camera.width, view.camera.height), (window, window)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    own, *grays = [gray_of(v) for v in (view, *others)]
+    mean = cv2.blur(own, box)
+    variance = np.maximum(cv2.blur(own * own, box) - mean * mean, 0) + NOISE
+    planes = np.empty((len(inverses), *own.shape), np.float32)
+    for inverse, total in zip(inverses, planes):
+        costs = []
+        for other, gray in zip(others, grays):
+            H = plane_homography(view.camera, other.camera, inverse)
+            warped = cv2.warpPerspective(gray, H, size, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=-1)
+            m = cv2.blur(warped, box)
+            v = np.maximum(cv2.blur(warped * warped, box) - m * m, 0) + NOISE
+            cost = 0.5 - 0.5 * (cv2.blur(own * warped, box) - mean * m) / np.sqrt(v * variance)
+            costs.append(np.where(warped >= 0, cost, NEUTRAL_COST))
+        total[:] = 0.5 * np.mean(costs, 0) + 0.5 * np.min(costs, 0)
+    return planes
+
+
+def best_inverse(costs: np.ndarray, inverses: np.ndarray) -> np.ndarray:
+    """Return the inverse depth [1/u], shape [H, W], of least cost [H, W, D], refined by the parabola through three costs."""
+    k = np.clip(costs.argmin(2), 1, len(inverses) - 2)
+    left, middle, right = (np.take_along_axis(costs, (k + o)[..., None], 2)[..., 0].astype(float) for o in (-1, 0, 1))
+    bend = left - 2 * middle + right
+    offset = np.where(bend > 1e-9, 0.5 * (left - right) / np.maximum(bend, 1e-9), 0).clip(-1, 1)
+    return inverses[0] + (k + offset) * (inverses[1] - inverses[0])
