@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
-import resource
+import re
 import sys
 import tempfile
 import time
@@ -28,6 +28,11 @@ from warpgs.synthetic.demo import write_demo
 WHAT = "fits of a demo of many views: time, steps, PSNR and peak memory"
 
 
+def peak_resident() -> int:
+    """Return the most memory that this process has held [bytes] (Linux); getrusage would count its parent's, too."""
+    return 1024 * int(re.search(r"VmHWM:\s*([0-9]+) kB", Path("/proc/self/status").read_text("ascii"))[1])
+
+
 def fit_in_new_process(task: tuple[str, str, str, int, str]) -> dict:
     """Fit (folder, split, preset, seed, device) and return its figures, with the peak memory of this process [bytes]."""
     folder, split, preset, seed, device = task
@@ -35,9 +40,8 @@ def fit_in_new_process(task: tuple[str, str, str, int, str]) -> dict:
     began = time.perf_counter()
     metrics = warpgs.fit(SceneRequest(folder, split), config, device=device, verbose=False).metrics
     wall = time.perf_counter() - began
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024  # Linux counts in KiB
     views = metrics["protocol"]["training_views"]
-    return {"seed": seed, "training_views": views, "wall": wall, "peak_rss_bytes": peak} | figures_of(metrics)
+    return {"seed": seed, "training_views": views, "wall": wall, "peak_rss_bytes": peak_resident()} | figures_of(metrics)
 
 
 def line(row: dict) -> str:
@@ -46,7 +50,8 @@ def line(row: dict) -> str:
         return f"failed: {row['error']}"
     torch_peak = f", {row['peak_torch_bytes'] / 2**30:.2f} GiB of the device" if "peak_torch_bytes" in row else ""
     return (
-        f"{row['training_views']} training views: {row['wall']:.1f} s (setup {row['setup']:.1f}, training {row['training']:.1f}), "
+        f"{row['training_views']} training views: {row['wall']:.1f} s (setup {row['setup']:.1f}, "
+        f"training {row['training']:.1f}), "
         f"{row['steps']} steps, {row['psnr']:.2f} dB, SSIM {row['ssim']:.4f}, {row['gaussians']:,} Gaussians, "
         f"{row['peak_rss_bytes'] / 2**30:.2f} GiB resident{torch_peak}; {row['ended'] or row['why']}"
     )

@@ -65,7 +65,8 @@ def verdict(kind: str, scenes: list[dict[str, float]]) -> str:
             d = paired_difference(values, [0.0] * len(values))
             parts.append(f"{d.mean:+.4f}{unit} [{d.low:+.4f}, {d.high:+.4f}]")
             kept &= d.mean >= LIMITS[key]
-    return f"- {kind}: {size:.2f} of the bytes, {', '.join(parts)} over {len(scenes)} scenes; {'within' if kept else 'beyond'} limits"
+    text = f"- {kind}: {size:.2f} of the bytes, {', '.join(parts)} over {len(scenes)} scenes"
+    return f"{text}; {'within' if kept else 'beyond'} limits"
 
 
 def main(arguments: list[str] | None = None) -> int:
