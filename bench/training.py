@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
+from warpgs.pipeline.model.parameter_bounds import model_bytes as bytes_of
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.complexity import complexity_figures
 from warpgs.pipeline.train.config import FitConfig
@@ -18,6 +19,7 @@ from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.loop import run
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import ViewStack
+from warpgs.pipeline.train.warmup import warm_up
 from warpgs.scene import Camera, Gaussians, PointCloud, View
 
 BLACK = (0.0, 0.0, 0.0)
@@ -30,6 +32,11 @@ def make_trainer(
 ) -> Trainer:
     """Return a trainer at step 0."""
     return Trainer(views, points, config, device, background)
+
+
+def compile_kernels(config: FitConfig, device: torch.device) -> None:
+    """Compile all kernels that a fit with these settings uses, by a tiny fit."""
+    warm_up(config, device)
 
 
 def finish(trainer: Trainer) -> None:
@@ -60,6 +67,11 @@ def sort_along_curve(trainer: Trainer) -> None:
 def model_bytes(trainer: Trainer) -> int:
     """Return the bytes of the model, each Gaussian with the coefficients of its own degree."""
     return complexity_figures(trainer)["complexity"]["bytes"]
+
+
+def full_bytes(count: int, degree: int = 3) -> int:
+    """Return the bytes of a model of so many Gaussians, all of one degree."""
+    return bytes_of(torch.full((count,), degree))
 
 
 def with_cap(config: FitConfig, most: int) -> FitConfig:
