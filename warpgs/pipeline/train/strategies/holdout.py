@@ -117,7 +117,10 @@ class Holdout(ImportanceSampling):
         begins = t.phases.refine if c.method.events else c.density.times(c.steps)[0]
         ends = self._growth_ends
         levels = c.holdout.levels
-        self.marks = sorted({max(1, begins + round(k * (ends - begins) / levels)) for k in range(levels + 1)})
+        marks = {max(1, begins + round(k * (ends - begins) / levels)) for k in range(levels + 1)}
+        if c.method.events:  # right before fine Gaussians are added, which cost up to 3 dB until they have been trained
+            marks = {next((e for e in t.phases.events if e >= m), ends) for m in marks}
+        self.marks = sorted(marks)
         """Steps done when the blocks are measured: before growth, and after each level."""
         self.whole = t.views
         self.blocks = sample_blocks(t.views, c.holdout.fraction, c.seed)
@@ -195,13 +198,15 @@ class Holdout(ImportanceSampling):
 
         Arguments are those of `CloneSplit.refine`: ``growing`` and ``protected`` are bool [N] or None.
         """
-        if self.measuring:
+        if self.measuring and self.trainer.config.holdout.bounds:
             self._observe()
         yield from super().refine(step, growing, protected)
 
     def after_step(self, phase, settings, going):
         """Apply the bounds of each Gaussian, and raise the opacities of protected ones; ``settings`` [3], ``going`` [1]."""
-        enforce_bounds(self.trainer.table)
+        c = self.trainer.config.holdout
+        if c.bounds or c.degrees or c.trim_db > 0:
+            enforce_bounds(self.trainer.table)
         super().after_step(phase, settings, going)
 
     @property
@@ -242,7 +247,8 @@ class Holdout(ImportanceSampling):
             fall, own = gain(self.before, errors), gain(hidden, errors)
             least: Gain = min(fall, own, key=lambda g: g.mean)
             self.levels.append(Level(step, len(model), decibels(errors), fall.mean, own.mean, least.mean, least.noise))
-            if least.upper_bound_below(c.least_db, c.noise):
+            early = self._is_early(step)
+            if not early and least.upper_bound_below(c.least_db, c.noise):
                 self.why = (
                     f"level {len(self.levels)} gained {least.mean:+.3f} dB on the held-out blocks, which with {c.noise:g} x "
                     f"its noise of {least.noise:.3f} dB is less than {c.least_db:g} dB"
@@ -252,7 +258,7 @@ class Holdout(ImportanceSampling):
                 yield from self._close(step)
                 return
             lately = sum(x.fall for x in self.levels[-2:])
-            if len(self.levels) > 1 and lately < c.stop_db:
+            if not early and len(self.levels) > 1 and lately < c.stop_db:
                 self.why = f"the held-out blocks gained {lately:+.3f} dB in the last two levels, less than {c.stop_db:g} dB"
                 yield from self._close(step)
                 return
@@ -263,6 +269,11 @@ class Holdout(ImportanceSampling):
         self.before = errors
         self.growing += 1
 
+    def _is_early(self, step: int) -> bool:
+        """Return whether it is too early to end growth: in the first third of its time, or while views are half their size."""
+        c = self.trainer.config
+        return 3 * step < self.marks[-1] or step <= c.half_resolution * c.steps
+
     def _close(self, step: int) -> Iterator[DensityUpdate]:
         """End growth: lower the degrees that held-out blocks do not need, and train on all pixels from here on."""
         t, c = self.trainer, self.trainer.config.holdout
@@ -270,7 +281,8 @@ class Holdout(ImportanceSampling):
         if c.stop_db > 0:
             t.end_growth()
         yield from map(self._of_level, self._catch_up(step))
-        self._observe()
+        if c.bounds:
+            self._observe()
         if c.degrees:
             base = self._errors(t.gaussians)
             t.table.columns["max_degree"] = compress.needed_degrees(

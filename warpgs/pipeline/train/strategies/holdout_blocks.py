@@ -42,8 +42,11 @@ class HoldoutConfig:
     least_db: float = 0.02
     """Gain of a level, its noise added, below which growth ends early [dB]."""
     stop_db: float = 0.05
-    """Gain of the last two levels together, by growth and training, below which growth ends early [dB]. Where the fit has
-    phases the third begins then, so that the fit ends earlier, too; 0 for the planned number of steps."""
+    """Gain of the last two levels together, by growth and training, below which growth ends [dB]: where the fit has phases, the
+    third begins then, and with it the fit ends earlier; 0 for the planned number of steps. Not before a third of growth,
+    nor while views are half their size."""
+    bounds: bool = True
+    """Bound the degree and the least width of each Gaussian by what views resolve, and grow none that one view alone sees."""
     degrees: bool = True
     """Lower degrees: each Gaussian keeps only the harmonics that its views can resolve and the held-out blocks need."""
     keep_db: float = 0.1
