@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from warpgs.priors.sweep_planes import NEUTRAL_COST, NOISE, gray_of, plane_homography
+from warpgs.kernels.plane_costs import NEUTRAL
+from warpgs.priors.sweep_planes import NOISE, gray_of, plane_homography
 from warpgs.scene import View
 
 
@@ -25,7 +26,7 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
             m = cv2.blur(warped, box)
             v = np.maximum(cv2.blur(warped * warped, box) - m * m, 0) + NOISE
             cost = 0.5 - 0.5 * (cv2.blur(own * warped, box) - mean * m) / np.sqrt(v * variance)
-            costs.append(np.where(warped >= 0, cost, NEUTRAL_COST))
+            costs.append(np.where(warped >= 0, cost, NEUTRAL))
         total[:] = 0.5 * np.mean(costs, 0) + 0.5 * np.min(costs, 0)
     return planes
 

@@ -28,11 +28,10 @@ LOW = WHITE + 1
 """Added to colours while they are interpolated, so that those outside, -`WHITE`, are above 0."""
 MIDDLE = 2048
 """Subtracted from colours before they are multiplied, which keeps sums small."""
-MAX_RADIUS = 15
-"""Largest half side of a window [px] whose sums fit into 32 bits: there 961 squares of up to (`WHITE` + `MIDDLE`)^2 do not,
-but they are only reached where most of the window lies outside the other image, and then nothing is compared."""
+MAX_RADIUS = 3
+"""Largest half side of a window [px]: 49 squares of the largest colour, `WHITE` + `MIDDLE`, fit into 32 bits with a sign."""
 NEUTRAL = 0.5
-"""Cost where a plane leaves the other image."""
+"""Cost of correlation 0: where a plane leaves the other image, or nothing has texture."""
 
 
 @functools.cache

@@ -8,7 +8,7 @@ from warpgs.kernels.compiler import EXACT
 from warpgs.kernels.plane_costs import LANES
 
 FAR_AWAY = 2**14
-"""Number above every path cost that still has room for a penalty in 16 bits."""
+"""Number above every path cost to which a penalty can be added in 16 bits."""
 
 
 @functools.cache

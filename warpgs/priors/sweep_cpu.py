@@ -10,13 +10,13 @@ import torch
 from warpgs.kernels.plane_costs import plane_costs
 from warpgs.kernels.plane_depths import best_inverses
 from warpgs.kernels.scanlines import scanline_costs
-from warpgs.priors.sweep_planes import NOISE, UNIT, SweepConfig, gray_of, plane_homography, step_limits
+from warpgs.priors.sweep_planes import NOISE, UNIT, SweepConfig, gray_of, plane_homographies, step_limits
 from warpgs.scene import View
 
 
 def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, window: int) -> torch.Tensor:
     """Return the disagreement of views at D inverse depths [1/u] in units of 1 / `UNIT`, as `plane_costs` does."""
-    homographies = np.array([[plane_homography(view.camera, o.camera, w) for o in others] for w in inverses])
+    homographies = plane_homographies(view.camera, [o.camera for o in others], inverses)
     return plane_costs(gray_of(view), [gray_of(o) for o in others], homographies, window, NOISE, UNIT)
 
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from warpgs.kernels.plane_costs import NEUTRAL
 from warpgs.priors.sweep_cpu import path_costs
 from warpgs.priors.sweep_planes import (
-    NEUTRAL_COST,
     NOISE,
     PLANES_AT_ONCE,
     UNIT,
@@ -57,7 +57,7 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
             m = box(warped)
             v = (box(warped * warped) - m * m).clamp(min=0) + NOISE
             cost = 0.5 - 0.5 * (box(own * warped) - mean * m) / (variance * v).sqrt()
-            cost = torch.where(warped >= 0, cost, NEUTRAL_COST)
+            cost = torch.where(warped >= 0, cost, NEUTRAL)
             total = total + cost
             least = cost if least is None else torch.minimum(least, cost)
         found = (0.5 * least + total * (0.5 / len(others))).clamp(0, 1) * UNIT

@@ -17,8 +17,6 @@ NOISE = (2 / 255) ** 2
 """Variance of a window below which its pattern is noise: correlation fades to 0 there."""
 EDGE = 0.06
 """Colour step between neighbouring pixels at which the penalty for a jump in depth falls to 1/e."""
-NEUTRAL_COST = 0.5
-"""Cost of correlation 0: where a plane leaves the other image, or nothing has texture."""
 UNIT = 4096
 """Cost 1 in the 16-bit whole numbers that volumes hold: to touch memory for the first time takes as long as to compute what
 goes there, and this is half of float32's."""
@@ -37,7 +35,7 @@ class SweepConfig:
     max_views: int = 30
     """Most views that are swept; of more, those that together see most. The others are still compared with."""
     window: int = 7
-    """Side of the square in which pixels are correlated [px]; odd, at least 3."""
+    """Side of the square in which pixels are correlated [px]: 3, 5 or 7."""
     spacing: float = 0.5
     """Largest step of a match from one plane to the next [px], while `max_planes` allows it."""
     max_planes: int = 256
@@ -54,8 +52,8 @@ class SweepConfig:
     """Smallest angle between the two rays [deg]; below it depth is noise."""
 
     def __post_init__(self):
-        if not (3 <= self.window <= 31 and self.window % 2 == 1):
-            raise UsageError(f"sweep window {self.window} must be odd and 3 to 31")
+        if self.window not in (3, 5, 7):  # kernels add up squares in 32 bits
+            raise UsageError(f"sweep window {self.window} must be 3, 5 or 7")
         if not (self.max_planes >= 8 and self.near_count >= 1 and self.max_pixels >= 1 and self.max_views >= 2):
             raise UsageError("sweep needs at least 8 planes, 1 near view, 1 pixel and 2 views")
         for name in ("spacing", "small_step", "large_step", "max_round_trip", "min_parallax"):
@@ -113,6 +111,13 @@ def plane_homography(first: Camera, second: Camera, inverse: float) -> np.ndarra
     H = matmul(matmul(second.K, moved), geometry.inverse(first.K))
     back, shift = (np.array([[1, 0, s], [0, 1, s], [0, 0, 1]]) for s in (-0.5, 0.5))
     return matmul(matmul(back, H), shift)
+
+
+def plane_homographies(first: Camera, others: Sequence[Camera], inverses: np.ndarray) -> np.ndarray:
+    """Return `plane_homography` of D inverse depths [1/u] and N other cameras, shape [D, N, 3, 3]: it is linear in them."""
+    start = np.stack([plane_homography(first, o, 0.0) for o in others])
+    slope = np.stack([plane_homography(first, o, 1.0) for o in others]) - start
+    return start + inverses[:, None, None, None] * slope
 
 
 def gray_of(view: View) -> np.ndarray:

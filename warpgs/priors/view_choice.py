@@ -15,13 +15,13 @@ SAMPLES = 4
 """Pixels along either side of an image at which sight is sampled."""
 DEPTHS = 3
 """Depths at each of them."""
-LEAST_ANGLE, MOST_ANGLE, LOST_ANGLE = 1.5, 30.0, 60.0
+LEAST_ANGLE, MOST_ANGLE, LOST_ANGLE = 1.0, 30.0, 60.0
 """Angles between two rays to a point [deg]: below the first depth is uncertain, from the second on a surface looks different
 to both views, and at the third they are taken to share nothing."""
 
 
 class Sight(NamedTuple):
-    """What pairs of V views share, as fractions of what the first one sees."""
+    """Sight that pairs of V views share, as fractions of what the first one sees."""
 
     overlap: np.ndarray
     """Fraction of the first view's sight that the second shares, less at large angles, in [0, 1], shape [V, V]."""
@@ -35,7 +35,6 @@ def _sampled(camera: Camera, bounds: tuple[float, float]) -> np.ndarray:
     along = (np.arange(SAMPLES) + 0.5) / SAMPLES
     x, y = (a.ravel() for a in np.meshgrid(along * camera.width, along * camera.height))
     near, far = bounds
-    # the roots and powers of numpy's own code are not the same on all processors; choices are made of rounded sums
     depths = [near * (far / near) ** ((k + 0.5) / DEPTHS) for k in range(DEPTHS)]
     pixels = np.tile(np.stack([x, y], 1), (DEPTHS, 1))
     return geometry.back_project(camera, pixels, np.repeat(depths, len(x)))
