@@ -1,7 +1,7 @@
 """Size and shape of the Gaussians of fits without limits and with them, and the view one step beside the cameras.
 
-usage: python -m bench.experiments.scale_limits SCENE@SPLIT... [--preset quick] [--limits max_size=1,max_ratio=30]
-           [--seeds 1] [--aside 0.3] [--downscale 1] [--device auto] --out FOLDER
+usage: python -m bench.experiments.scale_limits SCENE@SPLIT[@DOWNSCALE]... [--preset quick] [--limits max_size=1,max_ratio=30]
+           [--seeds 1] [--aside 0.3] [--device auto] --out FOLDER
 SPLIT is one of `warpgs fit`, or even:K, which fits K views evenly spaced in their order and holds out the others. FOLDER gets
 shape.json, shape.md and SCENE.png: without limits and with them, from the mean training camera moved sideways by --aside of its
 distance to the point that the cameras look at.
@@ -104,19 +104,18 @@ def table(rows: list[dict]) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Fit each scene without limits and with them, seed by seed, and write figures and pictures."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("scenes", nargs="+", metavar="SCENE@SPLIT")
+    p.add_argument("scenes", nargs="+", metavar="SCENE@SPLIT[@DOWNSCALE]")
     p.add_argument("--preset", default="quick", choices=PRESETS)
     p.add_argument("--limits", default="")
     p.add_argument("--seeds", type=int, default=1)
     p.add_argument("--aside", type=float, default=0.3)
-    p.add_argument("--downscale", type=int, default=1)
     p.add_argument("--device", default="auto")
     p.add_argument("--out", type=Path, required=True)
     a = p.parse_args(arguments)
     device, ways, rows = choose_device(a.device)[0], {"off": OFF, "on": limits_of(a.limits)}, []
     for word in a.scenes:
-        path, _, split = word.rpartition("@")
-        request = SceneRequest(path, None, a.downscale)
+        path, split, *downscale = word.split("@")
+        request = SceneRequest(path, None, *map(int, downscale))
         request = replace(request, split=split_of(read_scene(request)[0], split))
         name = Path(path).resolve().name
         for seed in range(a.seeds):
