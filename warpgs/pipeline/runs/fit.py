@@ -17,6 +17,7 @@ from warpgs.files import write_json
 from warpgs.io.splits import Split
 from warpgs.pipeline.metrics.lpips import Lpips, load_lpips
 from warpgs.pipeline.model.compress import drop_unused_sh
+from warpgs.pipeline.model.scale_limits import shape_figures, shape_summary
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.runs.failed_step import FILE as FAILED
 from warpgs.pipeline.runs.failed_step import failed_step, save_failed_step
@@ -264,14 +265,17 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
         half_resolution=c.half_resolution,
         max_instances=trainer.max_instances,
     )
-    job.notes.append(rule["summary"])
-    job.say(f"  {rule['summary']}")
+    shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.extent)
+    for line in (rule["summary"], shape_summary(shape)):
+        job.notes.append(line)
+        job.say(f"  {line}")
     return metrics | {
         "protocol": protocol_of(scene, job.request.split, job.request.downscale, train, test),
         "steps": trainer.step, "gaussians": len(gaussians), "preset": c.preset, "seed": c.seed,
         "config_hash": c.fingerprint(), "fingerprint": scene.fingerprint, "device": job.where.removeprefix("on "),
         "seconds": {**seconds, "total": time.perf_counter() - job.began}, **peak,
-        "memory": trainer.memory.to_json(), "rule": rule, **event_figures(trainer), **complexity_figures(trainer),
+        "memory": trainer.memory.to_json(), "rule": rule, "shape": shape,
+        **event_figures(trainer), **complexity_figures(trainer),
     }  # fmt: skip
 
 

@@ -80,6 +80,11 @@ def check_record(record: Any) -> None:
 
 MODEL_STATE = fields({"step": whole(0)})
 """Schema of the plain values in a checkpoint that a model is read from."""
+_SHAPE = fields(
+    {n: number(0) for n in ("largest", "largest_over_radius", "largest_over_extent")}
+    | {n: number(0) for n in ("needles", "needles_by_opacity", "thin")}
+    | {"radius": number(above=0), "extent": number(above=0), "beyond": whole(0)}
+)
 METRICS = fields(
     {
         "test": mapping(or_null(real)), "train": mapping(or_null(real)),
@@ -90,6 +95,6 @@ METRICS = fields(
             "resolution": items(text), "score_masks": whole(0),
         }),
     },
-    {"gaussians": whole(0), "seconds": fields({"total": number(0)})},
+    {"gaussians": whole(0), "seconds": fields({"total": number(0)}), "shape": _SHAPE},
 )  # fmt: skip
 """Schema of metrics.json and of eval.json."""

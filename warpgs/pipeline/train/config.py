@@ -12,6 +12,7 @@ from typing import Any
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.model.scale_limits import LimitConfig
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossConfig, LossTerm, check_terms
 from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES, find_strategy
@@ -76,6 +77,8 @@ class FitConfig:
     """Learning rates."""
     density: DensityConfig = field(default_factory=DensityConfig)
     """Settings of cloning, splitting and pruning (strategies clone_split, importance_sampling and holdout)."""
+    limits: LimitConfig = field(default_factory=LimitConfig)
+    """Limits of the size and the shape of every Gaussian."""
     phases: PhaseConfig = field(default_factory=PhaseConfig)
     """Lengths of the three phases, and times of sampling."""
     method: MethodConfig = field(default_factory=MethodConfig)

@@ -21,6 +21,7 @@ from warpgs.kernels.project import project
 from warpgs.kernels.step_buffers import NOT_FINITE, begin_step, end_step
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, bin_tiles
 from warpgs.pipeline.metrics.psnr import masked_mse
+from warpgs.pipeline.model.scale_limits import NO_LIMITS, Limits
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.loss import LossTerm, Target
 from warpgs.pipeline.train.strategies.base import Strategy
@@ -50,6 +51,8 @@ class StepPlan:
     """Loss terms, in the order in which they are summed."""
     phase: Hashable
     """Value of `Strategy.phase`."""
+    limits: Limits = NO_LIMITS
+    """Limits that the step holds every Gaussian to."""
 
 
 class StepBuffers:
@@ -184,6 +187,7 @@ def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPla
         table.adam_step(dict(zip(table.params, gradients)), lrs[:split], buffers.stop, strategy.lr_factors(plan.phase))
         learned.views.adam_step(dict(zip(learned.views.params, gradients[len(table.params) :])), lrs[split:], buffers.stop)
         strategy.after_step(plan.phase, settings, going)
+        plan.limits.apply(table.params, going)
         size = (views.size["width"], views.size["height"])
         strategy.after_backward(plan.phase, v_projected, rendered.visible, size, going)
 

@@ -15,6 +15,7 @@ from warpgs.errors import DataError, NotFiniteError, OutOfMemoryError, ResourceE
 from warpgs.kernels.step_buffers import NOT_FINITE
 from warpgs.pipeline.metrics.psnr import psnr_of
 from warpgs.pipeline.model.init import initial_gaussians, scene_extent
+from warpgs.pipeline.model.scale_limits import scene_radius
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import FitConfig
@@ -94,9 +95,11 @@ class Trainer:
         """Sentences on what was chosen for the user before the first step."""
         self.messages: list[str] = []
         """Sentences for the user that were not shown yet."""
-        cloud = made.start.cloud
-        self.extent = scene_extent([v.camera for v in train], cloud)
+        cloud, cameras = made.start.cloud, [v.camera for v in train]
+        self.extent = scene_extent(cameras, cloud)
         """Size of the scene [u], as `scene_extent` measures it."""
+        self.radius = scene_radius(cameras, cloud)
+        """Radius of the scene [u], as `scene_radius` measures it."""
         self.background = torch.tensor(background, dtype=torch.float32, device=device)
         self.phases = plan_phases(config.phases, config.steps)
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
@@ -116,8 +119,7 @@ class Trainer:
         self.view_table = Table(first, {}, device, len(train))
         self.view_lrs = {n: p.lr for n, p in own.items()}
         self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(first)))
-        seed = config.seed if self.dropout > 0 else None
-        self.learned = Learned(self.table, self.view_table, self.strategy, seed)
+        self.learned = Learned(self.table, self.view_table, self.strategy, config.seed if self.dropout > 0 else None)
         self.graphs = StepGraphs(self.learned, self.buffers, config.rule, self.background) if device.type == "cuda" else None
         self.layout: Layout
         self.max_instances: int | None = None
@@ -153,7 +155,8 @@ class Trainer:
         """Return the plan of a step, counted from 1."""
         c = self.config
         terms = tuple(t for t in self.terms if t.active(step, c.steps))
-        return StepPlan(self.strategy.sh_degree(step), step <= c.half_resolution * c.steps, terms, self.strategy.phase(step))
+        strategy, half = self.strategy, step <= c.half_resolution * c.steps
+        return StepPlan(strategy.sh_degree(step), half, terms, strategy.phase(step), c.limits.at(step, c.steps, self.radius))
 
     def next_view(self) -> int:
         """Return the number of the next view; they come in random order, each once before any comes again."""
@@ -273,8 +276,7 @@ class Trainer:
         return True
 
     def _lr_row(self, step: int) -> list[float]:
-        c = self.config.optimizer
-        row = self.table.lr_row(self.lrs(step), step, c.head_lrs)
+        row = self.table.lr_row(self.lrs(step), step, self.config.optimizer.head_lrs)
         return row + self.view_table.lr_row(self.view_lrs, step, {})
 
     def lrs(self, step: int) -> dict[str, float]:
@@ -295,6 +297,7 @@ class Trainer:
         for change in self.strategy.update(self.step):
             self.table.apply(change)
             self.count_changed()
+        self.plan_of(self.step).limits.hold(self.table.params["log_scales"])
 
     def _forget_graphs(self) -> None:
         if self.graphs is not None:
