@@ -80,6 +80,10 @@ def check_record(record: Any) -> None:
 
 MODEL_STATE = fields({"step": whole(0)})
 """Schema of the plain values in a checkpoint that a model is read from."""
+_PHOTO = fields({
+    "name": _view_name, "compared_with": whole(0), "sharpness": or_null(number(0)), "brightness": or_null(number(0)),
+    "channels": or_null(items(number(0), 3)),
+})  # fmt: skip
 METRICS = fields(
     {
         "test": mapping(or_null(real)), "train": mapping(or_null(real)),
@@ -90,6 +94,6 @@ METRICS = fields(
             "resolution": items(text), "score_masks": whole(0),
         }),
     },
-    {"gaussians": whole(0), "seconds": fields({"total": number(0)})},
+    {"gaussians": whole(0), "seconds": fields({"total": number(0)}), "photos": items(_PHOTO)},
 )  # fmt: skip
 """Schema of metrics.json and of eval.json."""
