@@ -84,5 +84,5 @@ def test_what_cannot_be_compared_is_said(sharp):
     checks = check_photos(_with(sharp, 4, np.full_like(sharp[4].image, 0.5)))
     assert (checks[4].compared_with, checks[4].sharpness, checks[4].brightness, checks[4].channels) == (0, None, None, None)
     assert photo_notes(checks) == [
-        f"blur and exposure are unknown where too little matches the photos beside it: {sharp[4].name}"
+        f"blur and exposure are unknown where too little matches the photographs beside it: {sharp[4].name}"
     ]

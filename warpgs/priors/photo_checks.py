@@ -1,7 +1,7 @@
-"""Faults of photographs that explain a bad model: blur, and light or colours that differ from photo to photo.
+"""Faults of photographs that explain a bad model: blur, and light or colours that differ from photograph to photograph.
 
-Photos are compared at the places that two of them show: SIFT matches that agree with the poses. So it does not count what a
-photo shows, only how (docs/scenes.md, "Photographs with faults").
+Photographs are compared at the places that two of them show: SIFT matches that agree with the poses. So it does not count
+what a photograph shows, only how (docs/scenes.md, "Photographs with faults").
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from warpgs.priors.opencv import single_threaded_opencv, without_ipp
 from warpgs.scene import View
 
 MIN_SHARPNESS = 0.87
-"""Sharpness below which a photo is named: photos of four scenes that look sharp have 0.9 and more, blurred by 2 to 3 px at most
-0.86 (docs/scenes.md)."""
+"""Sharpness below which a photograph is named: untouched ones of five scenes have 0.88 and more, those blurred by a disk of 3
+px 0.5 to 0.85 (docs/scenes.md)."""
 MAX_BRIGHTNESS = 1.2
-"""Factor of brightness, up or down, beyond which a photo is named; it stays below 1.1 where the exposure does not change."""
+"""Factor of brightness, up or down, beyond which a photograph is named; below 1.1 where the exposure does not change."""
 MAX_TINT = 1.1
 """Largest factor between the brightness of one channel and of all three up to which the white balance counts as the same."""
 NEIGHBORS = 4
-"""Photos taken nearest by that each photo is compared with; each may itself be chosen by others."""
+"""Photographs taken nearest by that each photograph is compared with; each may itself be chosen by others."""
 MIN_MATCHES = 10
-"""Fewest matches from which two photos are compared."""
+"""Fewest matches from which two photographs are compared."""
 MAX_FEATURES = 1000
-"""Most features of a photo; they bound the time of a comparison."""
+"""Most features of a photograph; they bound the time of a comparison."""
 MAX_PIXELS = 100_000
-"""Number of pixels to which a photo is reduced for the search of features; sharpness is measured at its full size."""
+"""Number of pixels to which a photograph is reduced for the search of features; sharpness is measured at its full size."""
 FINE, COARSE = 1.0, 2.0
 """Standard deviations of the Gaussian filters that part fine detail from coarse [px]."""
 PATCH = 15
@@ -42,25 +42,25 @@ PATCH = 15
 NOISE = 0.1 / 255**2
 """Mean square that is added to both bands of detail: less than a level of an 8-bit image tells nothing."""
 DARKEST, BRIGHTEST = 0.04, 0.94
-"""Colours in [0, 1] between which brightness is compared: outside, a photo is black or clipped."""
+"""Colours in [0, 1] between which brightness is compared: outside, a photograph is black or clipped."""
 MAX_NAMED = 6
-"""Photos that one sentence names."""
+"""Photographs that one sentence names."""
 PROGRESS_INTERVAL = 5.0
 """Seconds between two lines of progress."""
 
 
 @dataclass(frozen=True)
 class PhotoCheck:
-    """One photo beside others, at the places that both show; None where too few places matched."""
+    """One photograph beside others, at the places that both show; None where too few places matched."""
 
     name: str
     """Name of the view."""
     compared_with: int
-    """Number of photos that it could be compared with."""
+    """Number of photographs that it could be compared with."""
     sharpness: float | None
-    """Fine detail relative to coarse, as a fraction of what the other photos have; 1 where it is as sharp as they are."""
+    """Fine detail relative to coarse, as a fraction of what the other photographs have; 1 where it is as sharp as they are."""
     brightness: float | None
-    """Factor to the brightness of the other photos, the mean of the three channels."""
+    """Factor to the brightness of the other photographs, the mean of the three channels."""
     channels: tuple[float, float, float] | None
     """Factor of red, green and blue."""
 
@@ -70,12 +70,12 @@ class PhotoCheck:
 
     @property
     def blurred(self) -> bool:
-        """True where the photo is less sharp than others beyond doubt."""
+        """True where the photograph is less sharp than others beyond doubt."""
         return self.sharpness is not None and self.sharpness < MIN_SHARPNESS
 
     @property
     def exposed_otherwise(self) -> bool:
-        """True where the photo is darker or brighter than others beyond doubt."""
+        """True where the photograph is darker or brighter than others beyond doubt."""
         return self.brightness is not None and not 1 / MAX_BRIGHTNESS <= self.brightness <= MAX_BRIGHTNESS
 
     @property
@@ -87,7 +87,7 @@ class PhotoCheck:
 
 
 class _Places(NamedTuple):
-    """What a photo looks like at its features."""
+    """What a photograph looks like at its features."""
 
     features: Features
     detail: np.ndarray
@@ -109,9 +109,9 @@ def _places(view: View) -> _Places:
 
 
 def _difference(views: Sequence[View], places: Sequence[_Places], i: int, j: int) -> np.ndarray | None:
-    """Return by how much photo i exceeds photo j: logarithms of the factors of detail, red, green and blue, NaN where unknown.
+    """Return by how much photograph i exceeds photograph j: logarithms of the factors of detail, red, green and blue.
 
-    None where too few places match.
+    A factor is NaN where it is unknown; None where too few places match.
     """
     a, b = places[i], places[j]
     ids, _ = agreeing_matches(views[i], views[j], a.features, b.features)
@@ -126,7 +126,7 @@ def _difference(views: Sequence[View], places: Sequence[_Places], i: int, j: int
 
 
 def _pairs(views: Sequence[View]) -> list[tuple[int, int]]:
-    """Return each photo with those taken nearest by, every pair once; work and memory grow with the number of photos alone."""
+    """Return each photograph with those taken nearest by, every pair once: their number is bounded per photograph."""
     centers, pairs = np.array([v.camera.center for v in views]), set()
     for i in range(len(views)):
         order = np.argsort(((centers - centers[i]) ** 2).sum(1), kind="stable")
@@ -135,7 +135,7 @@ def _pairs(views: Sequence[View]) -> list[tuple[int, int]]:
 
 
 def _typical(differences: list[float]) -> float | None:
-    """Return the median; of an even number the middle value nearer to 0, since a suspect photo differs from most others."""
+    """Return the median; of an even number the middle value nearer to 0: a suspect one differs from most others."""
     known = sorted(d for d in differences if np.isfinite(d))
     if not known:
         return None
@@ -144,7 +144,7 @@ def _typical(differences: list[float]) -> float | None:
 
 
 def check_photos(views: Sequence[View], progress: Callable[[str], object] = lambda line: None) -> list[PhotoCheck]:
-    """Compare each photo with those taken nearest by.
+    """Compare each photograph with those taken nearest by.
 
     Args:
         views: All views of the scene, those held out, too: at least one.
@@ -161,7 +161,7 @@ def check_photos(views: Sequence[View], progress: Callable[[str], object] = lamb
             places.append(place)
             if time.monotonic() - began > PROGRESS_INTERVAL:
                 began = time.monotonic()
-                progress(f"comparing photos: {len(places)} of {count}")
+                progress(f"comparing photographs: {len(places)} of {count}")
         found = list(pool.map(lambda pair: _difference(views, places, *pair), pairs))
     differences: list[list[np.ndarray]] = [[] for _ in views]
     for (i, j), difference in zip(pairs, found, strict=True):
@@ -172,7 +172,7 @@ def check_photos(views: Sequence[View], progress: Callable[[str], object] = lamb
 
 
 def _check(name: str, differences: list[np.ndarray]) -> PhotoCheck:
-    """Return the check of a photo from its differences to others, as `_difference` gives them."""
+    """Return the check of a photograph from its differences to others, as `_difference` gives them."""
     if not differences:
         return PhotoCheck(name, 0, None, None, None)
     detail, *colors = (_typical([float(d[k]) for d in differences]) for k in range(4))
@@ -185,27 +185,27 @@ def _check(name: str, differences: list[np.ndarray]) -> PhotoCheck:
 
 
 def photo_notes(checks: Sequence[PhotoCheck]) -> list[str]:
-    """Return the sentences that name photos with faults, and how many could not be compared; none where all is well."""
+    """Return the sentences that name photographs with faults, and how many could not be compared; none where all is well."""
     notes = []
     blurred = sorted((c for c in checks if c.blurred), key=lambda c: c.sharpness)
     if blurred:
         notes.append(
-            f"looks blurred, by the fine detail it has of what other photos show in the same places: "
-            f"{_listed([f'{c.name} ({c.sharpness:.2f})' for c in blurred])}; take such photos out, or expect soft places"
+            f"looks blurred, by the fine detail it has of what other photographs show in the same places: "
+            f"{_listed([f'{c.name} ({c.sharpness:.2f})' for c in blurred])}; take such photographs out, or expect soft places"
         )
     exposed = sorted((c for c in checks if c.exposed_otherwise), key=lambda c: -abs(math.log(c.brightness)))
     if exposed:
         notes.append(
-            "exposure differs from that of the photos beside it: "
+            "exposure differs from that of the photographs beside it: "
             f"{_listed([f'{c.name} ({c.brightness:.2f} x as bright)' for c in exposed])}; fix it in the camera, or even it out"
         )
     tinted = [c for c in checks if c.tinted]
     if tinted:
         factors = [f"{c.name} (red {c.channels[0]:.2f}, green {c.channels[1]:.2f}, blue {c.channels[2]:.2f} x)" for c in tinted]
-        notes.append(f"white balance differs from that of the photos beside it: {_listed(factors)}; fix it in the camera")
+        notes.append(f"white balance differs from that of the photographs beside it: {_listed(factors)}; fix it in the camera")
     alone = [c.name for c in checks if not c.compared_with]
     if alone:
-        notes.append(f"blur and exposure are unknown where too little matches the photos beside it: {_listed(alone)}")
+        notes.append(f"blur and exposure are unknown where too little matches the photographs beside it: {_listed(alone)}")
     return notes
 
 
