@@ -118,6 +118,8 @@ class SceneFolder:
         Raises:
             DataError: It lies outside, or `load_image` refuses it.
         """
+        if self.options.on_image is not None:
+            self.options.on_image(path)
         return load_image(
             self.inside(path), lens, downscale=downscale or self.options.downscale, mask=mask, background=background,
             max_pixels=self.options.max_pixels,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,6 +29,7 @@ def load_scene(
     invert_masks: bool = False,
     score_masks: str | Path | None = None,
     max_pixels: int = MAX_PIXELS,
+    progress: Callable[[str], object] | None = None,
 ) -> Scene:
     """Read a scene folder of any supported format.
 
@@ -44,6 +47,7 @@ def load_scene(
         score_masks: Folder with object masks for scoring, matched by image id; None for `idrmasks` in the scene folder where
             there is one.
         max_pixels: Largest number of pixels that an image or a mask may have as stored.
+        progress: Called with a line for the user before each image is decoded; None for nothing.
 
     Returns:
         The scene.
@@ -53,8 +57,13 @@ def load_scene(
         ResourceError: There is not enough memory to decode an image.
         UsageError: ``downscale`` or ``max_pixels`` is below 1, or there is no such reader.
     """
-    options = ReadOptions(downscale, strict, allow_outside, invert_masks, max_pixels)
-    root = Path(path)
+    root, numbers = Path(path), itertools.count(1)
+
+    def on_image(file: Path) -> None:
+        if progress is not None:
+            progress(f"reading {root}: image {next(numbers)}")
+
+    options = ReadOptions(downscale, strict, allow_outside, invert_masks, max_pixels, on_image)
     try:
         _check_folder(root)
         chosen, notes = detect(root) if reader is None else (_accepted(root, find_reader(reader)), [])

@@ -7,6 +7,7 @@ own reader is passed to `warpgs.load_scene`, or named as ``module:Class`` or ``f
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -31,6 +32,8 @@ class ReadOptions:
     """White in a mask file removes a pixel instead of keeping it."""
     max_pixels: int = MAX_PIXELS
     """Largest number of pixels that an image or a mask may have."""
+    on_image: Callable[[Path], object] | None = None
+    """Called with the file of each image before it is decoded; None for nothing."""
 
     def __post_init__(self) -> None:
         if isinstance(self.downscale, bool) or not isinstance(self.downscale, int) or self.downscale < 1:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +35,10 @@ from warpgs.pipeline.train.loop import run, train_views
 from warpgs.pipeline.train.time_budget import within_budget
 from warpgs.pipeline.train.trainer import StepReport, Trainer
 from warpgs.pipeline.train.warmup import background_warmup
+from warpgs.priors.photo_checks import PhotoCheck, check_photos, photo_notes
 from warpgs.report.events import EventLog
-from warpgs.report.progress import Progress
+from warpgs.report.progress import Progress, Stages
+from warpgs.runtime.load_module import told_of_compiling
 from warpgs.runtime.stop_signals import noted_signals
 from warpgs.runtime.terminal import say
 from warpgs.scene import Scene, View
@@ -75,6 +77,8 @@ class _Job:
     verbose: bool
     on_step: Callable[[StepReport], object] | None
     began: float
+    progress: Callable[[str], object]
+    photos: list[PhotoCheck] = field(default_factory=list)
 
     @property
     def train(self) -> list[View]:
@@ -144,18 +148,22 @@ def fit(
     out = None if out is None else Path(out)
     if resume and out is None:
         raise UsageError("resume needs the run folder that it continues: give out")
+    progress = Stages() if verbose else Stages(lambda line: None)
     folder: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
     if out is not None:
         folder = run_folder(out, resume)
-    with folder as held:
+    with folder as held, told_of_compiling(lambda name: progress("compiling kernels, once on this machine")):
         if out is not None and resume:
             read_record(out)  # a run of another version is refused before anything takes time
         where = choose_device(device)
         began = time.perf_counter()
         lpips = None if lpips_weights is None else load_lpips(Path(lpips_weights), where[0])
-        request, read, parts, found = _scene_of(scene, split)
+        request, read, parts, found = _scene_of(scene, split, progress)
         notes = (*notes, *held, *found, *([] if out is None else renaming_notes(image_names(v.name for v in read.views))))
-        job = _Job(read, request, parts, preset_config(config), *where, out, lpips, [*notes], verbose, on_step, began)
+        job = _Job(
+            read, request, parts, preset_config(config), *where, out, lpips, [*notes], verbose, on_step, began,
+            progress,
+        )  # fmt: skip
         if time_budget is not None:
             job.config, note = within_budget(job.config, time_budget, job.train, job.device)
             job.notes.append(note)
@@ -174,7 +182,9 @@ def fit_request(request: FitRequest) -> FitResult:
     )  # fmt: skip
 
 
-def _scene_of(scene: Scene | SceneRequest | str | Path, spec: str | None) -> tuple[SceneRequest, Scene, Split, list[str]]:
+def _scene_of(
+    scene: Scene | SceneRequest | str | Path, spec: str | None, progress: Callable[[str], object]
+) -> tuple[SceneRequest, Scene, Split, list[str]]:
     """Read and split a scene that is given in one of four ways; its notes come last."""
     if isinstance(scene, Scene):
         split, notes = choose_split(scene, spec)
@@ -182,7 +192,8 @@ def _scene_of(scene: Scene | SceneRequest | str | Path, spec: str | None) -> tup
     request = scene if isinstance(scene, SceneRequest) else SceneRequest(str(scene))
     if spec is not None:
         request = replace(request, split=spec)
-    return request, *read_scene(request)
+    progress(f"reading {request.path}")
+    return request, *read_scene(request, progress)
 
 
 def _prepare(job: _Job, resumed: Path | None) -> tuple[Trainer, State | None, dict[str, Any]]:
@@ -196,7 +207,8 @@ def _prepare(job: _Job, resumed: Path | None) -> tuple[Trainer, State | None, di
             check_checkpoint(state[1], stored, resumed)
     c = job.config
     with background_warmup(c, job.device) as ready:
-        trainer = Trainer(job.train, job.scene.points, c, job.device, job.scene.background, ready=ready)
+        job.photos = check_photos([*job.train, *job.test], job.progress)
+        trainer = Trainer(job.train, job.scene.points, c, job.device, job.scene.background, ready=ready, progress=job.progress)
     if job.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(job.device)  # the steps' need is told, not the start's or an earlier fit's
     return trainer, state, record
@@ -239,7 +251,7 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
 
 def _announce(job: _Job, trainer: Trainer) -> None:
     """Print what is fitted and every choice made for the user."""
-    job.notes += [*trainer.notes, trainer.memory.summary()]
+    job.notes += [*photo_notes(job.photos), *trainer.notes, trainer.memory.summary()]
     train, test = job.train, job.test
     size = f"{train[0].camera.width} x {train[0].camera.height} px"
     job.say(f"{job.scene.path}: {job.scene.format}, {len(train)} views to fit, {len(test)} held out, {size}, {job.where}")
@@ -276,6 +288,7 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
         "seconds": {**seconds, "total": time.perf_counter() - job.began}, **peak,
         "memory": trainer.memory.to_json(), "rule": rule, "shape": shape,
         **event_figures(trainer), **complexity_figures(trainer),
+        "photos": [p.to_json() for p in job.photos],
     }  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -111,12 +112,12 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
     return split, notes
 
 
-def read_scene(request: SceneRequest) -> tuple[Scene, Split, list[str]]:
-    """Load a scene and split its views; returns both with the notes for the user."""
+def read_scene(request: SceneRequest, progress: Callable[[str], object] | None = None) -> tuple[Scene, Split, list[str]]:
+    """Load a scene and split its views; returns both with the notes for the user. ``progress`` is as in `load_scene`."""
     scene = load_scene(
         request.path, reader=request.reader, downscale=request.downscale, strict=request.strict,
         allow_outside=request.allow_outside, invert_masks=request.invert_masks, score_masks=request.score_masks,
-        max_pixels=request.max_pixels,
+        max_pixels=request.max_pixels, progress=progress,
     )  # fmt: skip
     split, notes = choose_split(scene, request.split)
     return scene, split, [*scene.notes, *notes]

@@ -85,6 +85,10 @@ _SHAPE = fields(
     | {n: number(0) for n in ("needles", "needles_by_opacity", "thin")}
     | {"radius": number(above=0), "extent": number(above=0), "beyond": whole(0)}
 )
+_PHOTO = fields({
+    "name": _view_name, "compared_with": whole(0), "sharpness": or_null(number(0)), "brightness": or_null(number(0)),
+    "channels": or_null(items(number(0), 3)),
+})  # fmt: skip
 METRICS = fields(
     {
         "test": mapping(or_null(real)), "train": mapping(or_null(real)),
@@ -95,6 +99,8 @@ METRICS = fields(
             "resolution": items(text), "score_masks": whole(0),
         }),
     },
-    {"gaussians": whole(0), "seconds": fields({"total": number(0)}), "shape": _SHAPE},
+    {
+        "gaussians": whole(0), "seconds": fields({"total": number(0)}), "shape": _SHAPE, "photos": items(_PHOTO),
+    },
 )  # fmt: skip
 """Schema of metrics.json and of eval.json."""

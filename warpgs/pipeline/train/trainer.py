@@ -67,7 +67,7 @@ class Trainer:
     def __init__(
         self, train: list[View], points: PointCloud | None, config: FitConfig, device: torch.device,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0), priors: list[Prior] | None = None,
-        ready: Callable[[], object] = lambda: None,
+        ready: Callable[[], object] = lambda: None, *, progress: Callable[[str], object] = lambda line: None,
     ):  # fmt: skip
         """Set up the first Gaussians.
 
@@ -79,6 +79,7 @@ class Trainer:
             background: Colour behind the scene.
             priors: Prior of each view; None to compute them where sampling or a loss term needs them.
             ready: Called before the device is used.
+            progress: Called with a line for the user on what is done before the first step.
 
         Raises:
             DataError: There is nothing to start from.
@@ -90,7 +91,7 @@ class Trainer:
         config, chosen = settings_by_views(config, train, device.type)
         self.config, self.device = config, device
         self.generator = torch.Generator().manual_seed(config.seed)
-        made = prepare(train, points, config, np.random.default_rng(config.seed), device, priors, ready)
+        made = prepare(train, points, config, np.random.default_rng(config.seed), device, priors, ready, progress)
         self.notes: list[str] = [*chosen, *made.notes]
         """Sentences on what was chosen for the user before the first step."""
         self.messages: list[str] = []

@@ -247,8 +247,7 @@ class Holdout(ImportanceSampling):
             fall, own = gain(self.before, errors), gain(hidden, errors)
             least: Gain = min(fall, own, key=lambda g: g.mean)
             self.levels.append(Level(step, len(model), decibels(errors), fall.mean, own.mean, least.mean, least.noise))
-            early = self._is_early(step)
-            if not early and least.upper_bound_below(c.least_db, c.noise):
+            if c.stop_db == 0 and least.upper_bound_below(c.least_db, c.noise):
                 self.why = (
                     f"level {len(self.levels)} gained {least.mean:+.3f} dB on the held-out blocks, which with {c.noise:g} x "
                     f"its noise of {least.noise:.3f} dB is less than {c.least_db:g} dB"
@@ -258,7 +257,7 @@ class Holdout(ImportanceSampling):
                 yield from self._close(step)
                 return
             lately = sum(x.fall for x in self.levels[-2:])
-            if not early and len(self.levels) > 1 and lately < c.stop_db:
+            if len(self.levels) > 1 and lately < c.stop_db and not self._is_early(step):
                 self.why = f"the held-out blocks gained {lately:+.3f} dB in the last two levels, less than {c.stop_db:g} dB"
                 yield from self._close(step)
                 return
