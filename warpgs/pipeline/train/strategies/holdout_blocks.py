@@ -43,8 +43,8 @@ class HoldoutConfig:
     """Gain of a level, its noise added, below which growth ends early [dB]."""
     stop_db: float = 0.0
     """Gain of the last two levels together, by growth and training, below which growth ends [dB], in place of `least_db`:
-    where the fit has phases, the third begins then, and the fit ends earlier. Not before a third of the time of growth, nor while
-    views are half their size. 0: growth is judged by its own gain, and the fit takes the planned number of steps."""
+    where the fit has phases, the third begins then, and the fit ends earlier. Not before a third of the time of growth, nor
+    while views are half their size. 0: growth is judged by its own gain, and the fit takes the planned number of steps."""
     bounds: bool = True
     """Bound the degree and the least width of each Gaussian by what views resolve, and grow none that one view alone sees."""
     degrees: bool = True
