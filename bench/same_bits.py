@@ -34,7 +34,7 @@ from bench import result_file
 from warpgs.export.ply import write_ply
 from warpgs.io.load import load_scene
 from warpgs.io.splits import split_views
-from warpgs.kernels.compiler import ROLLED
+from warpgs.kernels.compiler import EXACT, ROLLED
 from warpgs.pipeline.train.config import PRESETS, FitConfig
 from warpgs.pipeline.train.loss import Target
 from warpgs.pipeline.train.step import total_loss
@@ -311,7 +311,8 @@ def _compile_for(target: str) -> None:
     """Have Warp compile the CPU kernels that are not made yet for another processor than this one."""
     flag = f"-target-cpu {target}"
     warp.config.cpu_compiler_flags = warp.config.cpu_compiler_flags.replace("-march=native", flag)
-    ROLLED["cpu_compiler_flags"] = ROLLED["cpu_compiler_flags"].replace("-march=native", flag)
+    for options in (EXACT, ROLLED):
+        options["cpu_compiler_flags"] = options["cpu_compiler_flags"].replace("-march=native", flag)
 
 
 def _arguments() -> argparse.Namespace:

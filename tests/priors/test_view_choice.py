@@ -35,9 +35,13 @@ def test_views_that_share_nothing_take_the_nearest():
 
 
 def test_few_views_cover_all():
-    """Of two dense groups and one lone view, every one gets a view; few views are all taken."""
+    """Of two dense groups and one lone view, every one gets a view; few views are all taken, and none twice."""
     cameras = ring([0, 1, 2, 3, 4, 120, 121, 122, 240])
     sight = shared_sight(cameras, [(3, 5)] * 9)
     taken = spread_views(sight, 3)
     assert len(taken) == 3 and taken[0] in range(5) and taken[1] in (5, 6, 7) and taken[2] == 8
+    arc = ring(range(31), look=1)
+    assert np.diff(spread_views(shared_sight(arc, [(3, 5)] * 31), 4)).min() > 4  # although all see nearly the same
+    same = shared_sight(ring([0] * 4), [(3, 5)] * 4)
+    assert spread_views(same, 3) == [0, 1, 2]
     assert spread_views(sight, 9) == list(range(9)) and len(spread_views(sight, 8)) == 8

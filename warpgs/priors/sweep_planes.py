@@ -39,7 +39,7 @@ class SweepConfig:
     spacing: float = 0.5
     """Largest step of a match from one plane to the next [px], while `max_planes` allows it."""
     max_planes: int = 256
-    """Largest number of planes, at least 8; memory is about 6 bytes per pixel and plane."""
+    """Largest number of planes, at least 8; memory is about 5 bytes per pixel and plane."""
     max_pixels: int = 200_000
     """Largest number of pixels of an image; larger ones are swept at a reduced size."""
     small_step: float = 0.03

@@ -24,9 +24,9 @@ class Sight(NamedTuple):
     """Sight that pairs of V views share, as fractions of what the first one sees."""
 
     overlap: np.ndarray
-    """Fraction of the first view's sight that the second shares, less at large angles, in [0, 1], shape [V, V]."""
+    """Fraction of the first view's sight that the second shares, evenly less with the angle, in [0, 1], shape [V, V]."""
     matching: np.ndarray
-    """The same with a weight for the angle by which depth is found, 0 for a view and itself, shape [V, V]."""
+    """The same by how well the angle lets depth be found, 0 for a view and itself, shape [V, V]."""
 
 
 def _sampled(camera: Camera, bounds: tuple[float, float]) -> np.ndarray:
@@ -67,7 +67,8 @@ def shared_sight(cameras: Sequence[Camera], bounds: Sequence[tuple[float, float]
         rays /= np.maximum(np.sqrt((rays**2).sum(2, keepdims=True)), 1e-12)
         turned = 1 - (rays * rays[i]).sum(2)  # 1 - cosine grows with the square of a small angle
         alike = np.clip((lost - turned) / (lost - most), 0, 1)
-        overlap[i] = (seen * alike).mean(1)
+        close = np.clip(1 - np.sqrt(np.maximum(turned, 0) / lost), 0, 1)
+        overlap[i] = (seen * close).mean(1)
         matching[i] = (seen * alike * np.clip(turned / least, 0, 1)).mean(1)
         matching[i, i] = 0
     return Sight(np.round(overlap, 9), np.round(matching, 9))  # last digits must not decide
