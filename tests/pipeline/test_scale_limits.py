@@ -20,6 +20,7 @@ from warpgs.pipeline.model.scale_limits import (
     shape_figures,
     shape_summary,
 )
+from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
@@ -116,6 +117,24 @@ def test_a_fit_ends_within_its_limits(strategy):
             fit.advance()
         beyond.append(shape_figures(fit.gaussians, config.limits, fit.radius, fit.extent)["beyond"])
     assert beyond[0] == 0 < beyond[1]
+
+
+def test_what_a_change_of_the_set_adds_is_within_the_limits():
+    """A strategy that adds a needle after the last step leaves none."""
+    config = FitConfig(steps=2, init=InitConfig(source="points"))
+    fit = Trainer(photos(2), seeds(), config, CPU)
+    fit.strategy.due = lambda step: step == config.steps
+
+    def update(step):
+        added = {n: t.detach()[:1].clone() for n, t in fit.table.params.items()}
+        added["log_scales"] += torch.tensor([[20.0, 0.0, 0.0]])
+        yield DensityUpdate(torch.arange(len(fit.table)), added, torch.tensor([0]))
+
+    fit.strategy.update = update
+    fit.advance()
+    fit.advance()
+    assert len(fit.gaussians) == len(seeds()) + 1
+    assert shape_figures(fit.gaussians, config.limits, fit.radius, fit.extent)["beyond"] == 0
 
 
 def test_the_ratio_is_held_from_its_time_on_and_at_the_last_step():
