@@ -24,7 +24,7 @@ from bench import result_file
 from warpgs.errors import UsageError
 from warpgs.files import write_bytes, write_text
 from warpgs.geometry import focus_point, look_at
-from warpgs.pipeline.model.scale_limits import LimitConfig
+from warpgs.pipeline.model.scale_limits import LimitConfig, shape_figures
 from warpgs.pipeline.runs.request import SceneRequest, choose_device, read_scene
 from warpgs.pipeline.train.config import PRESETS, FitConfig
 from warpgs.report.images import png, side_by_side
@@ -68,15 +68,21 @@ def beside(cameras: list[Camera], aside: float) -> Camera:
     return replace(middle, viewmat=look_at(eye, target, -middle.viewmat[1, :3]))
 
 
-def measure(request: SceneRequest, config: FitConfig, device: torch.device, aside: float) -> tuple[dict, np.ndarray]:
-    """Return the figures of one fit, and the image [H, W, 3] of its model from beside the cameras."""
+def measure(
+    request: SceneRequest, config: FitConfig, device: torch.device, aside: float, limits: LimitConfig
+) -> tuple[dict, np.ndarray]:
+    """Return the figures of one fit, and the image [H, W, 3] of its model from beside the cameras.
+
+    What is beyond ``limits`` is counted, whatever the fit's own were.
+    """
     scene, _, _ = read_scene(request)
     fit = warpgs.fit(scene, config, split=request.split, device=device, verbose=False)
     m, cameras = fit.metrics, fit.cameras()
     with torch.no_grad():
         image = warpgs.rasterize(fit.gaussians(), beside([cameras[n] for n in fit.train], aside), fit.options()).rgb
     row = {"psnr": m["test"].get("psnr"), "ssim": m["test"].get("ssim"), "train_psnr": m["train"]["psnr"]}
-    return row | {"gaussians": m["gaussians"]} | m["shape"], image.clamp(0, 1).cpu().numpy()
+    shape = shape_figures(fit.gaussians(), limits, m["shape"]["radius"], m["shape"]["extent"])
+    return row | {"gaussians": m["gaussians"]} | shape, image.clamp(0, 1).cpu().numpy()
 
 
 def table(rows: list[dict]) -> str:
@@ -121,7 +127,8 @@ def main(arguments: list[str] | None = None) -> int:
         for seed in range(a.seeds):
             images = []
             for kind, limits in ways.items():
-                row, image = measure(request, replace(PRESETS[a.preset], seed=seed, limits=limits), device, a.aside)
+                config = replace(PRESETS[a.preset], seed=seed, limits=limits)
+                row, image = measure(request, config, device, a.aside, ways["on"])
                 gc.collect()  # a fit and its recorded steps refer to each other: without this their device memory piles up
                 rows.append({"scene": name, "split": split, "preset": a.preset, "limits": kind, "seed": seed} | row)
                 images.append(image)

@@ -20,6 +20,7 @@ from warpgs.pipeline.model.scale_limits import (
     shape_figures,
     shape_summary,
 )
+from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
@@ -118,11 +119,29 @@ def test_a_fit_ends_within_its_limits(strategy):
     assert beyond[0] == 0 < beyond[1]
 
 
+def test_what_a_change_of_the_set_adds_is_within_the_limits():
+    """A strategy that adds a needle after the last step leaves none."""
+    config = FitConfig(steps=2, init=InitConfig(source="points"))
+    fit = Trainer(photos(2), seeds(), config, CPU)
+    fit.strategy.due = lambda step: step == config.steps
+
+    def update(step):
+        added = {n: t.detach()[:1].clone() for n, t in fit.table.params.items()}
+        added["log_scales"] += torch.tensor([[20.0, 0.0, 0.0]])
+        yield DensityUpdate(torch.arange(len(fit.table)), added, torch.tensor([0]))
+
+    fit.strategy.update = update
+    fit.advance()
+    fit.advance()
+    assert len(fit.gaussians) == len(seeds()) + 1
+    assert shape_figures(fit.gaussians, config.limits, fit.radius, fit.extent)["beyond"] == 0
+
+
 def test_the_ratio_is_held_from_its_time_on_and_at_the_last_step():
     """Not before; a limit of 0 is none; what cannot be a limit is refused."""
     config = LimitConfig(ratio_from=0.5)
     assert [config.at(s, 10, 2.0).ratio for s in (1, 5, 6, 10)] == [math.inf, math.inf, 30, 30]
-    assert LimitConfig(ratio_from=1.0).at(10, 10, 2.0).ratio == 30 and config.at(1, 10, 2.0).largest == 0.4
+    assert LimitConfig(ratio_from=1.0).at(10, 10, 2.0).ratio == 30 and config.at(1, 10, 3.0).largest == 3.0
     assert LimitConfig(0.0, 0.0).at(10, 10, 2.0) == Limits()
     for wrong in ({"max_size": -1}, {"max_ratio": 0.5}, {"ratio_from": 1.1}, {"opacity_decay": 0}, {"max_size": math.nan}):
         with pytest.raises(UsageError, match="limits"):

@@ -72,7 +72,7 @@ NO_LIMITS = Limits()
 class LimitConfig:
     """Limits of every Gaussian of a fit, and the decay of opacities."""
 
-    max_size: float = 0.2
+    max_size: float = 1.0
     """Largest standard deviation of an axis, as a fraction of the scene's radius; 0 for no limit."""
     max_ratio: float = NEEDLE
     """Largest ratio of the longest axis to the middle one, at least 1; 0 for no limit."""
