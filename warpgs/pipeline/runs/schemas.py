@@ -80,9 +80,9 @@ def check_record(record: Any) -> None:
 
 MODEL_STATE = fields({"step": whole(0)})
 """Schema of the plain values in a checkpoint that a model is read from."""
-_PHOTO = fields({
+_PHOTOGRAPH = fields({
     "name": _view_name, "compared_with": whole(0), "sharpness": or_null(number(0)), "brightness": or_null(number(0)),
-    "channels": or_null(items(number(0), 3)),
+    "channels": or_null(items(number(0), 3)), "moved": or_null(number(0)),
 })  # fmt: skip
 METRICS = fields(
     {
@@ -94,6 +94,6 @@ METRICS = fields(
             "resolution": items(text), "score_masks": whole(0),
         }),
     },
-    {"gaussians": whole(0), "seconds": fields({"total": number(0)}), "photos": items(_PHOTO)},
+    {"gaussians": whole(0), "seconds": fields({"total": number(0)}), "photographs": items(_PHOTOGRAPH)},
 )  # fmt: skip
 """Schema of metrics.json and of eval.json."""
