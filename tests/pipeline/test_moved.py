@@ -13,7 +13,7 @@ WALL = 2.2
 """Depth of a wall that all of it is painted on [u]."""
 
 
-def _scene(count: int = 5) -> tuple[list[View], list[Rendered]]:
+def _scene(count: int = 6) -> tuple[list[View], list[Rendered]]:
     """Views side by side of a wall that their renders show exactly."""
     first = photos(1, 64, 48)[0]
     views = []
@@ -47,12 +47,12 @@ def test_what_one_view_alone_shows_is_named(alone):
 
 
 def test_it_takes_two_others_that_show_the_place():
-    """Nothing is said where the renders of others show another depth, there is but one other, or a mask hides it."""
+    """Nothing is said where the renders of others show another depth, there are few views, or a mask hides it."""
     views, renders = _scene()
     views[2] = _with_patch(views[2])
     elsewhere = [r if i == 2 else r._replace(depth=2 * r.depth) for i, r in enumerate(renders)]
     assert not any(moved_fractions(views, elsewhere))
-    assert not any(moved_fractions(views[1:3], renders[1:3]))
+    assert not any(moved_fractions(views[:5], renders[:5]))
     mask = np.ones((48, 64), bool)
     mask[16:34, 22:42] = False
     masked = [dataclasses.replace(v, mask=mask) if i == 2 else v for i, v in enumerate(views)]
@@ -64,3 +64,10 @@ def test_a_view_that_fits_badly_as_a_whole_has_no_region_that_stands_out():
     views, renders = _scene()
     views[2] = _with_patch(dataclasses.replace(views[2], image=views[2].image + np.float32(0.1)))
     assert not any(moved_fractions(views, renders))
+
+
+def test_a_fit_that_has_hardly_begun_accuses_no_view():
+    """All views are far from their renders."""
+    views, renders = _scene()
+    views[2] = _with_patch(views[2])
+    assert not any(moved_fractions(views, [r._replace(rgb=r.rgb + np.float32(0.01)) for r in renders]))

@@ -22,6 +22,8 @@ FLOOR = 0.005
 """Residual of other views in [0, 1] below which they agree with the model wholly."""
 MIN_VIEWS = 2
 """Fewest other views that must show a point."""
+MIN_TRAINING = 6
+"""Fewest training views of which anything is said: with fewer the model has room to fit what one of them shows alone."""
 NEIGHBORS = 8
 """Views taken nearest by in which a point is looked up."""
 MAX_DEPTH_ERROR = 0.1
@@ -30,6 +32,8 @@ MIN_AREA = 0.004
 """Fraction of the image that one region must fill to be reported; static scenes have up to 0.002 (docs/scenes.md)."""
 MAX_MISFIT = 5.0
 """Median residual of a view, in medians of all views, from which it fits badly as a whole: then no single region stands out."""
+HIGH_MISFIT = 0.002
+"""Median over views of their median residuals from which a fit is not far enough to tell; finished ones have up to 0.001."""
 LOW_MISFIT = 0.0005
 """Median residual in [0, 1] below which views do not differ in that."""
 SMOOTHING = 32
@@ -101,7 +105,7 @@ def moved_fractions(views: Sequence[View], renders: Iterable[Rendered]) -> list[
     """Return for each training view the fraction of its pixels, in [0, 1], in regions that it shows otherwise than others do.
 
     A pixel counts where the view is farther from its render than other views are from theirs at the same point, and at least
-    two others show that point. Three views are too few: the model has room to fit what one of them shows alone.
+    two others show that point. All fractions are 0 for fewer than `MIN_TRAINING` views, and for a fit that is not far enough.
 
     Args:
         views: The training views, at least one.
@@ -109,13 +113,15 @@ def moved_fractions(views: Sequence[View], renders: Iterable[Rendered]) -> list[
     """
     import cv2
 
+    if len(views) < MIN_TRAINING:
+        return [0.0] * len(views)
     small = [_reduced(v, r) for v, r in zip(views, renders, strict=True)]
     misfits = [float(np.median(s.residual)) for s in small]
     usual = float(np.median(misfits))
     fractions = []
     for i, s in enumerate(small):
         others = nearest_views(views, i, NEIGHBORS)
-        if len(others) < MIN_VIEWS or misfits[i] > MAX_MISFIT * max(usual, LOW_MISFIT):
+        if usual > HIGH_MISFIT or misfits[i] > MAX_MISFIT * max(usual, LOW_MISFIT):
             fractions.append(0.0)
             continue
         elsewhere = _residuals_elsewhere(small, i, others)
