@@ -67,6 +67,7 @@ def test_exposure_is_measured(sharp, gain):
         checks = check_photos(changed)
         assert checks[1].brightness == pytest.approx(gain, rel=0.05)
         assert [c.name for c in checks if c.exposed_otherwise] == [views[1].name]
+        assert all(c.brightness == pytest.approx(1, abs=0.05) for c in checks if c.name != views[1].name)
         assert not any(c.tinted or c.blurred for c in checks)
         assert f"{views[1].name} ({checks[1].brightness:.2f} x as bright)" in photo_notes(checks)[0]
 

@@ -92,7 +92,8 @@ def _triangulate(a: View, b: View, pixels_a: np.ndarray, pixels_b: np.ndarray) -
     good = (s > 0) & (t > 0) & (sine2 > np.sin(np.radians(MIN_ANGLE)) ** 2)
     for view, pixels in ((a, pixels_a), (b, pixels_b)):
         projected, z = geometry.project_points(view.camera, points)
-        good &= (z > 0) & (np.linalg.norm(projected - pixels, axis=1) < MAX_ERROR)
+        with np.errstate(over="ignore"):  # points beside the camera are infinitely far from their pixels
+            good &= (z > 0) & (np.linalg.norm(projected - pixels, axis=1) < MAX_ERROR)
     return points, good
 
 

@@ -38,7 +38,7 @@ class Stages:
 
     def __call__(self, line: str) -> None:
         """Show a line, unless its stage had one a moment ago."""
-        stage, now = line.rpartition(":")[0] or line, time.monotonic()
+        stage, now = line.rpartition(":")[0] or line, time.perf_counter()
         if now - self.printed.get(stage, -STAGE_INTERVAL) >= STAGE_INTERVAL:
             self.printed[stage] = now
             self.show(line)

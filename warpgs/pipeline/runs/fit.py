@@ -15,7 +15,9 @@ from warpgs.errors import DataError, NotFiniteError, UsageError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.splits import Split
+from warpgs.pipeline.metrics.evaluate import options_for, render_view
 from warpgs.pipeline.metrics.lpips import Lpips, load_lpips
+from warpgs.pipeline.metrics.moved import Rendered, moved_fractions, moved_notes
 from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.model.scale_limits import shape_figures, shape_summary
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
@@ -78,7 +80,7 @@ class _Job:
     on_step: Callable[[StepReport], object] | None
     began: float
     progress: Callable[[str], object]
-    photos: list[PhotoCheck] = field(default_factory=list)
+    photographs: list[PhotoCheck] = field(default_factory=list)
 
     @property
     def train(self) -> list[View]:
@@ -207,7 +209,7 @@ def _prepare(job: _Job, resumed: Path | None) -> tuple[Trainer, State | None, di
             check_checkpoint(state[1], stored, resumed)
     c = job.config
     with background_warmup(c, job.device) as ready:
-        job.photos = check_photos([*job.train, *job.test], job.progress)
+        job.photographs = check_photos([*job.train, *job.test], job.progress)
         trainer = Trainer(job.train, job.scene.points, c, job.device, job.scene.background, ready=ready, progress=job.progress)
     if job.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(job.device)  # the steps' need is told, not the start's or an earlier fit's
@@ -251,7 +253,7 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
 
 def _announce(job: _Job, trainer: Trainer) -> None:
     """Print what is fitted and every choice made for the user."""
-    job.notes += [*photo_notes(job.photos), *trainer.notes, trainer.memory.summary()]
+    job.notes += [*photo_notes(job.photographs), *trainer.notes, trainer.memory.summary()]
     train, test = job.train, job.test
     size = f"{train[0].camera.width} x {train[0].camera.height} px"
     job.say(f"{job.scene.path}: {job.scene.format}, {len(train)} views to fit, {len(test)} held out, {size}, {job.where}")
@@ -278,9 +280,12 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
         max_instances=trainer.max_instances,
     )
     shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.extent)
-    for line in (rule["summary"], shape_summary(shape)):
-        job.notes.append(line)
-        job.say(f"  {line}")
+    options = options_for(c.rule, scene.background, gaussians, trainer.max_instances)
+    fractions = moved_fractions(train, (Rendered(*render_view(gaussians, v, options)) for v in train))
+    moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
+    for note in [rule["summary"], shape_summary(shape), *moved_notes(moved)]:
+        job.notes.append(note)
+        job.say(f"  {note}")
     return metrics | {
         "protocol": protocol_of(scene, job.request.split, job.request.downscale, train, test),
         "steps": trainer.step, "gaussians": len(gaussians), "preset": c.preset, "seed": c.seed,
@@ -288,7 +293,7 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
         "seconds": {**seconds, "total": time.perf_counter() - job.began}, **peak,
         "memory": trainer.memory.to_json(), "rule": rule, "shape": shape,
         **event_figures(trainer), **complexity_figures(trainer),
-        "photos": [p.to_json() for p in job.photos],
+        "photographs": [p.to_json() | {"moved": moved.get(p.name)} for p in job.photographs],
     }  # fmt: skip
 
 

@@ -85,9 +85,9 @@ _SHAPE = fields(
     | {n: number(0) for n in ("needles", "needles_by_opacity", "thin")}
     | {"radius": number(above=0), "extent": number(above=0), "beyond": whole(0)}
 )
-_PHOTO = fields({
+_PHOTOGRAPH = fields({
     "name": _view_name, "compared_with": whole(0), "sharpness": or_null(number(0)), "brightness": or_null(number(0)),
-    "channels": or_null(items(number(0), 3)),
+    "channels": or_null(items(number(0), 3)), "moved": or_null(number(0)),
 })  # fmt: skip
 METRICS = fields(
     {
@@ -100,7 +100,7 @@ METRICS = fields(
         }),
     },
     {
-        "gaussians": whole(0), "seconds": fields({"total": number(0)}), "shape": _SHAPE, "photos": items(_PHOTO),
+        "gaussians": whole(0), "seconds": fields({"total": number(0)}), "shape": _SHAPE, "photographs": items(_PHOTOGRAPH),
     },
 )  # fmt: skip
 """Schema of metrics.json and of eval.json."""
