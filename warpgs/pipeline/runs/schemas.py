@@ -80,6 +80,13 @@ def check_record(record: Any) -> None:
 
 MODEL_STATE = fields({"step": whole(0)})
 """Schema of the plain values in a checkpoint that a model is read from."""
+_COVERED = mapping(
+    fields({
+        "pixels": whole(0), "share_of_pixels": number(0), "share_of_error": number(0), "psnr": or_null(real),
+        "ssim": or_null(real), "expected_psnr": or_null(real),
+    }),
+    one_of("0", "1", "2+", "background"),
+)  # fmt: skip
 METRICS = fields(
     {
         "test": mapping(or_null(real)), "train": mapping(or_null(real)),
@@ -90,6 +97,12 @@ METRICS = fields(
             "resolution": items(text), "score_masks": whole(0),
         }),
     },
-    {"gaussians": whole(0), "seconds": fields({"total": number(0)})},
+    {
+        "gaussians": whole(0), "seconds": fields({"total": number(0)}),
+        "coverage": fields({
+            "classes": _COVERED, "views": items(fields({"name": text, "classes": _COVERED})), "tolerance": number(0),
+            "depth_differences": items(number(0)), "photo_psnr": or_null(items(or_null(real))), "summary": text,
+        }),
+    },
 )  # fmt: skip
 """Schema of metrics.json and of eval.json."""
