@@ -14,8 +14,8 @@ from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
 
 TOLERANCE = 0.02
-"""Largest difference of two depths of one surface, as a fraction of the depth. From training photographs alone: there two of them
-differ at one point by twice the squared error (3 dB) that they have where depths agree best (docs/evaluation.md)."""
+"""Largest difference of two depths of one surface, as a fraction of the depth. From training photographs alone: there two of
+them differ at one point by twice the squared error (3 dB) that they have where depths agree best (docs/evaluation.md)."""
 MIN_ALPHA = 0.5
 """Least opacity of a pixel that shows a surface, and so has a depth."""
 MAX_COUNT = 255
@@ -44,7 +44,8 @@ class Match:
     """Row in the other view [px]."""
     difference: torch.Tensor
     """Difference between the point's depth in the other view and the nearest of the depths that the other view sees at the four
-    pixels around it, as a fraction of the depth: what a pixel covers of a slanted surface has several. Infinite outside of the other image, where that view sees no surface, and where the pixel itself shows none."""
+    pixels around it, as a fraction of the depth: what a pixel covers of a slanted surface has several. Infinite outside of the
+    other image, where that view sees no surface, and where the pixel itself shows none."""
 
 
 @torch.no_grad()
@@ -128,7 +129,7 @@ def match(depth: torch.Tensor, camera: Camera, other: DepthView) -> Match:
 def _seen_from(depth: torch.Tensor, camera: Camera, other: Camera) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return column and row [px] and z-depth [u] in another view of the points at a view's pixels, shape [H, W] each.
 
-    Without a product of matrices: its bits would depend on the processor. Columns and rows mean nothing behind the other camera.
+    Without a product of matrices: its bits would depend on the processor. Columns and rows mean nothing behind the other.
     """
     rotation, translation = relative_pose(camera, other)
     K, other_K = camera.K, other.K

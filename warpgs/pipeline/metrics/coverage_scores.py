@@ -18,7 +18,7 @@ from warpgs.render.rasterize import RasterizeOptions
 from warpgs.scene import Gaussians, View
 
 CLASSES = {
-    "0": "seen by no training view", "1": "seen by one", "2+": "seen by two or more", "background": "transparent, nothing there",
+    "0": "seen by no training view", "1": "seen by one", "2+": "seen by two or more", "background": "transparent, empty",
 }  # fmt: skip
 """Classes of pixels, with what each is for people. Where no view of a scene has an alpha, nothing is background."""
 BINS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, np.inf)
@@ -31,17 +31,17 @@ PROBED = 12
 def photo_errors(train: Sequence[View], training: Sequence[DepthView]) -> np.ndarray | None:
     """Measure how far two training photographs of one point differ, by how far their depths do.
 
-    Each photograph is carried to another view by the model's depth and compared with the photograph there, pixel by pixel. That
-    is the error to expect of a pixel whose colour comes from a view with such a difference: measured on training data, after a fit
-    to the same data. It holds what the two photographs do not share (reflections, exposure), too.
+    Each photograph is carried to another view by the model's depth and compared with the photograph there, pixel by pixel.
+    That is the error to expect of a pixel whose colour comes from a view with such a difference: measured on training data,
+    after a fit to the same data. It holds what the two photographs do not share (reflections, exposure), too.
 
     Args:
         train: Training views.
         training: Their depths, as `depth_views` gives them.
 
     Returns:
-        Mean squared errors of colours in [0, 1] by class of `BINS`, float64, shape [8]; a class without pixels has that of the class
-        before it. None where no pixel of a photograph can be compared.
+        Mean squared errors of colours in [0, 1] by class of `BINS`, float64, shape [8]; a class without pixels has that of
+        the class before it. None where no pixel of a photograph can be compared.
     """
     chosen = np.unique(np.linspace(0, len(train) - 1, min(PROBED, len(train))).round().astype(int))
     photos = {i: _photo(train[i], training[i]) for i in chosen}

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, UsageError, WarpgsError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.splits import Split
@@ -17,10 +17,11 @@ from warpgs.pipeline.runs.coverage_report import coverage_lines, coverage_of_run
 from warpgs.pipeline.runs.failed_step import findings, read_failed_step
 from warpgs.pipeline.runs.folder import IMAGE_FOLDERS, StoredRun, open_run
 from warpgs.pipeline.runs.image_names import image_names, renaming_notes
-from warpgs.pipeline.runs.paths import FILM, render_path
+from warpgs.pipeline.runs.paths import COVERAGE, FILM, render_path
 from warpgs.pipeline.runs.request import choose_device, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line
 from warpgs.pipeline.train.trainer import train_views
+from warpgs.report.coverage_image import LEGEND
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Scene, View
 
@@ -89,8 +90,10 @@ def evaluate(
     return [*notes, *renaming_notes(names), *lines, f"mean of {len(test)}: {score_line(metrics['test'])}"]
 
 
-def render(folder: Path, kind: str, out: Path | None, frames: int, fps: int, device_name: str) -> str:
-    """Render a run along a path to PNG files and a film; returns a line for the user.
+def render(
+    folder: Path, kind: str, out: Path | None, frames: int, fps: int, device_name: str, coverage: bool = False
+) -> list[str]:  # fmt: skip
+    """Render a run along a path to PNG files and a film; returns lines for the user.
 
     Raises:
         DataError: The folder is no run.
@@ -100,10 +103,20 @@ def render(folder: Path, kind: str, out: Path | None, frames: int, fps: int, dev
     if kind not in PATHS:
         raise UsageError(f"path {kind!r} is not one of {', '.join(PATHS)}")
     out = folder / f"path-{kind}" if out is None else out
-    *files, last = render_path(open_run(folder, device_name), kind, out=out, frames=frames, fps=fps)
+    stored = open_run(folder, device_name)
+    training: list[View] | bool = False
+    notes = []
+    if coverage:
+        try:
+            training = scene_of(stored)[1]
+        except WarpgsError as e:
+            training = True
+            notes.append(f"what masks of training views hide counts as seen, since the scene cannot be read: {e}")
+        notes.append(f"images in {out / COVERAGE}: {LEGEND}")
+    *files, last = render_path(stored, kind, out=out, frames=frames, fps=fps, coverage=training)
     if last.name == FILM:
-        return f"{len(files)} images and {FILM} in {out}"
-    return f"{len(files) + 1} images in {out}; no film, since the views differ in size"
+        return [*notes, f"{len(files)} images and {FILM} in {out}"]
+    return [*notes, f"{len(files) + 1} images in {out}; no film, since the views differ in size"]
 
 
 def export(folder: Path, target: Path) -> list[str]:
