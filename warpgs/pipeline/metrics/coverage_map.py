@@ -26,7 +26,7 @@ MAX_PIXELS = 2**26
 
 @dataclass(frozen=True)
 class DepthView:
-    """What one training view sees: the depth of the model at its pixels."""
+    """Depth of the model at the pixels of one training view."""
 
     camera: Camera
     """Camera, arrays of numpy, at the size of ``depth``."""
