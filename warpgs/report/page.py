@@ -86,7 +86,7 @@ class CoverageReport:
     words: str
     """Sentences on how much that is."""
     legend: str
-    """What the images show."""
+    """Meaning of the patterns in the images."""
     images: list[tuple[str, bytes]]
     """Name and PNG of each view."""
     table: list[list[str]]
