@@ -21,6 +21,7 @@ from warpgs.pipeline.metrics.moved import Rendered, moved_fractions, moved_notes
 from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.model.scale_limits import shape_figures, shape_summary
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
+from warpgs.pipeline.runs.coverage_report import coverage_of_run
 from warpgs.pipeline.runs.failed_step import FILE as FAILED
 from warpgs.pipeline.runs.failed_step import failed_step, save_failed_step
 from warpgs.pipeline.runs.folder import CONFIG, check_checkpoint, check_same, read_record, record_of, run_folder
@@ -270,6 +271,10 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
     metrics = evaluate_run(
         job.out, gaussians, train, test, c.rule, scene.background, job.lpips, trainer.max_instances, names=names
     )
+    if test:
+        metrics["coverage"] = coverage_of_run(
+            job.out, gaussians, train, test, c.rule, scene.background, trainer.max_instances, names=names
+        )
     rule = rule_report_of(
         gaussians,
         train,
@@ -358,6 +363,7 @@ def _print_result(job: _Job, metrics: dict[str, Any]) -> None:
     """Print scores, sizes and where the results are."""
     if metrics["test"]:
         job.say(f"held-out {score_line(metrics['test'])} over {len(metrics['views'])} views")
+        job.say(f"  {metrics['coverage']['summary']}")
         for name, value in metrics["baselines"].items():
             job.say(f"  without a fit, the {name.replace('_', ' ')} scores {value:.2f} dB")
     job.say(complexity_summary(metrics))

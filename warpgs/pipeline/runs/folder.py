@@ -28,7 +28,7 @@ from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Camera, Gaussians, Normalization, Scene
 
 CONFIG = "config.json"
-IMAGE_FOLDERS = ("renders", "depth", "sampling")
+IMAGE_FOLDERS = ("renders", "depth", "coverage", "sampling")
 """Folders in a run folder with the images that its fit writes."""
 
 

@@ -10,18 +10,23 @@ import torch
 
 from warpgs.coordinates import convert_camera
 from warpgs.errors import UsageError
-from warpgs.files import write_bytes
+from warpgs.files import make_folder, write_bytes
+from warpgs.pipeline.metrics.coverage_map import MIN_ALPHA, DepthView, coverage_map, depth_views
+from warpgs.pipeline.metrics.coverage_scores import classes_of
 from warpgs.pipeline.runs.camera_paths import PATHS, camera_path
 from warpgs.pipeline.runs.image_names import image_names
 from warpgs.pipeline.runs.model_file import FittedModel
-from warpgs.render.rasterize import rasterize
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.report.coverage_image import coverage_image
 from warpgs.report.film import write_mp4
 from warpgs.report.images import png
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.runtime.terminal import say
-from warpgs.scene import Camera, Gaussians
+from warpgs.scene import Camera, Gaussians, View
 
 FILM = "film.mp4"
+COVERAGE = "coverage"
+"""Subfolder for the images of what training views saw."""
 
 
 @torch.no_grad()
@@ -47,6 +52,13 @@ def _named_cameras(model: FittedModel, path: str, frames: int) -> list[tuple[str
     return [(f"{i:04d}", c) for i, c in enumerate(cameras)]
 
 
+def _training_depths(model: FittedModel, views: bool | Sequence[View], options: RasterizeOptions) -> list[DepthView]:
+    """Return the depths of the training views of a model; with their masks where the views themselves are given."""
+    masks = [v.mask for v in views] if isinstance(views, Sequence) else None
+    cameras = [v.camera for v in views] if isinstance(views, Sequence) else [model.cameras()[n] for n in model.train]
+    return depth_views(model.gaussians(), cameras, options, masks)
+
+
 def render_path(
     model: FittedModel,
     path: str | Sequence[Camera] = "orbit",
@@ -55,6 +67,7 @@ def render_path(
     units: str = "scene",
     frames: int = 90,
     fps: int = 30,
+    coverage: bool | Sequence[View] = False,
 ) -> list[Path]:
     """Render a model along a path of cameras to PNG files and, where all images have one size, to a film.
 
@@ -65,9 +78,11 @@ def render_path(
         units: Units of your own cameras: scene or file.
         frames: Number of frames of an orbit or a spiral.
         fps: Frames per second of the film.
+        coverage: Whether to write, into the subfolder coverage, each image with what no training view saw striped in magenta
+            and what one saw in amber; or the training views, whose masks then count.
 
     Returns:
-        The files written: a PNG for each camera in order, then the film, if any.
+        The files written: a PNG for each camera in order, then the film, if any; the images of coverage are not among them.
 
     Raises:
         ResourceError: A file cannot be written, or another process writes into the folder.
@@ -82,14 +97,24 @@ def render_path(
     out, gaussians, options = Path(out), model.gaussians(), model.options()
     files = [out / f"{name}.png" for name, _ in cameras]
 
+    training = _training_depths(model, coverage, options) if coverage else None
+    transparent = isinstance(coverage, Sequence) and any(v.alpha is not None for v in coverage)
+
     def images() -> Iterator[np.ndarray]:
         for file, (_, camera) in zip(files, cameras):
             with torch.no_grad():
-                image = rasterize(gaussians, camera, options).rgb.cpu().numpy()
+                r = rasterize(gaussians, camera, options)
+            image = r.rgb.cpu().numpy()
             write_bytes(file, png(image))
+            if training is not None:
+                seen = coverage_map(torch.where(r.alpha >= MIN_ALPHA, r.depth, 0), camera, training)
+                classes = classes_of(seen, transparent)
+                write_bytes(out / COVERAGE / file.name, png(coverage_image(image, classes["0"], classes["1"])))
             yield image
 
-    with hold_folder(out) as notes:
+    with hold_folder(out, COVERAGE) as notes:
+        if training is not None:
+            make_folder(out / COVERAGE)
         for note in notes:
             say(f"warpgs: {note}", error=True)
         if len({(c.width, c.height) for _, c in cameras}) == 1:

@@ -14,6 +14,7 @@ from warpgs.io.splits import Split
 from warpgs.kernels.sh import C0
 from warpgs.pipeline.metrics.evaluate import ViewMetrics, baselines, options_for, render_view, score, summarize, variants
 from warpgs.pipeline.metrics.lpips import Lpips
+from warpgs.pipeline.runs.coverage_report import coverage_section
 from warpgs.pipeline.runs.image_names import image_names
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.report.curve import curve
@@ -208,6 +209,10 @@ def write_report(
     ]
     options = options_for(record["config"]["rule"], tuple(record["background"]), gaussians)
     images = _images(test or train, gaussians, options, {r["name"]: r for r in metrics["views"]})
+    covered = None
+    if "coverage" in metrics:
+        names = image_names(v.name for v in scene.views)
+        covered = coverage_section(out, metrics["coverage"], [v.name for v in images], names)
     camera = train[0].camera
     write_page(
         out / "report.html",
@@ -216,5 +221,6 @@ def write_report(
         f"{camera.width} x {camera.height} px, {metrics['device']}",
         figures=_figures(metrics), notes=notes, table=table, views=images, curves=curves, sampling=sampling,
         overview=overview, details={k: v for k, v in record.items() if k != "cameras"}, protocol=_protocol(metrics),
+        coverage=covered,
     )  # fmt: skip
     return why

@@ -89,6 +89,13 @@ _PHOTOGRAPH = fields({
     "name": _view_name, "compared_with": whole(0), "sharpness": or_null(number(0)), "brightness": or_null(number(0)),
     "channels": or_null(items(number(0), 3)), "moved": or_null(number(0)),
 })  # fmt: skip
+_COVERED = mapping(
+    fields({
+        "pixels": whole(0), "share_of_pixels": number(0), "share_of_error": number(0), "psnr": or_null(real),
+        "ssim": or_null(real), "expected_psnr": or_null(real),
+    }),
+    one_of("0", "1", "2+", "background"),
+)  # fmt: skip
 METRICS = fields(
     {
         "test": mapping(or_null(real)), "train": mapping(or_null(real)),
@@ -100,7 +107,12 @@ METRICS = fields(
         }),
     },
     {
-        "gaussians": whole(0), "seconds": fields({"total": number(0)}), "shape": _SHAPE, "photographs": items(_PHOTOGRAPH),
+        "gaussians": whole(0), "seconds": fields({"total": number(0)}), "shape": _SHAPE,
+        "photographs": items(_PHOTOGRAPH),
+        "coverage": fields({
+            "classes": _COVERED, "views": items(fields({"name": text, "classes": _COVERED})), "tolerance": number(0),
+            "depth_differences": items(number(0)), "photo_psnr": or_null(items(or_null(real))), "summary": text,
+        }),
     },
 )  # fmt: skip
 """Schema of metrics.json and of eval.json."""
