@@ -11,7 +11,7 @@ from warpgs.errors import UsageError
 from warpgs.geometry import look_at
 from warpgs.pipeline.metrics.region import fitted_region
 from warpgs.pipeline.model import init
-from warpgs.pipeline.model.hull import carve, fill_gaps, hull_points, in_empty_region, silhouettes
+from warpgs.pipeline.model.hull import carve, hull_points, in_empty_region, silhouettes
 from warpgs.pipeline.model.init import InitConfig, initial_points, random_points
 from warpgs.pipeline.runs.failed_step import failed_step, findings
 from warpgs.pipeline.train.config import FitConfig
@@ -20,7 +20,7 @@ from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView, half_size, stack_views, with_alpha
 from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.scene import Camera, PointCloud, Render, View, ViewDepth
+from warpgs.scene import Camera, PointCloud, Render, View
 
 CPU = torch.device("cpu")
 WHITE = (1.0, 1.0, 1.0)
@@ -113,7 +113,7 @@ def test_alpha_term_is_a_mean_absolute_difference(masked):
 @pytest.mark.parametrize("loss", [LossConfig(alpha_weight=0), LossConfig(random_background=False)], ids=["background", "alpha"])
 def test_either_way_empties_what_is_empty(loss, monkeypatch):
     """Without opacities Gaussians in the colour of the background are left where nothing is."""
-    monkeypatch.setattr(init, "on_object", lambda start, views, config: start)
+    monkeypatch.setattr(init, "on_object", lambda start, views: start)
     points = np.random.default_rng(0).uniform(-0.7, 0.7, (200, 3))
     white = PointCloud(np.concatenate([seeds().points, points]), np.ones((len(seeds()) + 200, 3), np.float32))
     views = cutouts()
@@ -176,17 +176,3 @@ def test_starts_stand_on_the_object():
     assert "left out: a view is empty there" in starts[1].how
     for cloud in (*(s.cloud for s in starts), random_points(views, 200, np.random.default_rng(0))[0]):
         assert len(cloud) >= 100 and not in_empty_region(shapes, cloud.points).any()
-
-
-def test_gaps_are_filled_from_the_hull():
-    """One half of a ball gets the other one; nothing lies before a depth that is sure."""
-    views = balls()
-    hull = hull_points(views, 2)[0]
-    left = hull.points[:, 0] < 0
-    known = PointCloud(hull.points[left], hull.colors[left])
-    nothing = ViewDepth(*(np.zeros((40, 40), t) for t in (np.float32, bool, np.float32)))
-    cloud, how = fill_gaps(views, known, [nothing] * 8, 4)
-    added = cloud.points[len(known) :]
-    assert len(added) > 20 and (added[:, 0] > -0.1).all() and how.startswith(f"{len(added)} of ")
-    behind = ViewDepth(np.full((40, 40), 9, np.float32), np.ones((40, 40), bool), nothing.sensitivity)
-    assert len(fill_gaps(views, known, [behind, *[nothing] * 7], 4)[0]) == len(known)

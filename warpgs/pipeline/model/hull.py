@@ -11,8 +11,8 @@ import numpy as np
 
 from warpgs import geometry
 from warpgs.pipeline.metrics.region import fitted_region
-from warpgs.pipeline.model.depth_points import focal_length, in_free_space, merge, merge_cells
-from warpgs.scene import PointCloud, View, ViewDepth
+from warpgs.pipeline.model.depth_points import focal_length, merge, merge_cells
+from warpgs.scene import PointCloud, View
 
 MARGIN = 1.5
 """Distance from the nearest opaque pixel at which a point lies in the empty region of a view [px]."""
@@ -24,7 +24,7 @@ MAX_LEVELS = 20
 """Most levels: the finest cells are a millionth of the first one."""
 TOLERANT = 12
 """Views for each one that may err: with so many, a cell is empty if two say so, with twice as many, three."""
-SEEN = 0.5
+SEEN = 0.9
 """Fraction of the views that must have a cell in their image: space that few look into cannot be carved."""
 OPAQUE_COLOR = 0.9
 """Opacity from which on a pixel shows the object alone, and gives its colour."""
@@ -32,8 +32,6 @@ LEAST_VIEWS = 2
 """Views that must see a cell: what none sees lies inside, or behind, where nothing was photographed."""
 LIKE = 0.15
 """Standard deviation of the colours that views see a cell in, up to which they are like, of the channel that differs most."""
-GAP = 1.0
-"""Width of the cells in which one point is enough, as a multiple of that in which points become one."""
 BEHIND_CELLS = 3.0
 """Distance behind the first cell of a pixel from which on a cell is hidden, as a multiple of the width of a cell."""
 
@@ -53,7 +51,7 @@ class Silhouette:
         """True where the object reaches the border of the image, so that it may go on outside."""
 
     def look(self, points: np.ndarray, radius: np.ndarray | float, pixels: float = 0.0) -> tuple[np.ndarray, ...]:
-        """Return three masks [N] of balls around points [N, 3]: before empty pixels alone; before opaque ones; in the image.
+        """Return three masks [N] of balls around points [N, 3]: before empty pixels alone; before opaque ones; perhaps seen.
 
         Args:
             points: Centres of the balls [u].
@@ -70,7 +68,8 @@ class Silhouette:
         count = self.sums[bottom, right] - self.sums[top, right] - self.sums[bottom, left] + self.sums[top, left]
         area = (right - left) * (bottom - top)
         empty = before & (count == 0) & (inside | (not self.cut))
-        return empty, before & inside & (count == area), before & (area > 0)
+        there = np.where(before, area > 0, z > -radius)  # a ball around the camera may be in the image
+        return empty, before & inside & (count == area), there
 
 
 def silhouettes(views: Sequence[View]) -> list[Silhouette]:
@@ -177,26 +176,3 @@ def hull_points(views: Sequence[View], merge_px: float) -> tuple[PointCloud, str
     wide = max(width, merge_px * _footprint([s.view.camera for s in shapes], cells))
     cloud = merge(cells, colors, merge_cells(cells, np.full(len(cells), wide)))
     return cloud, f"{len(cloud):,} points on the hull of {len(shapes)} silhouettes, from {len(cells):,} of its {total:,} cells"
-
-
-def fill_gaps(views: Sequence[View], cloud: PointCloud, depths: Sequence[ViewDepth], merge_px: float) -> tuple[PointCloud, str]:
-    """Return a cloud with points of the hull where it has none near, and a sentence on them.
-
-    Those that would hide what a view sees, by its consistent depth, are left out.
-
-    Args:
-        views: Training views, all of which know their opacity.
-        cloud: Points that were found otherwise.
-        depths: Consistent depth of each view.
-        merge_px: As of `hull_points`.
-    """
-    hull, how = hull_points(views, 0.5 * merge_px)
-    if not len(hull):
-        return cloud, how
-    hides = in_free_space(hull.points, views, [np.where(d.valid, d.depth, 0) for d in depths], -1)
-    width = GAP * merge_px * _footprint([v.camera for v in views], hull.points)
-    both = np.concatenate([cloud.points, hull.points])
-    cells = merge_cells(both, np.full(len(both), max(width, 1e-9)))
-    new = ~hides & ~np.isin(cells[len(cloud) :], cells[: len(cloud)])
-    points = np.concatenate([cloud.points, hull.points[new]])
-    return PointCloud(points, np.concatenate([cloud.colors, hull.colors[new]])), f"{int(new.sum()):,} of {how} fill gaps"

@@ -16,7 +16,7 @@ from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.sh import C0, MAX_DEGREE, coefficient_count
 from warpgs.pipeline.metrics.region import fitted_region
 from warpgs.pipeline.model.depth_points import coarse_points, depth_bounds
-from warpgs.pipeline.model.hull import fill_gaps, hull_points, in_empty_region, silhouettes
+from warpgs.pipeline.model.hull import hull_points, in_empty_region, silhouettes
 from warpgs.priors.epipolar import EpipolarConfig, flow_depth
 from warpgs.priors.flow import RANGES, flow_between
 from warpgs.priors.matches import triangulate_matches
@@ -46,7 +46,7 @@ class InitConfig:
     """Source: sweep or flow (a point per pixel whose depth other views confirm), points (those of the reconstruction), random,
     hull (on the surface of the visual hull of views that know their opacity), or auto: sweep for few views, else points where
     the scene has at least 100 that training views saw, else random. Where views know their opacity, points that are empty in
-    one are left out, and auto fills gaps of the sweep from the hull."""
+    one are left out."""
     sweep_up_to: int = 0
     """auto: most training views from which a fit starts with a sweep, which takes a second a view on two cores."""
     random_count: int = 20_000
@@ -278,23 +278,23 @@ def check_points(views: list[View], points: PointCloud | None, config: InitConfi
         )
 
 
-def on_object(start: Start, views: list[View], config: InitConfig) -> Start:
-    """Return the start without points that are empty in a view that knows its opacity; auto fills its gaps from the hull.
+def on_object(start: Start, views: list[View]) -> Start:
+    """Return the start without points that are empty in a view that knows its opacity.
 
     Where fewer than `MIN_POINTS` are left, it is as it was.
     """
     shapes = silhouettes(views)
     if not shapes:
         return start
-    cloud, how = start.cloud, start.how
+    cloud = start.cloud
     keep = ~in_empty_region(shapes, cloud.points)
-    if keep.sum() >= MIN_POINTS:
-        cloud = PointCloud(cloud.points[keep], cloud.colors[keep])
-        how += f"\n{int((~keep).sum()):,} of them left out: a view is empty there" if not keep.all() else ""
-    if config.source == "auto" and len(shapes) == len(views) and start.depths is not None:
-        cloud, added = fill_gaps(views, cloud, start.depths, config.merge_px)
-        how += f"\n{added}"
-    return start._replace(cloud=cloud, how=how)
+    if keep.all():
+        return start
+    count = int(keep.sum())
+    if count < MIN_POINTS:
+        return start._replace(how=f"{start.how}\na view is empty at all but {count} of them; do poses and images agree?")
+    how = f"{start.how}\n{len(keep) - count:,} of them left out: a view is empty there"
+    return start._replace(cloud=PointCloud(cloud.points[keep], cloud.colors[keep]), how=how)
 
 
 def initial_points(
@@ -313,7 +313,7 @@ def initial_points(
             return Start(cloud, how)
         cloud, made = random_points(views, config.random_count, generator)
         return Start(cloud, f"{made}, instead of --init.source hull: {how}")
-    return on_object(_found_points(views, points, config, generator, device), views, config)
+    return on_object(_found_points(views, points, config, generator, device), views)
 
 
 def _found_points(
