@@ -167,7 +167,7 @@ def _first_step(trainer: Trainer) -> Iterator[Stage]:
     render = rasterize(leaves, view.camera, options)
     for name, image in (("colour", render.rgb), ("alpha", render.alpha), ("depth", render.depth)):
         yield f"first render: {name}", digest(image)
-    loss = total_loss(plan, render, Target(view.image, view.mask, view.maps, {}), leaves, trainer.strategy)
+    loss = total_loss(plan, render, Target(view.image, view.mask, view.maps, {}, view.alpha), leaves, trainer.strategy)
     yield "first loss", digest(loss)
     loss.backward()
     for name, leaf in leaves.tensors().items():

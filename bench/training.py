@@ -160,7 +160,7 @@ class Steps:
         fixed = None if self.lr is None else dict.fromkeys(self.table.params, self.lr)
         lrs, heads = (config.lrs(0.0, 1.0), config.head_lrs) if fixed is None else (fixed, {})
         rows = [self.table.lr_row(lrs, k, heads) for k in steps]
-        self.buffers.load([0] * len(steps), rows, [(0.0, k, lrs["means"]) for k in steps])
+        self.buffers.load([0] * len(steps), rows, [(0.0, k, lrs["means"], 0.0, 0.0, 0.0) for k in steps])
 
     def eager(self) -> None:
         """Take the first step of a batch from Python, again and again: the same work each time."""

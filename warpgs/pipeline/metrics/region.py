@@ -6,6 +6,8 @@ import numpy as np
 
 from warpgs.scene import View
 
+OPAQUE = 0.5
+"""Opacity above which a pixel of a cut-out object shows it."""
 DARK = 16 / 255
 """Brightness below which the brightest channel of a pixel belongs to a black background, in [0, 1]."""
 DARK_FRACTION = 0.3
@@ -35,3 +37,14 @@ def counted_region(view: View) -> tuple[np.ndarray | None, str]:
     if dark.mean() >= DARK_FRACTION and border.mean() >= 0.5 and not dark.all():
         return ~dark, "foreground"
     return None, "all"
+
+
+def fitted_region(view: View) -> tuple[np.ndarray | None, str]:
+    """Return the pixels behind which a fit may start Gaussians, bool [H, W], and their name; None for all.
+
+    The opaque ones that its mask keeps where the view knows its opacity, else the region of `counted_region`.
+    """
+    if view.alpha is None:
+        return counted_region(view)
+    opaque = view.alpha > OPAQUE
+    return opaque if view.mask is None else opaque & view.mask, "object"

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from warpgs.pipeline.metrics.region import counted_region
+from warpgs.pipeline.metrics.region import fitted_region
 from warpgs.pipeline.model.init import Start, check_points, initial_points, subsample
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LossTerm, built_in_terms, collect
 from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.strategies.importance_sampling import scored
-from warpgs.pipeline.train.views import TrainingView
+from warpgs.pipeline.train.views import TrainingView, with_alpha
 from warpgs.priors.cache import cache_folder
 from warpgs.priors.view_prior import view_priors
 from warpgs.scene import PointCloud, Prior, View
@@ -68,7 +68,7 @@ def prepare(
 
     notes = []
     if priors is None and needs_priors(config):
-        regions, cache = [counted_region(v)[0] for v in train], cache_folder()
+        regions, cache = [fitted_region(v)[0] for v in train], cache_folder()
         progress("finding what stands out in the views")
         # semantics come first: they are found while the device is made ready
         priors, notes = view_priors(train, config.priors, depths=lambda: start().depths, regions=regions, cache=cache)
@@ -94,7 +94,7 @@ def prepared_views(
     Raises:
         UsageError: Two loss terms ask for a map of one name.
     """
-    views, disparities = [TrainingView.of(v, device) for v in train], []
+    views, disparities = [TrainingView.of(v, device) for v in with_alpha(train)], []
     priors = made.priors or [None] * len(train)
     if find_strategy(config.strategy).samples(config):
         disparities = [p.disparity for p in priors]

@@ -19,7 +19,7 @@ from warpgs.pipeline.model.scale_limits import scene_radius
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import built_in_terms, collect
+from warpgs.pipeline.train.loss import built_in_terms, collect, random_shift
 from warpgs.pipeline.train.memory_plan import Layout, layout_of, most_instances, plan
 from warpgs.pipeline.train.schedule import plan_phases
 from warpgs.pipeline.train.setup import prepare, prepared_views
@@ -101,11 +101,12 @@ class Trainer:
         """Size of the scene [u], as `scene_extent` measures it."""
         self.radius = scene_radius(cameras, cloud)
         """Radius of the scene [u], as `scene_radius` measures it."""
-        self.background = torch.tensor(background, dtype=torch.float32, device=device)
+        self.scene_background, self.background = background, torch.tensor(background, dtype=torch.float32, device=device)
         self.phases = plan_phases(config.phases, config.steps)
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
         """Dropout probability at the last step."""
-        self.terms = (*built_in_terms(config.loss), *config.loss_terms)
+        self.cutout = any(v.alpha is not None for v in train)  # some know their opacity: all have one then
+        self.terms = (*built_in_terms(config.loss, self.cutout), *config.loss_terms)
         self.step = 0
         """Steps taken."""
         self.memory_limit, self.captured = config.memory_limit, config.cuda_graph
@@ -286,9 +287,11 @@ class Trainer:
         stable_start = phases.stable_start / c.steps if phases.stable_start < c.steps else 0.0
         return c.optimizer.lrs(self.progress(step), self.extent, stable_start)
 
-    def settings(self, step: int) -> tuple[float, float, float]:
-        """Return dropout probability, number, and learning rate of the means [u] of a step, as `StepBuffers` takes them."""
-        return self.strategy.dropout(step), step, self.lrs(step)["means"]
+    def settings(self, step: int) -> tuple[float, ...]:
+        """Return the six settings of a step, as `StepBuffers` takes them."""
+        shifted = self.cutout and self.config.loss.random_background
+        shift = random_shift(self.config.seed, step, self.scene_background) if shifted else (0.0, 0.0, 0.0)
+        return self.strategy.dropout(step), step, self.lrs(step)["means"], *shift
 
     def _update(self) -> None:
         """Have the strategy change the set of Gaussians after the step that was just taken, where that is due."""
