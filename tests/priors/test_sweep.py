@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from tests.priors.rigs import rig, still_life
-from tests.reference import plane_costs
 from tests.reference.scanlines import scanline_costs
 from warpgs.errors import UsageError
 from warpgs.geometry import back_project, project_points
@@ -106,27 +105,6 @@ def test_parabola_between_planes():
     costs = torch.from_numpy(np.rint(1e5 * (inverses - truth[..., None]) ** 2).astype(np.int16))
     assert np.allclose(best_inverses(costs, inverses), truth, rtol=1e-4)
     assert np.allclose(best_inverses(torch.zeros(1, 1, 16, dtype=torch.int16), inverses), inverses[1])
-    noise = np.random.default_rng(2).integers(0, 99, (6, 5, 16)).astype(np.int16)
-    wanted = plane_costs.best_inverse(noise[..., :9], inverses)
-    assert np.array_equal(best_inverses(torch.from_numpy(noise), inverses), wanted)
-
-
-@pytest.mark.parametrize("size", [(7, 160), (160, 5), (1, 1), (40, 70)])
-def test_costs_are_those_of_opencv(size):
-    """Costs differ from those of OpenCV's warps and blurs by rounding, in images of any size, and at their borders."""
-    height, width = size
-    views = []
-    for v in still_life()[0]:
-        c = v.camera
-        views.append(View(v.name, Camera(c.viewmat, c.K, width, height), np.resize(v.image[40:], (height, width, 3))))
-    views[2] = still_life()[0][2]  # of another size
-    inverses = np.linspace(1 / 12, 1 / 2, 21)
-    found = matching_costs(views[1], [views[0], views[2]], inverses, 7).numpy()
-    wanted = plane_costs.matching_costs(views[1], [views[0], views[2]], inverses, 7).transpose(1, 2, 0)
-    off = np.abs(found[..., :21] / UNIT - wanted)
-    # a pixel at the very border is inside for one and outside for the other
-    assert found.shape == (height, width, 32) and np.quantile(off, 0.995) < 0.01 and off.mean() < 2e-3
-    assert (found[..., 21:] == UNIT).all()
 
 
 def test_depths_are_the_same_bits_on_any_number_of_threads():

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from tests.priors.rigs import still_life
-from tests.reference.plane_costs import best_inverse, matching_costs
+from tests.reference.plane_costs import matching_costs
+from tests.reference.plane_depths import best_inverse
 from tests.reference.scanlines import scanline_costs
 from warpgs.kernels.plane_costs import NEUTRAL
 from warpgs.priors import sweep, sweep_cpu, sweep_cuda
