@@ -75,7 +75,7 @@ def main(arguments: list[str] | None = None) -> int:
     p.add_argument("data", type=Path, nargs="?")
     p.add_argument("--rows", nargs="+", default=list(ROWS))
     p.add_argument("--default", default="default")
-    p.add_argument("--fixed", default="paper")
+    p.add_argument("--fixed", default="default")
     p.add_argument("--out", type=Path, required=True)
     p.add_argument("--only-table", action="store_true", help="print the table of the file; nothing is measured")
     a, others = p.parse_known_args(arguments)

@@ -12,11 +12,11 @@ from warpgs.pipeline.model.parameter_bounds import model_bytes as bytes_of
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.complexity import complexity_figures
 from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loop import run
 from warpgs.pipeline.train.loss import LossConfig, built_in_terms
 from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.step import MAX_BATCH, Learned, StepBuffers, StepGraphs, StepPlan, eager_renderer, step
 from warpgs.pipeline.train.strategies.base import Strategy
-from warpgs.pipeline.train.loop import run
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import ViewStack
 from warpgs.pipeline.train.warmup import warm_up

@@ -24,6 +24,7 @@ from warpgs.pipeline.model.init import InitConfig, initial_gaussians, initial_po
 from warpgs.pipeline.model.table import Column, DensityUpdate, Table
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loop import run
 from warpgs.pipeline.train.loss import LossConfig, photometric_loss
 from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig, refine
@@ -31,7 +32,6 @@ from warpgs.pipeline.train.strategies.holdout_blocks import HoldoutConfig
 from warpgs.pipeline.train.strategies.importance import ImportanceConfig, normalized
 from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig, ProtectConfig
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig, geometry_gate, sample_pixels
-from warpgs.pipeline.train.loop import run
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Normalization, PointCloud, View

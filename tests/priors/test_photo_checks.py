@@ -87,3 +87,11 @@ def test_what_cannot_be_compared_is_said(sharp):
     assert photo_notes(checks) == [
         f"blur and exposure are unknown where too little matches the photographs beside it: {sharp[4].name}"
     ]
+
+
+def test_photographs_that_stand_close_together_are_compared():
+    """A third of a degree apart: too little for depth, and enough to see the same places."""
+    views = photos(_print, width=160, height=120, half=(1.2, 0.9), cameras=ring(400, 160, 120)[196:204:2])
+    checks = check_photos(_with(views, 1, views[1].image * 0.7))
+    assert all(c.compared_with == 3 for c in checks)
+    assert [c.name for c in checks if c.exposed_otherwise] == [views[1].name]

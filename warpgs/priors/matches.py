@@ -55,8 +55,17 @@ def sift_features(view: View, max_pixels: int | None = None, most: int = 0) -> F
     return Features(pixels, None if descriptors is None else descriptors.astype(np.uint8))
 
 
-def agreeing_matches(a: View, b: View, first: Features, second: Features) -> tuple[np.ndarray, np.ndarray]:
+def agreeing_matches(
+    a: View, b: View, first: Features, second: Features, min_angle: float = MIN_ANGLE
+) -> tuple[np.ndarray, np.ndarray]:
     """Match the features of two views, and triangulate the matches that agree with their poses.
+
+    Args:
+        a: The first view.
+        b: The second view.
+        first: Features of the first.
+        second: Features of the second.
+        min_angle: Smallest angle between the two rays [deg]; 0 where places are compared and their depth does not count.
 
     Returns:
         The rows of both features of each match, int, shape [N, 2]; and its point [u], shape [N, 3].
@@ -71,11 +80,13 @@ def agreeing_matches(a: View, b: View, first: Features, second: Features) -> tup
     ids = np.array([(m.queryIdx, m.trainIdx) for m, n in matches if m.distance < RATIO * n.distance], dtype=int)
     if len(ids) == 0:
         return nothing
-    found, good = _triangulate(a, b, first.pixels[ids[:, 0]], second.pixels[ids[:, 1]])
+    found, good = _triangulate(a, b, first.pixels[ids[:, 0]], second.pixels[ids[:, 1]], min_angle)
     return ids[good], found[good]
 
 
-def _triangulate(a: View, b: View, pixels_a: np.ndarray, pixels_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _triangulate(
+    a: View, b: View, pixels_a: np.ndarray, pixels_b: np.ndarray, min_angle: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the points [u] midway between the rays of each match, shape [N, 3], and True where they pass the checks [N]."""
     origins = [v.camera.center for v in (a, b)]
     rays = []
@@ -89,7 +100,7 @@ def _triangulate(a: View, b: View, pixels_a: np.ndarray, pixels_b: np.ndarray) -
     s = (along[0] - cosine * along[1]) / sine2
     t = (cosine * along[0] - along[1]) / sine2
     points = 0.5 * (origins[0] + s[:, None] * rays[0] + origins[1] + t[:, None] * rays[1])
-    good = (s > 0) & (t > 0) & (sine2 > np.sin(np.radians(MIN_ANGLE)) ** 2)
+    good = (s > 0) & (t > 0) & (sine2 > np.sin(np.radians(min_angle)) ** 2)
     for view, pixels in ((a, pixels_a), (b, pixels_b)):
         projected, z = geometry.project_points(view.camera, points)
         with np.errstate(over="ignore"):  # points beside the camera are infinitely far from their pixels

@@ -114,7 +114,7 @@ def _difference(views: Sequence[View], places: Sequence[_Places], i: int, j: int
     A factor is NaN where it is unknown; None where too few places match.
     """
     a, b = places[i], places[j]
-    ids, _ = agreeing_matches(views[i], views[j], a.features, b.features)
+    ids, _ = agreeing_matches(views[i], views[j], a.features, b.features, min_angle=0.0)
     if len(ids) < MIN_MATCHES:
         return None
     detail = np.median(a.detail[ids[:, 0]] - b.detail[ids[:, 1]])

@@ -92,7 +92,8 @@ class Trainer:
         self.config, self.device = config, device
         self.generator = torch.Generator().manual_seed(config.seed)
         made = prepare(train, points, config, np.random.default_rng(config.seed), device, priors, ready, progress)
-        self.notes: list[str] = [*chosen, *made.notes]
+        made.notes[:0] = chosen
+        self.notes: list[str] = made.notes
         """Sentences on what was chosen for the user before the first step."""
         self.messages: list[str] = []
         """Sentences for the user that were not shown yet."""
