@@ -4,7 +4,7 @@ usage: python -m bench.same_bits [--out bench/results/same_bits.json] [--device 
 
 Makes the demo scene, then fits it by three presets: ``3dgs`` from the points of the scene, ``quick`` from swept depths, with
 saliency and sampling events, and ``mcmc`` with relocation and noise. Prints a line for each stage with the first 12 digits of
-its SHA-256, puts a row into the result ``--out`` (in the place of one of the same label, processor and arguments), and names the
+its SHA-256, puts a row into the result ``--out`` (in place of one of the same label, processor and arguments), and names the
 stages that differ from the first row of the same arguments and kind of device. Stages of single functions (``torch.exp``,
 ``cv2.SIFT``, ...) come first: they work on fixed numbers, so one that differs did not inherit it.
 
