@@ -12,7 +12,7 @@ import numpy as np
 from warpgs import geometry
 from warpgs.pipeline.metrics.region import fitted_region
 from warpgs.pipeline.model.depth_points import focal_length, merge, merge_cells
-from warpgs.scene import PointCloud, View
+from warpgs.scene import Camera, PointCloud, View
 
 MARGIN = 1.5
 """Distance from the nearest opaque pixel at which a point lies in the empty region of a view [px]."""
@@ -105,7 +105,7 @@ def carve(shapes: Sequence[Silhouette]) -> tuple[np.ndarray, float]:
     return cells, 2 * half
 
 
-def _footprint(cameras, points: np.ndarray) -> float:
+def _footprint(cameras: Sequence[Camera], points: np.ndarray) -> float:
     """Return the width of a pixel at points [N, 3] before the cameras, the median over both [u]."""
     widths = np.stack([geometry.project_points(c, points)[1] / focal_length(c) for c in cameras])
     return float(np.median(widths[widths > 0])) if (widths > 0).any() else 0.0

@@ -116,7 +116,9 @@ that is added to the background."""
 def eager_renderer(rule: str, background: torch.Tensor, max_instances: int | None) -> Renderer:
     """Return a renderer whose capacity follows the instances, in chunks of at most ``max_instances``; background [3]."""
 
-    def render(gaussians, camera, degree, factors, shift) -> Render:
+    def render(
+        gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None, shift: torch.Tensor | None
+    ) -> Render:
         behind = background if shift is None else background + shift
         options = RasterizeOptions(
             rule=rule, sh_degree=degree, background=behind, opacity_factors=factors, max_instances=max_instances,
@@ -132,7 +134,9 @@ def captured_renderer(rule: str, background: torch.Tensor, capacity: int, overfl
     """Return a renderer with a fixed capacity of instances, which sets ``overflow`` [1] if they do not fit; background [3]."""
     cut, backgrounds = RULES[rule], background[None]
 
-    def render(gaussians, camera, degree, factors, shift) -> Render:
+    def render(
+        gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None, shift: torch.Tensor | None
+    ) -> Render:
         behind = backgrounds if shift is None else backgrounds + shift
         size = {"width": camera.width, "height": camera.height}
         of = (*gaussians.tensors().values(), camera.viewmat, camera.K)
