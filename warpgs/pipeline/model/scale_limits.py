@@ -42,7 +42,7 @@ class Limits:
         if self.largest == math.inf and self.ratio == math.inf:
             return
         old = log_scales.detach()
-        new = old.clamp(max=math.log(self.largest))
+        new = torch.where(old.isinf(), old, old.clamp(max=math.log(self.largest)))  # what is not finite is not hidden
         if self.ratio < math.inf:
             longest, middle = (x[:, None] for x in long_axes(new))
             new = torch.where(new == middle, torch.maximum(new, longest - math.log(self.ratio)), new)
@@ -91,15 +91,14 @@ class LimitConfig:
         if not 0 < self.opacity_decay <= 1:
             raise UsageError(f"limits opacity-decay must be above 0 and at most 1, not {self.opacity_decay}")
 
-    def at(self, step: int, steps: int, radius: float) -> Limits:
-        """Return the limits at a step, counted from 1; the last one has all of them.
+    def at(self, progress: float, radius: float) -> Limits:
+        """Return the limits of a step.
 
         Args:
-            step: Number of the step.
-            steps: Steps of the fit.
+            progress: Fraction of the fit that is done before it, in [0, 1]; 1 for the last step, which has all of them.
             radius: Result of `scene_radius` [u].
         """
-        held = self.max_ratio > 0 and (step > self.ratio_from * steps or step == steps)
+        held = self.max_ratio > 0 and (progress > self.ratio_from or progress == 1)
         largest = self.max_size * radius if self.max_size > 0 else math.inf
         return Limits(largest, self.max_ratio if held else math.inf, self.opacity_decay)
 
@@ -151,7 +150,7 @@ def shape_figures(gaussians: Gaussians, config: LimitConfig, radius: float, exte
     opacities = gaussians.logit_opacities.detach().cpu().double().sigmoid()
     needle = longest - middle > math.log(NEEDLE) + ROUNDING
     thin = longest - scales.amin(1) > math.log(NEEDLE) + ROUNDING
-    at = config.at(1, 1, radius)
+    at = config.at(1.0, radius)
     largest = math.log(at.largest) + ROUNDING, math.log(at.ratio) + ROUNDING
     beyond = (longest > largest[0]) | (longest - middle > largest[1])
     count, sigma = max(1, len(gaussians)), float(longest.max().exp()) if len(gaussians) else 0.0

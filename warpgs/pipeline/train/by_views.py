@@ -13,8 +13,8 @@ from warpgs.scene import View
 
 MIN_STEPS = 3000
 """Steps of a fit of up to `FEW` views at most."""
-FEW = 4
-"""Views up to which steps are `MIN_STEPS`; with more they grow with the square root of the number of views."""
+FEW, STEPS_POWER, MAX_STEPS = 4, 0.75, 30_000
+"""Views up to which steps are `MIN_STEPS`; the power of their number with which they grow beyond; and their bound."""
 SCALES_LR, SCALES_VIEWS, SCALES_POWER = 0.1, 8, 0.6
 """Learning rate of the log scales up to so many views, and the power of their number with which it falls beyond."""
 OPACITIES_LR, MAX_OPACITIES_LR = 0.0125, 0.05
@@ -30,8 +30,8 @@ CPU_SECONDS = 60.0, 5.0, 1200.0
 
 
 def steps_by_views(views: int) -> int:
-    """Return the most steps of a fit of so many views: 3000 up to 4, 4500 for 9, 11,023 for 54, 25,981 for 300."""
-    return round(MIN_STEPS * math.sqrt(max(1.0, views / FEW)))
+    """Return the most steps of a fit of so many views: 3000 up to 4, 5511 for 9, 21,129 for 54, 30,000 from 87 on."""
+    return min(MAX_STEPS, round(MIN_STEPS * max(1.0, views / FEW) ** STEPS_POWER))
 
 
 def cpu_seconds(views: int) -> float:

@@ -159,7 +159,8 @@ class Trainer:
         c = self.config
         terms = tuple(t for t in self.terms if t.active(step, c.steps))
         strategy, half = self.strategy, step <= c.half_resolution * c.steps
-        return StepPlan(strategy.sh_degree(step), half, terms, strategy.phase(step), c.limits.at(step, c.steps, self.radius))
+        limits = c.limits.at(1.0 if step >= self.steps else self.progress(step), self.radius)
+        return StepPlan(strategy.sh_degree(step), half, terms, strategy.phase(step), limits)
 
     def next_view(self) -> int:
         """Return the number of the next view; they come in random order, each once before any comes again."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 
 import torch
 
@@ -24,6 +24,7 @@ from warpgs.pipeline.train.strategies.holdout_blocks import (
     FLOOR,
     MIN_BLOCKS,
     Gain,
+    Level,
     block_errors,
     decibels,
     gain,
@@ -39,36 +40,18 @@ from warpgs.scene import Gaussians
 RECOVERED_AGAIN = 0.5
 """Fraction of what training recovered of one trim that it is expected to recover of the next: a smaller model recovers less.
 With all of it smooth walls ended up to 1.1 dB below `HoldoutConfig.enough_db`, with half of it there (docs/complexity.md)."""
+LATELY = 1.5
+"""Factor by which the steps grow while less than `HoldoutConfig.stop_db` is gained, for a fit to end."""
 NEAR = 4.0
 """Distance below `HoldoutConfig.enough_db` over which the loss that a trim may cause falls to 0 [dB]. With a threshold instead,
 a tenth of a decibel decided whether a smooth wall kept 167 or 696 Gaussians (docs/complexity.md)."""
-
-
-@dataclass(frozen=True)
-class Level:
-    """One level of growth and what it gained; plain values as metrics.json has them."""
-
-    step: int
-    """Steps done when it was measured."""
-    count: int
-    """Gaussians at that step."""
-    held_out_psnr: float
-    """PSNR of the held-out blocks, the error floor included [dB]."""
-    fall: float
-    """Fall of the held-out error since the level before, by growth and training together [dB]."""
-    own: float
-    """Loss when the Gaussians that came with the level are hidden [dB]."""
-    gain: float
-    """The smaller of the two, which are both upper bounds of the gain by growth [dB]."""
-    noise: float
-    """Standard error of ``gain`` over the blocks [dB]."""
 
 
 _COUNT = schema.whole(0)
 _LEVEL = {f.name: _COUNT if f.name in ("step", "count") else schema.real for f in fields(Level)}
 STATE = schema.fields({
     "was_reset": schema.flag, "events": schema.items(EVENT), "closed": schema.or_null(_COUNT), "why": schema.text,
-    "levels": schema.items(schema.fields(_LEVEL, others=False)), "growing": _COUNT,
+    "levels": schema.items(schema.fields(_LEVEL, others=False)), "growing": _COUNT, "measured": schema.items(_COUNT),
     "trims": schema.items(schema.fields({
         "step": _COUNT, "before": schema.whole(1), "after": _COUNT, "psnr": schema.items(schema.real, 2),
     })),
@@ -101,6 +84,8 @@ class Holdout(ImportanceSampling):
         """Level of growth that new Gaussians come with."""
         self.before: torch.Tensor | None = None
         """Errors of the blocks when they were measured last, shape [B]."""
+        self.measured: list[tuple[int, torch.Tensor]] = []
+        """Steps done, and errors of the blocks [B], of every measurement, where the end of the fit follows from them."""
 
     def columns(self):
         """Return the columns of importance sampling, the bounds of each Gaussian, and the level of growth that it came with."""
@@ -256,9 +241,13 @@ class Holdout(ImportanceSampling):
                     self.why = f"no Gaussian came with level {len(self.levels)}: the capacity is used up, or nothing is to add"
                 yield from self._close(step)
                 return
-            lately = sum(x.fall for x in self.levels[-2:])
-            if len(self.levels) > 1 and lately < c.stop_db and not self._is_early(step):
-                self.why = f"the held-out blocks gained {lately:+.3f} dB in the last two levels, less than {c.stop_db:g} dB"
+            since, earlier = next((m for m in reversed(self.measured) if m[0] * LATELY <= step), (0, None))
+            lately = Gain(math.inf, 0.0) if earlier is None or self._is_early(step) else gain(earlier, errors)
+            if c.stop_db > 0 and lately.upper_bound_below(c.stop_db, c.noise):
+                self.why = (
+                    f"the held-out blocks gained {lately.mean:+.3f} dB in the last {step - since:,} steps, which with "
+                    f"{c.noise:g} x its noise of {lately.noise:.3f} dB is less than {c.stop_db:g} dB"
+                )
                 yield from self._close(step)
                 return
             if step == self.marks[-1]:
@@ -266,6 +255,8 @@ class Holdout(ImportanceSampling):
                 yield from self._close(step)
                 return
         self.before = errors
+        if c.stop_db > 0:
+            self.measured.append((step, errors))
         self.growing += 1
 
     def _is_early(self, step: int) -> bool:
@@ -362,9 +353,11 @@ class Holdout(ImportanceSampling):
         tensors, plain = super().state()
         if self.before is not None:
             tensors["holdout.before"] = self.before
+        if self.measured:
+            tensors["holdout.measured"] = torch.stack([e for _, e in self.measured])
         return tensors, plain | {
             "closed": self.closed, "why": self.why, "levels": [asdict(x) for x in self.levels], "trims": self.trims,
-            "growing": self.growing,
+            "growing": self.growing, "measured": [s for s, _ in self.measured],
         }  # fmt: skip
 
     def load(self, tensors, plain):
@@ -378,10 +371,13 @@ class Holdout(ImportanceSampling):
         self.levels = [Level(**x) for x in plain["levels"]]
         self.before = tensors.get("holdout.before")
         blocks = sum(map(len, self.blocks)) if self.measuring else 0
-        if self.before is not None and self.before.shape != (blocks,):
-            raise DataError(
-                f"the stored errors of the held-out blocks have shape {list(self.before.shape)}, not [{blocks}]; fit again"
-            )
+        measured = tensors.get("holdout.measured", torch.zeros(0, blocks))
+        for errors, shape in ((self.before, (blocks,)), (measured, (len(plain["measured"]), blocks))):
+            if errors is not None and errors.shape != shape:
+                raise DataError(
+                    f"the stored errors of the held-out blocks have shape {list(errors.shape)}, not {list(shape)}; fit again"
+                )
+        self.measured = list(zip(plain["measured"], measured))
         if self.closed is not None:
             self.trainer.views = self.whole
 

@@ -42,9 +42,9 @@ class HoldoutConfig:
     least_db: float = 0.02
     """Gain of a level, its noise added, below which growth ends early [dB]."""
     stop_db: float = 0.0
-    """Gain of the last two levels together, by growth and training, below which growth ends [dB], in place of `least_db`:
-    where the fit has phases, the third begins then, and the fit ends earlier. Not before a third of the time of growth, nor
-    while views are half their size. 0: growth is judged by its own gain, and the fit takes the planned number of steps."""
+    """Gain by growth and training in the last third of the steps, its noise added, below which growth ends [dB], in place of
+    `least_db`: where the fit has phases, the third begins then, and the fit ends earlier. Not before a third of the time of
+    growth, nor while views are half their size. 0: growth is judged by its own gain; the fit takes the planned steps."""
     bounds: bool = True
     """Bound the degree and the least width of each Gaussian by what views resolve, and grow none that one view alone sees."""
     degrees: bool = True
@@ -193,3 +193,23 @@ def gain(before: torch.Tensor, after: torch.Tensor) -> Gain:
     if count == 0:
         return Gain(math.nan, math.inf)
     return Gain(float(each.mean()), float(each.std() / math.sqrt(count)) if count > 1 else math.inf)
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level of growth and what it gained; plain values as metrics.json has them."""
+
+    step: int
+    """Steps done when it was measured."""
+    count: int
+    """Gaussians at that step."""
+    held_out_psnr: float
+    """PSNR of the held-out blocks, the error floor included [dB]."""
+    fall: float
+    """Fall of the held-out error since the level before, by growth and training together [dB]."""
+    own: float
+    """Loss when the Gaussians that came with the level are hidden [dB]."""
+    gain: float
+    """The smaller of the two, which are both upper bounds of the gain by growth [dB]."""
+    noise: float
+    """Standard error of ``gain`` over the blocks [dB]."""
