@@ -1,5 +1,6 @@
 """Decoding, orientation, masks, undistortion and resizing, each with the camera in step."""
 
+import dataclasses
 import io
 
 import numpy as np
@@ -11,6 +12,7 @@ from warpgs.errors import DataError, UsageError
 from warpgs.io.decoding import decode
 from warpgs.io.images import Lens, load_image
 from warpgs.io.load import load_scene
+from warpgs.io.normalize import fingerprint
 
 
 def lens(width, height, focal=20.0, distortion=(), model="PINHOLE"):
@@ -217,15 +219,59 @@ def test_masks_of_middlebury_lie_in_the_scene_folder(tmp_path):
     assert views[0].mask is None and not views[1].mask[0].any()
 
 
-def test_alpha_becomes_the_mask_outside_blender(tmp_path):
-    scenes.write_colmap(tmp_path)
-    alpha = np.full((12, 16, 1), 255, np.uint8)
-    alpha[:, :4] = 100
-    scenes.save(tmp_path / "images" / "photo0.png", np.concatenate([scenes.image(0), alpha], axis=2))
+def rgba(i, alpha):
+    """Return the test image [12, 16, 4] with an alpha channel [12, 16]."""
+    return np.concatenate([scenes.image(i), alpha[..., None]], axis=2)
+
+
+@pytest.mark.parametrize("write", [scenes.write_colmap, scenes.write_transforms, scenes.write_llff])
+def test_alpha_arrives_in_every_format(write, tmp_path):
+    """Straight colours come multiplied, over black; an alpha of one everywhere is an opaque image."""
+    write(tmp_path)
+    alpha = np.full((12, 16), 255, np.uint8)
+    scenes.save(tmp_path / "images" / "photo1.png", rgba(1, alpha))
+    alpha[:, :4], alpha[0] = 100, 0
+    scenes.save(tmp_path / "images" / "photo0.png", rgba(0, alpha))
     scene = load_scene(tmp_path)
-    assert (scene.views[0].mask == (alpha[..., 0] > 127)).all() and scene.background == (0, 0, 0)
-    np.testing.assert_allclose(scene.views[0].image, scenes.image(0) / 255, atol=1e-6)  # straight, not multiplied
-    assert "1 image masked by its alpha channel" in scene.notes
+    first, second, *_ = scene.views
+    np.testing.assert_allclose(first.alpha, alpha / 255, atol=1e-6)
+    np.testing.assert_allclose(first.image, scenes.image(0) / 255 * (alpha / 255)[..., None], atol=1e-6)
+    assert first.alpha.dtype == np.float32 and first.mask is None and scene.background == (0, 0, 0)
+    assert second.alpha is None and "1 image transparent in part, by the alpha channel" in scene.notes
+    other = first.alpha.copy()
+    other[3, 3] = 0.25
+    assert fingerprint([first]) != fingerprint([dataclasses.replace(first, alpha=other)])
+
+
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 0.5, 0.25)])
+def test_transparent_colours_do_not_run_into_others(background, tmp_path):
+    """Resampling is a mean over what can be seen: the red of transparent pixels leaves no trace."""
+    image = np.zeros((8, 12, 4), np.uint8)
+    image[...] = 255, 0, 0, 0
+    image[:, 5:] = 40, 80, 120, 255
+    scenes.save(tmp_path / "a.png", image)
+    loaded = load_image(tmp_path / "a.png", lens(12, 8), downscale=2, background=background)
+    alpha = np.tile(np.float32([0, 0, 0.5, 1, 1, 1]), (4, 1))
+    np.testing.assert_allclose(loaded.alpha, alpha, atol=1e-6)
+    expected = alpha[..., None] * np.array([40, 80, 120]) / 255 + (1 - alpha[..., None]) * background
+    np.testing.assert_allclose(loaded.image, expected, atol=1e-6)
+
+
+def test_alpha_is_freed_of_distortion_with_its_image(tmp_path):
+    """White where opaque, so that over black every channel is the alpha."""
+    image = np.full((48, 64, 4), 255, np.uint8)
+    image[..., 3] = np.tile((np.arange(64) % 8 < 4) * 255, (48, 1))
+    scenes.save(tmp_path / "a.png", image)
+    loaded = load_image(tmp_path / "a.png", lens(64, 48, 60.0, (0.3, 0.0, 0.0, 0.0)), downscale=2)
+    np.testing.assert_allclose(loaded.image, loaded.alpha[..., None].repeat(3, 2), atol=1e-6)
+    straight = load_image(tmp_path / "a.png", lens(64, 48, 60.0), downscale=2)
+    assert np.abs(straight.alpha - loaded.alpha)[0].max() > 0.5 and loaded.mask is not None
+
+
+def test_an_image_that_shows_nothing_is_named(tmp_path):
+    scenes.write_colmap(tmp_path)
+    scenes.save(tmp_path / "images" / "photo0.png", rgba(0, np.zeros((12, 16), np.uint8)))
+    assert "1 image wholly transparent: it shows nothing" in load_scene(tmp_path).notes
 
 
 def test_masks_that_cannot_be_used(tmp_path):

@@ -12,7 +12,7 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.io.decoding import MAX_PIXELS, decode
-from warpgs.io.images import Lens, LoadedImage, list_images, load_image
+from warpgs.io.images import BLACK, Lens, LoadedImage, list_images, load_image
 from warpgs.io.readers import ReadOptions
 from warpgs.scene import Camera, View
 
@@ -101,7 +101,7 @@ class SceneFolder:
         *,
         downscale: int | None = None,
         mask: np.ndarray | None = None,
-        background: tuple[float, float, float] | None = None,
+        background: tuple[float, float, float] = BLACK,
     ) -> LoadedImage:
         """Load an image of the scene as `load_image` does.
 
@@ -208,7 +208,8 @@ class ViewList:
     def add(self, name: str, viewmat: np.ndarray, loaded: LoadedImage) -> None:
         """Append a view of an image at its final size; ``viewmat`` is camera_from_world [4, 4] in file units, rigid."""
         height, width = loaded.image.shape[:2]
-        self.views.append(View(name, Camera(viewmat, loaded.K, width, height), loaded.image, loaded.mask))
+        camera = Camera(viewmat, loaded.K, width, height)
+        self.views.append(View(name, camera, loaded.image, loaded.mask, alpha=loaded.alpha))
         self._done.update(loaded.done)
 
     def notes(self) -> list[str]:

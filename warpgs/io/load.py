@@ -158,7 +158,9 @@ def _check_views(root: Path, views: list[View]) -> None:
         seen.add(v.name)
         where, size = f"{root}, image {v.name!r}", (v.camera.height, v.camera.width)
         rigid(np.asarray(v.camera.viewmat), where)
-        wanted = [("image", v.image, (*size, 3), np.float32), ("mask", v.mask, size, bool)]
+        wanted = [
+            ("image", v.image, (*size, 3), np.float32), ("mask", v.mask, size, bool), ("alpha", v.alpha, size, np.float32),
+        ]  # fmt: skip
         for noun, array, shape, dtype in wanted:
             if array is not None and (array.shape != shape or array.dtype != dtype):
                 raise DataError(
