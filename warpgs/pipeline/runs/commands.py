@@ -19,6 +19,7 @@ from warpgs.pipeline.runs.image_names import image_names, renaming_notes
 from warpgs.pipeline.runs.paths import FILM, render_path
 from warpgs.pipeline.runs.request import choose_device, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line
+from warpgs.pipeline.train.background import over_background
 from warpgs.pipeline.train.loop import train_views
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Scene, View
@@ -37,7 +38,7 @@ def scene_of(stored: StoredRun, reader: str | None = None) -> tuple[Scene, list[
     scene, _, _ = read_scene(stored.scene_request(reader))
     if scene.fingerprint != stored.record["fingerprint"]:
         raise DataError(f"{scene.path}: its images or cameras are not those that {stored.folder} was fitted to; restore them")
-    split = Split(stored.train, stored.test)
+    scene, split = over_background(scene, stored.background), Split(stored.train, stored.test)
     return scene, train_views(scene, split.train), train_views(scene, split.test)
 
 
