@@ -90,7 +90,7 @@ def test_dtu_masks_match_by_number_and_can_be_inverted(tmp_path):
     for i in range(5):
         scenes.save(tmp_path / "mask" / f"{i:03d}.png", mask)
     assert all((v.mask == (mask > 0)).all() for v in load_scene(tmp_path).views)
-    assert all((v.mask == (mask == 0)).all() for v in load_scene(tmp_path, invert_masks=True).views)
+    assert all((v.mask == (mask == 0)).all() for v in load_scene(tmp_path, mask_keeps="black").views)
 
 
 def test_transforms_per_frame_intrinsics_and_mask_path(tmp_path):

@@ -196,17 +196,22 @@ def test_distortion_is_noted_once_per_model(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["photo0.png", "photo0.png.png"])
-@pytest.mark.parametrize("invert", [False, True])
-def test_masks_folder(name, invert, tmp_path):
+@pytest.mark.parametrize("keeps", ["white", "black"])
+def test_masks_folder(name, keeps, tmp_path):
     scenes.write_colmap(tmp_path)
     mask = np.zeros((12, 16), np.uint8)
     mask[:, 4:] = 255
     scenes.save(tmp_path / "masks" / name, mask)
-    scene = load_scene(tmp_path, invert_masks=invert)
-    assert (scene.views[0].mask == ((mask > 0) != invert)).all() and scene.views[1].mask is None
+    scene = load_scene(tmp_path, mask_keeps=keeps)
+    assert (scene.views[0].mask == ((mask > 0) == (keeps == "white"))).all() and scene.views[1].mask is None
     assert "1 image masked by a mask file" in scene.notes
-    half = load_scene(tmp_path, downscale=2, invert_masks=invert).views[0].mask
-    assert (half == ((mask[::2, ::2] > 0) != invert)).all()
+    kept = "75.0%" if keeps == "white" else "25.0%"
+    assert (
+        f"masks keep {kept} of the pixels, the {keeps} ones (--mask-keeps {keeps}); the others do not count (--masks ignore)"
+        in (scene.notes)
+    )
+    half = load_scene(tmp_path, downscale=2, mask_keeps=keeps).views[0].mask
+    assert (half == ((mask[::2, ::2] > 0) == (keeps == "white"))).all()
 
 
 def test_masks_of_middlebury_lie_in_the_scene_folder(tmp_path):
@@ -274,11 +279,44 @@ def test_an_image_that_shows_nothing_is_named(tmp_path):
     assert "1 image wholly transparent: it shows nothing" in load_scene(tmp_path).notes
 
 
+def test_masks_cut_out(tmp_path):
+    """Gray is transparent in part; an alpha channel counts too; masks that keep nothing or everything are named."""
+    scenes.write_colmap(tmp_path)
+    mask = np.full((12, 16), 255, np.uint8)
+    mask[:, :4], mask[:, 4] = 0, 51
+    scenes.save(tmp_path / "masks" / "photo0.png", mask)
+    for i, value in ((1, 0), (2, 255)):
+        scenes.save(tmp_path / "masks" / f"photo{i}.png", np.full((12, 16), value, np.uint8))
+    scenes.save(tmp_path / "images" / "photo0.png", rgba(0, np.full((12, 16), 204, np.uint8)))
+    scene = load_scene(tmp_path, masks="cutout")
+    first, second, third, *_ = scene.views
+    alpha = 0.8 * mask / 255
+    np.testing.assert_allclose(first.alpha, alpha, atol=1e-6)
+    np.testing.assert_allclose(first.image, alpha[..., None] * scenes.image(0) / 255, atol=1e-6)
+    assert first.mask is None and not second.alpha.any() and third.alpha is None
+    assert {
+        "3 images cut out by a mask file", "1 image wholly transparent: it shows nothing",
+        "masks that keep no pixel: photo1.png (1)", "masks that keep every pixel: photo2.png (1)",
+    } <= set(scene.notes)  # fmt: skip
+    assert any("the white ones (--mask-keeps white); the others are transparent (--masks cutout)" in n for n in scene.notes)
+    half = load_scene(tmp_path, masks="cutout", downscale=2).views[0].alpha
+    np.testing.assert_allclose(half, alpha.reshape(6, 2, 8, 2).mean((1, 3)), atol=1e-6)
+
+
+def test_cutting_out_without_masks_is_said_and_words_are_checked(tmp_path):
+    scenes.write_colmap(tmp_path)
+    assert "--masks cutout changes nothing: no image has a mask file" in load_scene(tmp_path, masks="cutout").notes
+    with pytest.raises(UsageError, match="--masks must be ignore or cutout, not 'cut'"):
+        load_scene(tmp_path, masks="cut")
+    with pytest.raises(UsageError, match="--mask-keeps must be white or black, not 'gray'"):
+        load_scene(tmp_path, mask_keeps="gray")
+
+
 def test_masks_that_cannot_be_used(tmp_path):
     scenes.write_colmap(tmp_path)
     path = tmp_path / "masks" / "photo0.png"
     scenes.save(path, np.zeros((12, 16), np.uint8))
-    with pytest.raises(DataError, match=r"photo0.png: its mask leaves no pixel.*--invert-masks"):
+    with pytest.raises(DataError, match=r"photo0.png: its mask leaves no pixel.*--mask-keeps"):
         load_scene(tmp_path)
     scenes.save(path, np.full((12, 30), 255, np.uint8))
     with pytest.raises(DataError, match=r"photo0.png: its mask is 30 x 12 px, the image 16 x 12"):

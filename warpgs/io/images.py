@@ -77,6 +77,8 @@ class LoadedImage:
     """Changes of the pixels that a user should know of, in words that continue "1 image ..."."""
     alpha: np.ndarray | None = None
     """Opacity in [0, 1], float32, shape [H, W]; None where the image is opaque."""
+    kept: float | None = None
+    """Fraction of the pixels that a mask file keeps, in [0, 1]; None without one."""
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -153,7 +155,7 @@ def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     if loaded.alpha is not None:
         alpha = cv2.remap(loaded.alpha, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     done = (*loaded.done, f"freed of lens distortion ({lens.model})")
-    return LoadedImage(image, None if inside.all() else inside, loaded.K, done, alpha)
+    return LoadedImage(image, None if inside.all() else inside, loaded.K, done, alpha, loaded.kept)
 
 
 def _shrink(path: Path, loaded: LoadedImage, downscale: int) -> LoadedImage:
@@ -167,11 +169,14 @@ def _shrink(path: Path, loaded: LoadedImage, downscale: int) -> LoadedImage:
     K = np.diag([small_w / width, small_h / height, 1.0]) @ loaded.K
     mask = None if loaded.mask is None else _resize(loaded.mask.astype(np.float32), small_w, small_h) > 0.5
     alpha = None if loaded.alpha is None else _resize(loaded.alpha, small_w, small_h)
-    return LoadedImage(_resize(loaded.image, small_w, small_h), mask, K, loaded.done, alpha)
+    return LoadedImage(_resize(loaded.image, small_w, small_h), mask, K, loaded.done, alpha, loaded.kept)
 
 
 def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tuple[int, int], orientation: int) -> np.ndarray:
-    """Return the mask at the upright size (height, width); a mask that lies like the stored raster is turned with it."""
+    """Return the mask at the upright size (height, width); a mask that lies like the stored raster is turned with it.
+
+    It is resampled as gray, and stays bool where it is.
+    """
     if stored != upright and mask.shape == stored:
         mask = _turn(mask, orientation)
     height, width = upright
@@ -183,7 +188,8 @@ def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tu
             f"{path}: its mask is {mask.shape[1]} x {mask.shape[0]} px, the image {width} x {height}: the aspects differ. "
             "Give a mask made from this image"
         )
-    return _resize(mask.astype(np.float32), width, height) > 0.5
+    resized = _resize(mask.astype(np.float32), width, height)
+    return resized > 0.5 if mask.dtype == bool else resized
 
 
 def _upright(path: Path, lens: Lens, image: np.ndarray) -> int:
@@ -207,6 +213,7 @@ def load_image(
     mask: np.ndarray | None = None,
     background: tuple[float, float, float] = BLACK,
     max_pixels: int = MAX_PIXELS,
+    cutout: bool = False,
 ) -> LoadedImage:
     """Decode an image, set it upright if its camera says so, undo distortion, and resample.
 
@@ -217,9 +224,10 @@ def load_image(
         lens: Its intrinsics, at any size; they are scaled to the image. Or a function that makes them from the width and
             height [px] of the stored raster, for formats that leave the size to the image.
         downscale: Factor by which both sides shrink (area resampling).
-        mask: True where a pixel counts, [H, W] at the size of the file or of the same aspect.
+        mask: How far a pixel is kept, in [0, 1], [H, W] at the size of the file or of the same aspect.
         background: Colour in [0, 1] behind transparent pixels.
         max_pixels: Largest number of pixels that the file may have.
+        cutout: What the mask does not keep is transparent, gray in part; else pixels kept by half or less do not count.
 
     Returns:
         The image with intrinsics for its final size.
@@ -237,18 +245,26 @@ def load_image(
         image, alpha = _turn(image, orientation), None if alpha is None else _turn(alpha, orientation)
         done.append("turned by the EXIF tag, as the camera asks")
     height, width = image.shape[:2]
-    K = np.diag([width / lens.width, height / lens.height, 1.0]) @ lens.K
+    K, kept = np.diag([width / lens.width, height / lens.height, 1.0]) @ lens.K, None
     if mask is not None:
-        mask = _fit_mask(path, mask, stored, (height, width), orientation)
-        done.append("masked by a mask file")
+        mask = _fit_mask(path, mask if cutout else mask > 0.5, stored, (height, width), orientation)
+        kept = float(mask.mean(dtype=np.float64))
+        done.append("cut out by a mask file" if cutout else "masked by a mask file")
+    if cutout and mask is not None:
+        alpha, mask = mask.astype(np.float32) if alpha is None else alpha * mask, None
     if alpha is not None and alpha.min() < 1:
         image *= alpha[..., None]  # until it is resampled
-        done.append("transparent in part, by the alpha channel" if alpha.any() else "wholly transparent: it shows nothing")
+        if not alpha.any():
+            done.append("wholly transparent: it shows nothing")
+        elif kept is None or not cutout:
+            done.append("transparent in part, by the alpha channel")
     else:
         alpha = None
     if mask is not None and not mask.any():
-        raise DataError(f"{path}: its mask leaves no pixel; white keeps a pixel, so perhaps --invert-masks is wanted")
-    loaded = LoadedImage(image, mask, K, tuple(done), alpha)
+        raise DataError(
+            f"{path}: its mask leaves no pixel; --mask-keeps says which of its colours, white or black, keeps a pixel"
+        )
+    loaded = LoadedImage(image, mask, K, tuple(done), alpha, kept)
     if any(lens.distortion):
         loaded = _undistort(loaded, lens)
     if downscale > 1:
@@ -260,4 +276,4 @@ def load_image(
         alpha = np.clip(alpha, 0, 1)  # a mean of ones may come to more
         for channel, value in enumerate(background):
             image[..., channel] += np.float32(value) * (1 - alpha)
-    return LoadedImage(image, loaded.mask, loaded.K, loaded.done, alpha)
+    return LoadedImage(image, loaded.mask, loaded.K, loaded.done, alpha, kept)

@@ -219,7 +219,7 @@ class TransformsReader(Reader):
             notes.append(f"skipped: {text}")
         if reading.outside:
             notes.append(f"{reading.outside} images lie outside the scene folder; their views are named outside/...")
-        notes += resampling_note(options.downscale) + reading.views.notes()
+        notes += resampling_note(options.downscale) + reading.views.notes(options)
         return self.scene(
             folder,
             reading.views.views,

@@ -45,7 +45,7 @@ _CAMERA = fields(
 _SCENE = fields(
     {
         "path": or_null(text), "split": or_null(text), "downscale": whole(1), "strict": flag, "allow_outside": flag,
-        "invert_masks": flag, "score_masks": or_null(text), "reader": or_null(text),
+        "masks": one_of("ignore", "cutout"), "mask_keeps": one_of("white", "black"), "black_is_empty": flag, "score_masks": or_null(text), "reader": or_null(text),
     },
     {"max_pixels": whole(1)},
     others=False,
