@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError, UsageError
+from warpgs.io.black_background import cut_from_black
 from warpgs.io.decoding import MAX_PIXELS
 from warpgs.io.folders import SceneFolder
 from warpgs.io.normalize import fingerprint, normalization_of, normalize_points, normalize_view
@@ -137,6 +138,9 @@ def _finished(
             "Add images with cameras"
         )
     _check_views(root, views)
+    if options.black_is_empty and not any(scene.background):
+        views, note = cut_from_black(views)
+        more = (*more, note) if note else more
     n: Normalization = normalization_of(views, points, str(root))
     views = [normalize_view(v, n) for v in sorted(views, key=lambda v: v.name)]
     if points is not None:
