@@ -54,7 +54,7 @@ def _request_type() -> type:
         allow_outside: bool = False
         """Let names and links of the scene lead to images and masks outside its folder."""
         masks: str = "ignore"
-        """What becomes of pixels that a mask file does not keep: ignore (they do not count) or cutout (they are transparent)."""
+        """What becomes of pixels that a mask file does not keep: ignore (they do not count), cutout (they are transparent)."""
         mask_keeps: str = "white"
         """Colour of a mask file that keeps a pixel: white or black."""
         black_is_empty: bool = True

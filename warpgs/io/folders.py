@@ -232,8 +232,8 @@ class ViewList:
             return ["--masks cutout changes nothing: no image has a mask file"] if cutout else []
         mean = math.fsum(self._kept.values()) / len(self._kept)
         notes = [
-            f"masks keep {mean:.1%} of the pixels, the {options.mask_keeps} ones (--mask-keeps {options.mask_keeps}); the others "
-            f"{'are transparent' if cutout else 'do not count'} (--masks {options.masks})"
+            f"masks keep {mean:.1%} of the pixels, the {options.mask_keeps} ones (--mask-keeps {options.mask_keeps}); "
+            f"the others {'are transparent' if cutout else 'do not count'} (--masks {options.masks})"
         ]
         for fraction, what in ((0.0, "keep no pixel"), (1.0, "keep every pixel")):
             names = [n for n, kept in self._kept.items() if kept == fraction]

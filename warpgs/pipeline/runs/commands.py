@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -19,10 +21,13 @@ from warpgs.pipeline.runs.image_names import image_names, renaming_notes
 from warpgs.pipeline.runs.paths import FILM, render_path
 from warpgs.pipeline.runs.request import choose_device, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line
-from warpgs.pipeline.train.background import over_background
+from warpgs.pipeline.train.background import color_of, over_background
 from warpgs.pipeline.train.loop import train_views
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Scene, View
+
+ALPHAS = {"alpha_empty": "where empty", "alpha_object": "in the object"}
+"""Scores of the rendered alpha, with the words for each view's line."""
 
 
 def scene_of(stored: StoredRun, reader: str | None = None) -> tuple[Scene, list[View], list[View]]:
@@ -73,22 +78,42 @@ def evaluate(folder: Path, device_name: str, lpips_weights: Path | None = None, 
         write_json(folder / "eval.json", metrics)
     if not test:
         return [*notes, *renaming_notes(names), f"no view is held out; training PSNR {metrics['train']['psnr']:.2f} dB"]
-    lines = [f"{r['name']}: PSNR {r['psnr']:.2f} dB, SSIM {r['ssim']:.4f} ({r['region']})" for r in metrics["views"]]
+    lines = [_view_line(r) for r in metrics["views"]]
     return [*notes, *renaming_notes(names), *lines, f"mean of {len(test)}: {score_line(metrics['test'])}"]
 
 
-def render(folder: Path, kind: str, out: Path | None, frames: int, fps: int, device_name: str) -> str:
+def _view_line(row: dict[str, Any]) -> str:
+    """Return the scores of a view as a line for the user."""
+    alphas = [f", alpha {row[k]:.3f} {words}" for k, words in ALPHAS.items() if not math.isnan(row.get(k, math.nan))]
+    return f"{row['name']}: PSNR {row['psnr']:.2f} dB, SSIM {row['ssim']:.4f}{''.join(alphas)} ({row['region']})"
+
+
+def render(
+    folder: Path, kind: str, out: Path | None, frames: int, fps: int, device_name: str, *, background: str = "auto"
+) -> str:
     """Render a run along a path to PNG files and a film; returns a line for the user.
+
+    Args:
+        folder: The run folder.
+        kind: views, orbit or spiral.
+        out: Folder to write; None for `path-KIND` in the run folder.
+        frames: Number of frames of an orbit or a spiral.
+        fps: Frames per second of the film.
+        device_name: auto, cpu or cuda.
+        background: Colour behind the scene; auto for that of the fit, and transparent images of cut-out objects.
 
     Raises:
         DataError: The folder is no run.
         ResourceError: A file cannot be written.
-        UsageError: The path is unknown.
+        UsageError: The path is unknown, or the background is no colour.
     """
+    color = color_of(background)
+    if color is None and background != "auto":
+        raise UsageError(f"--background {background}: a render takes auto, black, white, #rrggbb or r,g,b")
     if kind not in PATHS:
         raise UsageError(f"path {kind!r} is not one of {', '.join(PATHS)}")
     out = folder / f"path-{kind}" if out is None else out
-    *files, last = render_path(open_run(folder, device_name), kind, out=out, frames=frames, fps=fps)
+    *files, last = render_path(open_run(folder, device_name), kind, out=out, frames=frames, fps=fps, background=color)
     if last.name == FILM:
         return f"{len(files)} images and {FILM} in {out}"
     return f"{len(files) + 1} images in {out}; no film, since the views differ in size"

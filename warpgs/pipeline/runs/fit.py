@@ -255,6 +255,7 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
     return FitResult(
         trainer.gaussians, job.scene.normalization, cameras, job.split.train, job.split.test, job.config.rule,
         job.scene.background, trainer.step, job.config, metrics, tuple(job.notes), job.out,
+        transparent=job.scene.transparent,
     )  # fmt: skip
 
 

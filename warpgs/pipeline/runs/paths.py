@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from warpgs.pipeline.runs.image_names import image_names
 from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.render.rasterize import rasterize
 from warpgs.report.film import write_mp4
-from warpgs.report.images import png
+from warpgs.report.images import png, straight_alpha
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.runtime.terminal import say
 from warpgs.scene import Camera, Gaussians
@@ -55,8 +56,12 @@ def render_path(
     units: str = "scene",
     frames: int = 90,
     fps: int = 30,
+    background: tuple[float, float, float] | None = None,
 ) -> list[Path]:
     """Render a model along a path of cameras to PNG files and, where all images have one size, to a film.
+
+    Images of a model whose scene knows its opacity are transparent, with straight alpha, unless a background is named; a film
+    never is.
 
     Args:
         model: Result of `fit` or `open_run`.
@@ -65,6 +70,7 @@ def render_path(
         units: Units of your own cameras: scene or file.
         frames: Number of frames of an orbit or a spiral.
         fps: Frames per second of the film.
+        background: Colour behind the scene, in [0, 1]; None for that of the fit.
 
     Returns:
         The files written: a PNG for each camera in order, then the film, if any.
@@ -81,12 +87,16 @@ def render_path(
         raise UsageError("there is no camera to render; give at least one")
     out, gaussians, options = Path(out), model.gaussians(), model.options()
     files = [out / f"{name}.png" for name, _ in cameras]
+    transparent = model.transparent and background is None
+    if background is not None:
+        options = dataclasses.replace(options, background=gaussians.means.new_tensor(background))
 
     def images() -> Iterator[np.ndarray]:
         for file, (_, camera) in zip(files, cameras):
             with torch.no_grad():
-                image = rasterize(gaussians, camera, options).rgb.cpu().numpy()
-            write_bytes(file, png(image))
+                r = rasterize(gaussians, camera, options)
+            image = r.rgb.cpu().numpy()
+            write_bytes(file, png(straight_alpha(image, r.alpha.cpu().numpy(), model.background) if transparent else image))
             yield image
 
     with hold_folder(out) as notes:

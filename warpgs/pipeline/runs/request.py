@@ -121,7 +121,8 @@ def read_scene(request: SceneRequest, progress: Callable[[str], object] | None =
     scene = load_scene(
         request.path, reader=request.reader, downscale=request.downscale, strict=request.strict,
         allow_outside=request.allow_outside, masks=request.masks, mask_keeps=request.mask_keeps,
-        black_is_empty=request.black_is_empty, score_masks=request.score_masks, max_pixels=request.max_pixels, progress=progress,
+        black_is_empty=request.black_is_empty, score_masks=request.score_masks, max_pixels=request.max_pixels,
+        progress=progress,
     )  # fmt: skip
     split, notes = choose_split(scene, request.split)
     return scene, split, [*scene.notes, *notes]
