@@ -1,7 +1,7 @@
 """A step that runs out of memory is tried once more with less, and what cannot go on is saved."""
 
-import copy
 import contextlib
+import copy
 import dataclasses
 
 import numpy as np

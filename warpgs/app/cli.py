@@ -107,6 +107,8 @@ def _render(arguments: list[str]) -> int:
         """Number of frames of an orbit or a spiral."""
         fps: int = 30
         """Frames per second of the film."""
+        background: str = "auto"
+        """auto (that of the fit; images of objects cut out are transparent PNGs), black, white, #rrggbb, or r,g,b in [0, 1]."""
         device: str = "auto"
         """auto, cpu or cuda."""
         coverage: bool = False
@@ -117,7 +119,7 @@ def _render(arguments: list[str]) -> int:
     check_range("--fps", a.fps, 1, 1000)
     from warpgs.pipeline.runs.commands import render
 
-    for line in render(a.run, a.path, a.out, a.frames, a.fps, a.device, a.coverage):
+    for line in render(a.run, a.path, a.out, a.frames, a.fps, a.device, a.coverage, background=a.background):
         say(line)
     return 0
 

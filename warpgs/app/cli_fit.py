@@ -53,8 +53,12 @@ def _request_type() -> type:
         """A frame without an image file is an error."""
         allow_outside: bool = False
         """Let names and links of the scene lead to images and masks outside its folder."""
-        invert_masks: bool = False
-        """White in a mask removes a pixel."""
+        masks: str = "ignore"
+        """What becomes of pixels that a mask file does not keep: ignore (they do not count), cutout (they are transparent)."""
+        mask_keeps: str = "white"
+        """Colour of a mask file that keeps a pixel: white or black."""
+        black_is_empty: bool = True
+        """Where every image shows an object on black, take the dark pixels around it for transparent."""
         max_pixels: int = MAX_PIXELS
         """Largest number of pixels that an image or a mask may have as stored."""
         score_masks: Path | None = None
@@ -217,6 +221,7 @@ def fit(arguments: list[str], description: str) -> FitRequest:
         say(f"preset {base.preset}: {PRESET_NOTES[base.preset]}")
     masks = None if a.score_masks is None else str(a.score_masks.resolve())
     scene = SceneRequest(
-        str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.invert_masks, masks, a.reader, max_pixels=a.max_pixels
-    )
+        str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.masks, a.mask_keeps, a.black_is_empty, masks, a.reader,
+        a.max_pixels,
+    )  # fmt: skip
     return FitRequest(scene, a.out, config, a.device, a.resume, a.lpips_weights, a.time_budget, notes)

@@ -28,8 +28,12 @@ class ReadOptions:
     """A frame without an image file is an error instead of a note."""
     allow_outside: bool = False
     """Names and links of the scene may lead to images and masks outside its folder."""
-    invert_masks: bool = False
-    """White in a mask file removes a pixel instead of keeping it."""
+    masks: str = "ignore"
+    """What becomes of pixels that a mask file does not keep: ignore (they do not count) or cutout (they are transparent)."""
+    mask_keeps: str = "white"
+    """Colour of a mask file that keeps a pixel: white or black."""
+    black_is_empty: bool = True
+    """Where every image shows an object on black, the dark pixels around it are transparent."""
     max_pixels: int = MAX_PIXELS
     """Largest number of pixels that an image or a mask may have."""
     on_image: Callable[[Path], object] | None = None
@@ -40,6 +44,10 @@ class ReadOptions:
             raise UsageError(f"--downscale must be a whole number of at least 1, not {self.downscale!r}")
         if isinstance(self.max_pixels, bool) or not isinstance(self.max_pixels, int) or self.max_pixels < 1:
             raise UsageError(f"--max-pixels must be a whole number of at least 1, not {self.max_pixels!r}")
+        if self.masks not in ("ignore", "cutout"):
+            raise UsageError(f"--masks must be ignore or cutout, not {self.masks!r}")
+        if self.mask_keeps not in ("white", "black"):
+            raise UsageError(f"--mask-keeps must be white or black, not {self.mask_keeps!r}")
 
 
 @dataclass(frozen=True)

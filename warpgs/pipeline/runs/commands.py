@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -20,10 +22,14 @@ from warpgs.pipeline.runs.image_names import image_names, renaming_notes
 from warpgs.pipeline.runs.paths import COVERAGE, FILM, render_path
 from warpgs.pipeline.runs.request import choose_device, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line
+from warpgs.pipeline.train.background import color_of, over_background
 from warpgs.pipeline.train.loop import train_views
 from warpgs.report.coverage_image import LEGEND
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Scene, View
+
+ALPHAS = {"alpha_empty": "where empty", "alpha_object": "in the object"}
+"""Scores of the rendered alpha, with the words for each view's line."""
 
 
 def scene_of(stored: StoredRun, reader: str | None = None) -> tuple[Scene, list[View], list[View]]:
@@ -39,7 +45,7 @@ def scene_of(stored: StoredRun, reader: str | None = None) -> tuple[Scene, list[
     scene, _, _ = read_scene(stored.scene_request(reader))
     if scene.fingerprint != stored.record["fingerprint"]:
         raise DataError(f"{scene.path}: its images or cameras are not those that {stored.folder} was fitted to; restore them")
-    split = Split(stored.train, stored.test)
+    scene, split = over_background(scene, stored.background), Split(stored.train, stored.test)
     return scene, train_views(scene, split.train), train_views(scene, split.test)
 
 
@@ -85,21 +91,41 @@ def evaluate(
         write_json(folder / "eval.json", metrics)
     if not test:
         return [*notes, *renaming_notes(names), f"no view is held out; training PSNR {metrics['train']['psnr']:.2f} dB"]
-    lines = [f"{r['name']}: PSNR {r['psnr']:.2f} dB, SSIM {r['ssim']:.4f} ({r['region']})" for r in metrics["views"]]
+    lines = [_view_line(r) for r in metrics["views"]]
     lines += coverage_lines(metrics["coverage"]) if by_coverage else []
     return [*notes, *renaming_notes(names), *lines, f"mean of {len(test)}: {score_line(metrics['test'])}"]
 
 
+def _view_line(row: dict[str, Any]) -> str:
+    """Return the scores of a view as a line for the user."""
+    alphas = [f", alpha {row[k]:.3f} {words}" for k, words in ALPHAS.items() if not math.isnan(row.get(k, math.nan))]
+    return f"{row['name']}: PSNR {row['psnr']:.2f} dB, SSIM {row['ssim']:.4f}{''.join(alphas)} ({row['region']})"
+
+
 def render(
-    folder: Path, kind: str, out: Path | None, frames: int, fps: int, device_name: str, coverage: bool = False
+    folder: Path, kind: str, out: Path | None, frames: int, fps: int, device_name: str, coverage: bool = False, *,
+    background: str = "auto",
 ) -> list[str]:  # fmt: skip
     """Render a run along a path to PNG files and a film; returns lines for the user.
+
+    Args:
+        folder: The run folder.
+        kind: views, orbit or spiral.
+        out: Folder to write; None for `path-KIND` in the run folder.
+        frames: Number of frames of an orbit or a spiral.
+        fps: Frames per second of the film.
+        device_name: auto, cpu or cuda.
+        coverage: Whether to write images of what no training view saw, too.
+        background: Colour behind the scene; auto for that of the fit, and transparent images of cut-out objects.
 
     Raises:
         DataError: The folder is no run.
         ResourceError: A file cannot be written.
-        UsageError: The path is unknown.
+        UsageError: The path is unknown, or the background is no colour.
     """
+    color = color_of(background)
+    if color is None and background != "auto":
+        raise UsageError(f"--background {background}: a render takes auto, black, white, #rrggbb or r,g,b")
     if kind not in PATHS:
         raise UsageError(f"path {kind!r} is not one of {', '.join(PATHS)}")
     out = folder / f"path-{kind}" if out is None else out
@@ -113,7 +139,7 @@ def render(
             training = True
             notes.append(f"what masks of training views hide counts as seen, since the scene cannot be read: {e}")
         notes.append(f"images in {out / COVERAGE}: {LEGEND}")
-    *files, last = render_path(stored, kind, out=out, frames=frames, fps=fps, coverage=training)
+    *files, last = render_path(stored, kind, out=out, frames=frames, fps=fps, background=color, coverage=training)
     if last.name == FILM:
         return [*notes, f"{len(files)} images and {FILM} in {out}"]
     return [*notes, f"{len(files) + 1} images in {out}; no film, since the views differ in size"]

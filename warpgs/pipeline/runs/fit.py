@@ -31,6 +31,7 @@ from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line, write_report
 from warpgs.pipeline.runs.rule_report import rule_report_of
 from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, sampling_report_of
+from warpgs.pipeline.train.background import choose_background, over_background
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.complexity import complexity_figures, complexity_summary
 from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESETS, FitConfig
@@ -170,10 +171,18 @@ def fit(
         if time_budget is not None:
             job.config, note = within_budget(job.config, time_budget, job.train, job.device)
             job.notes.append(note)
+        _set_background(job)
         job.config, chosen = settings_by_views(job.config, job.train, job.device.type)
         job.notes += chosen
         trainer, state, record = _prepare(job, out if resume else None)
         return _finish(job, trainer, state, record, resume)
+
+
+def _set_background(job: _Job) -> None:
+    """Put the scene over the background that the settings ask for."""
+    color, note = choose_background(job.config.background, job.scene, job.train)
+    job.scene = over_background(job.scene, color)
+    job.notes += [note] if note else []
 
 
 def fit_request(request: FitRequest) -> FitResult:
@@ -249,6 +258,7 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
     return FitResult(
         trainer.gaussians, job.scene.normalization, cameras, job.split.train, job.split.test, job.config.rule,
         job.scene.background, trainer.step, job.config, metrics, tuple(job.notes), job.out,
+        transparent=job.scene.transparent,
     )  # fmt: skip
 
 

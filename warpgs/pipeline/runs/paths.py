@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -19,10 +20,10 @@ from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.report.coverage_image import coverage_image
 from warpgs.report.film import write_mp4
-from warpgs.report.images import png
+from warpgs.report.images import png, straight_alpha
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.runtime.terminal import say
-from warpgs.scene import Camera, Gaussians, View
+from warpgs.scene import Camera, Gaussians, Render, View
 
 FILM = "film.mp4"
 COVERAGE = "coverage"
@@ -59,6 +60,13 @@ def _training_depths(model: FittedModel, views: bool | Sequence[View], options: 
     return depth_views(model.gaussians(), cameras, options, masks)
 
 
+def _covered(image: np.ndarray, render: Render, camera: Camera, training: list[DepthView], cut_out: bool) -> bytes:
+    """Return the PNG of an image [H, W, 3] that shows what no training view saw, and what one saw."""
+    seen = coverage_map(torch.where(render.alpha >= MIN_ALPHA, render.depth, 0), camera, training)
+    classes = classes_of(seen, cut_out)
+    return png(coverage_image(image, classes["0"], classes["1"]))
+
+
 def render_path(
     model: FittedModel,
     path: str | Sequence[Camera] = "orbit",
@@ -67,9 +75,13 @@ def render_path(
     units: str = "scene",
     frames: int = 90,
     fps: int = 30,
+    background: tuple[float, float, float] | None = None,
     coverage: bool | Sequence[View] = False,
 ) -> list[Path]:
     """Render a model along a path of cameras to PNG files and, where all images have one size, to a film.
+
+    Images of a model whose scene knows its opacity are transparent, with straight alpha, unless a background is named; a film
+    never is.
 
     Args:
         model: Result of `fit` or `open_run`.
@@ -78,6 +90,7 @@ def render_path(
         units: Units of your own cameras: scene or file.
         frames: Number of frames of an orbit or a spiral.
         fps: Frames per second of the film.
+        background: Colour behind the scene, in [0, 1]; None for that of the fit.
         coverage: Whether to write, into the subfolder coverage, each image with what no training view saw striped in magenta
             and what one saw in amber; or the training views, whose masks then count.
 
@@ -96,20 +109,21 @@ def render_path(
         raise UsageError("there is no camera to render; give at least one")
     out, gaussians, options = Path(out), model.gaussians(), model.options()
     files = [out / f"{name}.png" for name, _ in cameras]
+    transparent = model.transparent and background is None
+    if background is not None:
+        options = dataclasses.replace(options, background=gaussians.means.new_tensor(background))
 
     training = _training_depths(model, coverage, options) if coverage else None
-    transparent = isinstance(coverage, Sequence) and any(v.alpha is not None for v in coverage)
+    cut_out = isinstance(coverage, Sequence) and any(v.alpha is not None for v in coverage)
 
     def images() -> Iterator[np.ndarray]:
         for file, (_, camera) in zip(files, cameras):
             with torch.no_grad():
                 r = rasterize(gaussians, camera, options)
             image = r.rgb.cpu().numpy()
-            write_bytes(file, png(image))
+            write_bytes(file, png(straight_alpha(image, r.alpha.cpu().numpy(), model.background) if transparent else image))
             if training is not None:
-                seen = coverage_map(torch.where(r.alpha >= MIN_ALPHA, r.depth, 0), camera, training)
-                classes = classes_of(seen, transparent)
-                write_bytes(out / COVERAGE / file.name, png(coverage_image(image, classes["0"], classes["1"])))
+                write_bytes(out / COVERAGE / file.name, _covered(image, r, camera, training, cut_out))
             yield image
 
     with hold_folder(out, COVERAGE) as notes:

@@ -45,7 +45,8 @@ _CAMERA = fields(
 _SCENE = fields(
     {
         "path": or_null(text), "split": or_null(text), "downscale": whole(1), "strict": flag, "allow_outside": flag,
-        "invert_masks": flag, "score_masks": or_null(text), "reader": or_null(text),
+        "masks": one_of("ignore", "cutout"), "mask_keeps": one_of("white", "black"), "black_is_empty": flag,
+        "score_masks": or_null(text), "reader": or_null(text),
     },
     {"max_pixels": whole(1)},
     others=False,
@@ -60,7 +61,7 @@ _RECORD = fields(
         ),
         "cameras": mapping(_CAMERA, _view_name),
     },
-    {"scene_format": text, "pruned": fields({"source": text})},
+    {"scene_format": text, "transparent": flag, "pruned": fields({"source": text})},
 )  # fmt: skip
 
 
@@ -96,10 +97,12 @@ _COVERED = mapping(
     }),
     one_of("0", "1", "2+", "background"),
 )  # fmt: skip
+OPACITY = ("psnr_whole", "psnr_foreground", "alpha_empty", "alpha_object")
+"""Scores of views that know their opacity, as `warpgs.pipeline.metrics.evaluate` defines them."""
 METRICS = fields(
     {
         "test": mapping(or_null(real)), "train": mapping(or_null(real)),
-        "views": items(fields({"name": text, "psnr": or_null(real)})),
+        "views": items(fields({"name": text, "psnr": or_null(real)}, dict.fromkeys(OPACITY, or_null(real)))),
         "variants": mapping(text), "config_hash": text, "steps": whole(0),
         "protocol": fields({
             "split": text, "training_views": whole(0), "held_out_views": whole(0), "ground_truth": text,

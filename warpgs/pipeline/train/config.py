@@ -13,6 +13,7 @@ from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.model.scale_limits import LimitConfig
+from warpgs.pipeline.train.background import color_of
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossConfig, LossTerm, check_terms
 from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES, find_strategy
@@ -58,6 +59,10 @@ class FitConfig:
     """CUDA graphs: a step is captured once and replayed; the same kernels and the same bytes as without, in less time."""
     max_gaussians: int = 1_000_000
     """Largest number of Gaussians, from the start on."""
+    background: str = "scene"
+    """Colour behind the scene, where no Gaussian lies: auto (the mean colour of the training views where they are opaque and
+    show no object on black, else as scene), mean, scene (that of the files: white for Blender, else black), black, white,
+    #rrggbb, or r,g,b in [0, 1]."""
     strategy: str = "clone_split"
     """Density strategy, which adds and removes Gaussians: clone_split, importance_sampling, holdout (held-out blocks of the
     training views decide how many there are and of which degree, docs/complexity.md), mcmc, or your own as module:Class or
@@ -102,6 +107,7 @@ class FitConfig:
             raise UsageError(f"dropout must lie in [0, 1), not {self.dropout}")
         if self.rule not in RULES:
             raise UsageError(f"rule {self.rule!r} is not one of {', '.join(RULES)}")
+        color_of(self.background)
         check_terms(self.loss_terms)
         if isinstance(self.strategy, type):
             object.__setattr__(self, "strategy", STRATEGIES.name_of(self.strategy))
@@ -148,7 +154,7 @@ def _compose(kind: type, values: dict[str, Any]) -> Any:
 
 
 _DEFAULT = FitConfig(
-    preset="default", steps=None, half_resolution=None, sh_every=500, dropout=0.6, strategy="holdout",
+    preset="default", background="auto", steps=None, half_resolution=None, sh_every=500, dropout=0.6, strategy="holdout",
     phases=PhaseConfig(coarse=2000, stable=3000), init=InitConfig(sweep_up_to=1000, max_sh_degree=None, merge_px=8, fill_px=32),
     optimizer=OptimizerConfig(scales_lr=None, scales_decay=0.1, opacities_lr=None), density=DensityConfig(gradient=5e-4),
     holdout=HoldoutConfig(bounds=False, degrees=False, trim_db=0, levels=12, stop_db=0.1),
