@@ -67,7 +67,7 @@ def config_of(preset: str, device: torch.device) -> FitConfig:
         UsageError: A name is unknown, or a value is out of range.
     """
     name, sep, changes = preset.removeprefix(PRUNED).partition(":")
-    name = preset_config(None, device).preset if name == "default" else name
+    name = preset_config(None).preset if name == "default" else name
     return trial_config(f"{name}{sep}{changes}")
 
 

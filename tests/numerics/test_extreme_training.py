@@ -21,6 +21,7 @@ from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.ssim import differences, ssim
 from warpgs.pipeline.metrics.quantiles import quantiles
 from warpgs.pipeline.model.init import InitConfig, initial_gaussians, initial_points
+from warpgs.pipeline.model.scale_limits import LimitConfig
 from warpgs.pipeline.model.table import Column, DensityUpdate, Table
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.config import FitConfig
@@ -351,7 +352,7 @@ def test_constant_images_of_any_size(device, dtype, value, height, width):
 NUMBERS = [math.nan, math.inf, -1, 0, 1e-300, 1, 3, 1e300]
 KINDS = [
     DensityConfig, OptimizerConfig, LossConfig, ImportanceConfig, SamplerConfig, ProtectConfig, PhaseConfig, MethodConfig,
-    InitConfig, HoldoutConfig, FitConfig,
+    InitConfig, HoldoutConfig, LimitConfig, FitConfig,
 ]  # fmt: skip
 SHORT = FitConfig(
     steps=4, init=InitConfig(source="points", max_sh_degree=1), sh_every=2, phases=PhaseConfig(coarse=1, every=1),

@@ -33,7 +33,7 @@ class FitConfig:
     steps: int | None = 7000
     """Number of optimisation steps, one view each; strategy holdout may end earlier. None: by the number of views."""
     cpu_limit: bool = True
-    """On a CPU, where the steps follow from the number of views, take no more than two cores do in 1 to 20 minutes."""
+    """Take no more steps on a CPU than two cores do in 1 to 20 minutes, where the steps follow from the number of views."""
     seed: int = 0
     """Seed of every random choice; the same seed, data and kind of device give the same bytes."""
     rule: str = "exact"

@@ -44,7 +44,7 @@ class HoldoutConfig:
     stop_db: float = 0.0
     """Gain by growth and training in the last third of the steps, its noise added, below which growth ends [dB], in place of
     `least_db`: where the fit has phases, the third begins then, and the fit ends earlier. Not before a third of the time of
-    growth, nor while views are half their size. 0: growth is judged by its own gain; the fit takes the planned steps."""
+    growth, nor while views are half their size. 0: growth ends by its own gain, and the fit takes the planned steps."""
     bounds: bool = True
     """Bound the degree and the least width of each Gaussian by what views resolve, and grow none that one view alone sees."""
     degrees: bool = True
