@@ -122,7 +122,7 @@ class Scene:
 
     @property
     def transparent(self) -> bool:
-        """Whether a view knows its opacity: the scene is an object cut out."""
+        """True where a view knows its opacity: the scene is an object cut out."""
         return any(v.alpha is not None for v in self.views)
 
     def view(self, name: str) -> View:

@@ -54,7 +54,7 @@ class FittedModel(Model):
     step: int
     """Steps done."""
     transparent: bool = field(default=False, kw_only=True)
-    """Whether views of the scene know their opacity, so that renders are to be transparent."""
+    """True where views of the scene know their opacity, so that renders are to be transparent."""
 
     def __repr__(self) -> str:
         """Say in one line what it is."""
