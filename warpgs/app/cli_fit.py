@@ -54,11 +54,11 @@ def _request_type() -> type:
         allow_outside: bool = False
         """Let names and links of the scene lead to images and masks outside its folder."""
         masks: str = "ignore"
-        """What becomes of pixels that a mask file does not keep: ignore (they do not count), cutout (they are transparent)."""
+        """Fate of pixels that a mask file does not keep: ignore (they do not count) or cutout (they are transparent)."""
         mask_keeps: str = "white"
         """Colour of a mask file that keeps a pixel: white or black."""
         black_is_empty: bool = True
-        """Where every image shows an object on black, take the dark pixels around it for transparent."""
+        """Dark pixels around an object are transparent, where every image shows one on black."""
         max_pixels: int = MAX_PIXELS
         """Largest number of pixels that an image or a mask may have as stored."""
         score_masks: Path | None = None

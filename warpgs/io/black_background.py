@@ -13,6 +13,9 @@ DARK = 16 / 255
 DARK_FRACTION = 0.3
 """Fraction of dark pixels from which on an image with a dark border shows an object on black."""
 
+HOLE = 0.001
+"""Fraction of an image from which on dark pixels that an object encloses are a hole in it, not a part of it."""
+
 
 def dark_pixels(image: np.ndarray) -> np.ndarray | None:
     """Return the dark pixels, bool [H, W], of an image [H, W, 3] that shows an object on black; None for any other image.
@@ -24,21 +27,25 @@ def dark_pixels(image: np.ndarray) -> np.ndarray | None:
     return dark if dark.mean() >= DARK_FRACTION and border.mean() >= 0.5 and not dark.all() else None
 
 
-def joined_to_border(pixels: np.ndarray) -> np.ndarray:
-    """Return those of the pixels, bool [H, W], that lead to the border over others, sideways or up and down."""
+def empty_pixels(dark: np.ndarray) -> np.ndarray:
+    """Return those of the dark pixels, bool [H, W], between which and the camera nothing stands.
+
+    They are joined to the border over others, sideways or up and down, or make up `HOLE` of the image together.
+    """
     import cv2
 
-    _, labels = cv2.connectedComponents(pixels.astype(np.uint8), connectivity=4)
-    border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-    joined: np.ndarray = pixels & np.isin(labels, border)
-    return joined
+    _, labels, found, _ = cv2.connectedComponentsWithStats(dark.astype(np.uint8), connectivity=4)
+    empty = found[:, cv2.CC_STAT_AREA] >= HOLE * dark.size
+    empty[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = True
+    pixels: np.ndarray = dark & empty[labels]
+    return pixels
 
 
 def cut_from_black(views: list[View]) -> tuple[list[View], str]:
-    """Give views that all show an object on black an opacity: 0 for dark pixels joined to the border, 1 for all others.
+    """Give views that all show an object on black an opacity: 0 for the dark pixels around it and in its holes, else 1.
 
-    Dark pixels that the object encloses may be part of it and stay opaque. Views of which any has an opacity or a mask, or
-    shows something else, stay as they are.
+    Specks and cracks that the object encloses stay opaque. Views of which any has an opacity or a mask, or shows something
+    else, stay as they are.
 
     Args:
         views: The views of a scene.
@@ -51,11 +58,11 @@ def cut_from_black(views: list[View]) -> tuple[list[View], str]:
         dark = dark_pixels(v.image) if v.alpha is None and v.mask is None else None
         if dark is None:
             return views, ""
-        outside = joined_to_border(dark)
-        empty += float(outside.mean()) / len(views)
-        alpha = 1 - outside.astype(np.float32)
+        nothing = empty_pixels(dark)
+        empty += float(nothing.mean()) / len(views)
+        alpha = 1 - nothing.astype(np.float32)
         done.append(replace(v, image=v.image * alpha[..., None], alpha=alpha))
     return done, (
-        f"every image shows an object on black: {empty:.1%} of the pixels, dark and joined to the border, are taken for "
+        f"every image shows an object on black: {empty:.1%} of the pixels, dark ones around it and in its holes, are taken for "
         "transparent; --no-black-is-empty leaves them black"
     )

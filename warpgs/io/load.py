@@ -46,11 +46,11 @@ def load_scene(
         downscale: Factor by which both image sides shrink; a ready-made folder `images_N` is used where there is one.
         strict: A frame without an image file is an error instead of a note.
         allow_outside: Let names and links of the scene lead to images and masks outside its folder.
-        masks: What becomes of pixels that a mask file does not keep: ignore (they do not count, in fit and score) or cutout
+        masks: Fate of pixels that a mask file does not keep: ignore (they do not count, in fit and score) or cutout
             (they are transparent, gray ones in part: `View.alpha`).
         mask_keeps: Colour of a mask file that keeps a pixel: white or black.
-        black_is_empty: Where every image shows an object on black and has neither alpha nor mask, its dark pixels that join the
-            border are transparent.
+        black_is_empty: Dark pixels around an object and in its holes are transparent, where every image shows one on black and
+            none has an alpha channel or a mask.
         score_masks: Folder with object masks for scoring, matched by image id; None for `idrmasks` in the scene folder where
             there is one.
         max_pixels: Largest number of pixels that an image or a mask may have as stored.

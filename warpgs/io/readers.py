@@ -29,11 +29,11 @@ class ReadOptions:
     allow_outside: bool = False
     """Names and links of the scene may lead to images and masks outside its folder."""
     masks: str = "ignore"
-    """Use of pixels that a mask file does not keep: ignore (they do not count) or cutout (they are transparent)."""
+    """Fate of pixels that a mask file does not keep: ignore (they do not count) or cutout (they are transparent)."""
     mask_keeps: str = "white"
     """Colour of a mask file that keeps a pixel: white or black."""
     black_is_empty: bool = True
-    """Take the dark pixels around an object as transparent, where every image shows it on black."""
+    """Dark pixels around an object are transparent, where every image shows one on black."""
     max_pixels: int = MAX_PIXELS
     """Largest number of pixels that an image or a mask may have."""
     on_image: Callable[[Path], object] | None = None

@@ -73,10 +73,11 @@ def over_white(image: np.ndarray, region: np.ndarray) -> np.ndarray:
     return np.where(region[..., None], image, np.float32(1))
 
 
-def _opacity_scores(view: View, image: np.ndarray, target: np.ndarray, alpha: np.ndarray) -> dict[str, float]:
-    """Return the scores of `ALPHA_VARIANTS` for images of 8 bits [H, W, 3] and a rendered alpha [H, W]."""
-    true = view.alpha
-    counted = np.ones(true.shape, bool) if view.mask is None else view.mask
+def _opacity_scores(
+    image: np.ndarray, target: np.ndarray, alpha: np.ndarray, true: np.ndarray, mask: np.ndarray | None
+) -> dict[str, float]:
+    """Return the scores of `ALPHA_VARIANTS` for images of 8 bits [H, W, 3], a rendered and a true alpha and a mask [H, W]."""
+    counted = np.ones(true.shape, bool) if mask is None else mask
     regions = {"psnr_whole": counted, "psnr_foreground": counted & (true > OPAQUE)}
     scores = {k: psnr(image, target, r) if r.any() else float("nan") for k, r in regions.items()}
     for name, r in (("alpha_empty", counted & (true < EMPTY)), ("alpha_object", counted & (true > OBJECT))):
@@ -95,7 +96,7 @@ def score(view: View, image: np.ndarray, lpips: Lpips | None = None, alpha: np.n
     region, name = scored_region(view)
     image, target = to_8_bit(image), to_8_bit(view.image)
     decibels = psnr(image, target, region)
-    opacity = {} if alpha is None or view.alpha is None else _opacity_scores(view, image, target, alpha)
+    opacity = {} if alpha is None or view.alpha is None else _opacity_scores(image, target, alpha, view.alpha, view.mask)
     if region is not None and name != "foreground":
         image, target = over_white(image, region), over_white(target, region)
     similarity = float(ssim(torch.from_numpy(image), torch.from_numpy(target)).mean())

@@ -58,7 +58,7 @@ def mean_color(views: list[View]) -> Color:
 
 
 def choose_background(wish: str, scene: Scene, train: list[View]) -> tuple[Color, str]:
-    """Return the colour behind a scene, and a note for the user; no note where it is the scene's own by default.
+    """Return the colour behind a scene, and a note for the user; no note where opaque views stay before the scene's own.
 
     Args:
         wish: As `FitConfig.background`.
@@ -83,7 +83,7 @@ def choose_background(wish: str, scene: Scene, train: list[View]) -> tuple[Color
         )
     if wish == "auto":
         return scene.background, f"background: {_words(scene.background)}, since the views show an object cut out"
-    return scene.background, ""
+    return scene.background, f"background: {_words(scene.background)}, that of the scene" if cut_out else ""
 
 
 def over_background(scene: Scene, color: Color) -> Scene:
