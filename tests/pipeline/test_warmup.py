@@ -94,7 +94,7 @@ def test_the_device_is_asked_for_last(changes, monkeypatch):
     order = []
     views = photos(3)
     monkeypatch.setattr(setup, "view_priors", lambda *a, depths, **k: (order.append("semantics"), depths(), ([], []))[-1])
-    monkeypatch.setattr(init, "sweep_depths", lambda v, b, c, device: (order.append(str(device)), consistent(v))[1])
+    monkeypatch.setattr(init, "sweep_depths", lambda v, b, c, device, progress: (order.append(str(device)), consistent(v))[1])
     config = dataclasses.replace(PRESETS["default"], **changes)
     made = prepare(views, None, config, np.random.default_rng(0), CUDA, None, lambda: order.append("ready"))
     swept = ["ready", "cpu" if "memory_limit" in changes else "cuda"] if "init" not in changes else []

@@ -217,8 +217,9 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
 
 
 def consistent_depths(
-    views: list[View], known: PointCloud, config: InitConfig, device: Callable[[], torch.device] = lambda: CPU
-) -> list[ViewDepth]:
+    views: list[View], known: PointCloud, config: InitConfig, device: Callable[[], torch.device] = lambda: CPU,
+    progress: Callable[[str], object] = lambda line: None,
+) -> list[ViewDepth]:  # fmt: skip
     """Return the geometrically consistent depth of each of at least two views, by flow or by sweeping planes.
 
     Args:
@@ -226,18 +227,22 @@ def consistent_depths(
         known: Points that bound the planes.
         config: Source and its settings.
         device: Returns the device to sweep on, once it may be used.
+        progress: Called with a line for the user on what is being done.
     """
     if config.source == "flow":
         between = flow_between(views, config.flow, config.flow_range)
         return [flow_depth(views, i, between, config.epipolar()) for i in range(len(views))]
     points = np.concatenate([known.points, triangulate_matches(views).points])
     bounds = [depth_bounds(v, points, camera_depths(views)) for v in views]
-    return sweep_depths(views, bounds, SweepConfig(near_count=config.near_views), device())
+    return sweep_depths(
+        views, bounds, SweepConfig(near_count=config.near_views), device(),
+        lambda done, total: progress(f"finding depth: {done} of {total} views"),
+    )  # fmt: skip
 
 
 def consistent_points(
     views: list[View], points: PointCloud, config: InitConfig, generator: np.random.Generator,
-    device: Callable[[], torch.device],
+    device: Callable[[], torch.device], progress: Callable[[str], object],
 ) -> Start:  # fmt: skip
     """Return points behind pixels whose depth other views confirm, and a line on each view.
 
@@ -245,7 +250,7 @@ def consistent_points(
     """
     reason, depths = "a single view has no other to compare with", None
     if len(views) > 1:
-        depths = consistent_depths(views, points, config, device)
+        depths = consistent_depths(views, points, config, device, progress)
         cloud, notes = coarse_points(views, depths, merge_px=config.merge_px, fill_px=config.fill_px, source=config.source)
         if len(cloud) >= MIN_POINTS:
             return Start(cloud, "\n    ".join((notes[-1], *notes[:-1])), depths)
@@ -299,9 +304,11 @@ def on_object(start: Start, views: list[View]) -> Start:
 
 def initial_points(
     views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator,
-    device: Callable[[], torch.device] = lambda: CPU,
+    device: Callable[[], torch.device] = lambda: CPU, progress: Callable[[str], object] = lambda line: None,
 ) -> Start:  # fmt: skip
-    """Return the points to start from; ``device`` returns the device to sweep on, once it may be used.
+    """Return the points to start from.
+
+    ``device`` returns the device to sweep on, once it may be used; ``progress`` is called with lines on what is being done.
 
     Raises:
         DataError: Points were asked for and the scene has none that the training views saw.
@@ -313,19 +320,19 @@ def initial_points(
             return Start(cloud, how)
         cloud, made = random_points(views, config.random_count, generator)
         return Start(cloud, f"{made}, instead of --init.source hull: {how}")
-    return on_object(_found_points(views, points, config, generator, device), views)
+    return on_object(_found_points(views, points, config, generator, device, progress), views)
 
 
 def _found_points(
     views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator,
-    device: Callable[[], torch.device],
+    device: Callable[[], torch.device], progress: Callable[[str], object],
 ) -> Start:  # fmt: skip
     """Return the points of any source but the hull."""
     usable = seen_points(views, points)
     if config.source == "auto" and sweeps(config, len(views)):
-        return consistent_points(views, usable, dataclasses.replace(config, source="sweep"), generator, device)
+        return consistent_points(views, usable, dataclasses.replace(config, source="sweep"), generator, device, progress)
     if config.source in ("sweep", "flow"):
-        return consistent_points(views, usable, config, generator, device)
+        return consistent_points(views, usable, config, generator, device, progress)
     if config.source == "points" or (config.source == "auto" and len(usable) >= MIN_POINTS):
         return Start(usable, f"{len(usable):,} points of the reconstruction that the training views saw")
     cloud, how = random_points(views, config.random_count, generator)

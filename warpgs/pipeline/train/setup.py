@@ -63,7 +63,7 @@ def prepare(
     @functools.cache
     def start() -> Start:
         progress("finding the first points")
-        found = initial_points(train, points, config.init, generator, usable)
+        found = initial_points(train, points, config.init, generator, usable, progress)
         return subsample(found, config.max_gaussians, generator)
 
     notes = []
