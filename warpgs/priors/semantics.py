@@ -30,7 +30,7 @@ L0_WEIGHT, L0_GROWTH = 0.04, 2.0
 """Weight of a gradient, and growth per round, of L0 smoothing. Xu et al. 2011 use 0.02 and 2 for photographs; twice that weight
 drops foliage and gravel and keeps outlines."""
 MAX_PIXELS = 50_000
-"""Largest number of pixels of an image that is looked at without a network; larger ones are reduced first: smoothing takes 0.6 s
+"""Largest number of pixels of an image without a network; larger ones are reduced first: smoothing takes 0.6 s
 at 504 x 378 px."""
 EDGE_LOW, EDGE_HIGH = 100.0, 250.0
 """Canny's thresholds on the smoothed image: sums of absolute Sobel derivatives of 8-bit colours."""
