@@ -240,18 +240,29 @@ def _demo(arguments: list[str]) -> int:
         height: int = 240
         """Image height [px]."""
         seed: int = 0
-        """Decides the textures."""
+        """Decides the textures; of an object also its shape."""
+        object: bool = False
+        """Instead of a still life, an object with nothing around it: RGBA images, eight of them to fit."""
+        format: str = "transforms"
+        """Of an object: transforms (transforms.json with RGBA images) or colmap (RGB images with cut-out masks)."""
 
     a = _parse(Demo, "demo", arguments)
     check_range("--views", a.views, 8, 10_000)
     check_range("--width", a.width, 8, 8192)
     check_range("--height", a.height, 8, 8192)
     check_range("--seed", a.seed, 0, 2**31 - 1)
-    from warpgs.synthetic.demo import write_demo
+    size = {"views": a.views, "width": a.width, "height": a.height, "seed": a.seed}
+    if a.object:
+        from warpgs.synthetic.cut_out import write_object
 
-    split = write_demo(a.folder, views=a.views, width=a.width, height=a.height, seed=a.seed)
-    say(f"{a.folder}: {a.views} views of {a.width} x {a.height} px as a COLMAP folder")
-    say(f"next: warpgs fit {a.folder} --split '{split}' --out run")
+        split, masks = write_object(a.folder, form=a.format, **size), " --masks cutout" if a.format == "colmap" else ""
+    else:
+        from warpgs.synthetic.demo import write_demo
+
+        split, masks = write_demo(a.folder, **size), ""
+    form = "transforms.json" if a.object and a.format == "transforms" else "COLMAP"
+    say(f"{a.folder}: {a.views} views of {a.width} x {a.height} px as a {form} folder")
+    say(f"next: warpgs fit {a.folder} --split '{split}'{masks} --out run")
     return 0
 
 

@@ -7,6 +7,7 @@ training image, nor their mean, resembles a held-out view pixel by pixel.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ CANDIDATES = 4800  # surface points tried at 320 x 240; fewer in smaller images,
 TAU = 2 * np.pi
 
 
-def _texture(rng: np.random.Generator, low: str, high: str, period: float, kind: str = "solid") -> raycast.Texture:
+def checker_texture(rng: np.random.Generator, low: str, high: str, period: float, kind: str = "solid") -> raycast.Texture:
     """Return a smoothed checker with five tinting waves between half and twice its pitch.
 
     Args:
@@ -36,6 +37,9 @@ def _texture(rng: np.random.Generator, low: str, high: str, period: float, kind:
         period: Period of the checker [u].
         kind: ``solid``; ``flat`` where the surface is the local plane z = 0 and only x and y make a pattern; ``box``
             where the period is half the edge, so that the faces lie in the strongest layers of the checker.
+
+    Returns:
+        The texture, matte.
     """
     directions = rng.normal(size=(5, 3))
     if kind == "flat":
@@ -70,7 +74,7 @@ def still_life(seed: int = 0) -> list[raycast.Shape]:
     rng = np.random.default_rng(seed)
 
     def surface(low: str, high: str, period: float, kind: str = "solid") -> raycast.Texture:
-        return _texture(rng, low, high, period, kind)
+        return checker_texture(rng, low, high, period, kind)
 
     return [
         raycast.Plane((0, 0, 6.4), surface("1a3a5f", "f7e6c6", 0.92, "flat")),
@@ -192,9 +196,15 @@ def surface_points(
 
 
 def _quaternion(R: np.ndarray) -> np.ndarray:
-    """Return the unit quaternion wxyz [4] of a rotation [3, 3] by less than half a turn."""
-    w = np.sqrt(1 + np.trace(R)) / 2
-    return np.array([w, *(np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (4 * w))])
+    """Return a unit quaternion wxyz [4] of a rotation [3, 3], from its largest component, so that nothing cancels."""
+    w = np.sqrt(max(1 + np.trace(R), 0.0)) / 2
+    if w > 0.1:
+        return np.array([w, *(np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (4 * w))])
+    i = int(np.diagonal(R).argmax())
+    j, k = (i + 1) % 3, (i + 2) % 3
+    q = np.zeros(4)
+    q[[0, 1 + i, 1 + j, 1 + k]] = R[k, j] - R[j, k], 1 + R[i, i] - R[j, j] - R[k, k], R[j, i] + R[i, j], R[k, i] + R[i, k]
+    return q / np.linalg.norm(q)
 
 
 def colmap_text(cameras: list[Camera], x: np.ndarray, colors: np.ndarray, seen: np.ndarray) -> dict[str, str]:
@@ -238,10 +248,8 @@ def colmap_text(cameras: list[Camera], x: np.ndarray, colors: np.ndarray, seen: 
     return {name: "\n".join(lines) + "\n" for name, lines in named.items()}
 
 
-def _check(folder: Path, views: int, width: int, height: int) -> None:
+def _check(folder: Path, width: int, height: int) -> None:
     """Raise a UsageError for a demo that cannot be written, before anything is."""
-    if views < MIN_VIEWS:
-        raise UsageError(f"a demo needs at least {MIN_VIEWS} views ({TRAIN_VIEWS} to fit, the rest held out), not {views}")
     if min(width, height) < MIN_SIDE:
         raise UsageError(f"a demo image must be at least {MIN_SIDE} px on each side, not {width} x {height}")
     try:
@@ -270,6 +278,28 @@ def _files(views: int, width: int, height: int, seed: int) -> dict[str, bytes]:
     return files
 
 
+def write_files(folder: Path, size: tuple[int, int], contents: Callable[[], dict[str, bytes]]) -> None:
+    """Write the files of a demo into a new or empty folder.
+
+    Args:
+        folder: Target folder.
+        size: Image width and height [px].
+        contents: Makes the contents by relative path, once the folder is there.
+
+    Raises:
+        UsageError: The folder is not empty, or the images are too small.
+        ResourceError: The folder cannot be written.
+    """
+    _check(folder, *size)
+    with hold_folder(folder) as notes:  # before the work: a folder that cannot be made is reported at once
+        for note in notes:
+            say(f"warpgs: {note}", error=True)
+        _check(folder, *size)  # another process may have filled it before it was ours
+        for path, content in contents().items():
+            make_folder((folder / path).parent)
+            write_bytes(folder / path, content)
+
+
 def write_demo(folder: Path, *, views: int = 24, width: int = 320, height: int = 240, seed: int = 0) -> str:
     """Write the demo scene as a COLMAP folder: images, cameras, and exact points with their tracks.
 
@@ -289,13 +319,7 @@ def write_demo(folder: Path, *, views: int = 24, width: int = 320, height: int =
         UsageError: The folder is not empty, or the sizes are too small.
         ResourceError: The folder cannot be written.
     """
-    folder = Path(folder)
-    _check(folder, views, width, height)
-    with hold_folder(folder) as notes:  # before the work: a folder that cannot be made is reported at once
-        for note in notes:
-            say(f"warpgs: {note}", error=True)
-        _check(folder, views, width, height)  # another process may have filled it before it was ours
-        for path, content in _files(views, width, height, seed).items():
-            make_folder((folder / path).parent)
-            write_bytes(folder / path, content)
+    if views < MIN_VIEWS:
+        raise UsageError(f"a demo needs at least {MIN_VIEWS} views ({TRAIN_VIEWS} to fit, the rest held out), not {views}")
+    write_files(Path(folder), (width, height), lambda: _files(views, width, height, seed))
     return split_spec(views)

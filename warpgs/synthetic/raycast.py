@@ -70,6 +70,9 @@ class Shape(abc.ABC):
     """Albedo as a function of local position."""
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
     """Rotation world_from_local, shape [3, 3]."""
+    shading: float = 0.8
+    """Radius of the sphere that stands for the shape where it shades others, over that of its bounding sphere; 0 for thin
+    shapes, which such a sphere would overstate: they shade nothing."""
 
     @property
     def radius(self) -> float:
@@ -316,10 +319,10 @@ def shade(shapes: Sequence[Shape], light: Light, x: np.ndarray, index: np.ndarra
     to_light = to_light / np.linalg.norm(to_light)
     lit, open_sky = np.ones(len(x), x.dtype), np.ones(len(x), x.dtype)
     for i, shape in enumerate(shapes):
-        if not np.isfinite(shape.radius):
+        if not np.isfinite(shape.radius) or not shape.shading:
             continue
         # Each object shades the others as the sphere of its bulk would: smooth everywhere, and needs no second ray.
-        bulk = 0.8 * shape.radius
+        bulk = shape.shading * shape.radius
         rows = np.flatnonzero(index != i)
         away = np.asarray(shape.center, x.dtype) - x[rows]
         square = np.einsum("ij,ij->i", away, away)
@@ -351,10 +354,10 @@ def pixel_rays(K: np.ndarray, viewmat: np.ndarray, xy: np.ndarray) -> np.ndarray
     return matmul(d, viewmat[:3, :3].astype(xy.dtype))
 
 
-def render(
+def render_rgba(
     shapes: Sequence[Shape], light: Light, K: np.ndarray, viewmat: np.ndarray, width: int, height: int, samples: int = 3
 ) -> np.ndarray:
-    """Render an anti-aliased image.
+    """Render an anti-aliased image and its alpha.
 
     Args:
         shapes: Shapes of the scene.
@@ -366,11 +369,12 @@ def render(
         samples: Number of rays along each side of a pixel.
 
     Returns:
-        Colours in [0, 1], float32, shape [H, W, 3].
+        Colours in [0, 1], times the fraction of a pixel's rays that hit a shape, and that fraction as fourth channel: float32,
+        shape [H, W, 4].
     """
     origin = -matmul(viewmat[:3, :3].T, viewmat[:3, 3])
     sub = (np.arange(width * samples, dtype=np.float32) + 0.5) / samples
-    out = np.empty((height, width, 3), np.float32)
+    out = np.empty((height, width, 4), np.float32)
     rows = max(1, BAND_RAYS // (width * samples**2))
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
@@ -379,6 +383,14 @@ def render(
         d = pixel_rays(K, viewmat, xy)
         t, index = cast(shapes, origin, d)
         x = origin.astype(np.float32) + np.where(np.isfinite(t), t, 0)[:, None] * d
-        fine = shade(shapes, light, x, index)
-        out[top:bottom] = fine.reshape(bottom - top, samples, width, samples, 3).mean(axis=(1, 3))
+        tiles = (bottom - top, samples, width, samples)
+        out[top:bottom, :, :3] = shade(shapes, light, x, index).reshape(*tiles, 3).mean(axis=(1, 3))
+        out[top:bottom, :, 3] = (index >= 0).reshape(tiles).mean(axis=(1, 3))
     return out
+
+
+def render(
+    shapes: Sequence[Shape], light: Light, K: np.ndarray, viewmat: np.ndarray, width: int, height: int, samples: int = 3
+) -> np.ndarray:
+    """Return the colours of `render_rgba`, over black: float32, shape [H, W, 3]."""
+    return np.ascontiguousarray(render_rgba(shapes, light, K, viewmat, width, height, samples)[..., :3])
