@@ -35,7 +35,7 @@ The scene is a random cloud whose Gaussians shrink as their number grows, render
 around 100,000 Gaussians, 504 x 378 px, degree 3, one camera; a few points let Gaussians and image grow together.
 
 Other programs: `torch conv2d` is SSIM as most trainers write it, `torch dense` a rasterizer without tiles in plain torch, up
-to 1,000 Gaussians, `naive` a kernel with one thread per pixel, `numpy` the paths of a sweep as a fit on a CPU follows them,
+to 1,000 Gaussians, `naive` a kernel with one thread per pixel, `numpy` the paths of a sweep, a line at a time in numpy,
 `gsplat` that package with `packed=False`, `gsplat + torch` a step made of its rendering, the loss in plain torch and torch's
 fused Adam.
 """

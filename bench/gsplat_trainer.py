@@ -1,8 +1,9 @@
-"""A plain training loop around gsplat's rasterizer and its MCMC strategy, with the settings of its own example trainer.
+"""A plain training loop around gsplat's rasterizer and its two strategies, with the settings of its own example trainer.
 
-gsplat is called, never copied. The settings are those of ``examples/simple_trainer.py mcmc`` of nerfstudio-project/gsplat at
-90d7b4b3 (2026-08-20): `Settings` holds them, and `train` takes its steps in its order. Its fused SSIM is optional there and
-absent here: SSIM is by convolutions with zero padding, which is what it falls back to.
+gsplat is called, never copied. The settings are those of ``examples/simple_trainer.py`` of nerfstudio-project/gsplat, of
+``mcmc`` at 90d7b4b3 (2026-08-20) and of ``default``, whose thresholds are `DefaultStrategy`'s own: `Settings` holds them, and
+`train` takes its steps in its order. Its fused SSIM is optional there and absent here: SSIM is by convolutions with zero
+padding, which is what it falls back to.
 """
 
 from __future__ import annotations
@@ -23,11 +24,13 @@ C0 = 0.28209479177387814
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of gsplat's example trainer for MCMC; lengths are in the units of its world."""
+    """Settings of gsplat's example trainer, for MCMC where nothing else is said; lengths are in the units of its world."""
 
     steps: int
     cap: int
-    """Most Gaussians."""
+    """Most Gaussians of MCMC; the default strategy has no limit."""
+    strategy: str = "mcmc"
+    """mcmc or default."""
     init_opacity: float = 0.5
     init_scale: float = 0.1
     """Width of a first Gaussian over the root mean square distance to its three neighbours."""
@@ -55,6 +58,16 @@ class Settings:
     def last_refinement(self) -> int:
         """The step at which refinement stops, scaled to the length of this run."""
         return self.refine_stop * self.steps // self.full_steps
+
+
+def default_settings(steps: int) -> Settings:
+    """Return the settings for gsplat's default strategy, whose refinement ends at half of the steps, as at 15,000 of 30,000.
+
+    gsplat 1.5.3 never resets opacities: it writes ``step % reset_every == 0 & step > 0``, which Python reads as false.
+    """
+    return Settings(
+        steps, cap=0, strategy="default", init_opacity=0.1, init_scale=1.0, opacity_reg=0.0, scale_reg=0.0, refine_stop=15_000
+    )
 
 
 def own_scale(cameras: list[Camera], normalization: Normalization) -> float:
@@ -127,6 +140,18 @@ def loss_of(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None
     return (1 - s.ssim_lambda) * l1 + s.ssim_lambda * (1 - similarity) + regular
 
 
+def strategy_of(s: Settings, size: float):
+    """Return gsplat's strategy for a scene of that size in its world, and the first state of the strategy."""
+    import gsplat
+
+    times = {"refine_start_iter": s.refine_start, "refine_stop_iter": s.last_refinement, "refine_every": s.refine_every}
+    if s.strategy == "default":
+        strategy = gsplat.DefaultStrategy(**times)
+        return strategy, strategy.initialize_state(scene_scale=size)
+    strategy = gsplat.MCMCStrategy(cap_max=s.cap, noise_lr=s.noise_lr, **times)
+    return strategy, strategy.initialize_state()
+
+
 @dataclass(frozen=True)
 class _Loaded:
     """A training view on the device, in gsplat's world."""
@@ -156,18 +181,12 @@ def train(views: list[View], first: Gaussians, s: Settings, *, seed: int, scale:
         scale: Length of our unit in gsplat's world.
         size: Size of the scene in gsplat's world.
     """
-    from gsplat import MCMCStrategy
-
     device = first.means.device
     torch.manual_seed(seed)
     params = start(scale * first.means.detach(), C0 * first.sh.detach()[:, 0] + 0.5, s)
     optimizers = optimizers_of(params, s, size)
-    strategy = MCMCStrategy(
-        cap_max=s.cap, noise_lr=s.noise_lr, refine_start_iter=s.refine_start, refine_stop_iter=s.last_refinement,
-        refine_every=s.refine_every,
-    )  # fmt: skip
+    strategy, state = strategy_of(s, size)
     strategy.check_sanity(params, optimizers)
-    state = strategy.initialize_state()
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], gamma=0.01 ** (1 / s.steps))
     there, order = [loaded(v, device, scale) for v in views], []
     for step in range(s.steps):
@@ -181,8 +200,8 @@ def train(views: list[View], first: Gaussians, s: Settings, *, seed: int, scale:
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
         schedule.step()
-        lr = schedule.get_last_lr()[0]
-        strategy.step_post_backward(params=params, optimizers=optimizers, state=state, step=step, info=info, lr=lr)
+        last = {"lr": schedule.get_last_lr()[0]} if s.strategy == "mcmc" else {}
+        strategy.step_post_backward(params=params, optimizers=optimizers, state=state, step=step, info=info, **last)
     return params
 
 
@@ -192,3 +211,11 @@ def image_of(params, view: View, scale: float) -> np.ndarray:
     there = loaded(view, params["means"].device, scale)
     degree = math.isqrt(params["shN"].shape[1] + 1) - 1
     return render(params, there.viewmat, there.K, view.camera.width, view.camera.height, degree)[0].cpu().numpy()
+
+
+def compile_kernels(device: torch.device) -> None:
+    """Draw a few Gaussians and their gradients: gsplat builds its kernels at the first call, which takes minutes."""
+    points = torch.rand(8, 3, device=device)
+    params = start(points, points, default_settings(1))
+    viewmat, K = torch.eye(4, device=device), torch.tensor([[16.0, 0, 8], [0, 16, 8], [0, 0, 1]], device=device)
+    render(params, viewmat, K, 16, 16, 0)[0].sum().backward()

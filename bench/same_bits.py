@@ -3,8 +3,8 @@
 usage: python -m bench.same_bits [--out bench/results/same_bits.json] [--device cpu] [--threads N] [--avx2] [--label WORDS]
 
 Makes the demo scene, then fits it by three presets: ``3dgs`` from the points of the scene, ``quick`` from swept depths, with
-saliency and sampling events, and ``fsgs`` with a depth term. Prints a line for each stage with the first 12 digits of its
-SHA-256, puts a row into the result ``--out`` (in the place of one of the same label, processor and arguments), and names the
+saliency and sampling events, and ``mcmc`` with relocation and noise. Prints a line for each stage with the first 12 digits of
+its SHA-256, puts a row into the result ``--out`` (in place of one of the same label, processor and arguments), and names the
 stages that differ from the first row of the same arguments and kind of device. Stages of single functions (``torch.exp``,
 ``cv2.SIFT``, ...) come first: they work on fixed numbers, so one that differs did not inherit it.
 
@@ -34,12 +34,13 @@ from bench import result_file
 from warpgs.export.ply import write_ply
 from warpgs.io.load import load_scene
 from warpgs.io.splits import split_views
-from warpgs.kernels.compiler import ROLLED
+from warpgs.kernels.compiler import EXACT, ROLLED
 from warpgs.pipeline.train.config import PRESETS, FitConfig
+from warpgs.pipeline.train.loop import train_views
 from warpgs.pipeline.train.loss import Target
 from warpgs.pipeline.train.step import total_loss
 from warpgs.pipeline.train.strategies.base import find_strategy
-from warpgs.pipeline.train.trainer import Trainer, train_views
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.priors.matches import triangulate_matches
 from warpgs.priors.semantics import classical_maps
 from warpgs.render.rasterize import RasterizeOptions, rasterize
@@ -49,7 +50,7 @@ from warpgs.synthetic.demo import split_spec, write_demo
 
 WHAT = "SHA-256, first 12 digits, of every stage from photographs to the PLY of a fit, and of single library functions"
 RESULTS = result_file.FOLDER / "same_bits.json"
-PRESET_NAMES = ("3dgs", "quick", "fsgs")
+PRESET_NAMES = ("3dgs", "quick", "mcmc")
 DIGITS = 12
 AVX2 = {
     "ATEN_CPU_CAPABILITY": "avx2",
@@ -166,7 +167,7 @@ def _first_step(trainer: Trainer) -> Iterator[Stage]:
     render = rasterize(leaves, view.camera, options)
     for name, image in (("colour", render.rgb), ("alpha", render.alpha), ("depth", render.depth)):
         yield f"first render: {name}", digest(image)
-    loss = total_loss(plan, render, Target(view.image, view.mask, view.maps, {}), leaves, trainer.strategy)
+    loss = total_loss(plan, render, Target(view.image, view.mask, view.maps, {}, view.alpha), leaves, trainer.strategy)
     yield "first loss", digest(loss)
     loss.backward()
     for name, leaf in leaves.tensors().items():
@@ -310,7 +311,8 @@ def _compile_for(target: str) -> None:
     """Have Warp compile the CPU kernels that are not made yet for another processor than this one."""
     flag = f"-target-cpu {target}"
     warp.config.cpu_compiler_flags = warp.config.cpu_compiler_flags.replace("-march=native", flag)
-    ROLLED["cpu_compiler_flags"] = ROLLED["cpu_compiler_flags"].replace("-march=native", flag)
+    for options in (EXACT, ROLLED):
+        options["cpu_compiler_flags"] = options["cpu_compiler_flags"].replace("-march=native", flag)
 
 
 def _arguments() -> argparse.Namespace:

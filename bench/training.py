@@ -8,15 +8,18 @@ from dataclasses import dataclass
 
 import torch
 
+from warpgs.pipeline.model.parameter_bounds import model_bytes as bytes_of
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.complexity import complexity_figures
 from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loop import run
 from warpgs.pipeline.train.loss import LossConfig, built_in_terms
 from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.step import MAX_BATCH, Learned, StepBuffers, StepGraphs, StepPlan, eager_renderer, step
 from warpgs.pipeline.train.strategies.base import Strategy
-from warpgs.pipeline.train.trainer import Trainer, run
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import ViewStack
+from warpgs.pipeline.train.warmup import warm_up
 from warpgs.scene import Camera, Gaussians, PointCloud, View
 
 BLACK = (0.0, 0.0, 0.0)
@@ -29,6 +32,11 @@ def make_trainer(
 ) -> Trainer:
     """Return a trainer at step 0."""
     return Trainer(views, points, config, device, background)
+
+
+def compile_kernels(config: FitConfig, device: torch.device) -> None:
+    """Compile all kernels that a fit with these settings uses, by a tiny fit."""
+    warm_up(config, device)
 
 
 def finish(trainer: Trainer) -> None:
@@ -59,6 +67,11 @@ def sort_along_curve(trainer: Trainer) -> None:
 def model_bytes(trainer: Trainer) -> int:
     """Return the bytes of the model, each Gaussian with the coefficients of its own degree."""
     return complexity_figures(trainer)["complexity"]["bytes"]
+
+
+def full_bytes(count: int, degree: int = 3) -> int:
+    """Return the bytes of a model of so many Gaussians, all of one degree."""
+    return bytes_of(torch.full((count,), degree))
 
 
 def with_cap(config: FitConfig, most: int) -> FitConfig:
@@ -147,7 +160,7 @@ class Steps:
         fixed = None if self.lr is None else dict.fromkeys(self.table.params, self.lr)
         lrs, heads = (config.lrs(0.0, 1.0), config.head_lrs) if fixed is None else (fixed, {})
         rows = [self.table.lr_row(lrs, k, heads) for k in steps]
-        self.buffers.load([0] * len(steps), rows, [(0.0, k, lrs["means"]) for k in steps])
+        self.buffers.load([0] * len(steps), rows, [(0.0, k, lrs["means"], 0.0, 0.0, 0.0) for k in steps])
 
     def eager(self) -> None:
         """Take the first step of a batch from Python, again and again: the same work each time."""

@@ -64,7 +64,7 @@ class ShotsReader(Reader):
                     lambda width, height: centred_lens(focal, width, height).checked(where),  # noqa: B023 - called at once
                 )
                 views.add(view_name(name), look_at(position, target, UP), image)
-        return self.scene(folder, views.views, views.notes())
+        return self.scene(folder, views.views, views.notes(options))
 
 
 def parse(row: list[str], where: str) -> tuple[str, np.ndarray, np.ndarray, float]:

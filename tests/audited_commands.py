@@ -42,7 +42,7 @@ for words in (
     ["export", run, "--to", str(out / "a.ply")],
     ["prune", run, "--keep-psnr", "3", *cpu],
     ["priors", "show", scene, *split, "--out", str(out / "priors")],
-    ["compare", scene, *split, "--out", str(out / "study"), "--presets", "3dgs,fsgs", "--seeds", "1", "--steps", "2", *cpu],
+    ["compare", scene, *split, "--out", str(out / "study"), "--presets", "3dgs,mcmc", "--seeds", "1", "--steps", "2", *cpu],
 ):
     assert main(words) == 0, words
 

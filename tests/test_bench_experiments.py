@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from bench import result_file
-from bench.experiments import bucket, complexity, pareto, tradeoff, tradeoff_kernel, tradeoff_outcome
+from bench.experiments import bucket, complexity, pareto, scale_limits, tradeoff, tradeoff_kernel, tradeoff_outcome
 from bench.experiments.bucket_kernel import SIZES, make_backward
 from bench.experiments.depth_order import depth_order, main
 from bench.experiments.frozen import scenes
@@ -21,6 +21,7 @@ from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference
 from warpgs.app.cli import main as warpgs
 from warpgs.errors import UsageError
+from warpgs.geometry import focus_point, project_points
 from warpgs.io.load import load_scene
 from warpgs.pipeline.runs.request import SceneRequest
 from warpgs.pipeline.train.config import PRESETS
@@ -238,3 +239,23 @@ def test_rule_costs_quote_the_stored_results():
         assert cost.max_error == pytest.approx(row["max_to_exact"], rel=0.06)
         assert cost.time == pytest.approx(row["both_ms"] / by_name["exact"]["both_ms"], abs=0.03)
     assert all(math.isfinite(r["mean"]) for r in rows)
+
+
+def test_scale_limits_are_compared_from_beside_the_cameras(tmp_path):
+    """The camera stands aside and looks at the same point; splits and limits are read; the table has a row for each way."""
+    write_demo(tmp_path / "scene", views=8, width=64, height=48)
+    scene = load_scene(tmp_path / "scene")
+    cameras = [v.camera for v in scene.views]
+    here, aside = scale_limits.beside(cameras, 0.0), scale_limits.beside(cameras, 0.5)
+    target = focus_point(cameras)
+    assert np.allclose(np.linalg.norm(aside.center - here.center), 0.5 * np.linalg.norm(target - here.center))
+    assert np.allclose(project_points(aside, target[None])[0], aside.K[:2, 2])
+    assert scale_limits.split_of(scene, "even:4").startswith("train=000.png,002.png,004.png,006.png;test=001.png")
+    assert scale_limits.split_of(scene, "every:8") == "every:8"
+    assert scale_limits.limits_of("max_size=2,ratio_from=0").max_size == 2
+    for wrong in (lambda: scale_limits.split_of(scene, "even:9"), lambda: scale_limits.limits_of("size=1")):
+        with pytest.raises(UsageError):
+            wrong()
+    row = {"scene": "a", "psnr": 20.0, "ssim": 0.5, "gaussians": 9} | dict.fromkeys(scale_limits.FIGURES, 0.25)
+    rows = [row | {"limits": kind, "seed": seed} for kind in ("off", "on") for seed in (0, 1)]
+    assert scale_limits.table(rows).count("\n| a | ") == 2 and "| on | 2 | 20.00 |" in scale_limits.table(rows)

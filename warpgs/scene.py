@@ -120,6 +120,11 @@ class Scene:
     """Source of the pixels: the image folder, and whether they are as stored or area-resampled. Scores against `images_8` and
     against `images` resampled by 8 cannot be compared."""
 
+    @property
+    def transparent(self) -> bool:
+        """True where a view knows its opacity: the scene is an object cut out."""
+        return any(v.alpha is not None for v in self.views)
+
     def view(self, name: str) -> View:
         """Return the view of that name.
 

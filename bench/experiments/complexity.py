@@ -1,6 +1,6 @@
 """Bytes against PSNR: fixed and adaptive fits over seeds, and what is left of them when they are pruned further.
 
-    python -m bench.experiments.complexity SCENE ... --out DIR [--split llff:3] [--preset paper] [--seeds 5] [--device auto]
+    python -m bench.experiments.complexity SCENE ... --out DIR [--split llff:3] [--preset default] [--seeds 5] [--device auto]
 
 DIR is a study as `warpgs compare` makes it, with finished runs kept when the command is given again, and besides its files
 complexity.json (a row per run), complexity.md (means, paired differences), curve.json and curve.svg (every scene's first seed
@@ -165,7 +165,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--from-runs", action="store_true")
     parser.add_argument("--split", default="llff:3")
     parser.add_argument("--downscale", type=int, default=1)
-    parser.add_argument("--preset", default="paper")
+    parser.add_argument("--preset", default="default")
     parser.add_argument("--steps", type=int)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--device", default="auto")

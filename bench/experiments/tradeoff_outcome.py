@@ -42,7 +42,7 @@ def trials() -> list[Trial]:
     made += [turned("degree 0", "SH degree", init=dataclasses.replace(base.init, max_sh_degree=0))]
     pairs = ((1200, "balanced", 0.3), (1200, "fast", 0.6))
     made += [turned(f"{n} steps, {r}, half {h:g}", "pairs", steps=n, rule=r, half_resolution=h) for n, r, h in pairs]
-    return made + [Trial(n, "preset", PRESETS[n], preset=True) for n in ("balanced", "paper")]
+    return made + [Trial(n, "preset", PRESETS[n], preset=True) for n in ("default",)]
 
 
 def fit_once(scene: Scene, split: str, config: FitConfig, device: torch.device) -> dict:

@@ -1,4 +1,4 @@
-"""Time of the path costs of an image's depth planes, beside numpy, which a fit on a CPU uses."""
+"""Time of the path costs of an image's depth planes, beside numpy, a line of pixels at a time."""
 
 import numpy as np
 import torch
@@ -6,13 +6,35 @@ import torch
 from bench import inputs, roofline
 from bench.harness import OURS, Task
 from warpgs.kernels.scanlines import scanline_costs
-from warpgs.priors.sweep_cpu import path_costs
-from warpgs.priors.sweep_planes import UNIT
+from warpgs.priors.sweep_planes import UNIT, step_limits
 
 AXES = ("image",)
 NUMPY = "numpy"
 PROGRAMS = {OURS: ("forward",), NUMPY: ("forward",)}
 PLANES = 64
+
+
+def path_costs(costs: np.ndarray, image: np.ndarray, small_step: float, large_step: float, *, down: bool) -> np.ndarray:
+    """Sum of the path costs along columns or rows, in numpy, which runs side by side on several threads."""
+    total = np.zeros_like(costs)
+    c, t, colors = (a if down else a.swapaxes(0, 1) for a in (costs, total, image))
+    bounds, small = step_limits(colors, small_step, large_step), np.int16(round(small_step * UNIT))
+    for order, edge in ((range(len(c)), -1), (range(len(c) - 1, -1, -1), 0)):
+        path = None
+        for k in order:
+            if path is None:
+                path = c[k].copy()
+            else:
+                lowest = path.min(1, keepdims=True)
+                step = np.minimum(path, lowest + bounds[k + edge, :, None])
+                path += small
+                np.minimum(step[:, 1:], path[:, :-1], out=step[:, 1:])
+                np.minimum(step[:, :-1], path[:, 1:], out=step[:, :-1])
+                step -= lowest
+                step += c[k]
+                path = step
+            t[k] += path
+    return total
 
 
 def tasks(point, device, wanted):

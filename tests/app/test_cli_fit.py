@@ -98,10 +98,10 @@ def test_without_flags_the_settings_are_the_presets(preset):
 
 
 def test_flags_change_what_they_name(capsys):
-    """Sizes with units, nested settings, the preset that depends on the device, and both forms of a flag."""
+    """Sizes with units, nested settings, the default preset, and both forms of a flag."""
     found = parsed("--memory-limit", "2GiB", "--init.source=random", "--no-cuda-graph", "--max-gaussians", "900")
     assert (found.memory_limit, found.init.source, found.cuda_graph, found.max_gaussians) == (2 * 2**30, "random", False, 900)
-    assert found.preset == "quick" and "preset quick, as usual on cpu" in capsys.readouterr().out
+    assert found.preset == "default" and "preset default: any capture" in capsys.readouterr().out
     found = parsed(
         "--strategy=mcmc", "--mcmc.noise-lr", "1e4", "--loss-terms", "depth_correlation", "--depth-correlation.until", "0.5"
     )

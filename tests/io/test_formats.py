@@ -79,7 +79,8 @@ def test_blender_is_put_over_white_and_split_by_folder(tmp_path):
     assert scene.background == (1.0, 1.0, 1.0)
     assert [v.name for v in scene.views] == ["test/r_4.png", *(f"train/r_{i}.png" for i in range(3)), "val/r_3.png"]
     assert all(v.mask is None and (v.image[:, :8] == 1).all() for v in scene.views)
-    assert any("put over the background" in n for n in scene.notes)
+    assert all((v.alpha[:, :8] == 0).all() and (v.alpha[:, 8:] == 1).all() for v in scene.views)
+    assert "5 images transparent in part, by the alpha channel" in scene.notes
 
 
 def test_dtu_masks_match_by_number_and_can_be_inverted(tmp_path):
@@ -89,7 +90,7 @@ def test_dtu_masks_match_by_number_and_can_be_inverted(tmp_path):
     for i in range(5):
         scenes.save(tmp_path / "mask" / f"{i:03d}.png", mask)
     assert all((v.mask == (mask > 0)).all() for v in load_scene(tmp_path).views)
-    assert all((v.mask == (mask == 0)).all() for v in load_scene(tmp_path, invert_masks=True).views)
+    assert all((v.mask == (mask == 0)).all() for v in load_scene(tmp_path, mask_keeps="black").views)
 
 
 def test_transforms_per_frame_intrinsics_and_mask_path(tmp_path):

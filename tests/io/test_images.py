@@ -1,5 +1,6 @@
 """Decoding, orientation, masks, undistortion and resizing, each with the camera in step."""
 
+import dataclasses
 import io
 
 import numpy as np
@@ -11,6 +12,7 @@ from warpgs.errors import DataError, UsageError
 from warpgs.io.decoding import decode
 from warpgs.io.images import Lens, load_image
 from warpgs.io.load import load_scene
+from warpgs.io.normalize import fingerprint
 
 
 def lens(width, height, focal=20.0, distortion=(), model="PINHOLE"):
@@ -194,17 +196,22 @@ def test_distortion_is_noted_once_per_model(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["photo0.png", "photo0.png.png"])
-@pytest.mark.parametrize("invert", [False, True])
-def test_masks_folder(name, invert, tmp_path):
+@pytest.mark.parametrize("keeps", ["white", "black"])
+def test_masks_folder(name, keeps, tmp_path):
     scenes.write_colmap(tmp_path)
     mask = np.zeros((12, 16), np.uint8)
     mask[:, 4:] = 255
     scenes.save(tmp_path / "masks" / name, mask)
-    scene = load_scene(tmp_path, invert_masks=invert)
-    assert (scene.views[0].mask == ((mask > 0) != invert)).all() and scene.views[1].mask is None
+    scene = load_scene(tmp_path, mask_keeps=keeps)
+    assert (scene.views[0].mask == ((mask > 0) == (keeps == "white"))).all() and scene.views[1].mask is None
     assert "1 image masked by a mask file" in scene.notes
-    half = load_scene(tmp_path, downscale=2, invert_masks=invert).views[0].mask
-    assert (half == ((mask[::2, ::2] > 0) != invert)).all()
+    kept = "75.0%" if keeps == "white" else "25.0%"
+    assert (
+        f"masks keep {kept} of the pixels, the {keeps} ones (--mask-keeps {keeps}); the others do not count (--masks ignore)"
+        in (scene.notes)
+    )
+    half = load_scene(tmp_path, downscale=2, mask_keeps=keeps).views[0].mask
+    assert (half == ((mask[::2, ::2] > 0) == (keeps == "white"))).all()
 
 
 def test_masks_of_middlebury_lie_in_the_scene_folder(tmp_path):
@@ -217,22 +224,99 @@ def test_masks_of_middlebury_lie_in_the_scene_folder(tmp_path):
     assert views[0].mask is None and not views[1].mask[0].any()
 
 
-def test_alpha_becomes_the_mask_outside_blender(tmp_path):
-    scenes.write_colmap(tmp_path)
-    alpha = np.full((12, 16, 1), 255, np.uint8)
-    alpha[:, :4] = 100
-    scenes.save(tmp_path / "images" / "photo0.png", np.concatenate([scenes.image(0), alpha], axis=2))
+def rgba(i, alpha):
+    """Return the test image [12, 16, 4] with an alpha channel [12, 16]."""
+    return np.concatenate([scenes.image(i), alpha[..., None]], axis=2)
+
+
+@pytest.mark.parametrize("write", [scenes.write_colmap, scenes.write_transforms, scenes.write_llff])
+def test_alpha_arrives_in_every_format(write, tmp_path):
+    """Straight colours come multiplied, over black; an alpha of one everywhere is an opaque image."""
+    write(tmp_path)
+    alpha = np.full((12, 16), 255, np.uint8)
+    scenes.save(tmp_path / "images" / "photo1.png", rgba(1, alpha))
+    alpha[:, :4], alpha[0] = 100, 0
+    scenes.save(tmp_path / "images" / "photo0.png", rgba(0, alpha))
     scene = load_scene(tmp_path)
-    assert (scene.views[0].mask == (alpha[..., 0] > 127)).all() and scene.background == (0, 0, 0)
-    np.testing.assert_allclose(scene.views[0].image, scenes.image(0) / 255, atol=1e-6)  # straight, not multiplied
-    assert "1 image masked by its alpha channel" in scene.notes
+    first, second, *_ = scene.views
+    np.testing.assert_allclose(first.alpha, alpha / 255, atol=1e-6)
+    np.testing.assert_allclose(first.image, scenes.image(0) / 255 * (alpha / 255)[..., None], atol=1e-6)
+    assert first.alpha.dtype == np.float32 and first.mask is None and scene.background == (0, 0, 0)
+    assert second.alpha is None and "1 image transparent in part, by the alpha channel" in scene.notes
+    other = first.alpha.copy()
+    other[3, 3] = 0.25
+    assert fingerprint([first]) != fingerprint([dataclasses.replace(first, alpha=other)])
+
+
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 0.5, 0.25)])
+def test_transparent_colours_do_not_run_into_others(background, tmp_path):
+    """Resampling is a mean over what can be seen: the red of transparent pixels leaves no trace."""
+    image = np.zeros((8, 12, 4), np.uint8)
+    image[...] = 255, 0, 0, 0
+    image[:, 5:] = 40, 80, 120, 255
+    scenes.save(tmp_path / "a.png", image)
+    loaded = load_image(tmp_path / "a.png", lens(12, 8), downscale=2, background=background)
+    alpha = np.tile(np.float32([0, 0, 0.5, 1, 1, 1]), (4, 1))
+    np.testing.assert_allclose(loaded.alpha, alpha, atol=1e-6)
+    expected = alpha[..., None] * np.array([40, 80, 120]) / 255 + (1 - alpha[..., None]) * background
+    np.testing.assert_allclose(loaded.image, expected, atol=1e-6)
+
+
+def test_alpha_is_freed_of_distortion_with_its_image(tmp_path):
+    """White where opaque, so that over black every channel is the alpha."""
+    image = np.full((48, 64, 4), 255, np.uint8)
+    image[..., 3] = np.tile((np.arange(64) % 8 < 4) * 255, (48, 1))
+    scenes.save(tmp_path / "a.png", image)
+    loaded = load_image(tmp_path / "a.png", lens(64, 48, 60.0, (0.3, 0.0, 0.0, 0.0)), downscale=2)
+    np.testing.assert_allclose(loaded.image, loaded.alpha[..., None].repeat(3, 2), atol=1e-6)
+    straight = load_image(tmp_path / "a.png", lens(64, 48, 60.0), downscale=2)
+    assert np.abs(straight.alpha - loaded.alpha)[0].max() > 0.5 and loaded.mask is not None
+
+
+def test_an_image_that_shows_nothing_is_named(tmp_path):
+    scenes.write_colmap(tmp_path)
+    scenes.save(tmp_path / "images" / "photo0.png", rgba(0, np.zeros((12, 16), np.uint8)))
+    assert "1 image wholly transparent: it shows nothing" in load_scene(tmp_path).notes
+
+
+def test_masks_cut_out(tmp_path):
+    """Gray is transparent in part; an alpha channel counts too; masks that keep nothing or everything are named."""
+    scenes.write_colmap(tmp_path)
+    mask = np.full((12, 16), 255, np.uint8)
+    mask[:, :4], mask[:, 4] = 0, 51
+    scenes.save(tmp_path / "masks" / "photo0.png", mask)
+    for i, value in ((1, 0), (2, 255)):
+        scenes.save(tmp_path / "masks" / f"photo{i}.png", np.full((12, 16), value, np.uint8))
+    scenes.save(tmp_path / "images" / "photo0.png", rgba(0, np.full((12, 16), 204, np.uint8)))
+    scene = load_scene(tmp_path, masks="cutout")
+    first, second, third, *_ = scene.views
+    alpha = 0.8 * mask / 255
+    np.testing.assert_allclose(first.alpha, alpha, atol=1e-6)
+    np.testing.assert_allclose(first.image, alpha[..., None] * scenes.image(0) / 255, atol=1e-6)
+    assert first.mask is None and not second.alpha.any() and third.alpha is None
+    assert {
+        "3 images cut out by a mask file", "1 image wholly transparent: it shows nothing",
+        "masks that keep no pixel: photo1.png (1)", "masks that keep every pixel: photo2.png (1)",
+    } <= set(scene.notes)  # fmt: skip
+    assert any("the white ones (--mask-keeps white); the others are transparent (--masks cutout)" in n for n in scene.notes)
+    half = load_scene(tmp_path, masks="cutout", downscale=2).views[0].alpha
+    np.testing.assert_allclose(half, alpha.reshape(6, 2, 8, 2).mean((1, 3)), atol=1e-6)
+
+
+def test_cutting_out_without_masks_is_said_and_words_are_checked(tmp_path):
+    scenes.write_colmap(tmp_path)
+    assert "--masks cutout changes nothing: no image has a mask file" in load_scene(tmp_path, masks="cutout").notes
+    with pytest.raises(UsageError, match="--masks must be ignore or cutout, not 'cut'"):
+        load_scene(tmp_path, masks="cut")
+    with pytest.raises(UsageError, match="--mask-keeps must be white or black, not 'gray'"):
+        load_scene(tmp_path, mask_keeps="gray")
 
 
 def test_masks_that_cannot_be_used(tmp_path):
     scenes.write_colmap(tmp_path)
     path = tmp_path / "masks" / "photo0.png"
     scenes.save(path, np.zeros((12, 16), np.uint8))
-    with pytest.raises(DataError, match=r"photo0.png: its mask leaves no pixel.*--invert-masks"):
+    with pytest.raises(DataError, match=r"photo0.png: its mask leaves no pixel.*--mask-keeps"):
         load_scene(tmp_path)
     scenes.save(path, np.full((12, 30), 255, np.uint8))
     with pytest.raises(DataError, match=r"photo0.png: its mask is 30 x 12 px, the image 16 x 12"):

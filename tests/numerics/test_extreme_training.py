@@ -21,9 +21,11 @@ from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.ssim import differences, ssim
 from warpgs.pipeline.metrics.quantiles import quantiles
 from warpgs.pipeline.model.init import InitConfig, initial_gaussians, initial_points
+from warpgs.pipeline.model.scale_limits import LimitConfig
 from warpgs.pipeline.model.table import Column, DensityUpdate, Table
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loop import run
 from warpgs.pipeline.train.loss import LossConfig, photometric_loss
 from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig, refine
@@ -31,7 +33,7 @@ from warpgs.pipeline.train.strategies.holdout_blocks import HoldoutConfig
 from warpgs.pipeline.train.strategies.importance import ImportanceConfig, normalized
 from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig, ProtectConfig
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig, geometry_gate, sample_pixels
-from warpgs.pipeline.train.trainer import Trainer, run
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Normalization, PointCloud, View
 
@@ -350,7 +352,7 @@ def test_constant_images_of_any_size(device, dtype, value, height, width):
 NUMBERS = [math.nan, math.inf, -1, 0, 1e-300, 1, 3, 1e300]
 KINDS = [
     DensityConfig, OptimizerConfig, LossConfig, ImportanceConfig, SamplerConfig, ProtectConfig, PhaseConfig, MethodConfig,
-    InitConfig, HoldoutConfig, FitConfig,
+    InitConfig, HoldoutConfig, LimitConfig, FitConfig,
 ]  # fmt: skip
 SHORT = FitConfig(
     steps=4, init=InitConfig(source="points", max_sh_degree=1), sh_every=2, phases=PhaseConfig(coarse=1, every=1),

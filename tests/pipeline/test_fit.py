@@ -46,6 +46,8 @@ def test_command_and_function_are_one_fit(folder, fitted):
         assert torch.equal(getattr(result.gaussians(), name), t), name
     stored = json.loads((folder / "run" / "metrics.json").read_text())
     assert {k: result.metrics[k] for k in ("test", "train", "views")} == {k: stored[k] for k in ("test", "train", "views")}
+    assert [p["name"] for p in stored["photographs"]] == [*run.train, *run.test]
+    assert [p["moved"] is None for p in stored["photographs"]] == [False] * len(run.train) + [True] * len(run.test)
     log = [json.loads(line) for line in (folder / "run" / "metrics.jsonl").read_text().splitlines()]
     assert [(r.step, r.loss, r.count) for r in steps] == [(r["step"], r["loss"], r["count"]) for r in log]
     assert (result.config, result.step, result.folder) == (CONFIG, STEPS, None)
@@ -60,6 +62,7 @@ def test_nothing_is_written_or_printed_unless_asked_for(folder, tmp_path, monkey
     few = dataclasses.replace(CONFIG, steps=2)
     loud = warpgs.fit(folder / "scene", few, device="cpu")
     printed = capsys.readouterr().out
+    assert printed.splitlines()[0] == f"reading {folder / 'scene'}"
     assert "views to fit" in printed and "no folder was asked for" in printed and all(n in printed for n in loud.notes)
     assert warpgs.fit(folder / "scene", few, device="cpu", verbose=False).notes == loud.notes
     assert capsys.readouterr().out == "" and not list(tmp_path.iterdir())

@@ -1,5 +1,6 @@
 """A step that runs out of memory is tried once more with less, and what cannot go on is saved."""
 
+import contextlib
 import copy
 import dataclasses
 
@@ -12,7 +13,8 @@ from tests.pipeline.test_trainer import BUSY, fitted
 from tests.scenes import photos, seeds
 from warpgs.errors import OutOfMemoryError, ResourceError
 from warpgs.pipeline.train import trainer as trainer_module
-from warpgs.pipeline.train.trainer import Trainer, run
+from warpgs.pipeline.train.loop import run
+from warpgs.pipeline.train.trainer import Trainer
 
 CPU = torch.device("cpu")
 CUDA = torch.device("cuda", 0)
@@ -146,6 +148,13 @@ class OtherProgram:
                     except RuntimeError:
                         break
 
+    def take_what_torch_holds(self):
+        """Take what torch keeps for later, too: some of it lies in pieces that it cannot give back."""
+        for mib in (64, 8, 1):
+            with contextlib.suppress(torch.OutOfMemoryError):
+                while True:
+                    self.held.append(torch.empty(mib * 2**20, dtype=torch.uint8, device=CUDA))
+
     def give_back(self):
         self.held = []
 
@@ -168,6 +177,7 @@ def test_a_device_without_memory_ends_the_fit_which_goes_on_later():
     fit, states, other = Trainer(photos(4, 1600, 1200), seeds(), BUSY, CUDA), [], OtherProgram()
     states.append(saved(fit))
     other.take_all_but(2)
+    other.take_what_torch_holds()
     with pytest.raises(ResourceError) as found:
         finished(fit, states)
     assert found.value.exit_code == 4

@@ -73,7 +73,7 @@ def test_whatever_writes_into_a_run_waits_for_nobody(folder, tmp_path, capsys):
             ["render", str(run), *cpu],
             ["export", str(run), "--to", str(run / "a.ply")],
             ["prune", str(run), "--keep-psnr", "3", "--out", str(run / "pruned"), *cpu],
-            ["compare", scene, "--out", str(run), "--presets", "3dgs,fsgs", "--steps", "1", "--split", "every:4", *cpu],
+            ["compare", scene, "--out", str(run), "--presets", "3dgs,mcmc", "--steps", "1", "--split", "every:4", *cpu],
             ["priors", "show", scene, "--out", str(tmp_path / "priors"), "--split", "every:4"],
         ):
             assert main(words) == 4, words

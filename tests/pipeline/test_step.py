@@ -44,7 +44,14 @@ def sizes() -> list[View]:
     return [View("masked", views[0].camera, views[0].image, mask), *views[1:]]
 
 
-@pytest.mark.parametrize("views", [photos(4), sizes()], ids=["one size", "two sizes and a mask"])
+def cut_out() -> list[View]:
+    """Views that know an opacity, which grows from left to right."""
+    views = photos(4)
+    alpha = np.linspace(0, 1, views[0].image.shape[1], dtype=np.float32)
+    return [dataclasses.replace(v, alpha=np.broadcast_to(alpha, v.image.shape[:2]).copy()) for v in views]
+
+
+@pytest.mark.parametrize("views", [photos(4), sizes(), cut_out()], ids=["one size", "two sizes and a mask", "cut out"])
 def test_recorded_steps_equal_single_steps(views):
     """Through densification, opacity resets and changes of degree: the same Gaussians and the same reports, bit for bit."""
     single, said = fitted(views, recorded=False)

@@ -14,9 +14,10 @@ from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.train import setup
 from warpgs.pipeline.train import warmup as warmups
 from warpgs.pipeline.train.config import PRESETS
+from warpgs.pipeline.train.loop import run
 from warpgs.pipeline.train.setup import prepare
 from warpgs.pipeline.train.strategies.importance_sampling import ImportanceSampling
-from warpgs.pipeline.train.trainer import Trainer, run
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.warmup import POINTS, STEPS, background_warmup, warm_up
 from warpgs.scene import ViewDepth
 
@@ -45,8 +46,8 @@ def test_limits_of_the_real_fit_do_not_stop_it():
 def test_only_a_free_gpu_is_warmed_up(monkeypatch):
     """Nothing is begun on a CPU, nor where networks for priors run on the GPU."""
     monkeypatch.setattr(warmups, "warm_up", lambda *_: pytest.fail("begun"))
-    networks = dataclasses.replace(PRESETS["paper"].priors, onnx_provider="cuda")
-    for config, device in ((PRESETS["paper"], CPU), (dataclasses.replace(PRESETS["paper"], priors=networks), CUDA)):
+    networks = dataclasses.replace(PRESETS["default"].priors, onnx_provider="cuda")
+    for config, device in ((PRESETS["default"], CPU), (dataclasses.replace(PRESETS["default"], priors=networks), CUDA)):
         with background_warmup(config, device) as ready:
             assert ready() is None
 
@@ -59,7 +60,7 @@ def test_what_goes_wrong_is_raised(monkeypatch):
 
     monkeypatch.setattr(warmups, "warm_up", fail)
     monkeypatch.setattr(torch.cuda, "device", lambda _: torch.no_grad())  # there may be none here
-    with background_warmup(PRESETS["paper"], CUDA) as ready, pytest.raises(RuntimeError, match="out of order"):
+    with background_warmup(PRESETS["default"], CUDA) as ready, pytest.raises(RuntimeError, match="out of order"):
         ready()
 
 
@@ -75,7 +76,7 @@ def test_nothing_goes_on_after_the_block(monkeypatch):
 
     monkeypatch.setattr(warmups, "warm_up", endless)
     monkeypatch.setattr(torch.cuda, "device", lambda _: torch.no_grad())
-    with pytest.raises(DataError), background_warmup(PRESETS["paper"], CUDA):
+    with pytest.raises(DataError), background_warmup(PRESETS["default"], CUDA):
         began.wait()
         raise DataError("nothing to start from")
     assert len(ended) == 1 and not ended[0].is_alive()
@@ -93,8 +94,8 @@ def test_the_device_is_asked_for_last(changes, monkeypatch):
     order = []
     views = photos(3)
     monkeypatch.setattr(setup, "view_priors", lambda *a, depths, **k: (order.append("semantics"), depths(), ([], []))[-1])
-    monkeypatch.setattr(init, "sweep_depths", lambda v, b, c, device: (order.append(str(device)), consistent(v))[1])
-    config = dataclasses.replace(PRESETS["paper"], **changes)
+    monkeypatch.setattr(init, "sweep_depths", lambda v, b, c, device, progress: (order.append(str(device)), consistent(v))[1])
+    config = dataclasses.replace(PRESETS["default"], **changes)
     made = prepare(views, None, config, np.random.default_rng(0), CUDA, None, lambda: order.append("ready"))
     swept = ["ready", "cpu" if "memory_limit" in changes else "cuda"] if "init" not in changes else []
     assert order == ["semantics", *swept, "ready"] and len(made.start.cloud) > 100
@@ -109,19 +110,19 @@ def consistent(views):
 def test_missing_points_are_said_before_anything_takes_time(monkeypatch):
     """Before networks run and before the device is waited for."""
     monkeypatch.setattr(setup, "view_priors", lambda *a, **k: pytest.fail("begun"))
-    config = dataclasses.replace(PRESETS["paper"], init=InitConfig(source="points"))
+    config = dataclasses.replace(PRESETS["default"], init=InitConfig(source="points"))
     with pytest.raises(DataError, match="no 3D points"):
         prepare(photos(2), None, config, np.random.default_rng(0), CPU, None, lambda: pytest.fail("asked"))
 
 
-@pytest.mark.parametrize("preset", ["paper", "3dgs"])
+@pytest.mark.parametrize("preset", ["default", "3dgs"])
 def test_only_fits_that_sweep_warm_up_a_sweep(preset, monkeypatch):
     """And none under a memory limit, which leaves the sweep to the CPU."""
     swept = []
     monkeypatch.setattr(warmups, "sweep_depths", lambda views, *_: swept.append(len(views)))
     warm_up(PRESETS[preset], CPU)
     warm_up(dataclasses.replace(PRESETS[preset], memory_limit=10**9), CPU)
-    assert swept == ([2] if preset == "paper" else [])
+    assert swept == ([2] if preset == "default" else [])
 
 
 @pytest.mark.cuda

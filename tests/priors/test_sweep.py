@@ -2,16 +2,26 @@
 
 import numpy as np
 import pytest
+import torch
 
 from tests.priors.rigs import rig, still_life
 from tests.reference.scanlines import scanline_costs
 from warpgs.errors import UsageError
 from warpgs.geometry import back_project, project_points
+from warpgs.kernels.plane_depths import best_inverses
 from warpgs.priors.completion import complete
 from warpgs.priors.epipolar import pixel_grid
 from warpgs.priors.sweep import consistent_depth, sweep_depths
-from warpgs.priors.sweep_cpu import best_inverse, matching_costs, path_costs
-from warpgs.priors.sweep_planes import MAX_LARGE_STEP, UNIT, SweepConfig, plane_homography, plane_inverses, project_inverse
+from warpgs.priors.sweep_cpu import inverse_depths, matching_costs, path_costs
+from warpgs.priors.sweep_planes import (
+    MAX_LARGE_STEP,
+    UNIT,
+    SweepConfig,
+    plane_homographies,
+    plane_homography,
+    plane_inverses,
+    project_inverse,
+)
 from warpgs.scene import Camera, View
 
 
@@ -24,6 +34,8 @@ def test_homography_and_inverse_depth_agree_with_projection():
     # whole numbers are the centres there
     p = np.concatenate([pixels - 0.5, np.ones((len(pixels), 1))], 1) @ plane_homography(a, b, 1 / 3.7).T
     assert np.allclose(p[:, :2] / p[:, 2:] + 0.5, wanted, atol=1e-9)
+    several = plane_homographies(a, [b], np.array([0.2, 1 / 3.7]))
+    assert several.shape == (2, 1, 3, 3) and np.allclose(several[1, 0], plane_homography(a, b, 1 / 3.7), rtol=1e-12, atol=1e-12)
     assert np.isnan(project_inverse(a, b, pixels[:1], np.array([1e3]))).all() or b.viewmat[2, 3] > 0
 
 
@@ -51,9 +63,9 @@ def test_cost_is_least_at_the_true_plane():
         View("a", Camera(np.eye(4), K, 40, 30), texture[:, :40]),
         View("b", Camera(shifted, K, 40, 30), 0.5 * texture[:, 5:45] + 0.2),  # another exposure
     ]
-    costs = matching_costs(views[0], views[1:], np.array([0.15, 0.25, 0.35]), 5)
+    costs = matching_costs(views[0], views[1:], np.array([0.15, 0.25, 0.35]), 5).numpy().transpose(2, 0, 1) / UNIT
     seen = (slice(3, -3), slice(9, -3))
-    assert costs.shape == (3, 30, 40) and costs[1][seen].max() < 0.01
+    assert costs.shape == (16, 30, 40) and (costs[3:] == 1).all() and costs[1][seen].max() < 0.01
     assert costs[0][seen].min() > 0.1 and costs[2][seen].min() > 0.1
     assert np.allclose(costs[1, :, :4], 0.5)
 
@@ -70,7 +82,7 @@ def test_paths_are_those_of_the_definition():
 
     down = np.array([[limit(image[y, x], image[y + 1, x]) for x in range(5)] for y in range(3)])
     across = np.array([[limit(image[y, x], image[y, x + 1]) for x in range(4)] for y in range(4)])
-    found = sum(path_costs(costs, image, p1, p2, down=way).astype(int) for way in (True, False))
+    found = path_costs(torch.from_numpy(costs), image, p1, p2).numpy()
     assert np.array_equal(found, scanline_costs(costs, down, across, round(p1 * UNIT))) and np.ptp(down) > 500
 
 
@@ -79,9 +91,10 @@ def test_paths_of_the_largest_costs_fit_in_16_bits():
     costs = np.full((6, 6, 8), UNIT, np.int16)
     y, x = np.indices((6, 6))
     costs[y, x, (3 * y + 5 * x) % 8] = 0
-    parts = [path_costs(costs, np.zeros((6, 6, 3), np.float32), 0.03, MAX_LARGE_STEP, down=down) for down in (True, False)]
-    wide = sum(p.astype(int) for p in parts)
-    assert np.array_equal((parts[0] + parts[1]).astype(int), wide) and wide.max() > 3 * UNIT and wide.min() >= 0
+    found = path_costs(torch.from_numpy(costs), np.zeros((6, 6, 3), np.float32), 0.03, MAX_LARGE_STEP).numpy()
+    limits = np.full((6, 6), round(MAX_LARGE_STEP * UNIT))
+    wanted = scanline_costs(costs, limits[1:], limits[:, 1:], round(0.03 * UNIT))
+    assert np.array_equal(found, wanted) and wanted.max() > 3 * UNIT and wanted.min() >= 0
     assert 4 * (1 + MAX_LARGE_STEP) * UNIT + 4 < 2**15
 
 
@@ -89,9 +102,20 @@ def test_parabola_between_planes():
     """The minimum of a sampled parabola is found between the samples; flat costs give the sample itself."""
     inverses = np.linspace(0.1, 0.5, 9)
     truth = np.array([[0.2, 0.237, 0.31]])
-    costs = ((inverses - truth[..., None]) ** 2).astype(np.float64)
-    assert np.allclose(best_inverse(costs, inverses), truth)
-    assert np.allclose(best_inverse(np.zeros((1, 1, 9)), inverses), inverses[1])
+    costs = torch.from_numpy(np.rint(1e5 * (inverses - truth[..., None]) ** 2).astype(np.int16))
+    assert np.allclose(best_inverses(costs, inverses), truth, rtol=1e-4)
+    assert np.allclose(best_inverses(torch.zeros(1, 1, 16, dtype=torch.int16), inverses), inverses[1])
+
+
+def test_depths_are_the_same_bits_on_any_number_of_threads():
+    """One and three threads find the same inverse depths."""
+    views, _ = still_life()
+    found, before = [], torch.get_num_threads()
+    for threads in (1, 3):
+        torch.set_num_threads(threads)
+        found.append(inverse_depths(views[1], [views[0], views[2]], np.linspace(1 / 12, 1 / 2, 40), SweepConfig()))
+    torch.set_num_threads(before)
+    assert np.array_equal(*found)
 
 
 def test_only_consistent_depth_counts():
@@ -99,21 +123,21 @@ def test_only_consistent_depth_counts():
     views, depths = still_life()
     inverses = [1 / d for d in depths]
     config = SweepConfig()
-    right = consistent_depth(views, inverses, 1, config)
+    right = consistent_depth(views, inverses, 1, (0, 2), config)
     assert right.coverage > 0.85 and np.allclose(right.depth[right.valid], depths[1][right.valid], rtol=1e-5)
     wrong = [i.copy() for i in inverses]
     wrong[1][40:60, 60:90] *= 1.2
-    patch = consistent_depth(views, wrong, 1, config)
+    patch = consistent_depth(views, wrong, 1, (0, 2), config)
     assert not patch.valid[42:58, 62:88].any() and np.array_equal(patch.valid[:38], right.valid[:38])
     assert np.isinf(patch.sensitivity[~patch.valid]).all() and (patch.depth[~patch.valid] == 0).all()
-    still = consistent_depth([views[0], views[0]], [inverses[0]] * 2, 0, config)
+    still = consistent_depth([views[0], views[0]], [inverses[0]] * 2, 0, (1,), config)
     assert still.coverage == 0 and "agrees" in still.notes[0]
 
 
 def test_sensitivity_is_depth_per_pixel():
     """A change of depth by the sensitivity moves the match by a pixel, in the view where it moves most."""
     views, depths = still_life()
-    found = consistent_depth(views, [1 / d for d in depths], 1, SweepConfig())
+    found = consistent_depth(views, [1 / d for d in depths], 1, (0, 2), SweepConfig())
     pixels, z = pixel_grid(views[1].camera), depths[1].ravel()
     moved = []
     for j in (0, 2):
@@ -146,9 +170,23 @@ def test_large_images_are_swept_small_and_masks_hold():
     assert found[1].valid[:, 50:].mean() > 0.6 and np.median(error) < 0.015
 
 
+def test_of_many_views_some_are_swept():
+    """No more views than asked are swept; the others say so and are valid nowhere; depths are as good, progress is told."""
+    views, depths = still_life(5)
+    told = []
+    config = SweepConfig(max_views=3, max_pixels=10_000)
+    found = sweep_depths(views, [(2, 12)] * 5, config, progress=lambda *counts: told.append(counts))
+    assert told == [(1, 3), (2, 3), (3, 3)]
+    left = [f for f in found if f.notes[0].startswith("not swept: 3 of 5 views")]
+    assert len(left) == 2 and all(f.coverage == 0 and not f.depth.any() and np.isinf(f.sensitivity).all() for f in left)
+    for f, true in zip(found, depths):
+        if not f.notes[0].startswith("not swept"):
+            assert f.coverage > 0.6 and np.median(np.abs(f.depth / true - 1)[f.valid]) < 0.015
+
+
 @pytest.mark.parametrize("bad", [
     {"window": 4}, {"window": 1}, {"max_planes": 2}, {"spacing": np.nan}, {"near_count": 0}, {"large_step": 1.0},
-    {"small_step": 0.7},
+    {"small_step": 0.7}, {"window": 9}, {"max_views": 1},
 ])  # fmt: skip
 def test_bad_settings_are_refused(bad):
     """A UsageError is raised when the settings are made."""

@@ -1,15 +1,17 @@
 """The sweep in torch finds what the one on the CPU does, step by step; its code is the same on any device."""
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 import pytest
 import torch
 
 from tests.priors.rigs import still_life
+from tests.reference.plane_costs import matching_costs
+from tests.reference.plane_depths import best_inverse
+from tests.reference.scanlines import scanline_costs
+from warpgs.kernels.plane_costs import NEUTRAL
 from warpgs.priors import sweep, sweep_cpu, sweep_cuda
 from warpgs.priors.sweep import sweep_depths
-from warpgs.priors.sweep_planes import NEUTRAL_COST, UNIT, SweepConfig, plane_inverses
+from warpgs.priors.sweep_planes import UNIT, SweepConfig, plane_inverses, step_limits
 from warpgs.scene import Camera, View
 
 CPU = torch.device("cpu")
@@ -23,7 +25,7 @@ def device(request):
 
 
 def computed(view: View, others: list[View], inverses: np.ndarray, window: int, device: torch.device) -> np.ndarray:
-    """Return costs in the layout of `sweep_cpu`, [D, H, W]."""
+    """Return costs in the layout of the reference, [D, H, W]."""
     found = sweep_cuda.matching_costs(view, others, inverses, window, device)
     return found.cpu().numpy().transpose(2, 0, 1) / UNIT
 
@@ -31,12 +33,12 @@ def computed(view: View, others: list[View], inverses: np.ndarray, window: int, 
 def test_costs_agree(device):
     """Costs agree to half a unit and the rounding of correlations; neutral costs are neutral in both."""
     views, _ = still_life()
-    wanted = sweep_cpu.matching_costs(views[1], [views[0], views[2]], PLANES, 7)
+    wanted = matching_costs(views[1], [views[0], views[2]], PLANES, 7)
     found = computed(views[1], [views[0], views[2]], PLANES, 7, device)
     off = np.abs(found - wanted)
     assert off.max() < 2e-3 and np.quantile(off, 0.999) < 2e-4 + 0.5 / UNIT and off.mean() < 5e-6 + 0.25 / UNIT
-    silent = wanted == NEUTRAL_COST
-    assert 0.001 < silent.mean() < 0.5 and (found[silent] == NEUTRAL_COST).mean() > 0.999
+    silent = wanted == NEUTRAL
+    assert 0.001 < silent.mean() < 0.5 and (found[silent] == NEUTRAL).mean() > 0.999
 
 
 def test_costs_of_another_size_agree(device):
@@ -48,9 +50,9 @@ def test_costs_of_another_size_agree(device):
     behind[:3, 3] = [-0.5, 0.1, -3.0]
     views = [View("a", Camera(np.eye(4), K, 40, 30), texture[:, :40]), View("b", Camera(behind, K, 60, 30), texture)]
     inverses = np.array([0.15, 0.25, 0.5, 1.0])
-    wanted = sweep_cpu.matching_costs(views[0], views[1:], inverses, 5)
+    wanted = matching_costs(views[0], views[1:], inverses, 5)
     found = computed(views[0], views[1:], inverses, 5, device)
-    assert np.abs(found - wanted).max() < 1e-4 + 0.5 / UNIT and (wanted != NEUTRAL_COST).mean() > 0.3
+    assert np.abs(found - wanted).max() < 1e-4 + 0.5 / UNIT and (wanted != NEUTRAL).mean() > 0.3
 
 
 def test_paths_agree(device):
@@ -58,8 +60,9 @@ def test_paths_agree(device):
     generator = np.random.default_rng(1)
     costs = generator.integers(0, UNIT + 1, (9, 7, 12)).astype(np.int16)
     image = generator.uniform(0.4, 0.55, (9, 7, 3)).astype(np.float32)
-    wanted = sum(sweep_cpu.path_costs(costs, image, 0.05, 0.6, down=down) for down in (True, False))
-    found = sweep_cuda.path_costs(torch.from_numpy(costs).to(device), image, 0.05, 0.6)
+    limits = [step_limits(colors, 0.05, 0.6) for colors in (image, image.swapaxes(0, 1))]
+    wanted = scanline_costs(costs, limits[0], limits[1].T, round(0.05 * UNIT))
+    found = sweep_cpu.path_costs(torch.from_numpy(costs).to(device), image, 0.05, 0.6)
     assert np.array_equal(found.cpu().numpy(), wanted)
 
 
@@ -68,7 +71,7 @@ def test_parabola_agrees(device):
     generator = np.random.default_rng(2)
     costs = generator.integers(0, 1000, (6, 5, 40)).astype(np.float32)
     costs[0], costs[1, :, 0], costs[2, :, -1] = 7.0, -1.0, -1.0
-    wanted = sweep_cpu.best_inverse(costs, PLANES)
+    wanted = best_inverse(costs, PLANES)
     assert np.allclose(sweep_cuda.best_inverse(torch.from_numpy(costs).to(device), PLANES), wanted, rtol=1e-12)
 
 
@@ -77,10 +80,9 @@ def test_depths_agree(device):
     views, depths = still_life()
     config, others = SweepConfig(), [views[0], views[2]]
     planes = plane_inverses(views[1].camera, [o.camera for o in others], (2, 12), config.spacing, config.max_planes)
-    with ThreadPoolExecutor(2) as pool:
-        wanted, _ = sweep._inverses(views, [(2, 12)] * 3, config, CPU, pool)
+    wanted = sweep_cpu.inverse_depths(views[1], others, planes, config)
     found = sweep_cuda.inverse_depths(views[1], others, planes, config, device)
-    assert found.shape == depths[1].shape and np.quantile(np.abs(found / wanted[1] - 1), 0.95) < 2e-4
+    assert found.shape == depths[1].shape and np.quantile(np.abs(found / wanted - 1), 0.95) < 2e-4
     error = np.abs(1 / (found * depths[1]) - 1)
     assert np.median(error) < 0.008
 

@@ -1,7 +1,7 @@
 import pytest
 
 from warpgs.report import progress as module
-from warpgs.report.progress import Progress, duration
+from warpgs.report.progress import Progress, Stages, duration
 
 
 @pytest.fixture
@@ -63,3 +63,15 @@ def test_live_view_shows_all_values_and_ends_cleanly(capsys):
 )
 def test_durations(seconds, text):
     assert duration(seconds) == text
+
+
+def test_stages_of_the_set_up_are_shown_at_once_and_then_every_few_seconds(clock):
+    """A stage's first line, and one every five seconds; another stage does not wait."""
+    lines = []
+    stages = Stages(lines.append)
+    for view in range(20):
+        stages(f"finding depth: view {view} of 20")
+        clock[0] += 1
+    stages("compiling kernels")
+    stages("compiling kernels")
+    assert lines == [*(f"finding depth: view {v} of 20" for v in (0, 5, 10, 15)), "compiling kernels"]

@@ -68,6 +68,18 @@ def test_a_loaded_module_takes_no_lock(cache, monkeypatch):
     assert seen.tolist() == [1, 2, 3]
 
 
+def test_a_listener_hears_of_modules_that_the_cache_lacks(cache, monkeypatch):
+    """Once: not of one that the cache holds by now, nor after the block."""
+    cpu, heard = wp.get_device("cpu"), []
+    for _ in range(2):
+        monkeypatch.setattr(load_module, "_LOADED", set())
+        mark.module.unload()
+        with load_module.told_of_compiling(heard.append):
+            load_module.load_module(mark.module, cpu, 1)
+        assert heard == [mark.module.get_module_identifier(1)]
+    assert not load_module._LISTENERS
+
+
 def test_a_file_system_without_locks_is_no_obstacle(tmp_path, monkeypatch):
     def refuse(_):
         raise OSError(95, "not supported")

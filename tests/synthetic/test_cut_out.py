@@ -57,5 +57,5 @@ def test_seeds_differ_and_wishes_are_checked(tmp_path):
     assert (a != b).mean() > 0.05
     with pytest.raises(UsageError, match="transforms or colmap"):
         cut_out.write_object(tmp_path / "a", form="llff", **SIZE)
-    with pytest.raises(UsageError, match="at least 9"):
+    with pytest.raises(UsageError, match="9 views or more"):
         cut_out.write_object(tmp_path / "a", views=8)

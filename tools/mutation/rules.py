@@ -61,6 +61,7 @@ OPS = {
     "native": [
         "kernels/test_project.py", "kernels/test_tiles.py", "render/test_rasterize.py", LIMITS_PROJECT, LIMITS_BLEND, RECORDS,
     ],
+    "plane_costs": ["kernels/test_plane_costs.py"], "plane_depths": ["kernels/test_plane_depths.py"],
     "project": ["kernels/test_project.py", LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "render/test_rasterize.py"],
     "project_backward": ["kernels/test_project.py", LIMITS_PROJECT, RECORDS, EXTREMES, "render/test_rasterize.py"],
     "scanlines": ["kernels/test_scanlines.py"],

@@ -81,11 +81,13 @@ def _eval(arguments: list[str]) -> int:
         """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
         reader: str | None = None
         """Reader from outside warpgs, as `warpgs fit --reader` was given it."""
+        by_coverage: bool = False
+        """Split the scores by how many training views saw what a pixel shows: none, one, two or more."""
 
     a = _parse(Eval, "eval", arguments)
     from warpgs.pipeline.runs.commands import evaluate
 
-    for line in evaluate(a.run, a.device, a.lpips_weights, a.reader):
+    for line in evaluate(a.run, a.device, a.lpips_weights, a.reader, a.by_coverage):
         say(line)
     return 0
 
@@ -105,15 +107,20 @@ def _render(arguments: list[str]) -> int:
         """Number of frames of an orbit or a spiral."""
         fps: int = 30
         """Frames per second of the film."""
+        background: str = "auto"
+        """auto (that of the fit; images of objects cut out are transparent PNGs), black, white, #rrggbb, or r,g,b in [0, 1]."""
         device: str = "auto"
         """auto, cpu or cuda."""
+        coverage: bool = False
+        """Write images of what no training view saw, too, into the subfolder coverage."""
 
     a = _parse(Render, "render", arguments)
     check_range("--frames", a.frames, 1, 1_000_000)
     check_range("--fps", a.fps, 1, 1000)
     from warpgs.pipeline.runs.commands import render
 
-    say(render(a.run, a.path, a.out, a.frames, a.fps, a.device))
+    for line in render(a.run, a.path, a.out, a.frames, a.fps, a.device, a.coverage, background=a.background):
+        say(line)
     return 0
 
 

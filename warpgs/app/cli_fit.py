@@ -1,7 +1,7 @@
 """Flags of `warpgs fit`, derived from `FitConfig`: names, defaults and help texts are those of its fields.
 
-Defaults depend on the preset, and the preset on the device; a strategy and loss terms bring settings of their own. So the few
-flags that decide which others there are, are looked up first. This module parses and prints; it holds no logic of a fit.
+Defaults depend on the preset; a strategy and loss terms bring settings of their own. So the few flags that decide which others
+there are, are looked up first. This module parses and prints; it holds no logic of a fit.
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ from warpgs.app.flags import MAX_THREADS, check_range, flags_of, parse_flags, se
 from warpgs.errors import UsageError, WarpgsError
 from warpgs.io.decoding import MAX_PIXELS
 from warpgs.io.readers import READERS
-from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device
+from warpgs.pipeline.runs.request import FitRequest, SceneRequest
 from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESET_NOTES, PRESETS, FitConfig
 from warpgs.pipeline.train.loss import LOSS_TERMS
 from warpgs.pipeline.train.strategies.base import STRATEGIES
@@ -53,8 +53,12 @@ def _request_type() -> type:
         """A frame without an image file is an error."""
         allow_outside: bool = False
         """Let names and links of the scene lead to images and masks outside its folder."""
-        invert_masks: bool = False
-        """White in a mask removes a pixel."""
+        masks: str = "ignore"
+        """Fate of pixels that a mask file does not keep: ignore (they do not count) or cutout (they are transparent)."""
+        mask_keeps: str = "white"
+        """Colour of a mask file that keeps a pixel: white or black."""
+        black_is_empty: bool = True
+        """Dark pixels around an object are transparent, where every image shows one on black."""
         max_pixels: int = MAX_PIXELS
         """Largest number of pixels that an image or a mask may have as stored."""
         score_masks: Path | None = None
@@ -110,19 +114,17 @@ def _terms(arguments: list[str], base: FitConfig) -> dict[str, Any]:
     return terms
 
 
-def _preset(arguments: list[str]) -> tuple[FitConfig, str]:
-    """Return the settings that the flags start from, and the kind of device that they go with."""
-    named, device = word_after(arguments, "--preset"), word_after(arguments, "--device") or "auto"
-    kind = "cpu" if {"-h", "--help"} & set(arguments) and device == "auto" else choose_device(device)[0].type
-    name = named or DEFAULT_PRESET[kind]
+def _preset(arguments: list[str]) -> FitConfig:
+    """Return the settings that the flags start from."""
+    name = word_after(arguments, "--preset") or DEFAULT_PRESET
     if name not in PRESETS:
         raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
     base = PRESETS[name]
     strategy = word_after(arguments, "--strategy")
     if strategy is None or strategy == base.strategy:
-        return base, kind
+        return base
     own = _load(STRATEGIES, strategy).Config
-    return dataclasses.replace(base, strategy=strategy, strategy_config=None if own is None else own()), kind
+    return dataclasses.replace(base, strategy=strategy, strategy_config=None if own is None else own())
 
 
 def _presets() -> str:
@@ -204,10 +206,9 @@ def fit(arguments: list[str], description: str) -> FitRequest:
     """Return the request that the words of a command line make.
 
     Raises:
-        ResourceError: The device is not there.
         UsageError: A flag is wrong, or a plug-in cannot be loaded.
     """
-    base, kind = _preset(arguments)
+    base = _preset(arguments)
     terms = _terms(arguments, base)
     a: Any = parse_flags(_flags(base, terms), arguments, "warpgs fit", f"{description}\n\n{_presets()}")
     if a.reader is not None:
@@ -217,10 +218,10 @@ def fit(arguments: list[str], description: str) -> FitRequest:
         set_threads(a.threads)
     config, notes = _chosen(a, arguments, _config(a, base, terms))
     if word_after(arguments, "--preset") is None:
-        steps = "as many steps as the time allows" if a.time_budget else f"{config.steps} steps"
-        say(f"preset {base.preset}, as usual on {kind}, {steps}; the time left stands in the line of progress")
+        say(f"preset {base.preset}: {PRESET_NOTES[base.preset]}")
     masks = None if a.score_masks is None else str(a.score_masks.resolve())
     scene = SceneRequest(
-        str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.invert_masks, masks, a.reader, max_pixels=a.max_pixels
-    )
+        str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.masks, a.mask_keeps, a.black_is_empty, masks, a.reader,
+        a.max_pixels,
+    )  # fmt: skip
     return FitRequest(scene, a.out, config, a.device, a.resume, a.lpips_weights, a.time_budget, notes)

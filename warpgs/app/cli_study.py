@@ -75,13 +75,13 @@ def compare(arguments: list[str], description: str) -> int:
 
 def ablate(arguments: list[str], description: str) -> int:
     """Run `warpgs ablate`: one preset with its parts off one at a time."""
-    from warpgs.pipeline.train.config import PRESETS
+    from warpgs.pipeline.train.config import DEFAULT_PRESET
 
     base = _flags()
 
     @dataclass(frozen=True, kw_only=True)
     class Ablate(base):
-        preset: str = "paper" if "paper" in PRESETS else next(iter(PRESETS))
+        preset: str = DEFAULT_PRESET
         """Preset whose parts are switched off one at a time."""
 
     a = _parse(Ablate, "ablate", arguments, description)

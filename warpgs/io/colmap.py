@@ -376,4 +376,4 @@ def _read_views(scene: SceneFolder, model: Path, kind: str, poses: dict[int, Pos
     unposed = len(set(list_images(images)) - set(paths.values()))
     if unposed:
         notes.append(f"{unposed} images of {images.name} have no pose in the reconstruction and are left out")
-    return views.views, notes + views.notes()
+    return views.views, notes + views.notes(scene.options)

@@ -127,5 +127,5 @@ class DTUReader(Reader):
                 mask=scene.mask(masks[file]) if file in masks else None,
             )
             views.add(name, viewmat, loaded)
-        notes = resampling_note(options.downscale) + views.notes()
+        notes = resampling_note(options.downscale) + views.notes(options)
         return self.scene(folder, views.views, notes, pixels=scene.pixel_source(by_folder=False))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import posixpath
 from collections import Counter
@@ -12,7 +13,7 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.io.decoding import MAX_PIXELS, decode
-from warpgs.io.images import Lens, LoadedImage, list_images, load_image
+from warpgs.io.images import BLACK, Lens, LoadedImage, list_images, load_image
 from warpgs.io.readers import ReadOptions
 from warpgs.scene import Camera, View
 
@@ -101,7 +102,7 @@ class SceneFolder:
         *,
         downscale: int | None = None,
         mask: np.ndarray | None = None,
-        background: tuple[float, float, float] | None = None,
+        background: tuple[float, float, float] = BLACK,
     ) -> LoadedImage:
         """Load an image of the scene as `load_image` does.
 
@@ -109,7 +110,7 @@ class SceneFolder:
             path: The image file.
             lens: Its intrinsics, or a function that makes them from width and height [px].
             downscale: Factor by which both sides shrink, where a ready-made folder leaves another than the user's.
-            mask: True where a pixel counts, shape [H, W].
+            mask: How far a pixel is kept, in [0, 1], shape [H, W], as the method `mask` reads it.
             background: Colour in [0, 1] behind transparent pixels.
 
         Returns:
@@ -118,14 +119,16 @@ class SceneFolder:
         Raises:
             DataError: It lies outside, or `load_image` refuses it.
         """
+        if self.options.on_image is not None:
+            self.options.on_image(path)
         return load_image(
             self.inside(path), lens, downscale=downscale or self.options.downscale, mask=mask, background=background,
-            max_pixels=self.options.max_pixels,
+            max_pixels=self.options.max_pixels, cutout=self.options.masks == "cutout",
         )  # fmt: skip
 
     def mask(self, path: Path) -> np.ndarray:
-        """Return a mask file of the scene as bool [H, W]: True keeps a pixel."""
-        return read_mask(self.inside(path), self.options.invert_masks, self.options.max_pixels)
+        """Return a mask file of the scene, how far it keeps each pixel: float32 [H, W], 0 not at all, 1 wholly."""
+        return read_mask(self.inside(path), self.options.mask_keeps, self.options.max_pixels)
 
     def find_mask(self, image: Path, images_root: Path, folder: Path | None = None) -> np.ndarray | None:
         """Return the mask [H, W] of an image, None where it has none.
@@ -166,9 +169,14 @@ class SceneFolder:
         return f"{name} area-resampled by {factor}" if factor > 1 else f"{name} as stored"
 
 
-def read_mask(path: Path, invert: bool, max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Return a mask file as bool [H, W]: white keeps a pixel; ``invert`` turns that round. DataError where unreadable."""
-    return (decode(path, max_pixels)[0][..., 0] > 0.5) != invert
+def read_mask(path: Path, keeps: str = "white", max_pixels: int = MAX_PIXELS) -> np.ndarray:
+    """Return how far a mask file keeps each pixel, float32 [H, W] in [0, 1]; ``keeps`` is the colour that does, white or black.
+
+    Raises:
+        DataError: The file cannot be read.
+    """
+    gray = np.ascontiguousarray(decode(path, max_pixels)[0][..., 0])
+    return gray if keeps == "white" else 1 - gray
 
 
 def _is_below(path: Path, root: Path) -> bool:
@@ -202,13 +210,33 @@ class ViewList:
     def __init__(self) -> None:
         self.views: list[View] = []
         self._done: Counter[str] = Counter()
+        self._kept: dict[str, float] = {}
 
     def add(self, name: str, viewmat: np.ndarray, loaded: LoadedImage) -> None:
         """Append a view of an image at its final size; ``viewmat`` is camera_from_world [4, 4] in file units, rigid."""
         height, width = loaded.image.shape[:2]
-        self.views.append(View(name, Camera(viewmat, loaded.K, width, height), loaded.image, loaded.mask))
+        camera = Camera(viewmat, loaded.K, width, height)
+        self.views.append(View(name, camera, loaded.image, loaded.mask, alpha=loaded.alpha))
         self._done.update(loaded.done)
+        if loaded.kept is not None:
+            self._kept[name] = loaded.kept
 
-    def notes(self) -> list[str]:
-        """Return what was done to the pixels, a sentence each."""
-        return [f"{n} image{'s' if n != 1 else ''} {what}" for what, n in sorted(self._done.items())]
+    def notes(self, options: ReadOptions | None = None) -> list[str]:
+        """Return what was done to the pixels, a sentence each; with ``options`` also what was assumed of masks."""
+        done = [f"{n} image{'s' if n != 1 else ''} {what}" for what, n in sorted(self._done.items())]
+        return done + ([] if options is None else self._mask_notes(options))
+
+    def _mask_notes(self, options: ReadOptions) -> list[str]:
+        cutout = options.masks == "cutout"
+        if not self._kept:
+            return ["--masks cutout changes nothing: no image has a mask file"] if cutout else []
+        mean = math.fsum(self._kept.values()) / len(self._kept)
+        notes = [
+            f"masks keep {mean:.1%} of the pixels, the {options.mask_keeps} ones (--mask-keeps {options.mask_keeps}); "
+            f"the others {'are transparent' if cutout else 'do not count'} (--masks {options.masks})"
+        ]
+        for fraction, what in ((0.0, "keep no pixel"), (1.0, "keep every pixel")):
+            names = [n for n, kept in self._kept.items() if kept == fraction]
+            if names:
+                notes.append(f"masks that {what}: {', '.join(names[:5])}{' ...' if len(names) > 5 else ''} ({len(names)})")
+        return notes

@@ -13,6 +13,7 @@ import numpy as np
 from warpgs.errors import DataError, UsageError
 from warpgs.io.decoding import MAX_PIXELS, decode, format_of, read_image_file
 
+BLACK = (0.0, 0.0, 0.0)
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 EXIF_ORIENTATION = 0x0112
 MIN_SIDE = 4
@@ -67,13 +68,17 @@ class LoadedImage:
     """A decoded image with its intrinsics at its own size."""
 
     image: np.ndarray
-    """Colours in [0, 1], float32, shape [H, W, 3]."""
+    """Colours in [0, 1], float32, shape [H, W, 3], over the background where transparent."""
     mask: np.ndarray | None
     """True where the pixel counts, bool, shape [H, W]; None for everywhere."""
     K: np.ndarray
     """Intrinsics [px], shape [3, 3]."""
     done: tuple[str, ...] = ()
     """Changes of the pixels that a user should know of, in words that continue "1 image ..."."""
+    alpha: np.ndarray | None = None
+    """Opacity in [0, 1], float32, shape [H, W]; None where the image is opaque."""
+    kept: float | None = None
+    """Fraction of the pixels that a mask file keeps, in [0, 1]; None without one."""
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -146,9 +151,11 @@ def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     inside &= y2[:, None] + x2 < _fold_radius2(lens.distortion)
     if loaded.mask is not None:
         inside &= cv2.remap(loaded.mask.astype(np.float32), map_x, map_y, cv2.INTER_LINEAR) > 0.5
-    return LoadedImage(
-        image, None if inside.all() else inside, loaded.K, (*loaded.done, f"freed of lens distortion ({lens.model})")
-    )
+    alpha = None
+    if loaded.alpha is not None:
+        alpha = cv2.remap(loaded.alpha, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    done = (*loaded.done, f"freed of lens distortion ({lens.model})")
+    return LoadedImage(image, None if inside.all() else inside, loaded.K, done, alpha, loaded.kept)
 
 
 def _shrink(path: Path, loaded: LoadedImage, downscale: int) -> LoadedImage:
@@ -161,11 +168,15 @@ def _shrink(path: Path, loaded: LoadedImage, downscale: int) -> LoadedImage:
         )
     K = np.diag([small_w / width, small_h / height, 1.0]) @ loaded.K
     mask = None if loaded.mask is None else _resize(loaded.mask.astype(np.float32), small_w, small_h) > 0.5
-    return LoadedImage(_resize(loaded.image, small_w, small_h), mask, K, loaded.done)
+    alpha = None if loaded.alpha is None else _resize(loaded.alpha, small_w, small_h)
+    return LoadedImage(_resize(loaded.image, small_w, small_h), mask, K, loaded.done, alpha, loaded.kept)
 
 
 def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tuple[int, int], orientation: int) -> np.ndarray:
-    """Return the mask at the upright size (height, width); a mask that lies like the stored raster is turned with it."""
+    """Return the mask at the upright size (height, width); a mask that lies like the stored raster is turned with it.
+
+    It is resampled as gray, and stays bool where it is.
+    """
     if stored != upright and mask.shape == stored:
         mask = _turn(mask, orientation)
     height, width = upright
@@ -177,7 +188,8 @@ def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tu
             f"{path}: its mask is {mask.shape[1]} x {mask.shape[0]} px, the image {width} x {height}: the aspects differ. "
             "Give a mask made from this image"
         )
-    return _resize(mask.astype(np.float32), width, height) > 0.5
+    resized = _resize(mask.astype(np.float32), width, height)
+    return resized > 0.5 if mask.dtype == bool else resized
 
 
 def _upright(path: Path, lens: Lens, image: np.ndarray) -> int:
@@ -199,19 +211,23 @@ def load_image(
     *,
     downscale: int = 1,
     mask: np.ndarray | None = None,
-    background: tuple[float, float, float] | None = None,
+    background: tuple[float, float, float] = BLACK,
     max_pixels: int = MAX_PIXELS,
+    cutout: bool = False,
 ) -> LoadedImage:
     """Decode an image, set it upright if its camera says so, undo distortion, and resample.
+
+    Colours are resampled in proportion to their opacity, so that what transparent pixels hold does not run into others.
 
     Args:
         path: The image file.
         lens: Its intrinsics, at any size; they are scaled to the image. Or a function that makes them from the width and
             height [px] of the stored raster, for formats that leave the size to the image.
         downscale: Factor by which both sides shrink (area resampling).
-        mask: True where a pixel counts, [H, W] at the size of the file or of the same aspect.
-        background: Colour in [0, 1] behind transparent pixels; None turns transparency into the mask instead.
+        mask: How far a pixel is kept, in [0, 1], [H, W] at the size of the file or of the same aspect.
+        background: Colour in [0, 1] behind transparent pixels.
         max_pixels: Largest number of pixels that the file may have.
+        cutout: What the mask does not keep is transparent, gray in part; else pixels kept by half or less do not count.
 
     Returns:
         The image with intrinsics for its final size.
@@ -229,24 +245,35 @@ def load_image(
         image, alpha = _turn(image, orientation), None if alpha is None else _turn(alpha, orientation)
         done.append("turned by the EXIF tag, as the camera asks")
     height, width = image.shape[:2]
-    K = np.diag([width / lens.width, height / lens.height, 1.0]) @ lens.K
+    K, kept = np.diag([width / lens.width, height / lens.height, 1.0]) @ lens.K, None
     if mask is not None:
-        mask = _fit_mask(path, mask, stored, (height, width), orientation)
-        done.append("masked by a mask file")
+        mask = _fit_mask(path, mask if cutout else mask > 0.5, stored, (height, width), orientation)
+        kept = float(mask.mean(dtype=np.float64))
+        done.append("cut out by a mask file" if cutout else "masked by a mask file")
+    if cutout and mask is not None:
+        alpha, mask = mask.astype(np.float32) if alpha is None else alpha * mask, None
     if alpha is not None and alpha.min() < 1:
-        if background is not None:
-            image = image * alpha[..., None] + np.float32(background) * (1 - alpha[..., None])
-            done.append("put over the background where transparent")
-        else:
-            mask = (alpha > 0.5) if mask is None else mask & (alpha > 0.5)
-            done.append("masked by its alpha channel")
+        image *= alpha[..., None]  # until it is resampled
+        if not alpha.any():
+            done.append("wholly transparent: it shows nothing")
+        elif kept is None or not cutout:
+            done.append("transparent in part, by the alpha channel")
+    else:
+        alpha = None
     if mask is not None and not mask.any():
-        raise DataError(f"{path}: its mask leaves no pixel; white keeps a pixel, so perhaps --invert-masks is wanted")
-    loaded = LoadedImage(image, mask, K, tuple(done))
+        raise DataError(
+            f"{path}: its mask leaves no pixel; --mask-keeps says which of its colours, white or black, keeps a pixel"
+        )
+    loaded = LoadedImage(image, mask, K, tuple(done), alpha, kept)
     if any(lens.distortion):
         loaded = _undistort(loaded, lens)
     if downscale > 1:
         loaded = _shrink(path, loaded, downscale)
     if loaded.mask is not None and not loaded.mask.any():
         raise DataError(f"{path}: no pixel is left after its mask, its lens distortion and --downscale; look at all three")
-    return LoadedImage(np.ascontiguousarray(loaded.image, np.float32), loaded.mask, loaded.K, loaded.done)
+    image, alpha = np.ascontiguousarray(loaded.image, np.float32), loaded.alpha
+    if alpha is not None:
+        alpha = np.clip(alpha, 0, 1)  # a mean of ones may come to more
+        for channel, value in enumerate(background):
+            image[..., channel] += np.float32(value) * (1 - alpha)
+    return LoadedImage(image, loaded.mask, loaded.K, loaded.done, alpha, kept)

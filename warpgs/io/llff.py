@@ -73,5 +73,5 @@ class LLFFReader(Reader):
             pose = np.stack([matrix[:, 1], matrix[:, 0], -matrix[:, 2], matrix[:, 3]], axis=1)
             loaded = scene.image(file, lens.checked(where), downscale=factor, mask=scene.find_mask(file, images))
             views.add(name, from_camera_to_world(pose, where, opengl=False), loaded)
-        notes = ([note] if note else []) + views.notes()
+        notes = ([note] if note else []) + views.notes(options)
         return self.scene(folder, views.views, notes, pixels=scene.pixel_source(by_folder=True))

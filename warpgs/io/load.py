@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from warpgs.errors import DataError, UsageError
+from warpgs.io.black_background import cut_from_black
 from warpgs.io.decoding import MAX_PIXELS
 from warpgs.io.folders import SceneFolder
 from warpgs.io.normalize import fingerprint, normalization_of, normalize_points, normalize_view
@@ -24,9 +27,12 @@ def load_scene(
     downscale: int = 1,
     strict: bool = False,
     allow_outside: bool = False,
-    invert_masks: bool = False,
+    masks: str = "ignore",
+    mask_keeps: str = "white",
+    black_is_empty: bool = True,
     score_masks: str | Path | None = None,
     max_pixels: int = MAX_PIXELS,
+    progress: Callable[[str], object] | None = None,
 ) -> Scene:
     """Read a scene folder of any supported format.
 
@@ -40,10 +46,15 @@ def load_scene(
         downscale: Factor by which both image sides shrink; a ready-made folder `images_N` is used where there is one.
         strict: A frame without an image file is an error instead of a note.
         allow_outside: Let names and links of the scene lead to images and masks outside its folder.
-        invert_masks: White in a mask file removes a pixel instead of keeping it.
+        masks: Fate of pixels that a mask file does not keep: ignore (they do not count, in fit and score) or cutout
+            (they are transparent, gray ones in part: `View.alpha`).
+        mask_keeps: Colour of a mask file that keeps a pixel: white or black.
+        black_is_empty: Dark pixels around an object and in its holes are transparent, where every image shows one on black and
+            none has an alpha channel or a mask.
         score_masks: Folder with object masks for scoring, matched by image id; None for `idrmasks` in the scene folder where
             there is one.
         max_pixels: Largest number of pixels that an image or a mask may have as stored.
+        progress: Called with a line for the user before each image is decoded; None for nothing.
 
     Returns:
         The scene.
@@ -51,10 +62,18 @@ def load_scene(
     Raises:
         DataError: Anything in the folder is missing or malformed; the message names file, reason and remedy.
         ResourceError: There is not enough memory to decode an image.
-        UsageError: ``downscale`` or ``max_pixels`` is below 1, or there is no such reader.
+        UsageError: ``downscale`` or ``max_pixels`` is below 1, ``masks`` or ``mask_keeps`` is another word, or there is no such
+            reader.
     """
-    options = ReadOptions(downscale, strict, allow_outside, invert_masks, max_pixels)
-    root = Path(path)
+    root, numbers = Path(path), itertools.count(1)
+
+    def on_image(file: Path) -> None:
+        if progress is not None:
+            progress(f"reading {root}: image {next(numbers)}")
+
+    options = ReadOptions(
+        downscale, strict, allow_outside, masks, mask_keeps, black_is_empty, max_pixels=max_pixels, on_image=on_image
+    )
     try:
         _check_folder(root)
         chosen, notes = detect(root) if reader is None else (_accepted(root, find_reader(reader)), [])
@@ -119,6 +138,9 @@ def _finished(
             "Add images with cameras"
         )
     _check_views(root, views)
+    if options.black_is_empty and not any(scene.background):
+        views, note = cut_from_black(views)
+        more = (*more, note) if note else more
     n: Normalization = normalization_of(views, points, str(root))
     views = [normalize_view(v, n) for v in sorted(views, key=lambda v: v.name)]
     if points is not None:
@@ -126,7 +148,7 @@ def _finished(
     if score_masks is not None or (root / FOLDER).is_dir():
         # a folder that the user names is its own bound, that of the scene must not lead out of it
         masks, bound = (root / FOLDER, root) if score_masks is None else (Path(score_masks), Path(score_masks))
-        views, note = add_score_masks(views, masks, SceneFolder(bound, replace(options, invert_masks=False)))
+        views, note = add_score_masks(views, masks, SceneFolder(bound, replace(options, mask_keeps="white")))
         more = (*more, note)
     return replace(
         scene,
@@ -149,7 +171,9 @@ def _check_views(root: Path, views: list[View]) -> None:
         seen.add(v.name)
         where, size = f"{root}, image {v.name!r}", (v.camera.height, v.camera.width)
         rigid(np.asarray(v.camera.viewmat), where)
-        wanted = [("image", v.image, (*size, 3), np.float32), ("mask", v.mask, size, bool)]
+        wanted = [
+            ("image", v.image, (*size, 3), np.float32), ("mask", v.mask, size, bool), ("alpha", v.alpha, size, np.float32),
+        ]  # fmt: skip
         for noun, array, shape, dtype in wanted:
             if array is not None and (array.shape != shape or array.dtype != dtype):
                 raise DataError(

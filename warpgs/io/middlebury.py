@@ -86,5 +86,5 @@ class MiddleburyReader(Reader):
                 mask=scene.find_mask(file, folder, folder / "masks"),
             )
             views.add(view_name(name), viewmat, loaded)
-        notes += resampling_note(options.downscale) + views.notes()
+        notes += resampling_note(options.downscale) + views.notes(options)
         return self.scene(folder, views.views, notes, pixels=scene.pixel_source(by_folder=False))

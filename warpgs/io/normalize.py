@@ -74,7 +74,7 @@ def fingerprint(views: list[View]) -> str:
     for v in views:
         # cameras to 1e-9: their last bits depend on the machine's linear algebra
         cameras = [np.round(m, 9) + 0.0 for m in (v.camera.viewmat, v.camera.K)]
-        arrays = [*cameras, v.image] + [m for m in (v.mask, v.score_mask) if m is not None]
+        arrays = [*cameras, v.image] + [m for m in (v.mask, v.score_mask, v.alpha) if m is not None]
         # name and shapes are delimited, so that bytes moved from one field to the next cannot give the same hash
         model = () if v.camera.model == "pinhole" else (v.camera.model,)
         digest.update(repr((v.name, [(a.shape, str(a.dtype)) for a in arrays], *model)).encode("utf-8", "surrogateescape"))

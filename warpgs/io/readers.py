@@ -7,6 +7,7 @@ own reader is passed to `warpgs.load_scene`, or named as ``module:Class`` or ``f
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -27,16 +28,26 @@ class ReadOptions:
     """A frame without an image file is an error instead of a note."""
     allow_outside: bool = False
     """Names and links of the scene may lead to images and masks outside its folder."""
-    invert_masks: bool = False
-    """White in a mask file removes a pixel instead of keeping it."""
+    masks: str = "ignore"
+    """Fate of pixels that a mask file does not keep: ignore (they do not count) or cutout (they are transparent)."""
+    mask_keeps: str = "white"
+    """Colour of a mask file that keeps a pixel: white or black."""
+    black_is_empty: bool = True
+    """Dark pixels around an object are transparent, where every image shows one on black."""
     max_pixels: int = MAX_PIXELS
     """Largest number of pixels that an image or a mask may have."""
+    on_image: Callable[[Path], object] | None = None
+    """Called with the file of each image before it is decoded; None for nothing."""
 
     def __post_init__(self) -> None:
         if isinstance(self.downscale, bool) or not isinstance(self.downscale, int) or self.downscale < 1:
             raise UsageError(f"--downscale must be a whole number of at least 1, not {self.downscale!r}")
         if isinstance(self.max_pixels, bool) or not isinstance(self.max_pixels, int) or self.max_pixels < 1:
             raise UsageError(f"--max-pixels must be a whole number of at least 1, not {self.max_pixels!r}")
+        if self.masks not in ("ignore", "cutout"):
+            raise UsageError(f"--masks must be ignore or cutout, not {self.masks!r}")
+        if self.mask_keeps not in ("white", "black"):
+            raise UsageError(f"--mask-keeps must be white or black, not {self.mask_keeps!r}")
 
 
 @dataclass(frozen=True)

@@ -84,5 +84,5 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
             f"{folder}: the images start with 1 ({views[ids.index(1)].name}), the masks with 0, so it cannot be known "
             "whether they are off by one; rename the images so that they count from 0, or remove mask 0"
         )
-    done = [replace(v, score_mask=_fit(masks[i], scene.mask(masks[i]), v)) for i, v in zip(ids, views)]
+    done = [replace(v, score_mask=_fit(masks[i], scene.mask(masks[i]) > 0.5, v)) for i, v in zip(ids, views)]
     return done, f"scores count the pixels of the masks in {folder}, matched by image id; the fit sees every pixel"

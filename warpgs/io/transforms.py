@@ -11,7 +11,7 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.io.folders import SceneFolder, ViewList, resampling_note, view_name_of
-from warpgs.io.images import SUFFIXES, Lens
+from warpgs.io.images import BLACK, SUFFIXES, Lens
 from warpgs.io.poses import from_camera_to_world
 from warpgs.io.readers import Probe, Reader, ReadOptions, register
 from warpgs.scene import Scene
@@ -140,7 +140,7 @@ class _Reading:
 
     root: Path
     scene: SceneFolder
-    background: tuple[float, float, float] | None
+    background: tuple[float, float, float]
     views: ViewList = field(default_factory=ViewList)
     missing: list[str] = field(default_factory=list)
     outside: int = 0
@@ -188,8 +188,8 @@ class _Reading:
 class TransformsReader(Reader):
     """Scenes with transforms.json, or Blender's transforms_train/val/test.json.
 
-    Frames without a file are skipped and named in the notes; `ReadOptions.strict` makes them an error. Transparent Blender
-    images are put over white.
+    Frames without a file are skipped and named in the notes; `ReadOptions.strict` makes them an error. Transparent images of
+    Blender stand over white, others over black.
     """
 
     description = "transforms.json or transforms_train.json (nerfstudio, instant-ngp, Blender)"
@@ -202,7 +202,7 @@ class TransformsReader(Reader):
 
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""
-        background = WHITE if is_blender(folder) else None
+        background = WHITE if is_blender(folder) else BLACK
         reading = _Reading(folder, SceneFolder(folder, options), background)
         notes = []
         for file in files_of(folder):
@@ -219,11 +219,11 @@ class TransformsReader(Reader):
             notes.append(f"skipped: {text}")
         if reading.outside:
             notes.append(f"{reading.outside} images lie outside the scene folder; their views are named outside/...")
-        notes += resampling_note(options.downscale) + reading.views.notes()
+        notes += resampling_note(options.downscale) + reading.views.notes(options)
         return self.scene(
             folder,
             reading.views.views,
             notes,
-            background=background or (0.0, 0.0, 0.0),
+            background=background,
             pixels=reading.scene.pixel_source(by_folder=False),
         )

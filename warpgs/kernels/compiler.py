@@ -2,17 +2,17 @@
 
 import warp as wp
 
-_FLAGS = (
-    wp.config.cpu_compiler_flags or "-march=native",
-    # fused multiply-add, half the instructions of a filter; Warp's own flags fuse nothing
-    "-ffp-contract=fast",
-    # A stack in steps of a cache line: else every access of 64 bytes to a local vector touches two.
-    "-mstackrealign -mstack-alignment=64",
-)
+_MACHINE = wp.config.cpu_compiler_flags or "-march=native"
+# A stack in steps of a cache line: else every access of 64 bytes to a local vector touches two.
+_STACK = "-mstackrealign -mstack-alignment=64"
 
 ROLLED = {
     # Warp would unroll loops of constant length, and the vectoriser needs loops.
     "max_unroll": 0,
-    "cpu_compiler_flags": " ".join(_FLAGS),
+    # fused multiply-add, half the instructions of a filter; Warp's own flags fuse nothing
+    "cpu_compiler_flags": f"{_MACHINE} -ffp-contract=fast {_STACK}",
 }
 """Module options, for kernels with ``module="unique"`` (elsewhere Warp ignores them)."""
+
+EXACT = {"max_unroll": 0, "cpu_compiler_flags": f"{_MACHINE} -ffp-contract=off {_STACK}"}
+"""The same without fused multiply-add: every operation rounds as it does on any other processor."""

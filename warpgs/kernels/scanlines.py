@@ -5,6 +5,7 @@ import functools
 import torch
 import warp as wp
 
+from warpgs.kernels import scanlines_cpu
 from warpgs.runtime import interop
 
 BLOCK = 32
@@ -87,12 +88,11 @@ def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor
                 f"{name} must be {dtype} of shape {list(shape)} on {costs.device}, "
                 f"not {tensor.dtype} of shape {list(tensor.shape)} on {tensor.device}"
             )
+    if costs.device.type == "cpu":
+        return _on_cpu(costs, down, across, small)
     total = torch.zeros_like(costs, memory_format=torch.contiguous_format)
     flat = [interop.view(t.contiguous().view(-1, planes), wp.int16) for t in (costs, total)]
-    for lines, length, steps, bounds, edges in (
-        (width, height, (1, width), down, (1, width)),
-        (height, width, (width, 1), across, (width - 1, 1)),
-    ):
+    for lines, length, steps, bounds, edges in _ways(height, width, down, across):
         path = torch.empty(lines, planes + 1, dtype=torch.int32, device=costs.device)
         inputs = [
             flat[0], interop.view(bounds.contiguous().view(-1), wp.int32), small, planes, *steps, length, *edges,
@@ -100,3 +100,26 @@ def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor
         ]  # fmt: skip
         interop.launch(make_kernel(), lines, inputs, costs.device, cost=max(1, length * planes // 2), block_dim=BLOCK)
     return total
+
+
+def _ways(height: int, width: int, down: torch.Tensor, across: torch.Tensor):
+    """Return the number of lines, their length, steps of pixels, limits and steps of limits, along rows, then columns."""
+    return (height, width, (width, 1), across, (width - 1, 1)), (width, height, (1, width), down, (1, width))
+
+
+def _on_cpu(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor, small: int) -> torch.Tensor:
+    """Return the sums of `scanline_costs`; a number of planes that is a multiple of `scanlines_cpu.LANES` saves a copy."""
+    height, width, planes = costs.shape
+    more = -planes % scanlines_cpu.LANES
+    if more:  # planes as bad as the worst: no path is better for them
+        costs = torch.nn.functional.pad(costs, (0, more), value=int(costs.max()))
+    total, padded = torch.empty_like(costs, memory_format=torch.contiguous_format), planes + more
+    flat = [interop.view(t.contiguous().view(-1), wp.int16) for t in (costs, total)]
+    for fresh, (lines, length, steps, bounds, edges) in zip((1, 0), _ways(height, width, down, across)):
+        path = torch.empty(lines * 2 * (padded + 2 * scanlines_cpu.LANES), dtype=torch.int16)
+        inputs = [
+            flat[0], interop.view(bounds.contiguous().view(-1), wp.int32), small, padded, *steps, length, *edges, fresh,
+            interop.view(path, wp.int16), flat[1],
+        ]  # fmt: skip
+        interop.launch(scanlines_cpu.make_kernel(), lines, inputs, costs.device, cost=max(1, length * padded // 20))
+    return total[..., :planes]

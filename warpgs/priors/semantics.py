@@ -29,6 +29,9 @@ SMOOTHING = 1000.0
 L0_WEIGHT, L0_GROWTH = 0.04, 2.0
 """Weight of a gradient, and growth per round, of L0 smoothing. Xu et al. 2011 use 0.02 and 2 for photographs; twice that weight
 drops foliage and gravel and keeps outlines."""
+MAX_PIXELS = 50_000
+"""Largest number of pixels of an image without a network; larger ones are reduced first: smoothing takes 0.6 s
+at 504 x 378 px."""
 EDGE_LOW, EDGE_HIGH = 100.0, 250.0
 """Canny's thresholds on the smoothed image: sums of absolute Sobel derivatives of 8-bit colours."""
 
@@ -112,13 +115,19 @@ def classical_semantics(image: np.ndarray) -> SemanticMaps:
 
     L0 smoothing (Xu et al. 2011) flattens texture; Canny's edges in the result are the boundaries. Foreground is
     fine-grained saliency (Montabone and Soto 2010), smoothed within the flat regions. Confidence is the larger of foreground
-    and 1 - foreground.
+    and 1 - foreground. Images above `MAX_PIXELS` are reduced, and their maps enlarged.
 
     Raises:
         DataError: OpenCV cannot compute the saliency.
     """
     import cv2
 
+    height, width = image.shape[:2]
+    shrink = (MAX_PIXELS / (height * width)) ** 0.5
+    if shrink < 1:
+        small = classical_semantics(resize(image, max(1, int(shrink * height)), max(1, int(shrink * width))))
+        parts = (np.clip(resize(part, height, width), 0, 1) for part in (small.confidence, small.boundary, small.foreground))
+        return SemanticMaps(*parts)
     pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
     flat = np.clip(cv2.ximgproc.l0Smooth(pixels, None, L0_WEIGHT, L0_GROWTH), 0, 255).astype(np.uint8)
     boundary = _falloff(cv2.Canny(flat, EDGE_LOW, EDGE_HIGH) > 0)

@@ -7,19 +7,17 @@ where another view's own sweep agrees. Compared with optical flow in docs/decisi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
 
-from warpgs import geometry
-from warpgs.geometry import matmul
+from warpgs.kernels.plane_depths import check_round_trip
 from warpgs.priors import sweep_cpu, sweep_cuda
-from warpgs.priors.epipolar import homogeneous, nearest_views, pixel_grid
-from warpgs.priors.opencv import single_threaded_opencv, without_ipp
-from warpgs.priors.sweep_planes import SweepConfig, inside_image, plane_inverses, project_inverse
+from warpgs.priors.opencv import single_threaded_opencv
+from warpgs.priors.sweep_planes import SweepConfig, plane_inverses
+from warpgs.priors.view_choice import matching_views, shared_sight, spread_views
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.device_memory import installed_bytes
 from warpgs.scene import View, ViewDepth
@@ -27,8 +25,6 @@ from warpgs.scene import View, ViewDepth
 CPU = torch.device("cpu")
 GPU_FRACTION = 0.25
 """Fraction of a GPU's memory that a sweep may take."""
-MAX_AT_ONCE = 4
-"""Views swept at a time on the CPU; each takes memory for three volumes."""
 
 
 def _reduced(view: View, max_pixels: int) -> View:
@@ -45,107 +41,113 @@ def _reduced(view: View, max_pixels: int) -> View:
     return View(view.name, replace(c, K=K, width=width, height=height), image)
 
 
-def consistent_depth(views: Sequence[View], inverses: Sequence[np.ndarray], index: int, config: SweepConfig) -> ViewDepth:
+def consistent_depth(
+    views: Mapping[int, View], inverses: Mapping[int, np.ndarray], index: int, others: Sequence[int], config: SweepConfig
+) -> ViewDepth:
     """Return the depth of one view where it is geometrically consistent with that of at least one other view.
 
     A point is projected to each other view and back by the depth found there. It must return nearer than ``max_round_trip``
     to its pixel, with both rays at least ``min_parallax`` apart. The sensitivity is the smallest of the consistent views.
 
     Args:
-        views: All views.
-        inverses: Inverse depths of each [1/u], shape [H, W].
+        views: Views by index.
+        inverses: Inverse depths of each [1/u], float64, shape [H, W].
         index: Index of the view.
+        others: Indices of the views to check it with.
         config: Checks.
     """
-    import cv2
-
-    view, own = views[index], inverses[index]
-    camera, pixels, w = view.camera, pixel_grid(view.camera), own.ravel()
-    sensitivity = np.full(len(pixels), np.inf)
-    rays = matmul(homogeneous(pixels), geometry.inverse(camera.K).T)
-    world = matmul(rays / w[:, None] - camera.viewmat[:3, 3], camera.viewmat[:3, :3])
-    notes, own_direction = [], world - camera.center
-    own_direction /= np.linalg.norm(own_direction, axis=1, keepdims=True)
-    for j in nearest_views(views, index, config.near_count):
-        other = views[j].camera
-        there = project_inverse(camera, other, pixels, w)
-        inside = inside_image(other, there)
-        at = np.where(inside[:, None], there - 0.5, -10).astype(np.float32).reshape(*own.shape, 2)
-        found = cv2.remap(inverses[j].astype(np.float32), at, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT).ravel()
-        back = project_inverse(other, camera, np.where(inside[:, None], there, 0), found.astype(float))
-        direction = world - other.center
-        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        parallax = (own_direction * direction).sum(1) < np.cos(np.radians(config.min_parallax))
-        good = inside & parallax & (found > 0) & (np.linalg.norm(back - pixels, axis=1) < config.max_round_trip)
-        if not good.any():
+    own, notes = inverses[index], []
+    sensitivity = np.full(own.shape, np.inf)
+    for j in others:
+        agrees = check_round_trip(
+            views[index].camera, views[j].camera, own, inverses[j], sensitivity, most=config.max_round_trip,
+            min_parallax=config.min_parallax,
+        )  # fmt: skip
+        if not agrees.any():
             notes.append(f"no depth agrees with {views[j].name}")
-        step = 1e-3 * w
-        slide = project_inverse(camera, other, pixels, w + step) - project_inverse(camera, other, pixels, w - step)
-        with np.errstate(divide="ignore"):
-            # dz = -dw / w^2
-            moved = 2 * step / w**2 / np.linalg.norm(slide, axis=1)
-        sensitivity = np.where(good & (moved < sensitivity), moved, sensitivity)
-    valid = np.isfinite(sensitivity).reshape(own.shape)
-    return ViewDepth(
-        np.where(valid, 1 / own, 0).astype(np.float32), valid, sensitivity.astype(np.float32).reshape(own.shape), tuple(notes)
-    )
+    valid = np.isfinite(sensitivity)
+    return ViewDepth(np.where(valid, 1 / own, 0).astype(np.float32), valid, sensitivity.astype(np.float32), tuple(notes))
 
 
-def _inverses(views: Sequence[View], bounds: Sequence[tuple[float, float]], config: SweepConfig, device: torch.device, pool):
-    """Return the inverse depths [1/u], shape [H, W], of every view, and messages on how they were found."""
-    others = {i: [views[j] for j in nearest_views(views, i, config.near_count)] for i in range(len(views))}
-    planes = {
-        i: plane_inverses(views[i].camera, [o.camera for o in found], bounds[i], config.spacing, config.max_planes)
-        for i, found in others.items()
-    }
-    found = {i: np.full(views[i].image.shape[:2], planes[i][0]) for i in planes if not others[i]}
-    left, notes = [i for i in planes if others[i]], []
-    if device.type == "cuda" and left:
-        needed = max(sweep_cuda.needed_bytes(views[i], len(planes[i])) for i in left)
-        smallest = min(min(v.image.shape[:2]) for v in views)
+def _backend(
+    views: Mapping[int, View], planes: Mapping[int, np.ndarray], config: SweepConfig, device: torch.device
+) -> tuple[Callable[[View, Sequence[View], np.ndarray], np.ndarray], list[str]]:
+    """Return the function that sweeps a view on the device, or on the CPU where that must do it, and messages on that."""
+    notes: list[str] = []
+    if device.type == "cuda":
+        needed = max(sweep_cuda.needed_bytes(views[i], len(p)) for i, p in planes.items())
+        smallest = min(min(v.image.shape[:2]) for v in views.values())
         # not by what is free now: a fit that is continued must find the same depths again
         if needed > GPU_FRACTION * installed_bytes(device):
             notes.append(f"swept on the CPU: a GPU should have {format_bytes(needed / GPU_FRACTION)} of memory for it")
         elif smallest > config.window // 2:  # torch mirrors no border wider than the image
-            found |= {i: sweep_cuda.inverse_depths(views[i], others[i], planes[i], config, device) for i in left}
-            left = []
-    for first in range(0, len(left), MAX_AT_ONCE):
-        some = left[first : first + MAX_AT_ONCE]
-        found |= zip(some, sweep_cpu.inverse_depths(views, others, {i: planes[i] for i in some}, config, pool))
-    return [found[i] for i in range(len(views))], notes
+            return lambda view, others, p: sweep_cuda.inverse_depths(view, others, p, config, device), notes
+    return lambda view, others, p: sweep_cpu.inverse_depths(view, others, p, config), notes
+
+
+def _at_size(found: ViewDepth, small: View, view: View, notes: Sequence[str]) -> ViewDepth:
+    """Return the depth that was found in a smaller image at the view's own size, without masked pixels."""
+    import cv2
+
+    depth, valid, sensitivity = found.depth, found.valid, found.sensitivity
+    if small is not view:
+        size, scale = (view.camera.width, view.camera.height), small.camera.width / view.camera.width
+        notes = [*notes, f"swept at {small.camera.width} x {small.camera.height} px"]
+        depth, sensitivity = (cv2.resize(a, size, interpolation=cv2.INTER_NEAREST) for a in (depth, sensitivity * scale))
+        valid = cv2.resize(valid.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    if view.mask is not None:
+        valid = valid & view.mask
+    return ViewDepth(np.where(valid, depth, 0), valid, np.where(valid, sensitivity, np.inf), (*notes, *found.notes))
+
+
+def _unswept(view: View, note: str) -> ViewDepth:
+    shape = view.image.shape[:2]
+    return ViewDepth(np.zeros(shape, np.float32), np.zeros(shape, bool), np.full(shape, np.inf, np.float32), (note,))
 
 
 def sweep_depths(
-    views: Sequence[View], bounds: Sequence[tuple[float, float]], config: SweepConfig, device: torch.device = CPU
-) -> list[ViewDepth]:
-    """Return the depth of every view by sweeping planes against its nearest others.
+    views: Sequence[View], bounds: Sequence[tuple[float, float]], config: SweepConfig, device: torch.device = CPU,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+) -> list[ViewDepth]:  # fmt: skip
+    """Return the depth of every view by sweeping planes against those that share most of its sight.
+
+    Of more than ``config.max_views`` views only so many are swept, so that the time is bounded. They are compared with their
+    best neighbours among all views, and checked by round trips to one another.
 
     Args:
         views: The views; a single one has no consistent depth.
         bounds: Nearest and farthest depth of each view [u], 0 < near < far.
         config: Planes, smoothing and checks.
         device: Device of costs and paths; the CPU computes them where a GPU has too little memory, or images are tiny.
+        progress: Called after each view with the number of views swept so far, and of all that will be.
 
     Returns:
-        One depth per view at its own size; its notes name a reduced size and views without a consistent depth.
+        One depth per view at its own size; its notes name a reduced size and views without a consistent depth. A view that was
+        not swept is valid nowhere, and a note says so.
     """
-    import cv2
-
-    small = [_reduced(v, config.max_pixels) for v in views]
-    with single_threaded_opencv(), ThreadPoolExecutor(torch.get_num_threads(), initializer=without_ipp) as pool:
-        inverses, messages = _inverses(small, bounds, config, device, pool)
-        consistent = list(pool.map(lambda i: consistent_depth(small, inverses, i, config), range(len(views))))
-    out = []
-    for i, view in enumerate(views):
-        found, notes = consistent[i], list(messages if i == 0 else ())
-        depth, valid, sensitivity = found.depth, found.valid, found.sensitivity
-        size = (view.camera.width, view.camera.height)
-        if small[i] is not view:
-            notes.append(f"swept at {small[i].camera.width} x {small[i].camera.height} px")
-            scale = small[i].camera.width / size[0]
-            depth, sensitivity = (cv2.resize(a, size, interpolation=cv2.INTER_NEAREST) for a in (depth, sensitivity * scale))
-            valid = cv2.resize(valid.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-        if view.mask is not None:
-            valid = valid & view.mask
-        out.append(ViewDepth(np.where(valid, depth, 0), valid, np.where(valid, sensitivity, np.inf), (*notes, *found.notes)))
+    cameras = [v.camera for v in views]
+    sight = shared_sight(cameras, bounds)
+    swept = spread_views(sight, config.max_views)
+    others = {i: matching_views(sight, cameras, i, config.near_count, range(len(views))) for i in swept}
+    with single_threaded_opencv():
+        small = {i: _reduced(views[i], config.max_pixels) for i in sorted({*swept, *(j for o in others.values() for j in o)})}
+        planes = {
+            i: plane_inverses(
+                small[i].camera, [small[j].camera for j in others[i]], bounds[i], config.spacing, config.max_planes
+            )
+            for i in swept
+        }
+        find, messages = _backend(small, planes, config, device)
+        inverses = {}
+        for done, i in enumerate(swept, 1):
+            if others[i]:
+                inverses[i] = find(small[i], [small[j] for j in others[i]], planes[i])
+            else:
+                inverses[i] = np.full(small[i].image.shape[:2], planes[i][0])
+            progress(done, len(swept))
+        out = [_unswept(v, f"not swept: {len(swept)} of {len(views)} views see most of the scene") for v in views]
+        for i in swept:
+            partners = matching_views(sight, cameras, i, config.near_count, swept)
+            found = consistent_depth(small, inverses, i, partners, config)
+            out[i] = _at_size(found, small[i], views[i], messages if i == swept[0] else ())
     return out

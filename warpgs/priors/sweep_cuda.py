@@ -7,16 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from warpgs.kernels.scanlines import scanline_costs
+from warpgs.kernels.plane_costs import NEUTRAL
+from warpgs.priors.sweep_cpu import path_costs
 from warpgs.priors.sweep_planes import (
-    NEUTRAL_COST,
     NOISE,
     PLANES_AT_ONCE,
     UNIT,
     SweepConfig,
     gray_of,
     plane_homography,
-    step_limits,
 )
 from warpgs.scene import View
 
@@ -30,7 +29,7 @@ def needed_bytes(view: View, planes: int) -> int:
 
 
 def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, window: int, device: torch.device) -> torch.Tensor:
-    """Return the costs of `sweep_cpu.matching_costs` in units of 1 / `UNIT`, int16, shape [H, W, D], on the device."""
+    """Return the costs of `sweep_cpu.matching_costs`, without planes past the last, int16, shape [H, W, D], on the device."""
 
     def box(maps: torch.Tensor) -> torch.Tensor:
         r = window // 2
@@ -58,7 +57,7 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
             m = box(warped)
             v = (box(warped * warped) - m * m).clamp(min=0) + NOISE
             cost = 0.5 - 0.5 * (box(own * warped) - mean * m) / (variance * v).sqrt()
-            cost = torch.where(warped >= 0, cost, NEUTRAL_COST)
+            cost = torch.where(warped >= 0, cost, NEUTRAL)
             total = total + cost
             least = cost if least is None else torch.minimum(least, cost)
         found = (0.5 * least + total * (0.5 / len(others))).clamp(0, 1) * UNIT
@@ -66,17 +65,8 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
     return costs
 
 
-def path_costs(costs: torch.Tensor, image: np.ndarray, small_step: float, large_step: float) -> torch.Tensor:
-    """Return the sum of `sweep_cpu.path_costs` down and across, of costs [H, W, D] on their device."""
-    down, across = (
-        torch.from_numpy(step_limits(colors, small_step, large_step).astype(np.int32)).to(costs.device)
-        for colors in (image, image.swapaxes(0, 1))
-    )
-    return scanline_costs(costs, down, across.T, round(small_step * UNIT))
-
-
 def best_inverse(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
-    """Return the inverse depths [1/u] of `sweep_cpu.best_inverse`, float64, shape [H, W], on the host."""
+    """Return the inverse depths [1/u] of `plane_depths.best_inverses`, float64, shape [H, W], on the host."""
     k = costs.argmin(2, keepdim=True).clamp(1, len(inverses) - 2)
     left, middle, right = (costs.gather(2, k + o).double() for o in (-1, 0, 1))
     bend = left - 2 * middle + right

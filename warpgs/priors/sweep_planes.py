@@ -17,15 +17,13 @@ NOISE = (2 / 255) ** 2
 """Variance of a window below which its pattern is noise: correlation fades to 0 there."""
 EDGE = 0.06
 """Colour step between neighbouring pixels at which the penalty for a jump in depth falls to 1/e."""
-NEUTRAL_COST = 0.5
-"""Cost of correlation 0: where a plane leaves the other image, or nothing has texture."""
 UNIT = 4096
 """Cost 1 in the 16-bit whole numbers that volumes hold: to touch memory for the first time takes as long as to compute what
 goes there, and this is half of float32's."""
 MAX_LARGE_STEP = 0.99
 """P2 up to which the sum of four paths, each at most 1 + P2, stays below 2^15."""
 PLANES_AT_ONCE = 16
-"""Planes whose costs one thread, or the GPU, computes together: 32 bytes of each pixel."""
+"""Planes whose costs the GPU computes together."""
 
 
 @dataclass(frozen=True)
@@ -33,13 +31,15 @@ class SweepConfig:
     """Settings of the planes, of the smoothing of costs and of the consistency check."""
 
     near_count: int = 4
-    """Number of nearest other views with which each view is compared."""
+    """Number of other views with which each view is compared, those that share most of its sight."""
+    max_views: int = 30
+    """Most views that are swept; of more, those that together see most. The others are still compared with."""
     window: int = 7
-    """Side of the square in which pixels are correlated [px]; odd, at least 3."""
+    """Side of the square in which pixels are correlated [px]: 3, 5 or 7."""
     spacing: float = 0.5
     """Largest step of a match from one plane to the next [px], while `max_planes` allows it."""
     max_planes: int = 256
-    """Largest number of planes, at least 8; memory is 6 bytes per pixel and plane, for up to four views."""
+    """Largest number of planes, at least 8; memory is about 5 bytes per pixel and plane."""
     max_pixels: int = 200_000
     """Largest number of pixels of an image; larger ones are swept at a reduced size."""
     small_step: float = 0.03
@@ -52,10 +52,10 @@ class SweepConfig:
     """Smallest angle between the two rays [deg]; below it depth is noise."""
 
     def __post_init__(self):
-        if not (self.window >= 3 and self.window % 2 == 1):
-            raise UsageError(f"sweep window {self.window} must be odd and at least 3")
-        if not (self.max_planes >= 8 and self.near_count >= 1 and self.max_pixels >= 1):
-            raise UsageError("sweep needs at least 8 planes, 1 near view and 1 pixel")
+        if self.window not in (3, 5, 7):  # kernels add up squares in 32 bits
+            raise UsageError(f"sweep window {self.window} must be 3, 5 or 7")
+        if not (self.max_planes >= 8 and self.near_count >= 1 and self.max_pixels >= 1 and self.max_views >= 2):
+            raise UsageError("sweep needs at least 8 planes, 1 near view, 1 pixel and 2 views")
         for name in ("spacing", "small_step", "large_step", "max_round_trip", "min_parallax"):
             if not getattr(self, name) > 0:
                 raise UsageError(f"sweep {name.replace('_', '-')} must be above 0, not {getattr(self, name)}")
@@ -113,11 +113,17 @@ def plane_homography(first: Camera, second: Camera, inverse: float) -> np.ndarra
     return matmul(matmul(back, H), shift)
 
 
-def gray_of(view: View) -> np.ndarray:
-    """Return the brightness of a view's pixels in [0, 1], float32, shape [H, W]."""
-    import cv2
+def plane_homographies(first: Camera, others: Sequence[Camera], inverses: np.ndarray) -> np.ndarray:
+    """Return `plane_homography` of D inverse depths [1/u] and N other cameras, shape [D, N, 3, 3]: it is linear in them."""
+    start = np.stack([plane_homography(first, o, 0.0) for o in others])
+    slope = np.stack([plane_homography(first, o, 1.0) for o in others]) - start
+    return start + inverses[:, None, None, None] * slope
 
-    return cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
+
+def gray_of(view: View) -> np.ndarray:
+    """Return the brightness of a view's pixels in [0, 1], float32, shape [H, W], with the weights of ITU-R BT.601."""
+    red, green, blue = (view.image[..., i].astype(float) for i in range(3))
+    return (0.299 * red + 0.587 * green + 0.114 * blue).astype(np.float32)
 
 
 def step_limits(colors: np.ndarray, small_step: float, large_step: float) -> np.ndarray:

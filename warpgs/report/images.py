@@ -10,7 +10,7 @@ GRAY = (0.5, 0.5, 0.5)
 
 
 def png(image: np.ndarray) -> bytes:
-    """Encode colours in [0, 1], [H, W, 3], as 8-bit PNG; values outside are clamped.
+    """Encode colours in [0, 1], [H, W, 3] or with straight alpha [H, W, 4], as 8-bit PNG; values outside are clamped.
 
     Raises:
         ResourceError: OpenCV cannot encode the image.
@@ -18,10 +18,20 @@ def png(image: np.ndarray) -> bytes:
     import cv2
 
     pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
-    done, data = cv2.imencode(".png", pixels[..., ::-1])
+    done, data = cv2.imencode(".png", pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])
     if not done:
         raise ResourceError(f"an image of {image.shape[1]} x {image.shape[0]} px could not be encoded as PNG")
     return data.tobytes()
+
+
+def straight_alpha(image: np.ndarray, alpha: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
+    """Return colours with straight alpha, [H, W, 4], of colours over a background [H, W, 3]; black where nothing is seen.
+
+    Over ``background`` they show the image again, over another colour what the scene looks like before that.
+    """
+    own = image - (1 - alpha[..., None]) * np.float32(background)
+    colors = np.divide(own, alpha[..., None], out=np.zeros_like(own), where=alpha[..., None] > 0)
+    return np.concatenate([np.clip(colors, 0, 1), alpha[..., None]], axis=2)
 
 
 def resized(image: np.ndarray, width: int, height: int):

@@ -79,6 +79,20 @@ class SamplingReport:
     """Header row, then rows."""
 
 
+@dataclass(frozen=True)
+class CoverageReport:
+    """Section of the page on what no training view saw."""
+
+    words: str
+    """Sentences on how much that is."""
+    legend: str
+    """Meaning of the patterns in the images."""
+    images: list[tuple[str, bytes]]
+    """Name and PNG of each view."""
+    table: list[list[str]]
+    """Header row, then rows."""
+
+
 def _embed(data: bytes, alternative: str, style: str = "") -> str:
     source = base64.b64encode(data).decode()
     return f'<img alt="{html.escape(alternative)}"{style} src="data:image/png;base64,{source}">'
@@ -110,6 +124,14 @@ def _sampling(s: SamplingReport) -> str:
     return "".join(parts)
 
 
+def _coverage(c: CoverageReport) -> str:
+    images = "".join(_figure(data, f"{name}, by coverage") for name, data in c.images)
+    return (
+        f"<h2>Where no training view looked</h2><p>{html.escape(c.words)}</p>{_table(c.table)}"
+        f'<p class="sub">{html.escape(c.legend[0].upper() + c.legend[1:])}.</p><div class="curves">{images}</div>'
+    )
+
+
 def _table(rows: list[list[str]]) -> str:
     head, *body = ["".join(f"<{t}>{html.escape(c)}</{t}>" for c in row) for t, row in zip(["th"] + ["td"] * len(rows), rows)]
     return f"<table><tr>{head}</tr>{''.join(f'<tr>{r}</tr>' for r in body)}</table>"
@@ -137,6 +159,7 @@ def write_page(
     overview: bytes | None,
     protocol: dict[str, str],
     details: dict,
+    coverage: CoverageReport | None = None,
 ) -> None:
     """Write the report page: one file that refers to nothing outside it.
 
@@ -153,6 +176,7 @@ def write_page(
         overview: Image of cameras and points, or None.
         protocol: Settings in which two scores must agree to be compared, and the definition of each figure, by name.
         details: Configuration, versions and data, shown as JSON on request.
+        coverage: Scores of held-out views by what training views saw, or None.
 
     Raises:
         ResourceError: The file cannot be written.
@@ -168,6 +192,8 @@ def write_page(
         sections.append("<h2>Views the fit has not seen</h2>" + "".join(map(_view, views)))
     if len(table) > 1:
         sections.append("<h2>Scores</h2>" + _table(table))
+    if coverage:
+        sections.append(_coverage(coverage))
     if protocol:
         items = "".join(f"<dt>{html.escape(k)}</dt><dd>{html.escape(v)}</dd>" for k, v in protocol.items())
         sections.append(f"<h2>How it was scored</h2><dl>{items}</dl>")

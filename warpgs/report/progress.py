@@ -1,14 +1,17 @@
-"""Progress display of a fit: a live panel in a terminal, plain lines elsewhere."""
+"""Progress display of a fit: lines on its set-up; then a live panel in a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 
 from warpgs.runtime.terminal import say
 
 PLAIN_INTERVAL = 10.0
 """Seconds between two plain lines."""
+STAGE_INTERVAL = 5.0
+"""Seconds between two lines on one stage of the set-up."""
 SMOOTHING = 0.05
 """Weight of the newest value in the running means shown."""
 
@@ -21,6 +24,24 @@ def duration(seconds: float) -> str:
     if seconds < 3600:
         return f"{seconds // 60} min {seconds % 60:02d} s"
     return f"{seconds // 3600} h {seconds % 3600 // 60:02d} min"
+
+
+class Stages:
+    """Lines on what is done before the first step, such as ``finding depth: view 7 of 24``.
+
+    What stands before the colon names a stage. The first line of a stage is shown at once, and then one every few seconds.
+    """
+
+    def __init__(self, show: Callable[[str], object] = say):
+        """Show lines by ``show``."""
+        self.show, self.printed = show, {}
+
+    def __call__(self, line: str) -> None:
+        """Show a line, unless its stage had one a moment ago."""
+        stage, now = line.rpartition(":")[0] or line, time.perf_counter()
+        if now - self.printed.get(stage, -STAGE_INTERVAL) >= STAGE_INTERVAL:
+            self.printed[stage] = now
+            self.show(line)
 
 
 class Progress:

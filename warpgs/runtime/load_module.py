@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import warp as wp
@@ -16,6 +16,22 @@ from warpgs.runtime.kernel_cache import REMEDY
 _LOADED: set[tuple[wp.Module, object, int]] = set()
 """Modules that this process has loaded, with the context of the device and the threads of a block."""
 
+_LISTENERS: list[Callable[[str], object]] = []
+"""Functions that are told of each module that has to be compiled."""
+
+
+@contextlib.contextmanager
+def told_of_compiling(listener: Callable[[str], object]) -> Iterator[None]:
+    """Call ``listener`` within the block with the name of each module that the cache lacks, before it is compiled.
+
+    It may be called from any thread.
+    """
+    _LISTENERS.append(listener)
+    try:
+        yield
+    finally:
+        _LISTENERS.remove(listener)
+
 
 def load_module(module: wp.Module, device: wp.Device, block_dim: int):
     """Load a module for blocks of that many threads and return Warp's handle of it; compile it where the cache lacks it.
@@ -26,9 +42,13 @@ def load_module(module: wp.Module, device: wp.Device, block_dim: int):
     key = (module, device.context, block_dim)
     if key in _LOADED:  # Warp sees by its hash whether a kernel has joined the module since
         return module.load(device, block_dim=block_dim)
-    locks = Path(wp.config.kernel_cache_dir) / "locks"
+    cache, name = Path(wp.config.kernel_cache_dir), module.get_module_identifier(block_dim)
+    locks = cache / "locks"
     make_folder(locks)
-    with exclusive(locks / f"{module.get_module_identifier(block_dim)}.{device.is_cuda:d}"):
+    with exclusive(locks / f"{name}.{device.is_cuda:d}"):
+        if not (cache / name).is_dir():
+            for listener in tuple(_LISTENERS):
+                listener(name)
         loaded = module.load(device, block_dim=block_dim)
     _LOADED.add(key)
     return loaded

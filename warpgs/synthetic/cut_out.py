@@ -251,7 +251,7 @@ def write_object(
         raise UsageError(f"a demo object is written as {' or '.join(FORMATS)}, not as {form!r}")
     if views < MIN_VIEWS:
         raise UsageError(
-            f"a demo object needs at least {MIN_VIEWS} views ({TRAIN_VIEWS} to fit, the rest held out), not {views}"
+            f"a demo object needs {MIN_VIEWS} views or more ({TRAIN_VIEWS} to fit, the rest held out), not {views}"
         )
     write_files(Path(folder), (width, height), lambda: _files(form, views, (width, height), seed))
     return split_spec(views)

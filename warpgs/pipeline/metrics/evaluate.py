@@ -22,6 +22,15 @@ VARIANTS = {
     "ssim_skimage": "of scikit-image, as NeRF papers have it: the same window, border left out; about 0.005 lower",
 }
 """Definition of each score, for result files and reports. Every paper's table depends on these words."""
+ALPHA_VARIANTS = {
+    "psnr_whole": "of a view that knows its opacity: over all its pixels that its mask keeps, over the background of the fit",
+    "psnr_foreground": "the same over the pixels of an opacity above 0.5",
+    "alpha_empty": "mean rendered alpha over the pixels of an opacity below 0.02: 0 is right",
+    "alpha_object": "mean rendered alpha over the pixels of an opacity above 0.98: 1 is right",
+}
+"""Definition of each score of views that know their opacity. A mean is over the views that have such pixels."""
+EMPTY, OPAQUE, OBJECT = 0.02, 0.5, 0.98
+"""Opacity below which a pixel is empty, above which it shows the object, and above which it is the object alone."""
 MASKED = "where a view has a mask, SSIM and LPIPS compare both images with white outside of it"
 NO_LPIPS = "not measured: no --lpips-weights were given"
 SSIM_WINDOW = 11
@@ -44,11 +53,13 @@ class ViewMetrics:
     """Pixels that count: all, mask, score mask, or foreground (the object on a black background)."""
     lpips: dict[str, float] = field(default_factory=dict)
     """LPIPS by variant (`lpips_vgg_legacy`); empty where no weights were given, NaN where the image is too small."""
+    opacity: dict[str, float] = field(default_factory=dict)
+    """Scores by the names of `ALPHA_VARIANTS`, NaN where no pixel is of the kind; empty where the view is opaque."""
 
     def row(self) -> dict[str, Any]:
         """Return every score by name, flat, as result files have it."""
         plain: dict[str, Any] = asdict(self)
-        return {k: v for k, v in plain.items() if k != "lpips"} | self.lpips
+        return {k: v for k, v in plain.items() if k not in ("lpips", "opacity")} | self.opacity | self.lpips
 
 
 def to_8_bit(image: np.ndarray) -> np.ndarray:
@@ -62,8 +73,20 @@ def over_white(image: np.ndarray, region: np.ndarray) -> np.ndarray:
     return np.where(region[..., None], image, np.float32(1))
 
 
-def score(view: View, image: np.ndarray, lpips: Lpips | None = None) -> ViewMetrics:
-    """Compare a rendered image [H, W, 3] with the image of its view.
+def _opacity_scores(
+    image: np.ndarray, target: np.ndarray, alpha: np.ndarray, true: np.ndarray, mask: np.ndarray | None
+) -> dict[str, float]:
+    """Return the scores of `ALPHA_VARIANTS` for images of 8 bits [H, W, 3], a rendered and a true alpha and a mask [H, W]."""
+    counted = np.ones(true.shape, bool) if mask is None else mask
+    regions = {"psnr_whole": counted, "psnr_foreground": counted & (true > OPAQUE)}
+    scores = {k: psnr(image, target, r) if r.any() else float("nan") for k, r in regions.items()}
+    for name, r in (("alpha_empty", counted & (true < EMPTY)), ("alpha_object", counted & (true > OBJECT))):
+        scores[name] = float(alpha[r].mean(dtype=np.float64)) if r.any() else float("nan")
+    return scores
+
+
+def score(view: View, image: np.ndarray, lpips: Lpips | None = None, alpha: np.ndarray | None = None) -> ViewMetrics:
+    """Compare a rendered image [H, W, 3], and its alpha [H, W] where the view knows its opacity, with the image of its view.
 
     With a mask the recipe is that of DTU's protocol (Niemeyer et al. 2022 and all since): PSNR over the mask's pixels alone,
     SSIM and LPIPS on both images with white outside of it.
@@ -73,6 +96,7 @@ def score(view: View, image: np.ndarray, lpips: Lpips | None = None) -> ViewMetr
     region, name = scored_region(view)
     image, target = to_8_bit(image), to_8_bit(view.image)
     decibels = psnr(image, target, region)
+    opacity = {} if alpha is None or view.alpha is None else _opacity_scores(image, target, alpha, view.alpha, view.mask)
     if region is not None and name != "foreground":
         image, target = over_white(image, region), over_white(target, region)
     similarity = float(ssim(torch.from_numpy(image), torch.from_numpy(target)).mean())
@@ -83,7 +107,7 @@ def score(view: View, image: np.ndarray, lpips: Lpips | None = None) -> ViewMetr
     else:
         cropped = float("nan")  # the window does not fit
     distances = {} if lpips is None else lpips.measure(image, target)
-    return ViewMetrics(view.name, decibels, similarity, float(cropped), name, distances)
+    return ViewMetrics(view.name, decibels, similarity, float(cropped), name, distances, opacity)
 
 
 def options_for(
@@ -115,7 +139,8 @@ def evaluate(
         The scores of each view, in order; `summarize` gives their means.
     """
     options = RasterizeOptions() if options is None else options
-    return [score(v, render_view(gaussians, v, options)[0], lpips) for v in views]
+    rendered = ((v, render_view(gaussians, v, options)) for v in views)
+    return [score(v, image, lpips, alpha) for v, (image, _, alpha) in rendered]
 
 
 def baselines(train: list[View], test: list[View]) -> dict[str, float]:
@@ -137,11 +162,18 @@ def baselines(train: list[View], test: list[View]) -> dict[str, float]:
 
 
 def summarize(metrics: list[ViewMetrics]) -> dict[str, float]:
-    """Return the means over views of every score that is a number; empty where there are no views."""
+    """Return the means over views of every score that is a number; empty where there are no views.
+
+    Those of opacity are over the views that have one.
+    """
     if not metrics:
         return {}
     rows = [m.row() for m in metrics]
-    return {key: float(np.mean([r[key] for r in rows])) for key in ("psnr", "ssim", "ssim_skimage", *metrics[0].lpips)}
+    means = {key: float(np.mean([r[key] for r in rows])) for key in ("psnr", "ssim", "ssim_skimage", *metrics[0].lpips)}
+    for key in ALPHA_VARIANTS:
+        known = [r[key] for r in rows if not np.isnan(r.get(key, np.nan))]
+        means |= {key: float(np.mean(known))} if known else {}
+    return means
 
 
 def variants(lpips: Lpips | None) -> dict[str, str]:

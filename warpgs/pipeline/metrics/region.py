@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from warpgs.io.black_background import dark_pixels
 from warpgs.scene import View
 
-DARK = 16 / 255
-"""Brightness below which the brightest channel of a pixel belongs to a black background, in [0, 1]."""
-DARK_FRACTION = 0.3
-"""Fraction of dark pixels from which on an image with a dark border shows an object on black."""
+OPAQUE = 0.5
+"""Opacity above which a pixel of a cut-out object shows it."""
 
 
 def scored_region(view: View) -> tuple[np.ndarray | None, str]:
@@ -30,8 +29,16 @@ def counted_region(view: View) -> tuple[np.ndarray | None, str]:
     """
     if view.mask is not None and not view.mask.all():
         return view.mask, "mask"
-    dark = view.image.max(-1) < DARK
-    border = np.concatenate([dark[0], dark[-1], dark[:, 0], dark[:, -1]])
-    if dark.mean() >= DARK_FRACTION and border.mean() >= 0.5 and not dark.all():
-        return ~dark, "foreground"
-    return None, "all"
+    dark = dark_pixels(view.image)
+    return (None, "all") if dark is None else (~dark, "foreground")
+
+
+def fitted_region(view: View) -> tuple[np.ndarray | None, str]:
+    """Return the pixels behind which a fit may start Gaussians, bool [H, W], and their name; None for all.
+
+    The opaque ones that its mask keeps where the view knows its opacity, else the region of `counted_region`.
+    """
+    if view.alpha is None:
+        return counted_region(view)
+    opaque = view.alpha > OPAQUE
+    return opaque if view.mask is None else opaque & view.mask, "object"

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from warpgs import geometry
-from warpgs.pipeline.metrics.region import counted_region
+from warpgs.pipeline.metrics.region import fitted_region
 from warpgs.priors.completion import complete
 from warpgs.scene import Camera, PointCloud, View, ViewDepth
 
@@ -111,7 +111,7 @@ def coarse_points(
         The cloud, consistent points first, empty where no depth is valid; and notes: one per view ("image001.png: 71 % of
         pixels by flow, 20 % filled") and one on the merged cloud.
     """
-    regions = [counted_region(v) for v in views]
+    regions = [fitted_region(v) for v in views]
     consistent = [d.valid if r is None else d.valid & r for d, (r, _) in zip(depths, regions)]
     completed = [complete(d.depth, s, v.image) for v, d, s in zip(views, depths, consistent)] if fill_px > 0 else []
     found, filled_in, notes = [], [], []

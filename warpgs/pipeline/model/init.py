@@ -14,17 +14,20 @@ from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.sh import C0, MAX_DEGREE, coefficient_count
-from warpgs.pipeline.metrics.region import counted_region
+from warpgs.pipeline.metrics.region import fitted_region
 from warpgs.pipeline.model.depth_points import coarse_points, depth_bounds
+from warpgs.pipeline.model.hull import hull_points, in_empty_region, silhouettes
 from warpgs.priors.epipolar import EpipolarConfig, flow_depth
 from warpgs.priors.flow import RANGES, flow_between
 from warpgs.priors.matches import triangulate_matches
 from warpgs.priors.sweep import CPU, SweepConfig, sweep_depths
 from warpgs.scene import Camera, Gaussians, PointCloud, View, ViewDepth
 
-SOURCES = ("auto", "sweep", "flow", "points", "random")
+SOURCES = ("auto", "sweep", "flow", "points", "hull", "random")
 MIN_POINTS = 100
 """Fewest sparse points to start from: fewer leave most of the image empty, and a random start is better."""
+OBJECTS = ("foreground", "object")
+"""Names of the regions of an object (`fitted_region`): on black, and cut out."""
 MIN_MATCHES = 10
 """Fewest matched points of a view from which its random points take their depths."""
 NEIGHBORS = 5
@@ -41,7 +44,9 @@ class InitConfig:
 
     source: str = "auto"
     """Source: sweep or flow (a point per pixel whose depth other views confirm), points (those of the reconstruction), random,
-    or auto: sweep for few views, else points where the scene has at least 100 that training views saw, else random."""
+    hull (on the surface of the visual hull of views that know their opacity), or auto: sweep for few views, else points where
+    the scene has at least 100 that training views saw, else random. Where views know their opacity, points that are empty in
+    one are left out."""
     sweep_up_to: int = 0
     """auto: most training views from which a fit starts with a sweep, which takes a second a view on two cores."""
     random_count: int = 20_000
@@ -50,8 +55,8 @@ class InitConfig:
     """First opacity, in (0, 1)."""
     scale_factor: float = 1.0
     """First width of a Gaussian, as a multiple of the distance to its neighbours, in [0.001, 10]."""
-    max_sh_degree: int = 3
-    """Spherical-harmonics degree stored, 0 to 3."""
+    max_sh_degree: int | None = 3
+    """Spherical-harmonics degree stored, 0 to 3. None: by the number of views."""
     near_views: int = 4
     """sweep, flow: nearest other views that each view is matched with."""
     merge_px: float = 4.0
@@ -80,7 +85,7 @@ class InitConfig:
             raise UsageError(f"init scale-factor {self.scale_factor} must lie between 0.001 and 10")
         if not 0 < self.opacity < 1:
             raise UsageError(f"init opacity {self.opacity} must lie between 0 and 1")
-        if not 0 <= self.max_sh_degree <= MAX_DEGREE:
+        if self.max_sh_degree is not None and not 0 <= self.max_sh_degree <= MAX_DEGREE:
             raise UsageError(f"init max sh degree {self.max_sh_degree} must lie between 0 and {MAX_DEGREE}")
         if self.random_count < 1:
             raise UsageError(f"init random count {self.random_count} must be at least 1")
@@ -151,10 +156,10 @@ class _Depths:
 
 
 def empty_votes(views: list[View], regions: list[tuple[np.ndarray | None, str]], points: np.ndarray) -> np.ndarray:
-    """Count the views that see each point [N, 3] before the black around an object, int [N]: the visual hull has none."""
+    """Count the views that see each point [N, 3] before what is empty around an object, int [N]: the visual hull has none."""
     votes = np.zeros(len(points), int)
     for view, (region, name) in zip(views, regions):
-        if name != "foreground":
+        if name not in OBJECTS:
             continue
         seen = np.nonzero(geometry.in_image(view.camera, points))[0]
         pixels, _ = geometry.project_points(view.camera, points[seen])
@@ -168,13 +173,13 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
 
     A view in which at least 10 triangulated SIFT matches lie takes each depth from one of the 5 matches nearest to the pixel,
     spread by a tenth (docs/decisions/003-random-start.md); any other view samples inverse depths uniformly, and keeps points
-    that a second view sees where there are any. Where views show an object on black, points start on the object, and those
-    that fewest views see before black come first, so that none lies in empty space.
+    that a second view sees where there are any. Where views show an object on black, or know their opacity, points start on the
+    object, and those that fewest views see before what is empty come first, so that none lies there.
 
     Raises:
         DataError: Masks leave no pixel of any training view.
     """
-    regions = [counted_region(v) for v in views]
+    regions = [fitted_region(v) for v in views]
     matched = triangulate_matches(views)
     bounds = camera_depths(views)
     sources = [_Depths(v, matched, bounds) for v in views]
@@ -190,7 +195,7 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
         pixels = np.stack([columns, rows], 1) + 0.5
         elsewhere = not source.depth_supervised and len(views) > 1
         # where none is better than another, the first are taken, and the others need no depth
-        useful = len(pixels) if elsewhere or any(name == "foreground" for _, name in regions) else wanted
+        useful = len(pixels) if elsewhere or any(name in OBJECTS for _, name in regions) else wanted
         candidates = geometry.back_project(view.camera, pixels[:useful], source.sample(pixels, useful, generator))
         worse = empty_votes(views, regions, candidates)
         if elsewhere:
@@ -203,15 +208,18 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
         raise DataError("no random start: every pixel of the training views is masked out; check the masks' polarity")
     depth_supervised = sum(s.depth_supervised for s in sources)
     how = f"{count:,} random points, {depth_supervised} of {len(views)} views with depths from {len(matched):,} matched points"
-    objects = sum(name == "foreground" for _, name in regions)
+    objects, cut_out = (sum(name == of for _, name in regions) for of in OBJECTS)
     if objects:
         how += f", on the object that {objects} views show on black"
+    if cut_out:
+        how += f", where {cut_out} views are opaque"
     return PointCloud(np.concatenate(points), np.concatenate(colors)), how
 
 
 def consistent_depths(
-    views: list[View], known: PointCloud, config: InitConfig, device: Callable[[], torch.device] = lambda: CPU
-) -> list[ViewDepth]:
+    views: list[View], known: PointCloud, config: InitConfig, device: Callable[[], torch.device] = lambda: CPU,
+    progress: Callable[[str], object] = lambda line: None,
+) -> list[ViewDepth]:  # fmt: skip
     """Return the geometrically consistent depth of each of at least two views, by flow or by sweeping planes.
 
     Args:
@@ -219,18 +227,22 @@ def consistent_depths(
         known: Points that bound the planes.
         config: Source and its settings.
         device: Returns the device to sweep on, once it may be used.
+        progress: Called with a line for the user on what is being done.
     """
     if config.source == "flow":
         between = flow_between(views, config.flow, config.flow_range)
         return [flow_depth(views, i, between, config.epipolar()) for i in range(len(views))]
     points = np.concatenate([known.points, triangulate_matches(views).points])
     bounds = [depth_bounds(v, points, camera_depths(views)) for v in views]
-    return sweep_depths(views, bounds, SweepConfig(near_count=config.near_views), device())
+    return sweep_depths(
+        views, bounds, SweepConfig(near_count=config.near_views), device(),
+        lambda done, total: progress(f"finding depth: {done} of {total} views"),
+    )  # fmt: skip
 
 
 def consistent_points(
     views: list[View], points: PointCloud, config: InitConfig, generator: np.random.Generator,
-    device: Callable[[], torch.device],
+    device: Callable[[], torch.device], progress: Callable[[str], object],
 ) -> Start:  # fmt: skip
     """Return points behind pixels whose depth other views confirm, and a line on each view.
 
@@ -238,7 +250,7 @@ def consistent_points(
     """
     reason, depths = "a single view has no other to compare with", None
     if len(views) > 1:
-        depths = consistent_depths(views, points, config, device)
+        depths = consistent_depths(views, points, config, device, progress)
         cloud, notes = coarse_points(views, depths, merge_px=config.merge_px, fill_px=config.fill_px, source=config.source)
         if len(cloud) >= MIN_POINTS:
             return Start(cloud, "\n    ".join((notes[-1], *notes[:-1])), depths)
@@ -271,21 +283,56 @@ def check_points(views: list[View], points: PointCloud | None, config: InitConfi
         )
 
 
+def on_object(start: Start, views: list[View]) -> Start:
+    """Return the start without points that are empty in a view that knows its opacity.
+
+    Where fewer than `MIN_POINTS` are left, it is as it was.
+    """
+    shapes = silhouettes(views)
+    if not shapes:
+        return start
+    cloud = start.cloud
+    keep = ~in_empty_region(shapes, cloud.points)
+    if keep.all():
+        return start
+    count = int(keep.sum())
+    if count < MIN_POINTS:
+        return start._replace(how=f"{start.how}\na view is empty at all but {count} of them; do poses and images agree?")
+    how = f"{start.how}\n{len(keep) - count:,} of them left out: a view is empty there"
+    return start._replace(cloud=PointCloud(cloud.points[keep], cloud.colors[keep]), how=how)
+
+
 def initial_points(
     views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator,
-    device: Callable[[], torch.device] = lambda: CPU,
+    device: Callable[[], torch.device] = lambda: CPU, progress: Callable[[str], object] = lambda line: None,
 ) -> Start:  # fmt: skip
-    """Return the points to start from; ``device`` returns the device to sweep on, once it may be used.
+    """Return the points to start from.
+
+    ``device`` returns the device to sweep on, once it may be used; ``progress`` is called with lines on what is being done.
 
     Raises:
         DataError: Points were asked for and the scene has none that the training views saw.
     """
     check_points(views, points, config)
+    if config.source == "hull":
+        cloud, how = hull_points(views, config.merge_px)
+        if len(cloud) >= MIN_POINTS:
+            return Start(cloud, how)
+        cloud, made = random_points(views, config.random_count, generator)
+        return Start(cloud, f"{made}, instead of --init.source hull: {how}")
+    return on_object(_found_points(views, points, config, generator, device, progress), views)
+
+
+def _found_points(
+    views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator,
+    device: Callable[[], torch.device], progress: Callable[[str], object],
+) -> Start:  # fmt: skip
+    """Return the points of any source but the hull."""
     usable = seen_points(views, points)
     if config.source == "auto" and sweeps(config, len(views)):
-        return consistent_points(views, usable, dataclasses.replace(config, source="sweep"), generator, device)
+        return consistent_points(views, usable, dataclasses.replace(config, source="sweep"), generator, device, progress)
     if config.source in ("sweep", "flow"):
-        return consistent_points(views, usable, config, generator, device)
+        return consistent_points(views, usable, config, generator, device, progress)
     if config.source == "points" or (config.source == "auto" and len(usable) >= MIN_POINTS):
         return Start(usable, f"{len(usable):,} points of the reconstruction that the training views saw")
     cloud, how = random_points(views, config.random_count, generator)
@@ -329,6 +376,7 @@ def initial_gaussians(cloud: PointCloud, config: InitConfig, extent: float, devi
     # in float64: float32's roots and logarithms have other last digits on other processors (MKL)
     distances = mean_square_distances(points).double().sqrt()
     scales = config.scale_factor * distances.clamp(1e-6 * extent, 0.1 * extent)
+    assert config.max_sh_degree is not None  # `settings_by_views` has chosen
     sh = points.new_zeros(count, coefficient_count(config.max_sh_degree), 3)
     sh[:, 0] = (colors - 0.5) / C0
     quats = points.new_zeros(count, 4)

@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError, UsageError, WarpgsError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.splits import Split
 from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.runs.camera_paths import PATHS
+from warpgs.pipeline.runs.coverage_report import coverage_lines, coverage_of_run
 from warpgs.pipeline.runs.failed_step import findings, read_failed_step
 from warpgs.pipeline.runs.folder import IMAGE_FOLDERS, StoredRun, open_run
 from warpgs.pipeline.runs.image_names import image_names, renaming_notes
-from warpgs.pipeline.runs.paths import FILM, render_path
+from warpgs.pipeline.runs.paths import COVERAGE, FILM, render_path
 from warpgs.pipeline.runs.request import choose_device, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line
-from warpgs.pipeline.train.trainer import train_views
+from warpgs.pipeline.train.background import color_of, over_background
+from warpgs.pipeline.train.loop import train_views
+from warpgs.report.coverage_image import LEGEND
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Scene, View
+
+ALPHAS = {"alpha_empty": "where empty", "alpha_object": "in the object"}
+"""Scores of the rendered alpha, with the words for each view's line."""
 
 
 def scene_of(stored: StoredRun, reader: str | None = None) -> tuple[Scene, list[View], list[View]]:
@@ -37,11 +45,17 @@ def scene_of(stored: StoredRun, reader: str | None = None) -> tuple[Scene, list[
     scene, _, _ = read_scene(stored.scene_request(reader))
     if scene.fingerprint != stored.record["fingerprint"]:
         raise DataError(f"{scene.path}: its images or cameras are not those that {stored.folder} was fitted to; restore them")
-    split = Split(stored.train, stored.test)
+    scene, split = over_background(scene, stored.background), Split(stored.train, stored.test)
     return scene, train_views(scene, split.train), train_views(scene, split.test)
 
 
-def evaluate(folder: Path, device_name: str, lpips_weights: Path | None = None, reader: str | None = None) -> list[str]:
+def evaluate(
+    folder: Path,
+    device_name: str,
+    lpips_weights: Path | None = None,
+    reader: str | None = None,
+    by_coverage: bool = False,
+) -> list[str]:
     """Score a run on its held-out views and render them again; returns lines for the user.
 
     The scores go to eval.json beside metrics.json, which stays as the fit wrote it.
@@ -51,6 +65,7 @@ def evaluate(folder: Path, device_name: str, lpips_weights: Path | None = None, 
         device_name: auto, cpu or cuda.
         lpips_weights: File of `warpgs convert-lpips`; without one LPIPS is not measured.
         reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
+        by_coverage: Whether to split the scores by how many training views saw what a pixel shows.
 
     Raises:
         DataError: The folder is no run, its scene is gone, the scene's data have changed since the fit, or the weights are
@@ -65,6 +80,10 @@ def evaluate(folder: Path, device_name: str, lpips_weights: Path | None = None, 
     with hold_folder(folder, *IMAGE_FOLDERS) as notes:
         names = image_names(v.name for v in scene.views)
         metrics = evaluate_run(folder, stored.gaussians(), train, test, stored.rule, stored.background, lpips, names=names)
+        if by_coverage and test:
+            metrics["coverage"] = coverage_of_run(
+                folder, stored.gaussians(), train, test, stored.rule, stored.background, names=names
+            )
         metrics |= {
             "protocol": protocol_of(scene, request.split, request.downscale, train, test),
             "config_hash": stored.record["config_hash"], "steps": stored.step,
@@ -72,25 +91,58 @@ def evaluate(folder: Path, device_name: str, lpips_weights: Path | None = None, 
         write_json(folder / "eval.json", metrics)
     if not test:
         return [*notes, *renaming_notes(names), f"no view is held out; training PSNR {metrics['train']['psnr']:.2f} dB"]
-    lines = [f"{r['name']}: PSNR {r['psnr']:.2f} dB, SSIM {r['ssim']:.4f} ({r['region']})" for r in metrics["views"]]
+    lines = [_view_line(r) for r in metrics["views"]]
+    lines += coverage_lines(metrics["coverage"]) if by_coverage else []
     return [*notes, *renaming_notes(names), *lines, f"mean of {len(test)}: {score_line(metrics['test'])}"]
 
 
-def render(folder: Path, kind: str, out: Path | None, frames: int, fps: int, device_name: str) -> str:
-    """Render a run along a path to PNG files and a film; returns a line for the user.
+def _view_line(row: dict[str, Any]) -> str:
+    """Return the scores of a view as a line for the user."""
+    alphas = [f", alpha {row[k]:.3f} {words}" for k, words in ALPHAS.items() if not math.isnan(row.get(k, math.nan))]
+    return f"{row['name']}: PSNR {row['psnr']:.2f} dB, SSIM {row['ssim']:.4f}{''.join(alphas)} ({row['region']})"
+
+
+def render(
+    folder: Path, kind: str, out: Path | None, frames: int, fps: int, device_name: str, coverage: bool = False, *,
+    background: str = "auto",
+) -> list[str]:  # fmt: skip
+    """Render a run along a path to PNG files and a film; returns lines for the user.
+
+    Args:
+        folder: The run folder.
+        kind: views, orbit or spiral.
+        out: Folder to write; None for `path-KIND` in the run folder.
+        frames: Number of frames of an orbit or a spiral.
+        fps: Frames per second of the film.
+        device_name: auto, cpu or cuda.
+        coverage: Whether to write images of what no training view saw, too.
+        background: Colour behind the scene; auto for that of the fit, and transparent images of cut-out objects.
 
     Raises:
         DataError: The folder is no run.
         ResourceError: A file cannot be written.
-        UsageError: The path is unknown.
+        UsageError: The path is unknown, or the background is no colour.
     """
+    color = color_of(background)
+    if color is None and background != "auto":
+        raise UsageError(f"--background {background}: a render takes auto, black, white, #rrggbb or r,g,b")
     if kind not in PATHS:
         raise UsageError(f"path {kind!r} is not one of {', '.join(PATHS)}")
     out = folder / f"path-{kind}" if out is None else out
-    *files, last = render_path(open_run(folder, device_name), kind, out=out, frames=frames, fps=fps)
+    stored = open_run(folder, device_name)
+    training: list[View] | bool = False
+    notes = []
+    if coverage:
+        try:
+            training = scene_of(stored)[1]
+        except WarpgsError as e:
+            training = True
+            notes.append(f"what masks of training views hide counts as seen, since the scene cannot be read: {e}")
+        notes.append(f"images in {out / COVERAGE}: {LEGEND}")
+    *files, last = render_path(stored, kind, out=out, frames=frames, fps=fps, background=color, coverage=training)
     if last.name == FILM:
-        return f"{len(files)} images and {FILM} in {out}"
-    return f"{len(files) + 1} images in {out}; no film, since the views differ in size"
+        return [*notes, f"{len(files)} images and {FILM} in {out}"]
+    return [*notes, f"{len(files) + 1} images in {out}; no film, since the views differ in size"]
 
 
 def export(folder: Path, target: Path) -> list[str]:

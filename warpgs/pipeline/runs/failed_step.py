@@ -13,7 +13,7 @@ from warpgs.files import write_bytes
 from warpgs.kernels.dropout import opacity_dropout
 from warpgs.pipeline.runs.checkpoint import safetensors_chunks
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import Target, built_in_terms
+from warpgs.pipeline.train.loss import Target, built_in_terms, over
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import half_size
 from warpgs.render.rasterize import RasterizeOptions, rasterize
@@ -38,16 +38,22 @@ def failed_step(trainer: Trainer, view: int, name: str) -> Bundle:
     plan = trainer.plan_of(number)
     if plan.half_size:
         shown = half_size(shown)
-    camera = shown.camera
-    tensors = {"image": shown.image, "viewmat": camera.viewmat, "K": camera.K, "background": trainer.background}
+    camera, settings = shown.camera, list(trainer.settings(number))
+    image, background = shown.image, trainer.background
+    if shown.alpha is not None:  # over the colour that the step had behind it
+        shift = torch.tensor(settings[3:], dtype=torch.float32, device=image.device)
+        image, background = over(image, shown.alpha, shift), background + shift
+    tensors = {"image": image, "viewmat": camera.viewmat, "K": camera.K, "background": background}
     tensors |= {f"params.{n}": t for n, t in trainer.gaussians.tensors().items()}
     tensors |= {f"maps.{n}": t for n, t in shown.maps.items()}
     tensors |= {f"own.{n}": t.detach()[view] for n, t in trainer.view_table.params.items()}
     if shown.mask is not None:
         tensors["mask"] = shown.mask
+    if shown.alpha is not None:
+        tensors["alpha"] = shown.alpha
     plain = {
         "config": trainer.config.to_json(), "step": number, "view": name, "width": camera.width, "height": camera.height,
-        "degree": plan.degree, "settings": list(trainer.settings(number)), "dropout_seed": trainer.learned.dropout_seed,
+        "degree": plan.degree, "settings": settings, "dropout_seed": trainer.learned.dropout_seed,
     }  # fmt: skip
     return tensors, plain
 
@@ -90,14 +96,14 @@ def findings(bundle: Bundle) -> list[str]:
         config = FitConfig.from_json(plain["config"])
         gaussians = Gaussians(**{n: tensors[f"params.{n}"].requires_grad_() for n in Gaussians.__dataclass_fields__})
         parts = {p: {n.removeprefix(f"{p}."): t for n, t in tensors.items() if n.startswith(f"{p}.")} for p in ("maps", "own")}
-        target = Target(tensors["image"], tensors.get("mask"), parts["maps"], parts["own"])
+        target = Target(tensors["image"], tensors.get("mask"), parts["maps"], parts["own"], tensors.get("alpha"))
         lines = [
             f"step {plain['step']} on {plain['view']}, {plain['width']} x {plain['height']} px, {len(gaussians):,} Gaussians"
         ]
         lines += [f"  {name}: {_state(t)}" for name, t in tensors.items()]
         render = _rendered(gaussians, bundle, config)
         lines += [f"  rendered {n}: {_state(getattr(render, n))}" for n in ("rgb", "alpha", "depth")]
-        for term in (*built_in_terms(config.loss), *config.loss_terms):
+        for term in (*built_in_terms(config.loss, "alpha" in tensors), *config.loss_terms):
             if term.active(plain["step"], config.steps):
                 value = term(render, target, gaussians)
                 lines.append(f"  loss term {term.name}: {float(value.detach()):g}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,13 @@ from warpgs.errors import DataError, NotFiniteError, UsageError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.splits import Split
+from warpgs.pipeline.metrics.evaluate import options_for, render_view
 from warpgs.pipeline.metrics.lpips import Lpips, load_lpips
+from warpgs.pipeline.metrics.moved import Rendered, moved_fractions, moved_notes
 from warpgs.pipeline.model.compress import drop_unused_sh
+from warpgs.pipeline.model.scale_limits import shape_figures, shape_summary
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
+from warpgs.pipeline.runs.coverage_report import coverage_of_run
 from warpgs.pipeline.runs.failed_step import FILE as FAILED
 from warpgs.pipeline.runs.failed_step import failed_step, save_failed_step
 from warpgs.pipeline.runs.folder import CONFIG, check_checkpoint, check_same, read_record, record_of, run_folder
@@ -27,13 +31,18 @@ from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line, write_report
 from warpgs.pipeline.runs.rule_report import rule_report_of
 from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, sampling_report_of
+from warpgs.pipeline.train.background import choose_background, over_background
+from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.complexity import complexity_figures, complexity_summary
 from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESETS, FitConfig
+from warpgs.pipeline.train.loop import run, train_views
 from warpgs.pipeline.train.time_budget import within_budget
-from warpgs.pipeline.train.trainer import StepReport, Trainer, run, train_views
+from warpgs.pipeline.train.trainer import StepReport, Trainer
 from warpgs.pipeline.train.warmup import background_warmup
+from warpgs.priors.photo_checks import PhotoCheck, check_photos, photo_notes
 from warpgs.report.events import EventLog
-from warpgs.report.progress import Progress
+from warpgs.report.progress import Progress, Stages
+from warpgs.runtime.load_module import told_of_compiling
 from warpgs.runtime.stop_signals import noted_signals
 from warpgs.runtime.terminal import say
 from warpgs.scene import Scene, View
@@ -72,6 +81,8 @@ class _Job:
     verbose: bool
     on_step: Callable[[StepReport], object] | None
     began: float
+    progress: Callable[[str], object]
+    photographs: list[PhotoCheck] = field(default_factory=list)
 
     @property
     def train(self) -> list[View]:
@@ -89,15 +100,15 @@ class _Job:
             say(line)
 
 
-def preset_config(config: FitConfig | str | None, device: torch.device) -> FitConfig:
-    """Return the settings for a preset's name, for settings themselves, or for None: the usual preset of the device's kind.
+def preset_config(config: FitConfig | str | None) -> FitConfig:
+    """Return the settings for a preset's name, for settings themselves, or for None: the default preset.
 
     Raises:
         UsageError: There is no such preset.
     """
     if isinstance(config, FitConfig):
         return config
-    name = DEFAULT_PRESET[device.type] if config is None else config
+    name = DEFAULT_PRESET if config is None else config
     if name not in PRESETS:
         raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
     return PRESETS[name]
@@ -123,7 +134,7 @@ def fit(
 
     Args:
         scene: A scene, its folder, or a folder with the options it is read with.
-        config: Settings, the name of a preset, or None for the usual preset of the device's kind.
+        config: Settings, the name of a preset, or None for the default one.
         split: Views to fit and to hold out, as in `warpgs fit --split`; None for the default of the scene's format.
         out: Run folder to fill with configuration, log, checkpoints, PLY, images, scores and report; None to write nothing.
         device: auto, cpu, cuda, or one of torch's.
@@ -141,23 +152,37 @@ def fit(
     out = None if out is None else Path(out)
     if resume and out is None:
         raise UsageError("resume needs the run folder that it continues: give out")
+    progress = Stages() if verbose else Stages(lambda line: None)
     folder: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
     if out is not None:
         folder = run_folder(out, resume)
-    with folder as held:
+    with folder as held, told_of_compiling(lambda name: progress("compiling kernels, once on this machine")):
         if out is not None and resume:
             read_record(out)  # a run of another version is refused before anything takes time
         where = choose_device(device)
         began = time.perf_counter()
         lpips = None if lpips_weights is None else load_lpips(Path(lpips_weights), where[0])
-        request, read, parts, found = _scene_of(scene, split)
+        request, read, parts, found = _scene_of(scene, split, progress)
         notes = (*notes, *held, *found, *([] if out is None else renaming_notes(image_names(v.name for v in read.views))))
-        job = _Job(read, request, parts, preset_config(config, where[0]), *where, out, lpips, [*notes], verbose, on_step, began)
+        job = _Job(
+            read, request, parts, preset_config(config), *where, out, lpips, [*notes], verbose, on_step, began,
+            progress,
+        )  # fmt: skip
         if time_budget is not None:
             job.config, note = within_budget(job.config, time_budget, job.train, job.device)
             job.notes.append(note)
+        _set_background(job)
+        job.config, chosen = settings_by_views(job.config, job.train, job.device.type)
+        job.notes += chosen
         trainer, state, record = _prepare(job, out if resume else None)
         return _finish(job, trainer, state, record, resume)
+
+
+def _set_background(job: _Job) -> None:
+    """Put the scene over the background that the settings ask for."""
+    color, note = choose_background(job.config.background, job.scene, job.train)
+    job.scene = over_background(job.scene, color)
+    job.notes += [note] if note else []
 
 
 def fit_request(request: FitRequest) -> FitResult:
@@ -169,7 +194,9 @@ def fit_request(request: FitRequest) -> FitResult:
     )  # fmt: skip
 
 
-def _scene_of(scene: Scene | SceneRequest | str | Path, spec: str | None) -> tuple[SceneRequest, Scene, Split, list[str]]:
+def _scene_of(
+    scene: Scene | SceneRequest | str | Path, spec: str | None, progress: Callable[[str], object]
+) -> tuple[SceneRequest, Scene, Split, list[str]]:
     """Read and split a scene that is given in one of four ways; its notes come last."""
     if isinstance(scene, Scene):
         split, notes = choose_split(scene, spec)
@@ -177,7 +204,8 @@ def _scene_of(scene: Scene | SceneRequest | str | Path, spec: str | None) -> tup
     request = scene if isinstance(scene, SceneRequest) else SceneRequest(str(scene))
     if spec is not None:
         request = replace(request, split=spec)
-    return request, *read_scene(request)
+    progress(f"reading {request.path}")
+    return request, *read_scene(request, progress)
 
 
 def _prepare(job: _Job, resumed: Path | None) -> tuple[Trainer, State | None, dict[str, Any]]:
@@ -191,7 +219,8 @@ def _prepare(job: _Job, resumed: Path | None) -> tuple[Trainer, State | None, di
             check_checkpoint(state[1], stored, resumed)
     c = job.config
     with background_warmup(c, job.device) as ready:
-        trainer = Trainer(job.train, job.scene.points, c, job.device, job.scene.background, ready=ready)
+        job.photographs = check_photos([*job.train, *job.test], job.progress)
+        trainer = Trainer(job.train, job.scene.points, c, job.device, job.scene.background, ready=ready, progress=job.progress)
     if job.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(job.device)  # the steps' need is told, not the start's or an earlier fit's
     return trainer, state, record
@@ -229,12 +258,13 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
     return FitResult(
         trainer.gaussians, job.scene.normalization, cameras, job.split.train, job.split.test, job.config.rule,
         job.scene.background, trainer.step, job.config, metrics, tuple(job.notes), job.out,
+        transparent=job.scene.transparent,
     )  # fmt: skip
 
 
 def _announce(job: _Job, trainer: Trainer) -> None:
     """Print what is fitted and every choice made for the user."""
-    job.notes += [*trainer.notes, trainer.memory.summary()]
+    job.notes += [*photo_notes(job.photographs), *trainer.notes, trainer.memory.summary()]
     train, test = job.train, job.test
     size = f"{train[0].camera.width} x {train[0].camera.height} px"
     job.say(f"{job.scene.path}: {job.scene.format}, {len(train)} views to fit, {len(test)} held out, {size}, {job.where}")
@@ -251,6 +281,10 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
     metrics = evaluate_run(
         job.out, gaussians, train, test, c.rule, scene.background, job.lpips, trainer.max_instances, names=names
     )
+    if test:
+        metrics["coverage"] = coverage_of_run(
+            job.out, gaussians, train, test, c.rule, scene.background, trainer.max_instances, names=names
+        )
     rule = rule_report_of(
         gaussians,
         train,
@@ -260,14 +294,21 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
         half_resolution=c.half_resolution,
         max_instances=trainer.max_instances,
     )
-    job.notes.append(rule["summary"])
-    job.say(f"  {rule['summary']}")
+    shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.extent)
+    options = options_for(c.rule, scene.background, gaussians, trainer.max_instances)
+    fractions = moved_fractions(train, (Rendered(*render_view(gaussians, v, options)) for v in train))
+    moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
+    for note in [rule["summary"], shape_summary(shape), *moved_notes(moved)]:
+        job.notes.append(note)
+        job.say(f"  {note}")
     return metrics | {
         "protocol": protocol_of(scene, job.request.split, job.request.downscale, train, test),
         "steps": trainer.step, "gaussians": len(gaussians), "preset": c.preset, "seed": c.seed,
         "config_hash": c.fingerprint(), "fingerprint": scene.fingerprint, "device": job.where.removeprefix("on "),
         "seconds": {**seconds, "total": time.perf_counter() - job.began}, **peak,
-        "memory": trainer.memory.to_json(), "rule": rule, **event_figures(trainer), **complexity_figures(trainer),
+        "memory": trainer.memory.to_json(), "rule": rule, "shape": shape,
+        **event_figures(trainer), **complexity_figures(trainer),
+        "photographs": [p.to_json() | {"moved": moved.get(p.name)} for p in job.photographs],
     }  # fmt: skip
 
 
@@ -332,6 +373,7 @@ def _print_result(job: _Job, metrics: dict[str, Any]) -> None:
     """Print scores, sizes and where the results are."""
     if metrics["test"]:
         job.say(f"held-out {score_line(metrics['test'])} over {len(metrics['views'])} views")
+        job.say(f"  {metrics['coverage']['summary']}")
         for name, value in metrics["baselines"].items():
             job.say(f"  without a fit, the {name.replace('_', ' ')} scores {value:.2f} dB")
     job.say(complexity_summary(metrics))

@@ -28,7 +28,7 @@ from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Camera, Gaussians, Normalization, Scene
 
 CONFIG = "config.json"
-IMAGE_FOLDERS = ("renders", "depth", "sampling")
+IMAGE_FOLDERS = ("renders", "depth", "coverage", "sampling")
 """Folders in a run folder with the images that its fit writes."""
 
 
@@ -82,7 +82,8 @@ def record_of(
         "scene_format": scene.format, "fingerprint": scene.fingerprint,
         "train": split.train, "test": split.test, "notes": notes,
         "normalization": {"offset": scene.normalization.offset.tolist(), "scale": scene.normalization.scale},
-        "background": scene.background, "config": config.to_json(), "config_hash": config.fingerprint(),
+        "background": scene.background, "transparent": scene.transparent,
+        "config": config.to_json(), "config_hash": config.fingerprint(),
         "device": device.type, "versions": versions(),
         "cameras": {v.name: _camera_values(v.camera) for v in scene.views},
     }  # fmt: skip
@@ -230,7 +231,7 @@ def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredR
     return StoredRun(
         Gaussians(**{n: t.to(where) for n, t in gaussians.tensors().items()}),
         Normalization(np.array(offset, np.float64), float(scale)),
-        cameras, train, test, rule, (red, green, blue), step, folder, record,
+        cameras, train, test, rule, (red, green, blue), step, folder, record, transparent=record.get("transparent", False),
     )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +53,8 @@ class FittedModel(Model):
     """Colour behind the scene."""
     step: int
     """Steps done."""
+    transparent: bool = field(default=False, kw_only=True)
+    """True where views of the scene know their opacity, so that renders are to be transparent."""
 
     def __repr__(self) -> str:
         """Say in one line what it is."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,8 +30,12 @@ class SceneRequest:
     """A frame without an image file is an error."""
     allow_outside: bool = False
     """Names and links of the scene may lead to images and masks outside its folder."""
-    invert_masks: bool = False
-    """White in a mask removes a pixel."""
+    masks: str = "ignore"
+    """Fate of pixels that a mask file does not keep: ignore (they do not count) or cutout (they are transparent)."""
+    mask_keeps: str = "white"
+    """Colour of a mask file that keeps a pixel: white or black."""
+    black_is_empty: bool = True
+    """Dark pixels around an object are transparent, where every image shows one on black."""
     score_masks: str | None = None
     """Folder of object masks for scoring, matched by image id; None for the scene's own `idrmasks`, if any."""
     reader: str | None = None
@@ -111,12 +116,13 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
     return split, notes
 
 
-def read_scene(request: SceneRequest) -> tuple[Scene, Split, list[str]]:
-    """Load a scene and split its views; returns both with the notes for the user."""
+def read_scene(request: SceneRequest, progress: Callable[[str], object] | None = None) -> tuple[Scene, Split, list[str]]:
+    """Load a scene and split its views; returns both with the notes for the user. ``progress`` is as in `load_scene`."""
     scene = load_scene(
         request.path, reader=request.reader, downscale=request.downscale, strict=request.strict,
-        allow_outside=request.allow_outside, invert_masks=request.invert_masks, score_masks=request.score_masks,
-        max_pixels=request.max_pixels,
+        allow_outside=request.allow_outside, masks=request.masks, mask_keeps=request.mask_keeps,
+        black_is_empty=request.black_is_empty, score_masks=request.score_masks, max_pixels=request.max_pixels,
+        progress=progress,
     )  # fmt: skip
     split, notes = choose_split(scene, request.split)
     return scene, split, [*scene.notes, *notes]

@@ -12,8 +12,18 @@ import numpy as np
 from warpgs.files import make_folder, write_bytes
 from warpgs.io.splits import Split
 from warpgs.kernels.sh import C0
-from warpgs.pipeline.metrics.evaluate import ViewMetrics, baselines, options_for, render_view, score, summarize, variants
+from warpgs.pipeline.metrics.evaluate import (
+    ALPHA_VARIANTS,
+    ViewMetrics,
+    baselines,
+    options_for,
+    render_view,
+    score,
+    summarize,
+    variants,
+)
 from warpgs.pipeline.metrics.lpips import Lpips
+from warpgs.pipeline.runs.coverage_report import coverage_section
 from warpgs.pipeline.runs.image_names import image_names
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.report.curve import curve
@@ -25,7 +35,9 @@ from warpgs.runtime.byte_units import format_bytes
 from warpgs.scene import Gaussians, Scene, View
 
 LABELS = {
-    "psnr": "PSNR [dB]", "ssim": "SSIM", "ssim_skimage": "SSIM (scikit-image)",
+    "psnr": "PSNR [dB]", "psnr_whole": "PSNR, whole image [dB]", "psnr_foreground": "PSNR, foreground [dB]",
+    "alpha_empty": "alpha where empty", "alpha_object": "alpha in the object",
+    "ssim": "SSIM", "ssim_skimage": "SSIM (scikit-image)",
     "lpips_vgg_legacy": "LPIPS-VGG [0, 1]", "lpips_vgg_standard": "LPIPS-VGG [-1, 1]",
     "lpips_alex_legacy": "LPIPS-Alex [0, 1]", "lpips_alex_standard": "LPIPS-Alex [-1, 1]", "lpips": "LPIPS",
 }  # fmt: skip
@@ -46,7 +58,11 @@ def score_keys(metrics: dict[str, Any]) -> list[str]:
 def score_line(scores: dict[str, float]) -> str:
     """Return mean scores as one line for people."""
     distances = [f", {LABELS[k]} {v:.3f}" for k, v in scores.items() if k.startswith("lpips")]
-    return f"PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f}{''.join(distances) or ', LPIPS not measured'}"
+    opacity = [f", {LABELS[k]} {v:.3f}" for k, v in scores.items() if k.startswith("alpha")]
+    if "psnr_foreground" in scores:
+        opacity.insert(0, f", PSNR of the foreground {scores['psnr_foreground']:.2f} dB")
+    lpips = "".join(distances) or ", LPIPS not measured"
+    return f"PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f}{''.join(opacity)}{lpips}"
 
 
 def protocol_of(scene: Scene, spec: str | None, downscale: int, train: list[View], test: list[View]) -> dict[str, Any]:
@@ -101,10 +117,10 @@ def evaluate_run(
             row = side_by_side([np.clip(image, 0, 1), view.image, error_map(image, view.image)])
             write_bytes(out / "renders" / name, png(row))
             write_bytes(out / "depth" / name, png(depth_map(depth, alpha)))
-        return score(view, image, lpips if test else None)
+        return score(view, image, lpips if test else None, alpha)
 
     def compare(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:
-        return score(view, image)
+        return score(view, image, alpha=alpha)
 
     tasks, jobs = [(finish, v) for v in test or train] + [(compare, v) for v in train if test], []
     with ThreadPoolExecutor(RENDER_WORKERS if lpips is None else 1) as render_workers:  # LPIPS takes much memory a view
@@ -116,7 +132,8 @@ def evaluate_run(
     rows, train_rows = found[: len(test)], found[-len(train) :]
     return {
         "test": summarize(rows), "train": summarize(train_rows),
-        "views": [r.row() for r in rows], "variants": variants(lpips),
+        "views": [r.row() for r in rows],
+        "variants": variants(lpips) | (ALPHA_VARIANTS if any(r.opacity for r in found) else {}),
         "baselines": baselines(train, test) if test else {},
     }  # fmt: skip
 
@@ -154,6 +171,8 @@ def _figures(metrics: dict[str, Any]) -> list[tuple[str, str]]:
             ("held-out PSNR", f"{metrics['test']['psnr']:.2f} dB"), ("held-out SSIM", f"{metrics['test']['ssim']:.3f}"),
             ("best baseline without a fit", f"{best:.2f} dB"),
         ]  # fmt: skip
+        alphas = [k for k in ("alpha_empty", "alpha_object") if k in metrics["test"]]
+        held_out += [(LABELS[k], f"{metrics['test'][k]:.3f}") for k in alphas]
     return [
         *held_out,
         ("training PSNR", f"{metrics['train']['psnr']:.2f} dB"), ("Gaussians", f"{metrics['gaussians']:,}"),
@@ -204,10 +223,15 @@ def write_report(
     ]
     keys = score_keys(metrics)
     table = [["view", *(LABELS.get(k, k) for k in keys), "pixels"]] + [
-        [r["name"], *(f"{r[k]:.{2 if k == 'psnr' else 4}f}" for k in keys), r["region"]] for r in metrics["views"]
+        [r["name"], *(f"{r.get(k, math.nan):.{2 if k.startswith('psnr') else 4}f}" for k in keys), r["region"]]
+        for r in metrics["views"]
     ]
     options = options_for(record["config"]["rule"], tuple(record["background"]), gaussians)
     images = _images(test or train, gaussians, options, {r["name"]: r for r in metrics["views"]})
+    covered = None
+    if "coverage" in metrics:
+        names = image_names(v.name for v in scene.views)
+        covered = coverage_section(out, metrics["coverage"], [v.name for v in images], names)
     camera = train[0].camera
     write_page(
         out / "report.html",
@@ -216,5 +240,6 @@ def write_report(
         f"{camera.width} x {camera.height} px, {metrics['device']}",
         figures=_figures(metrics), notes=notes, table=table, views=images, curves=curves, sampling=sampling,
         overview=overview, details={k: v for k, v in record.items() if k != "cameras"}, protocol=_protocol(metrics),
+        coverage=covered,
     )  # fmt: skip
     return why

@@ -45,7 +45,8 @@ _CAMERA = fields(
 _SCENE = fields(
     {
         "path": or_null(text), "split": or_null(text), "downscale": whole(1), "strict": flag, "allow_outside": flag,
-        "invert_masks": flag, "score_masks": or_null(text), "reader": or_null(text),
+        "masks": one_of("ignore", "cutout"), "mask_keeps": one_of("white", "black"), "black_is_empty": flag,
+        "score_masks": or_null(text), "reader": or_null(text),
     },
     {"max_pixels": whole(1)},
     others=False,
@@ -60,7 +61,7 @@ _RECORD = fields(
         ),
         "cameras": mapping(_CAMERA, _view_name),
     },
-    {"scene_format": text, "pruned": fields({"source": text})},
+    {"scene_format": text, "transparent": flag, "pruned": fields({"source": text})},
 )  # fmt: skip
 
 
@@ -80,16 +81,41 @@ def check_record(record: Any) -> None:
 
 MODEL_STATE = fields({"step": whole(0)})
 """Schema of the plain values in a checkpoint that a model is read from."""
+_SHAPE = fields(
+    {n: number(0) for n in ("largest", "largest_over_radius", "largest_over_extent")}
+    | {n: number(0) for n in ("needles", "needles_by_opacity", "thin")}
+    | {"radius": number(above=0), "extent": number(above=0), "beyond": whole(0)}
+)
+_PHOTOGRAPH = fields({
+    "name": _view_name, "compared_with": whole(0), "sharpness": or_null(number(0)), "brightness": or_null(number(0)),
+    "channels": or_null(items(number(0), 3)), "moved": or_null(number(0)),
+})  # fmt: skip
+_COVERED = mapping(
+    fields({
+        "pixels": whole(0), "share_of_pixels": number(0), "share_of_error": number(0), "psnr": or_null(real),
+        "ssim": or_null(real), "expected_psnr": or_null(real),
+    }),
+    one_of("0", "1", "2+", "background"),
+)  # fmt: skip
+OPACITY = ("psnr_whole", "psnr_foreground", "alpha_empty", "alpha_object")
+"""Scores of views that know their opacity, as `warpgs.pipeline.metrics.evaluate` defines them."""
 METRICS = fields(
     {
         "test": mapping(or_null(real)), "train": mapping(or_null(real)),
-        "views": items(fields({"name": text, "psnr": or_null(real)})),
+        "views": items(fields({"name": text, "psnr": or_null(real)}, dict.fromkeys(OPACITY, or_null(real)))),
         "variants": mapping(text), "config_hash": text, "steps": whole(0),
         "protocol": fields({
             "split": text, "training_views": whole(0), "held_out_views": whole(0), "ground_truth": text,
             "resolution": items(text), "score_masks": whole(0),
         }),
     },
-    {"gaussians": whole(0), "seconds": fields({"total": number(0)})},
+    {
+        "gaussians": whole(0), "seconds": fields({"total": number(0)}), "shape": _SHAPE,
+        "photographs": items(_PHOTOGRAPH),
+        "coverage": fields({
+            "classes": _COVERED, "views": items(fields({"name": text, "classes": _COVERED})), "tolerance": number(0),
+            "depth_differences": items(number(0)), "photo_psnr": or_null(items(or_null(real))), "summary": text,
+        }),
+    },
 )  # fmt: skip
 """Schema of metrics.json and of eval.json."""

@@ -13,7 +13,7 @@ from warpgs.pipeline.runs.request import FitRequest, choose_device, read_scene
 from warpgs.pipeline.study.ensure_run import ensure_run
 from warpgs.pipeline.study.study import FILES, SWITCHES, Place, Runs, StudyRequest, run_folder, scene_name, write_study
 from warpgs.pipeline.train.config import PRESETS, FitConfig
-from warpgs.pipeline.train.trainer import train_views
+from warpgs.pipeline.train.loop import train_views
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.runtime.terminal import say
 

@@ -12,6 +12,8 @@ from typing import Any
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.model.scale_limits import LimitConfig
+from warpgs.pipeline.train.background import color_of
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossConfig, LossTerm, check_terms
 from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES, find_strategy
@@ -27,16 +29,18 @@ class FitConfig:
     """All settings of a fit."""
 
     preset: str = "3dgs"
-    """Named set of settings that the others start from: paper, quick, balanced, strong-3dgs, 3dgs, mcmc, nexusgs, dropgaussian,
-    fsgs or paper-literal."""
-    steps: int = 7000
-    """Number of optimisation steps, one view each."""
+    """Named set of settings that the others start from: default, quick, 3dgs, mcmc or paper-literal."""
+    steps: int | None = 7000
+    """Number of optimisation steps, one view each; strategy holdout may end earlier. None: by the number of views."""
+    cpu_limit: bool = True
+    """Take no more steps on a CPU than two cores do in 1 to 20 minutes, where the steps follow from the number of views."""
     seed: int = 0
     """Seed of every random choice; the same seed, data and kind of device give the same bytes."""
     rule: str = "exact"
     """Cut-offs of the rasterizer: exact, balanced, fast, gsplat or inria."""
-    half_resolution: float = 0.0
-    """Fraction of the steps, from the first, in which views are fitted at half their size (docs/trade.md)."""
+    half_resolution: float | None = 0.0
+    """Fraction of the steps, from the first, in which views are fitted at half their size (docs/trade.md). None: by the number
+    of views."""
     sh_every: int = 1000
     """Number of steps after which the spherical-harmonics degree in use rises by one."""
     dropout: float = 0.0
@@ -55,6 +59,10 @@ class FitConfig:
     """CUDA graphs: a step is captured once and replayed; the same kernels and the same bytes as without, in less time."""
     max_gaussians: int = 1_000_000
     """Largest number of Gaussians, from the start on."""
+    background: str = "scene"
+    """Colour behind the scene, where no Gaussian lies: auto (the mean colour of the training views where they are opaque and
+    show no object on black, else as scene), mean, scene (that of the files: white for Blender, else black), black, white,
+    #rrggbb, or r,g,b in [0, 1]."""
     strategy: str = "clone_split"
     """Density strategy, which adds and removes Gaussians: clone_split, importance_sampling, holdout (held-out blocks of the
     training views decide how many there are and of which degree, docs/complexity.md), mcmc, or your own as module:Class or
@@ -74,6 +82,8 @@ class FitConfig:
     """Learning rates."""
     density: DensityConfig = field(default_factory=DensityConfig)
     """Settings of cloning, splitting and pruning (strategies clone_split, importance_sampling and holdout)."""
+    limits: LimitConfig = field(default_factory=LimitConfig)
+    """Limits of the size and the shape of every Gaussian."""
     phases: PhaseConfig = field(default_factory=PhaseConfig)
     """Lengths of the three phases, and times of sampling."""
     method: MethodConfig = field(default_factory=MethodConfig)
@@ -83,7 +93,7 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         for name in ("steps", "sh_every", "checkpoint_every", "dropout_views", "max_gaussians"):
-            if getattr(self, name) < 1:
+            if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise UsageError(f"{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
         if not 0 <= self.seed < 2**31:
             raise UsageError(f"seed must be a whole number from 0 to 2^31 - 1, not {self.seed}")
@@ -91,12 +101,13 @@ class FitConfig:
             raise UsageError(f"memory-limit must be at least one byte, not {self.memory_limit}")
         if not self.checkpoint_seconds >= 0:
             raise UsageError(f"checkpoint-seconds must be at least 0, not {self.checkpoint_seconds}")
-        if not 0 <= self.half_resolution <= 1:
+        if self.half_resolution is not None and not 0 <= self.half_resolution <= 1:
             raise UsageError(f"half-resolution must lie in [0, 1], not {self.half_resolution}")
         if not 0 <= self.dropout < 1:
             raise UsageError(f"dropout must lie in [0, 1), not {self.dropout}")
         if self.rule not in RULES:
             raise UsageError(f"rule {self.rule!r} is not one of {', '.join(RULES)}")
+        color_of(self.background)
         check_terms(self.loss_terms)
         if isinstance(self.strategy, type):
             object.__setattr__(self, "strategy", STRATEGIES.name_of(self.strategy))
@@ -142,74 +153,42 @@ def _compose(kind: type, values: dict[str, Any]) -> Any:
     return kind(**{k: _compose(kinds[k], v) if dataclasses.is_dataclass(kinds[k]) else v for k, v in values.items()})
 
 
-_SPARSE = FitConfig(
-    preset="strong-3dgs", steps=3000, sh_every=500, dropout=0.6, phases=PhaseConfig(coarse=2000, stable=3000),
-    init=InitConfig(sweep_up_to=30, max_sh_degree=1, merge_px=8, fill_px=32),
-    optimizer=OptimizerConfig(scales_lr=0.1, scales_decay=0.1), density=DensityConfig(gradient=5e-4),
-)  # fmt: skip
-_PAPER = dataclasses.replace(
-    _SPARSE, preset="paper", strategy="importance_sampling",
+_DEFAULT = FitConfig(
+    preset="default", background="auto", steps=None, half_resolution=None, sh_every=500, dropout=0.6, strategy="holdout",
+    phases=PhaseConfig(coarse=2000, stable=3000), init=InitConfig(sweep_up_to=1000, max_sh_degree=None, merge_px=8, fill_px=32),
+    optimizer=OptimizerConfig(scales_lr=None, scales_decay=0.1, opacities_lr=None), density=DensityConfig(gradient=5e-4),
+    holdout=HoldoutConfig(bounds=False, degrees=False, trim_db=0, levels=12, stop_db=0.1),
     method=MethodConfig(
         events=True, hier=True,
         sampler=SamplerConfig(depth="consistent", fraction=0.02, footprint=3.0, gate_quantile=0.0, max_fraction=2.0),
     ),
 )  # fmt: skip
-_NEXUS = FitConfig(
-    preset="nexusgs", steps=10_000, sh_every=500, init=InitConfig(source="flow", merge_px=0, fill_px=0),
-    optimizer=OptimizerConfig(scales_lr=0.03),
-    density=DensityConfig(gradient=5e-4, stop_fraction=1.0, reset_every=3000, reset_opacity=0.05, prune_size=0),
-)  # fmt: skip
 
 PRESETS: dict[str, FitConfig] = {
-    "paper": _PAPER,
-    "quick": dataclasses.replace(
-        _PAPER, preset="quick", steps=600, init=dataclasses.replace(_SPARSE.init, sweep_up_to=12)
-    ),
-    "balanced": dataclasses.replace(
-        _PAPER, preset="balanced", steps=1200, half_resolution=0.3, init=dataclasses.replace(_SPARSE.init, sweep_up_to=12)
-    ),
-    "strong-3dgs": _SPARSE,
-    "3dgs": FitConfig(),
+    "default": _DEFAULT,
+    "quick": dataclasses.replace(_DEFAULT, preset="quick", steps=600),
+    "3dgs": FitConfig(limits=LimitConfig(max_size=0, max_ratio=0)),
     "mcmc": FitConfig(
         preset="mcmc", strategy="mcmc", init=InitConfig(opacity=0.5, scale_factor=0.1),
-        optimizer=OptimizerConfig(scales_lr=0.005),
+        optimizer=OptimizerConfig(scales_lr=0.005), limits=LimitConfig(max_size=0, max_ratio=0),
     ),
-    "nexusgs": _NEXUS,
-    "dropgaussian": FitConfig(
-        preset="dropgaussian", steps=10_000, dropout=0.2, optimizer=OptimizerConfig(scales_lr=0.005),
-        density=DensityConfig(gradient=5e-4, stop_fraction=1.0, prune_size=0),
-    ),
-    "fsgs": FitConfig(
-        preset="fsgs", steps=10_000, sh_every=500, init=InitConfig(sweep_up_to=30), loss=LossConfig(depth_weight=0.05),
-        optimizer=OptimizerConfig(scales_lr=0.005),
+    "paper-literal": FitConfig(
+        preset="paper-literal", strategy="importance_sampling", steps=30_000, sh_every=500,
+        init=InitConfig(source="flow", merge_px=0, fill_px=0), optimizer=OptimizerConfig(scales_lr=0.03),
         density=DensityConfig(gradient=5e-4, stop_fraction=1.0, reset_every=3000, reset_opacity=0.05, prune_size=0),
-    ),
-    "paper-literal": dataclasses.replace(
-        _NEXUS, preset="paper-literal", strategy="importance_sampling", steps=30_000,
         phases=PhaseConfig(coarse=2000, stable=3000), method=MethodConfig(events=True, hier=True),
     ),
 }  # fmt: skip
 """Presets by name; `PRESET_NOTES` describes them."""
 
+DEFAULT_PRESET = "default"
+"""Preset where the user names none."""
+
 PRESET_NOTES: dict[str, str] = {
-    "paper": "the method, with the constants of docs/decisions/008-method.md",
-    "quick": "the method in a fifth of the steps of paper",
-    "balanced": "the method in two fifths of the steps of paper, the first of them at half size (docs/trade.md)",
-    "strong-3dgs": "the start, degree, learning rates, dropout and schedule of paper, none of its parts",
-    "3dgs": "Kerbl et al. 2023 without opacity resets, which cost decibels when views are few",
-    "mcmc": "Kheradmand et al. 2024, from the same points as 3dgs",
-    "nexusgs": (
-        "our trainer from a flow start with the thresholds and resets of Zheng et al. 2025; 10,000 of their 30,000 steps, "
-        "splits of 2 instead of 4, another flow: no reproduction"
-    ),
-    "dropgaussian": "our trainer with the dropout, threshold and learning rates of Park et al. 2025: no reproduction",
-    "fsgs": (
-        "our trainer with the depth term, learning rates, threshold and resets of Zhu et al. 2024, from our own sweep, without "
-        "their unpooling and unseen views: no reproduction"
-    ),
-    "paper-literal": "the paper on nexusgs, with what it leaves open as first proposed",
+    "default": "any capture: steps, degree and rates follow from the number of views, and the fit ends when it gains no more",
+    "quick": "a first look: the same in 600 steps",
+    "3dgs": "a baseline: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few",
+    "mcmc": "a baseline: Kheradmand et al. 2024, which fills a given number of Gaussians, from the same points as 3dgs",
+    "paper-literal": "the paper to the letter, with first proposals for what it leaves open; slow",
 }
 """One description of each preset."""
-
-DEFAULT_PRESET = {"cuda": "paper", "cpu": "quick"}
-"""Preset where the user names none, by kind of device."""

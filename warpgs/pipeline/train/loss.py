@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, TypeVar
 
+import numpy as np
 import torch
 
 from warpgs.errors import UsageError
@@ -17,6 +18,8 @@ from warpgs.scene import Gaussians, Prior, Render
 
 MIN_ALPHA = 0.5
 """Opacity above which the depth of a pixel counts: elsewhere the background contributes more."""
+BEHIND = 0x62616B67
+"""Key that sets random backgrounds apart from other random numbers of a fit."""
 FLAT = 1e-3
 """Standard deviation at or below which a map counts as constant, for a disparity in [0, 1] and for mean depth over depth, whose
 values lie around 1. The gradient of a correlation grows with the inverse of it."""
@@ -33,9 +36,14 @@ class LossConfig:
     none, 0.05 in FSGS (Zhu et al. 2024)."""
     depth_until: float = 0.95
     """Fraction of the steps, from the first, that have the depth term, in [0, 1]."""
+    random_background: bool = True
+    """True to set views that know their opacity, and their renders, before another colour at each step: what is empty cannot
+    be matched by Gaussians in the colour of the background. Opaque views do not have it."""
+    alpha_weight: float = 1.0
+    """Weight of the mean absolute difference of opacities, in views that know theirs, in [0, 1000]; 0 for no such term."""
 
     def __post_init__(self) -> None:
-        for name, most in (("depth_weight", 1000), ("depth_until", 1)):
+        for name, most in (("depth_weight", 1000), ("depth_until", 1), ("alpha_weight", 1000)):
             if not 0 <= getattr(self, name) <= most:
                 raise UsageError(f"loss {name.replace('_', ' ')} {getattr(self, name)} must lie between 0 and {most}")
         if not 0 <= self.ssim_weight <= 1:
@@ -137,6 +145,20 @@ class Target:
     """Maps that loss terms asked for (`LossTerm.needs`), by name, each of shape [H, W] or [H, W, C]."""
     params: Mapping[str, torch.Tensor]
     """The view's own parameters (`LossTerm.view_parameters`), by name, shape [...]; differentiable."""
+    alpha: torch.Tensor | None = None
+    """Opacity of what was photographed, in [0, 1], shape [H, W]; None where no training view has one. ``image`` and the render
+    are over the same colour, another one at each step where `LossConfig.random_background` says so."""
+
+
+def over(image: torch.Tensor, alpha: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
+    """Return an image [H, W, 3] of opacity ``alpha`` [H, W] over another background, its own plus ``shift`` [3]."""
+    return image + (1 - alpha)[..., None] * shift
+
+
+def random_shift(seed: int, step: int, background: Sequence[float]) -> tuple[float, float, float]:
+    """Return the colour behind a step's view less the scene's background [3]: uniform in [0, 1], by seed and step alone."""
+    red, green, blue = (b - a for a, b in zip(background, np.random.default_rng([seed, step, BEHIND]).random(3).tolist()))
+    return red, green, blue
 
 
 @dataclass(frozen=True)
@@ -240,6 +262,28 @@ class DepthCorrelation(LossTerm):
         return self.weight * depth_disagreement(render.depth, render.alpha, target.maps["disparity"], target.mask)
 
 
+@register("alpha")
+@dataclass(frozen=True)
+class AlphaDifference(LossTerm):
+    """The weighted mean absolute difference of rendered and true opacity, 0 in views that do not know theirs."""
+
+    weight: float = 0.1
+    """Weight of the term, in [0, 1000]."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.weight <= 1000:
+            raise UsageError(f"alpha: weight {self.weight} must lie between 0 and 1000")
+
+    def __call__(self, render: Render, target: Target, gaussians: Gaussians) -> torch.Tensor:
+        """Compute ``weight`` times the mean absolute difference of opacities over the pixels that count, shape []."""
+        if target.alpha is None:
+            return render.alpha.new_zeros(())
+        difference = (render.alpha - target.alpha).abs()
+        if target.mask is None:
+            return _total(difference) * (self.weight / target.alpha.numel())
+        return _total(difference * target.mask) / target.mask.sum().clamp_min(1) * self.weight
+
+
 Part = TypeVar("Part")
 
 
@@ -284,7 +328,8 @@ def collect(terms: Sequence[LossTerm], parts: Callable[[LossTerm], Mapping[str, 
     return found
 
 
-def built_in_terms(config: LossConfig) -> tuple[LossTerm, ...]:
-    """Return the terms that every fit has by its settings."""
+def built_in_terms(config: LossConfig, cutout: bool = False) -> tuple[LossTerm, ...]:
+    """Return the terms that every fit has by its settings; ``cutout`` says that its views know their opacity."""
     depth = (DepthCorrelation(config.depth_weight, config.depth_until),) if config.depth_weight > 0 else ()
-    return (Photometric(config.ssim_weight), *depth)
+    alpha = (AlphaDifference(config.alpha_weight),) if config.alpha_weight > 0 and cutout else ()
+    return (Photometric(config.ssim_weight), *depth, *alpha)

@@ -68,6 +68,8 @@ class Layout:
     """True on a CUDA device."""
     graphs: int = 0
     """CUDA graphs that exist at a time, one for each size of view; 0 where steps are taken one by one."""
+    cutout: bool = False
+    """True where views know their opacity."""
 
     @property
     def row(self) -> int:
@@ -93,16 +95,18 @@ class Layout:
         sorting = count * (FLOAT * 4 + 2 * 8)  # depths and order twice, two running sums
         images = 5 * FLOAT * pixels  # colour, alpha, depth
         kept = 3 * FLOAT * pixels  # transmittance, weight, end: what blending leaves for its gradient
-        upstream = FLOAT * pixels * (3 if self.cuda and not self.depth_supervised else 5)
+        upstream = FLOAT * pixels * (3 if self.cuda and not (self.depth_supervised or self.cutout) else 5)
         # three partials for each colour and the gradient; masked copies; the two maps that are correlated, with gradients
-        loss = FLOAT * pixels * ((36 if self.masked else 12) + 4 * self.depth_supervised)
+        # the difference of opacities and its gradient
+        loss = FLOAT * pixels * ((36 if self.masked else 12) + 4 * self.depth_supervised + 3 * self.cutout)
         if not self.cuda:
             loss += 5 * FLOAT * (3 * self.width + 30) * -(-self.height // 8)
         # an event keeps image, scores and gate of each view until its end
         seen = 7 * FLOAT * pixels * min(self.views, SAMPLED) if self.scored else 0
         sampling = {"sampling": projected + ranges + listing + seen + 3 * images} if self.scored else {}
-        # on CUDA a step copies image, mask and disparity of its view from the stacks
-        own = FLOAT * pixels * (3 + self.masked + self.depth_supervised) if self.cuda else 0
+        # on CUDA a step copies image, mask, opacity and disparity of its view from the stacks
+        own = FLOAT * pixels * (3 + self.masked + self.cutout + self.depth_supervised) if self.cuda else 0
+        own += FLOAT * pixels * 6 * self.cutout  # the image over the step's background, and what was added to it
         if chunked:  # nothing of a chunk waits for the loss; in the backward pass its images stand beside the whole ones
             apart = own + projected + 2 * one + images + upstream
             return {
@@ -242,16 +246,17 @@ def layout_of(
         table.gaussians.sh.shape[1], largest.width, largest.height, view_bytes([*views, *kept]),
         sum(c.element_size() for c in table.columns.values()), len(views), any(v.mask is not None for v in views),
         scored, depth_supervised, cuda, len({v.kind for v in views}) if cuda and captured else 0,
+        any(v.alpha is not None for v in views),
     )  # fmt: skip
 
 
 def view_bytes(views: Iterable[TrainingView]) -> int:
-    """Return the bytes of views: images, masks, maps and scores, memory that several share counted once.
+    """Return the bytes of views: images, masks, opacities, maps and scores, memory that several share counted once.
 
-    Stacks are not counted: on CUDA images, masks and maps of the views are parts of them (`stack_views`), elsewhere there are
-    none.
+    Stacks are not counted: on CUDA images, masks, opacities and maps of the views are parts of them (`stack_views`), elsewhere
+    there are none.
     """
-    tensors = (t for v in views for t in (v.image, v.mask, v.semantic, v.geometry, v.consistent, *v.maps.values()))
+    tensors = (t for v in views for t in (v.image, v.mask, v.alpha, v.semantic, v.geometry, v.consistent, *v.maps.values()))
     storages = (t.untyped_storage() for t in tensors if t is not None)
     return sum({s.data_ptr(): s.nbytes() for s in storages}.values())
 

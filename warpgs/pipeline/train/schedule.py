@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from warpgs.errors import UsageError
 
@@ -33,13 +33,14 @@ class OptimizerConfig:
     """The same at the last step; log-linear between."""
     quats_lr: float = 1e-3
     """Learning rate of the rotations."""
-    scales_lr: float = 0.01
-    """Learning rate of the log scales; 0.005 in the reference (docs/decisions/004-scale-rate.md)."""
+    scales_lr: float | None = 0.01
+    """Learning rate of the log scales; 0.005 in the reference (docs/decisions/004-scale-rate.md). None: by the number of
+    views."""
     scales_decay: float = 1.0
     """Fraction of that learning rate which is left at the last step; log-linear from the beginning of phase 3, or of a fit
     without phases. 1 for a constant rate."""
-    opacities_lr: float = 0.05
-    """Learning rate of the opacity logits."""
+    opacities_lr: float | None = 0.05
+    """Learning rate of the opacity logits. None: by the number of views."""
     sh_lr: float = 2.5e-3
     """Learning rate of the constant colour coefficient."""
     sh_rest_factor: float = 0.05
@@ -47,7 +48,7 @@ class OptimizerConfig:
 
     def __post_init__(self):
         for name, value in vars(self).items():
-            if not 0 < value <= MAX_LR:
+            if value is not None and not 0 < value <= MAX_LR:
                 raise UsageError(f"optimizer {name} must be positive and at most {MAX_LR:g}, not {value}")
 
     def lrs(self, progress: float, extent: float, stable_start: float = 0.0) -> dict[str, float]:
@@ -58,6 +59,7 @@ class OptimizerConfig:
             extent: Size of the scene [u], which the rate of the means is multiplied by.
             stable_start: Fraction of the fit, in [0, 1), after which the rate of the scales falls.
         """
+        assert self.scales_lr is not None and self.opacities_lr is not None  # `settings_by_views` has chosen
         stable = (progress - stable_start) / (1 - stable_start)
         return {
             "means": extent * log_linear(self.means_lr, self.means_lr_final, progress),
@@ -104,6 +106,23 @@ class Phases:
     """Steps done when phase 3 begins."""
     events: tuple[int, ...]
     """Steps done when fine Gaussians are sampled, ascending; the first is ``refine``, or 1 where that is 0."""
+    planned: int
+    """Steps of the fit as planned, by which learning rates fall up to phase 3."""
+    steps: int
+    """Steps of the fit: fewer than planned once phase 3 began early."""
+
+    def progress(self, step: int) -> float:
+        """Return the fraction of the fit that is done before a step counted from 1, in [0, 1]; phase 3 ends with 1."""
+        planned = max(1, self.planned - 1)
+        if self.steps == self.planned or step <= self.stable_start:
+            return (step - 1) / planned
+        begun = (self.stable_start - 1) / planned
+        return begun + (1 - begun) * (step - self.stable_start) / (self.steps - self.stable_start)
+
+    def stable_from(self, step: int) -> Phases:
+        """Return the phases of which the third begins after ``step``, before its time: shorter by as much as the first two."""
+        length = round((self.planned - self.stable_start) * step / max(1, self.stable_start))
+        return replace(self, stable_start=step, steps=min(self.planned, step + max(1, length)))
 
 
 def plan_phases(config: PhaseConfig, steps: int) -> Phases:
@@ -118,4 +137,4 @@ def plan_phases(config: PhaseConfig, steps: int) -> Phases:
     while at < length:
         events.append(max(1, refine + int(at)))
         at += max(1.0, shrink * config.every) * (1 + config.growth * at / length)
-    return Phases(refine, stable_start, tuple(events))
+    return Phases(refine, stable_start, tuple(events), steps, steps)

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from warpgs.pipeline.metrics.region import counted_region
+from warpgs.pipeline.metrics.region import fitted_region
 from warpgs.pipeline.model.init import Start, check_points, initial_points, subsample
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LossTerm, built_in_terms, collect
 from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.strategies.importance_sampling import scored
-from warpgs.pipeline.train.views import TrainingView
+from warpgs.pipeline.train.views import TrainingView, with_alpha
 from warpgs.priors.cache import cache_folder
 from warpgs.priors.view_prior import view_priors
 from warpgs.scene import PointCloud, Prior, View
@@ -36,7 +36,7 @@ class Preparation:
 
 def prepare(
     train: list[View], points: PointCloud | None, config: FitConfig, generator: np.random.Generator, device: torch.device,
-    priors: list[Prior] | None, ready: Callable[[], object],
+    priors: list[Prior] | None, ready: Callable[[], object], progress: Callable[[str], object] = lambda line: None,
 ) -> Preparation:  # fmt: skip
     """Find the first points, and priors where they are not given and sampling or the depth term asks for them.
 
@@ -48,6 +48,7 @@ def prepare(
         device: Device to sweep on, unless there is a memory limit: depths take more than a step may.
         priors: Prior of each view; None to compute them where they are needed.
         ready: Called before the device is used, and in any case before the end.
+        progress: Called with a line for the user on what is being done.
 
     Raises:
         DataError: There is nothing to start from.
@@ -61,12 +62,14 @@ def prepare(
 
     @functools.cache
     def start() -> Start:
-        found = initial_points(train, points, config.init, generator, usable)
+        progress("finding the first points")
+        found = initial_points(train, points, config.init, generator, usable, progress)
         return subsample(found, config.max_gaussians, generator)
 
     notes = []
     if priors is None and needs_priors(config):
-        regions, cache = [counted_region(v)[0] for v in train], cache_folder()
+        regions, cache = [fitted_region(v)[0] for v in train], cache_folder()
+        progress("finding what stands out in the views")
         # semantics come first: they are found while the device is made ready
         priors, notes = view_priors(train, config.priors, depths=lambda: start().depths, regions=regions, cache=cache)
     found = start()
@@ -91,7 +94,7 @@ def prepared_views(
     Raises:
         UsageError: Two loss terms ask for a map of one name.
     """
-    views, disparities = [TrainingView.of(v, device) for v in train], []
+    views, disparities = [TrainingView.of(v, device) for v in with_alpha(train)], []
     priors = made.priors or [None] * len(train)
     if find_strategy(config.strategy).samples(config):
         disparities = [p.disparity for p in priors]

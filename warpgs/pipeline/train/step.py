@@ -21,8 +21,9 @@ from warpgs.kernels.project import project
 from warpgs.kernels.step_buffers import NOT_FINITE, begin_step, end_step
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, bin_tiles
 from warpgs.pipeline.metrics.psnr import masked_mse
+from warpgs.pipeline.model.scale_limits import NO_LIMITS, Limits
 from warpgs.pipeline.model.table import Table
-from warpgs.pipeline.train.loss import LossTerm, Target
+from warpgs.pipeline.train.loss import LossTerm, Target, over
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.views import Kind, Rows, ViewStack
 from warpgs.render.rasterize import RasterizeOptions, rasterize
@@ -50,6 +51,8 @@ class StepPlan:
     """Loss terms, in the order in which they are summed."""
     phase: Hashable
     """Value of `Strategy.phase`."""
+    limits: Limits = NO_LIMITS
+    """Limits that the step holds every Gaussian to."""
 
 
 class StepBuffers:
@@ -63,8 +66,9 @@ class StepBuffers:
         """Row of each step's view in its stack."""
         self.lr_rows = torch.ones(rows, lrs, device=device)
         """Learning rates of each step (`Table.lr_row` of all tables)."""
-        self.setting_rows = torch.zeros(rows, 3, device=device)
-        """Dropout probability, number, and learning rate of the means [u] of each step."""
+        self.setting_rows = torch.zeros(rows, 6, device=device)
+        """Dropout probability, number, and learning rate of the means [u] of each step; and the colour behind its view, less
+        the scene's."""
         self.counter = torch.zeros(1, dtype=torch.int64, device=device)
         """Number of the current step in its batch. It stays once a step stops, and so do all Gaussians."""
         self.stop = torch.zeros(1, dtype=torch.int32, device=device)
@@ -74,8 +78,8 @@ class StepBuffers:
         self.one = torch.ones((), device=device)
         """Gradient of the loss."""
 
-    def load(self, rows: list[int], lrs: list[list[float]], settings: list[tuple[float, float, float]]) -> None:
-        """Upload view rows, learning rates and settings of the next steps, at most `MAX_BATCH`."""
+    def load(self, rows: list[int], lrs: list[list[float]], settings: list[tuple[float, ...]]) -> None:
+        """Upload view rows, learning rates and settings (6 each) of the next steps, at most `MAX_BATCH`."""
         self.counter.zero_()
         self.stop.zero_()
         self.view_rows[: len(rows)] = torch.tensor(rows).to(self.device)
@@ -88,7 +92,7 @@ class StepBuffers:
         return done, stop, self.history[: done + 1].tolist()
 
     def begin(self, views: ViewStack) -> tuple[torch.Tensor, ...]:
-        """Return learning rates, settings [3], viewmat [1, 4, 4], K [1, 3, 3] and image [H, W, 3] of the current step."""
+        """Return learning rates, settings [6], viewmat [1, 4, 4], K [1, 3, 3] and image [H, W, 3] of the current step."""
         if self.device.type == "cpu":  # no copies
             step, row = int(self.counter), int(self.view_rows[int(self.counter)])
             view = views.viewmats[row : row + 1], views.Ks[row : row + 1], views.images[row]
@@ -104,16 +108,20 @@ class StepBuffers:
         return maps.index_select(0, self.view_rows.index_select(0, self.counter))[0]
 
 
-Renderer = Callable[[Gaussians, Camera, int, "torch.Tensor | None"], Render]
-"""Function that renders Gaussians for a camera with tensors of one view, a degree, and factors of the opacities."""
+Renderer = Callable[[Gaussians, Camera, int, "torch.Tensor | None", "torch.Tensor | None"], Render]
+"""Function that renders Gaussians for a camera with tensors of one view, a degree, factors of the opacities, and a colour [3]
+that is added to the background."""
 
 
 def eager_renderer(rule: str, background: torch.Tensor, max_instances: int | None) -> Renderer:
     """Return a renderer whose capacity follows the instances, in chunks of at most ``max_instances``; background [3]."""
 
-    def render(gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None) -> Render:
+    def render(
+        gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None, shift: torch.Tensor | None
+    ) -> Render:
+        behind = background if shift is None else background + shift
         options = RasterizeOptions(
-            rule=rule, sh_degree=degree, background=background, opacity_factors=factors, max_instances=max_instances,
+            rule=rule, sh_degree=degree, background=behind, opacity_factors=factors, max_instances=max_instances,
             record=False,  # it would allocate more than was planned
         )  # fmt: skip
         camera = replace(camera, viewmat=camera.viewmat[0], K=camera.K[0])
@@ -126,13 +134,16 @@ def captured_renderer(rule: str, background: torch.Tensor, capacity: int, overfl
     """Return a renderer with a fixed capacity of instances, which sets ``overflow`` [1] if they do not fit; background [3]."""
     cut, backgrounds = RULES[rule], background[None]
 
-    def render(gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None) -> Render:
+    def render(
+        gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None, shift: torch.Tensor | None
+    ) -> Render:
+        behind = backgrounds if shift is None else backgrounds + shift
         size = {"width": camera.width, "height": camera.height}
         of = (*gaussians.tensors().values(), camera.viewmat, camera.K)
         projected, counts = project(*of, **size, degree=degree, rule=cut, opacity_factors=factors)
         tiles = bin_tiles(projected, counts, **size, rule=cut, capacity=capacity, overflow=overflow)
         # not p[0], whose gradient would be a copy among zeros
-        images = (p.squeeze(0) for p in blend(projected, tiles, backgrounds, **size, rule=cut))
+        images = (p.squeeze(0) for p in blend(projected, tiles, behind, **size, rule=cut))
         return Render(*images, projected, counts)
 
     return render
@@ -169,11 +180,15 @@ def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPla
     mask = None if views.masks is None else buffers.of_view(views.masks)
     number = buffers.of_view(views.numbers).view(1)
     own = {n: t.index_select(0, number)[0] for n, t in learned.views.params.items()}  # not t[number], which reads it back
-    target = Target(image, mask, {n: buffers.of_view(t) for n, t in views.maps.items()}, own)
+    alpha = shift = None
+    if views.alphas is not None:
+        alpha, shift = buffers.of_view(views.alphas), settings[3:]
+        image = over(image, alpha, shift)
+    target = Target(image, mask, {n: buffers.of_view(t) for n, t in views.maps.items()}, own, alpha)
     factors = None
     if learned.dropout_seed is not None:
         factors = opacity_dropout(len(table), settings[:2], learned.dropout_seed)
-    rendered = render(table.gaussians, Camera(viewmat, K, **views.size), plan.degree, factors)
+    rendered = render(table.gaussians, Camera(viewmat, K, **views.size), plan.degree, factors, shift)
     loss = total_loss(plan, rendered, target, table.gaussians, strategy)
 
     projected, split = rendered.projected, 3 * len(table.params)
@@ -183,7 +198,8 @@ def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPla
         going = end_step(loss, masked_mse(rendered.rgb, image, mask), buffers.counter, buffers.stop, buffers.history)
         table.adam_step(dict(zip(table.params, gradients)), lrs[:split], buffers.stop, strategy.lr_factors(plan.phase))
         learned.views.adam_step(dict(zip(learned.views.params, gradients[len(table.params) :])), lrs[split:], buffers.stop)
-        strategy.after_step(plan.phase, settings, going)
+        strategy.after_step(plan.phase, settings[:3], going)
+        plan.limits.apply(table.params, going)
         size = (views.size["width"], views.size["height"])
         strategy.after_backward(plan.phase, v_projected, rendered.visible, size, going)
 

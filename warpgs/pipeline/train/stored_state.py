@@ -28,7 +28,7 @@ def check_state(
     """
     state = fields({
         "step": whole(0, steps), "order": items(whole(0, views - 1)), "extent": number(above=0), "notes": items(text),
-        "strategy": mapping(anything),
+        "strategy": mapping(anything), "stable_start": whole(0, steps), "steps": whole(1, steps),
     })  # fmt: skip
     try:
         state(plain, "")

@@ -15,9 +15,11 @@ from warpgs.errors import DataError, NotFiniteError, OutOfMemoryError, ResourceE
 from warpgs.kernels.step_buffers import NOT_FINITE
 from warpgs.pipeline.metrics.psnr import psnr_of
 from warpgs.pipeline.model.init import initial_gaussians, scene_extent
+from warpgs.pipeline.model.scale_limits import scene_radius
 from warpgs.pipeline.model.table import Table
+from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import built_in_terms, collect
+from warpgs.pipeline.train.loss import built_in_terms, collect, random_shift
 from warpgs.pipeline.train.memory_plan import Layout, layout_of, most_instances, plan
 from warpgs.pipeline.train.schedule import plan_phases
 from warpgs.pipeline.train.setup import prepare, prepared_views
@@ -37,7 +39,7 @@ from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.views import Kind, TrainingView, half_size, stack_views
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.device_memory import available_bytes, is_out_of_memory, no_memory_message
-from warpgs.scene import Gaussians, PointCloud, Prior, Scene, View
+from warpgs.scene import Gaussians, PointCloud, Prior, View
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class Trainer:
     def __init__(
         self, train: list[View], points: PointCloud | None, config: FitConfig, device: torch.device,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0), priors: list[Prior] | None = None,
-        ready: Callable[[], object] = lambda: None,
+        ready: Callable[[], object] = lambda: None, *, progress: Callable[[str], object] = lambda line: None,
     ):  # fmt: skip
         """Set up the first Gaussians.
 
@@ -77,6 +79,7 @@ class Trainer:
             background: Colour behind the scene.
             priors: Prior of each view; None to compute them where sampling or a loss term needs them.
             ready: Called before the device is used.
+            progress: Called with a line for the user on what is done before the first step.
 
         Raises:
             DataError: There is nothing to start from.
@@ -85,21 +88,26 @@ class Trainer:
         """
         if not train:
             raise DataError("there is no training view; name at least one in --split")
+        config, chosen = settings_by_views(config, train, device.type)
         self.config, self.device = config, device
         self.generator = torch.Generator().manual_seed(config.seed)
-        made = prepare(train, points, config, np.random.default_rng(config.seed), device, priors, ready)
+        made = prepare(train, points, config, np.random.default_rng(config.seed), device, priors, ready, progress)
+        made.notes[:0] = chosen
         self.notes: list[str] = made.notes
         """Sentences on what was chosen for the user before the first step."""
         self.messages: list[str] = []
         """Sentences for the user that were not shown yet."""
-        cloud = made.start.cloud
-        self.extent = scene_extent([v.camera for v in train], cloud)
+        cloud, cameras = made.start.cloud, [v.camera for v in train]
+        self.extent = scene_extent(cameras, cloud)
         """Size of the scene [u], as `scene_extent` measures it."""
-        self.background = torch.tensor(background, dtype=torch.float32, device=device)
+        self.radius = scene_radius(cameras, cloud)
+        """Radius of the scene [u], as `scene_radius` measures it."""
+        self.scene_background, self.background = background, torch.tensor(background, dtype=torch.float32, device=device)
         self.phases = plan_phases(config.phases, config.steps)
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
         """Dropout probability at the last step."""
-        self.terms = (*built_in_terms(config.loss), *config.loss_terms)
+        self.cutout = any(v.alpha is not None for v in train)  # some know their opacity: all have one then
+        self.terms = (*built_in_terms(config.loss, self.cutout), *config.loss_terms)
         self.step = 0
         """Steps taken."""
         self.memory_limit, self.captured = config.memory_limit, config.cuda_graph
@@ -114,8 +122,7 @@ class Trainer:
         self.view_table = Table(first, {}, device, len(train))
         self.view_lrs = {n: p.lr for n, p in own.items()}
         self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(first)))
-        seed = config.seed if self.dropout > 0 else None
-        self.learned = Learned(self.table, self.view_table, self.strategy, seed)
+        self.learned = Learned(self.table, self.view_table, self.strategy, config.seed if self.dropout > 0 else None)
         self.graphs = StepGraphs(self.learned, self.buffers, config.rule, self.background) if device.type == "cuda" else None
         self.layout: Layout
         self.max_instances: int | None = None
@@ -133,15 +140,27 @@ class Trainer:
         """Number of Gaussians that the settings and the memory limit allow."""
         return min(self.config.max_gaussians, self.memory.cap)
 
+    @property
+    def steps(self) -> int:
+        """Steps of the fit: those of the settings, or fewer once phase 3 began early."""
+        return self.phases.steps
+
     def progress(self, step: int) -> float:
         """Return the fraction of the fit that is done before a step, in [0, 1]."""
-        return (step - 1) / max(1, self.config.steps - 1)
+        return self.phases.progress(step)
+
+    def end_growth(self) -> None:
+        """Begin phase 3 after the step that was just taken, where it is not there yet."""
+        if self.step < self.phases.stable_start < self.config.steps:
+            self.phases = self.phases.stable_from(self.step)
 
     def plan_of(self, step: int) -> StepPlan:
         """Return the plan of a step, counted from 1."""
         c = self.config
         terms = tuple(t for t in self.terms if t.active(step, c.steps))
-        return StepPlan(self.strategy.sh_degree(step), step <= c.half_resolution * c.steps, terms, self.strategy.phase(step))
+        strategy, half = self.strategy, step <= c.half_resolution * c.steps
+        limits = c.limits.at(1.0 if step >= self.steps else self.progress(step), self.radius)
+        return StepPlan(strategy.sh_degree(step), half, terms, strategy.phase(step), limits)
 
     def next_view(self) -> int:
         """Return the number of the next view; they come in random order, each once before any comes again."""
@@ -207,7 +226,7 @@ class Trainer:
         plan, count = self.plan_of(first), 1
         if self.layout.graphs:
             while (
-                count < min(limit, MAX_BATCH, self.config.steps - self.step)
+                count < min(limit, MAX_BATCH, self.steps - self.step)
                 and self.plan_of(first + count) == plan
                 and not self.strategy.due(first + count - 1)
             ):
@@ -261,8 +280,7 @@ class Trainer:
         return True
 
     def _lr_row(self, step: int) -> list[float]:
-        c = self.config.optimizer
-        row = self.table.lr_row(self.lrs(step), step, c.head_lrs)
+        row = self.table.lr_row(self.lrs(step), step, self.config.optimizer.head_lrs)
         return row + self.view_table.lr_row(self.view_lrs, step, {})
 
     def lrs(self, step: int) -> dict[str, float]:
@@ -271,9 +289,11 @@ class Trainer:
         stable_start = phases.stable_start / c.steps if phases.stable_start < c.steps else 0.0
         return c.optimizer.lrs(self.progress(step), self.extent, stable_start)
 
-    def settings(self, step: int) -> tuple[float, float, float]:
-        """Return dropout probability, number, and learning rate of the means [u] of a step, as `StepBuffers` takes them."""
-        return self.strategy.dropout(step), step, self.lrs(step)["means"]
+    def settings(self, step: int) -> tuple[float, ...]:
+        """Return the six settings of a step, as `StepBuffers` takes them."""
+        shifted = self.cutout and self.config.loss.random_background
+        shift = random_shift(self.config.seed, step, self.scene_background) if shifted else (0.0, 0.0, 0.0)
+        return self.strategy.dropout(step), step, self.lrs(step)["means"], *shift
 
     def _update(self) -> None:
         """Have the strategy change the set of Gaussians after the step that was just taken, where that is due."""
@@ -283,6 +303,7 @@ class Trainer:
         for change in self.strategy.update(self.step):
             self.table.apply(change)
             self.count_changed()
+        self.plan_of(self.step).limits.hold(self.table.params["log_scales"])
 
     def _forget_graphs(self) -> None:
         if self.graphs is not None:
@@ -319,6 +340,7 @@ class Trainer:
         plain = {
             "step": self.step, "order": self.order, "extent": self.extent, "notes": self.notes,
             "config": self.config.to_json(), "strategy": strategy,
+            "stable_start": self.phases.stable_start, "steps": self.steps,
         }  # fmt: skip
         return tensors, plain
 
@@ -330,68 +352,10 @@ class Trainer:
         """
         check_state(tensors, plain, views=len(self.views), steps=self.config.steps, strategy=self.strategy.STATE)
         self.step, self.order = plain["step"], list(plain["order"])
+        self.phases = dataclasses.replace(self.phases, stable_start=plain["stable_start"], steps=plain["steps"])
         self.extent, self.notes = plain["extent"], plain["notes"]
         self.table.load(tensors)
         self.view_table.load({n.removeprefix("views."): t for n, t in tensors.items() if n.startswith("views.")})
         self.strategy.load(tensors, plain["strategy"])
         self.set_views(self.views)
         self.generator.set_state(tensors["generator"])
-
-
-def train_views(scene: Scene, names: tuple[str, ...]) -> list[View]:
-    """Return the named views of a scene, in the order named."""
-    return [scene.view(n) for n in names]
-
-
-def run(
-    trainer: Trainer,
-    on_step: Callable[[StepReport], None],
-    save: Callable[[Trainer], None],
-    stopped: Callable[[], bool],
-    restore: Callable[[Trainer], bool] = lambda _: False,
-) -> None:
-    """Take all remaining steps, reporting each and saving now and then and at the end.
-
-    A step that runs out of memory is tried once more with less (`Trainer.spare_memory`), from the last saved state where the
-    set of Gaussians was being changed.
-
-    Args:
-        trainer: The fit.
-        on_step: Called after each step.
-        save: Saves the state.
-        stopped: Whether to end after a step.
-        restore: Loads the state that was saved last; returns False where there is none.
-
-    Raises:
-        NotFiniteError: The loss or, when it is to be saved, a number of the state is not finite; nothing of it is saved.
-        OutOfMemoryError: A step ran out of memory twice; the state before it is saved where it is whole.
-        KeyboardInterrupt: ``stopped`` returned True after a step; the state after it is saved.
-    """
-    every, saved, ran_out = trainer.config.checkpoint_every, time.monotonic(), -1
-    while trainer.step < trainer.config.steps:
-        reports, failure = [], None
-        try:
-            reports = trainer.advance(every - trainer.step % every)
-        except OutOfMemoryError as e:
-            failure = e.with_traceback(None)  # whose frames hold tensors
-            failure.__cause__ = failure.__context__ = None
-        if failure is not None:
-            again, ran_out = trainer.step > ran_out, trainer.step
-            try:
-                if not again or not (failure.intact or restore(trainer)):
-                    raise failure
-                trainer.spare_memory()
-            except ResourceError:
-                if failure.intact:
-                    save(trainer)
-                raise
-            continue
-        for report in reports:
-            on_step(report)
-        stop = stopped()
-        due = trainer.step % every == 0 and time.monotonic() - saved >= trainer.config.checkpoint_seconds
-        if stop or due or trainer.step == trainer.config.steps:
-            save(trainer)
-            saved = time.monotonic()
-        if stop:
-            raise KeyboardInterrupt

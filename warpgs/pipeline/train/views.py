@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import torch
 from torch.nn.functional import interpolate
 
+from warpgs.pipeline.metrics.region import OPAQUE
 from warpgs.scene import Camera, View
 
 Kind = tuple[int, int, bool]
@@ -32,28 +34,46 @@ class TrainingView:
     """Geometrically consistent z-depth [u], 0 where no other view confirms it, shape [H, W]; None for none at all."""
     maps: Mapping[str, torch.Tensor] = field(default_factory=dict)
     """Maps that loss terms asked for, by name, each of shape [H, W] or [H, W, C]."""
+    alpha: torch.Tensor | None = None
+    """Opacity of what was photographed, in [0, 1], shape [H, W]; None where no training view has one (`with_alpha`)."""
 
     @staticmethod
     def of(view: View, device: torch.device) -> TrainingView:
-        """Return a view's pixels, mask and camera in float32 on a device."""
+        """Return a view's pixels, mask, opacity and camera in float32 on a device."""
 
         def there(array):
             return torch.as_tensor(array, dtype=torch.float32, device=device)
 
         c = view.camera
         camera = replace(c, viewmat=there(c.viewmat), K=there(c.K))
-        return TrainingView(camera, there(view.image), None if view.mask is None else there(view.mask))
+        mask, alpha = (None if a is None else there(a) for a in (view.mask, view.alpha))
+        return TrainingView(camera, there(view.image), mask, alpha=alpha)
 
     @property
     def kind(self) -> Kind:
         """Width, height and presence of a mask, which the views of one stack share."""
         return self.camera.width, self.camera.height, self.mask is not None
 
+    @property
+    def countable(self) -> torch.Tensor | None:
+        """Mask of the pixels that show something which counts, 1 or 0, shape [H, W]; None where all do."""
+        if self.alpha is None:
+            return self.mask
+        opaque = (self.alpha > OPAQUE).to(self.image.dtype)
+        return opaque if self.mask is None else opaque * self.mask
+
+
+def with_alpha(views: Sequence[View]) -> list[View]:
+    """Return the views, opaque ones with an opacity of 1 everywhere [H, W] if another one has an opacity: all have one then."""
+    if all(v.alpha is None for v in views):
+        return list(views)
+    return [replace(v, alpha=np.ones(v.image.shape[:2], np.float32)) if v.alpha is None else v for v in views]
+
 
 def half_size(view: TrainingView) -> TrainingView:
     """Return the view with both sides halved, rounded down but to at least one pixel; without scores.
 
-    Colours and maps are means over what a pixel covers, and a pixel counts where all of that does.
+    Colours, opacities and maps are means over what a pixel covers, and a pixel counts where all of that does.
     """
     c = view.camera
     width, height = max(1, c.width // 2), max(1, c.height // 2)
@@ -67,7 +87,8 @@ def half_size(view: TrainingView) -> TrainingView:
 
     mask = None if view.mask is None else (mean(view.mask[None])[0] > 1 - 1e-4).to(view.mask.dtype)
     camera = replace(c, K=scale[:, None] * c.K, width=width, height=height)
-    return TrainingView(camera, smaller(view.image), mask, maps={n: smaller(t) for n, t in view.maps.items()})
+    maps, alpha = {n: smaller(t) for n, t in view.maps.items()}, None if view.alpha is None else smaller(view.alpha)
+    return TrainingView(camera, smaller(view.image), mask, maps=maps, alpha=alpha)
 
 
 Rows = torch.Tensor | tuple[torch.Tensor, ...]
@@ -90,6 +111,8 @@ class ViewStack:
     """Maps that loss terms asked for, by name, each of shape [V, H, W, ...]."""
     numbers: torch.Tensor
     """Number of each view among all training views, int64, shape [V]."""
+    alphas: Rows | None = None
+    """Opacity of what was photographed, shape [V, H, W]; None where no training view has one."""
 
     @property
     def size(self) -> dict[str, int]:
@@ -140,10 +163,12 @@ def stack_views(
             stacked([v.image for v in same]), stacked([v.mask for v in same]) if kind[2] else None,
             {n: stacked([v.maps[n] for v in same]) for n in same[0].maps},
             torch.tensor([i % count for i in numbers], device=device),
+            None if same[0].alpha is None else stacked([v.alpha for v in same]),
         )  # fmt: skip
         for row, i in enumerate(numbers):
             maps = {n: t[row] for n, t in stack.maps.items()}
             mask = None if stack.masks is None else stack.masks[row]
-            shared[i] = replace(views[i], image=stack.images[row], mask=mask, maps=maps)
+            alpha = None if stack.alphas is None else stack.alphas[row]
+            shared[i] = replace(views[i], image=stack.images[row], mask=mask, maps=maps, alpha=alpha)
         stacks[kind] = stack
     return shared, stacks, [(k, kinds[:i].count(k)) for i, k in enumerate(kinds)]

@@ -18,8 +18,9 @@ import torch
 from warpgs.pipeline.metrics.evaluate import render_view, score
 from warpgs.pipeline.model.init import sweeps
 from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loop import run
 from warpgs.pipeline.train.strategies.base import find_strategy
-from warpgs.pipeline.train.trainer import Trainer, run
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.priors.sweep import SweepConfig, sweep_depths
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.scene import Camera, PointCloud, Prior, View

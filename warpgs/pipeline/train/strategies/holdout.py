@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 
 import torch
 
@@ -24,6 +24,7 @@ from warpgs.pipeline.train.strategies.holdout_blocks import (
     FLOOR,
     MIN_BLOCKS,
     Gain,
+    Level,
     block_errors,
     decibels,
     gain,
@@ -39,36 +40,18 @@ from warpgs.scene import Gaussians
 RECOVERED_AGAIN = 0.5
 """Fraction of what training recovered of one trim that it is expected to recover of the next: a smaller model recovers less.
 With all of it smooth walls ended up to 1.1 dB below `HoldoutConfig.enough_db`, with half of it there (docs/complexity.md)."""
+LATELY = 1.5
+"""Factor by which the steps grow while less than `HoldoutConfig.stop_db` is gained, for a fit to end."""
 NEAR = 4.0
 """Distance below `HoldoutConfig.enough_db` over which the loss that a trim may cause falls to 0 [dB]. With a threshold instead,
 a tenth of a decibel decided whether a smooth wall kept 167 or 696 Gaussians (docs/complexity.md)."""
-
-
-@dataclass(frozen=True)
-class Level:
-    """One level of growth and what it gained; plain values as metrics.json has them."""
-
-    step: int
-    """Steps done when it was measured."""
-    count: int
-    """Gaussians at that step."""
-    held_out_psnr: float
-    """PSNR of the held-out blocks, the error floor included [dB]."""
-    fall: float
-    """Fall of the held-out error since the level before, by growth and training together [dB]."""
-    own: float
-    """Loss when the Gaussians that came with the level are hidden [dB]."""
-    gain: float
-    """The smaller of the two, which are both upper bounds of the gain by growth [dB]."""
-    noise: float
-    """Standard error of ``gain`` over the blocks [dB]."""
 
 
 _COUNT = schema.whole(0)
 _LEVEL = {f.name: _COUNT if f.name in ("step", "count") else schema.real for f in fields(Level)}
 STATE = schema.fields({
     "was_reset": schema.flag, "events": schema.items(EVENT), "closed": schema.or_null(_COUNT), "why": schema.text,
-    "levels": schema.items(schema.fields(_LEVEL, others=False)), "growing": _COUNT,
+    "levels": schema.items(schema.fields(_LEVEL, others=False)), "growing": _COUNT, "measured": schema.items(_COUNT),
     "trims": schema.items(schema.fields({
         "step": _COUNT, "before": schema.whole(1), "after": _COUNT, "psnr": schema.items(schema.real, 2),
     })),
@@ -101,6 +84,8 @@ class Holdout(ImportanceSampling):
         """Level of growth that new Gaussians come with."""
         self.before: torch.Tensor | None = None
         """Errors of the blocks when they were measured last, shape [B]."""
+        self.measured: list[tuple[int, torch.Tensor]] = []
+        """Steps done, and errors of the blocks [B], of every measurement, where the end of the fit follows from them."""
 
     def columns(self):
         """Return the columns of importance sampling, the bounds of each Gaussian, and the level of growth that it came with."""
@@ -117,7 +102,10 @@ class Holdout(ImportanceSampling):
         begins = t.phases.refine if c.method.events else c.density.times(c.steps)[0]
         ends = self._growth_ends
         levels = c.holdout.levels
-        self.marks = sorted({max(1, begins + round(k * (ends - begins) / levels)) for k in range(levels + 1)})
+        marks = {max(1, begins + round(k * (ends - begins) / levels)) for k in range(levels + 1)}
+        if c.method.events:  # right before fine Gaussians are added, which cost up to 3 dB until they have been trained
+            marks = {next((e for e in t.phases.events if e >= m), ends) for m in marks}
+        self.marks = sorted(marks)
         """Steps done when the blocks are measured: before growth, and after each level."""
         self.whole = t.views
         self.blocks = sample_blocks(t.views, c.holdout.fraction, c.seed)
@@ -172,7 +160,7 @@ class Holdout(ImportanceSampling):
         c = self.trainer.config.holdout
         if self.closed is None or not c.trim_db > 0:
             return False
-        rest = self.trainer.config.steps - self.closed
+        rest = self.trainer.steps - self.closed
         return step in {self.closed + round(k * rest / c.trims) for k in range(1, c.trims + 1)}
 
     def due(self, step: int) -> bool:
@@ -195,13 +183,15 @@ class Holdout(ImportanceSampling):
 
         Arguments are those of `CloneSplit.refine`: ``growing`` and ``protected`` are bool [N] or None.
         """
-        if self.measuring:
+        if self.measuring and self.trainer.config.holdout.bounds:
             self._observe()
         yield from super().refine(step, growing, protected)
 
     def after_step(self, phase, settings, going):
         """Apply the bounds of each Gaussian, and raise the opacities of protected ones; ``settings`` [3], ``going`` [1]."""
-        enforce_bounds(self.trainer.table)
+        c = self.trainer.config.holdout
+        if c.bounds or c.degrees or c.trim_db > 0:
+            enforce_bounds(self.trainer.table)
         super().after_step(phase, settings, going)
 
     @property
@@ -242,7 +232,7 @@ class Holdout(ImportanceSampling):
             fall, own = gain(self.before, errors), gain(hidden, errors)
             least: Gain = min(fall, own, key=lambda g: g.mean)
             self.levels.append(Level(step, len(model), decibels(errors), fall.mean, own.mean, least.mean, least.noise))
-            if least.upper_bound_below(c.least_db, c.noise):
+            if c.stop_db == 0 and least.upper_bound_below(c.least_db, c.noise):
                 self.why = (
                     f"level {len(self.levels)} gained {least.mean:+.3f} dB on the held-out blocks, which with {c.noise:g} x "
                     f"its noise of {least.noise:.3f} dB is less than {c.least_db:g} dB"
@@ -251,19 +241,38 @@ class Holdout(ImportanceSampling):
                     self.why = f"no Gaussian came with level {len(self.levels)}: the capacity is used up, or nothing is to add"
                 yield from self._close(step)
                 return
+            since, earlier = next((m for m in reversed(self.measured) if m[0] * LATELY <= step), (0, None))
+            lately = Gain(math.inf, 0.0) if earlier is None or self._is_early(step) else gain(earlier, errors)
+            if c.stop_db > 0 and lately.upper_bound_below(c.stop_db, c.noise):
+                self.why = (
+                    f"the held-out blocks gained {lately.mean:+.3f} dB in the last {step - since:,} steps, which with "
+                    f"{c.noise:g} x its noise of {lately.noise:.3f} dB is less than {c.stop_db:g} dB"
+                )
+                yield from self._close(step)
+                return
             if step == self.marks[-1]:
                 self.why = f"its time was up: level {len(self.levels)} still gained {least.mean:+.3f} dB"
                 yield from self._close(step)
                 return
         self.before = errors
+        if c.stop_db > 0:
+            self.measured.append((step, errors))
         self.growing += 1
+
+    def _is_early(self, step: int) -> bool:
+        """Return whether it is too early to end growth: in the first third of its time, or while views are half their size."""
+        c = self.trainer.config
+        return 3 * step < self.marks[-1] or step <= c.half_resolution * c.steps
 
     def _close(self, step: int) -> Iterator[DensityUpdate]:
         """End growth: lower the degrees that held-out blocks do not need, and train on all pixels from here on."""
         t, c = self.trainer, self.trainer.config.holdout
         self.closed = step
+        if c.stop_db > 0:
+            t.end_growth()
         yield from map(self._of_level, self._catch_up(step))
-        self._observe()
+        if c.bounds:
+            self._observe()
         if c.degrees:
             base = self._errors(t.gaussians)
             t.table.columns["max_degree"] = compress.needed_degrees(
@@ -294,7 +303,7 @@ class Holdout(ImportanceSampling):
         """
         c = self.trainer.config.holdout
         over = psnr - c.enough_db
-        if step == self.trainer.config.steps:
+        if step == self.trainer.steps:
             return c.trim_db + max(over, 0.0)
         fraction = 1 + over / NEAR
         if not fraction > 0:
@@ -344,9 +353,11 @@ class Holdout(ImportanceSampling):
         tensors, plain = super().state()
         if self.before is not None:
             tensors["holdout.before"] = self.before
+        if self.measured:
+            tensors["holdout.measured"] = torch.stack([e for _, e in self.measured])
         return tensors, plain | {
             "closed": self.closed, "why": self.why, "levels": [asdict(x) for x in self.levels], "trims": self.trims,
-            "growing": self.growing,
+            "growing": self.growing, "measured": [s for s, _ in self.measured],
         }  # fmt: skip
 
     def load(self, tensors, plain):
@@ -360,10 +371,13 @@ class Holdout(ImportanceSampling):
         self.levels = [Level(**x) for x in plain["levels"]]
         self.before = tensors.get("holdout.before")
         blocks = sum(map(len, self.blocks)) if self.measuring else 0
-        if self.before is not None and self.before.shape != (blocks,):
-            raise DataError(
-                f"the stored errors of the held-out blocks have shape {list(self.before.shape)}, not [{blocks}]; fit again"
-            )
+        measured = tensors.get("holdout.measured", torch.zeros(0, blocks))
+        for errors, shape in ((self.before, (blocks,)), (measured, (len(plain["measured"]), blocks))):
+            if errors is not None and errors.shape != shape:
+                raise DataError(
+                    f"the stored errors of the held-out blocks have shape {list(errors.shape)}, not {list(shape)}; fit again"
+                )
+        self.measured = list(zip(plain["measured"], measured))
         if self.closed is not None:
             self.trainer.views = self.whole
 

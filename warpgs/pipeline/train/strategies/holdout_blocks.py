@@ -35,12 +35,18 @@ class HoldoutConfig:
 
     fraction: float = 0.03
     """Fraction of the pixels that is held out until growth ends."""
-    levels: int = 4
+    levels: int = 8
     """Number of levels of growth, of equal length; after each its gain is measured."""
     noise: float = 1.0
     """Standard errors of the mean gain over the blocks that count as its noise."""
     least_db: float = 0.02
     """Gain of a level, its noise added, below which growth ends early [dB]."""
+    stop_db: float = 0.0
+    """Gain by growth and training in the last third of the steps, its noise added, below which growth ends [dB], in place of
+    `least_db`: where the fit has phases, the third begins then, and the fit ends earlier. Not before a third of the time of
+    growth, nor while views are half their size. 0: growth ends by its own gain, and the fit takes the planned steps."""
+    bounds: bool = True
+    """Bound the degree and the least width of each Gaussian by what views resolve, and grow none that one view alone sees."""
     degrees: bool = True
     """Lower degrees: each Gaussian keeps only the harmonics that its views can resolve and the held-out blocks need."""
     keep_db: float = 0.1
@@ -62,7 +68,7 @@ class HoldoutConfig:
             raise UsageError(f"holdout fraction {self.fraction} must lie above 0 and be at most 0.5")
         if self.levels < 1 or self.trims < 1:
             raise UsageError(f"holdout: levels {self.levels} and trims {self.trims} must be at least 1")
-        for name in ("noise", "least_db", "keep_db", "trim_db", "enough_db"):
+        for name in ("noise", "least_db", "stop_db", "keep_db", "trim_db", "enough_db"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise UsageError(f"holdout {name.replace('_', '-')} must be 0 or more and finite, not {getattr(self, name)}")
 
@@ -187,3 +193,23 @@ def gain(before: torch.Tensor, after: torch.Tensor) -> Gain:
     if count == 0:
         return Gain(math.nan, math.inf)
     return Gain(float(each.mean()), float(each.std() / math.sqrt(count)) if count > 1 else math.inf)
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level of growth and what it gained; plain values as metrics.json has them."""
+
+    step: int
+    """Steps done when it was measured."""
+    count: int
+    """Gaussians at that step."""
+    held_out_psnr: float
+    """PSNR of the held-out blocks, the error floor included [dB]."""
+    fall: float
+    """Fall of the held-out error since the level before, by growth and training together [dB]."""
+    own: float
+    """Loss when the Gaussians that came with the level are hidden [dB]."""
+    gain: float
+    """The smaller of the two, which are both upper bounds of the gain by growth [dB]."""
+    noise: float
+    """Standard error of ``gain`` over the blocks [dB]."""

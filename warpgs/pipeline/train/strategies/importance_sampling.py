@@ -105,7 +105,7 @@ def scored(view: TrainingView, prior: Prior, depth: ViewDepth | None, config: Me
     """Return the view with the scores of its prior and its geometrically consistent depth."""
     maps = {n: torch.as_tensor(getattr(prior, n), dtype=torch.float32, device=view.image.device)
             for n in ("disparity", "confidence", "boundary", "foreground")}  # fmt: skip
-    valid = None if view.mask is None else view.mask > 0
+    valid = None if view.countable is None else view.countable > 0
     geometry = scoring.geometry_score(maps.pop("disparity"), config.importance.curvature, valid)
     semantic = scoring.semantic_score(**maps)
     consistent = None
@@ -159,7 +159,7 @@ def sample_view(
         known = view.consistent > 0
         depth = torch.where(known, view.consistent, depth)
         alpha = torch.where(known, 1.0, 0.0 if config.ra else alpha)
-    valid = valid_pixels(alpha, depth, view.mask, c)
+    valid = valid_pixels(alpha, depth, view.countable, c)
     known = view.semantic is not None
     semantic = view.semantic if known else torch.zeros_like(view.geometry)
     scores = (scoring.render_score(render.rgb, view.image, valid), semantic, view.geometry)

@@ -1,0 +1,97 @@
+"""Faults of photographs: what is injected is named, and nothing else is."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.scenes import ring
+from tests.textured_planes import photos
+from warpgs.priors.photo_checks import check_photos, photo_notes
+
+GAIN = np.array([1.25, 1.0, 0.8], np.float32)
+
+
+def _print(x: np.ndarray, y: np.ndarray, place: float) -> np.ndarray:
+    """Colours of a card with detail at every size, without tones that a gain of 1.4 would clip."""
+    noise = np.random.default_rng(0).integers(0, 2, (3, 96, 128)).astype(np.float32)
+    layers = [cv2.resize(n[: 96 // k, : 128 // k], (512, 384), interpolation=cv2.INTER_CUBIC) for n, k in zip(noise, (1, 2, 4))]
+    gray = np.clip(0.15 + 0.16 * sum(layers), 0.1, 0.65)
+    at = [np.clip(v / (2 * half) + 0.5, 0, 1) * (n - 1) for v, half, n in ((y, 0.9, 384), (x, 1.2, 512))]
+    rows, columns = (np.rint(a).astype(int) for a in at)
+    return gray[rows, columns][..., None] * [1.0, 0.9, 0.8]
+
+
+@pytest.fixture(scope="module")
+def sharp():
+    """Five photographs of a printed card."""
+    return photos(_print, width=160, height=120, half=(1.2, 0.9), cameras=ring(9, 160, 120)[2:7])
+
+
+def _named(views) -> list[str]:
+    """The notes on these photographs."""
+    return photo_notes(check_photos(views))
+
+
+def _with(views, index, image):
+    """The views, one of them with another image."""
+    changed = list(views)
+    changed[index] = dataclasses.replace(views[index], image=np.clip(image, 0, 1).astype(np.float32))
+    return changed
+
+
+def test_photographs_without_faults_are_not_named(sharp):
+    """All are compared with two others or more, and all figures lie near 1."""
+    checks = check_photos(sharp)
+    assert photo_notes(checks) == []
+    assert [c.name for c in checks] == [v.name for v in sharp]
+    assert all(c.compared_with >= 2 for c in checks)
+    assert all(0.9 < c.sharpness < 1.12 and 0.95 < c.brightness < 1.05 for c in checks)
+
+
+@pytest.mark.parametrize("index", [0, 2])
+def test_a_blurred_photograph_is_named_alone(sharp, index):
+    """A shake of 3 px, at the end of the row and in the middle."""
+    kernel = np.diag([1 / 3] * 3).astype(np.float32)
+    notes = _named(_with(sharp, index, cv2.filter2D(sharp[index].image, -1, kernel)))
+    assert len(notes) == 1 and "blurred" in notes[0]
+    assert [v.name for v in sharp if v.name in notes[0]] == [sharp[index].name]
+
+
+@pytest.mark.parametrize("gain", [0.7, 1.4])
+def test_exposure_is_measured(sharp, gain):
+    """The factor is found, also where only three photographs are there, and only that photograph is named."""
+    for views in (sharp, sharp[1:4]):
+        changed = _with(views, 1, views[1].image * gain)
+        checks = check_photos(changed)
+        assert checks[1].brightness == pytest.approx(gain, rel=0.05)
+        assert [c.name for c in checks if c.exposed_otherwise] == [views[1].name]
+        assert all(c.brightness == pytest.approx(1, abs=0.05) for c in checks if c.name != views[1].name)
+        assert not any(c.tinted or c.blurred for c in checks)
+        assert f"{views[1].name} ({checks[1].brightness:.2f} x as bright)" in photo_notes(checks)[0]
+
+
+def test_white_balance_is_told_from_exposure(sharp):
+    """A warmer photograph of the same brightness."""
+    checks = check_photos(_with(sharp, 3, sharp[3].image * GAIN))
+    assert [c.name for c in checks if c.tinted] == [sharp[3].name] and not any(c.exposed_otherwise for c in checks)
+    assert checks[3].channels == pytest.approx(tuple(GAIN), rel=0.05)
+    assert "white balance" in photo_notes(checks)[0]
+
+
+def test_what_cannot_be_compared_is_said(sharp):
+    """An even image matches nothing: no figure is made up for it, nor lost for the others."""
+    checks = check_photos(_with(sharp, 4, np.full_like(sharp[4].image, 0.5)))
+    assert (checks[4].compared_with, checks[4].sharpness, checks[4].brightness, checks[4].channels) == (0, None, None, None)
+    assert photo_notes(checks) == [
+        f"blur and exposure are unknown where too little matches the photographs beside it: {sharp[4].name}"
+    ]
+
+
+def test_photographs_that_stand_close_together_are_compared():
+    """A third of a degree apart: too little for depth, and enough to see the same places."""
+    views = photos(_print, width=160, height=120, half=(1.2, 0.9), cameras=ring(400, 160, 120)[196:204:2])
+    checks = check_photos(_with(views, 1, views[1].image * 0.7))
+    assert all(c.compared_with == 3 for c in checks)
+    assert [c.name for c in checks if c.exposed_otherwise] == [views[1].name]

@@ -1,0 +1,68 @@
+"""Objects photographed on black: how they are recognised, and the dark pixels around them as transparency."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from warpgs.scene import View
+
+DARK = 16 / 255
+"""Brightness below which the brightest channel of a pixel belongs to a black background, in [0, 1]."""
+DARK_FRACTION = 0.3
+"""Fraction of dark pixels from which on an image with a dark border shows an object on black."""
+
+HOLE = 0.001
+"""Fraction of an image from which on dark pixels that an object encloses are a hole in it, not a part of it."""
+
+
+def dark_pixels(image: np.ndarray) -> np.ndarray | None:
+    """Return the dark pixels, bool [H, W], of an image [H, W, 3] that shows an object on black; None for any other image.
+
+    At least `DARK_FRACTION` of its pixels and half of its border are dark, and not all are.
+    """
+    dark: np.ndarray = image.max(-1) < DARK
+    border = np.concatenate([dark[0], dark[-1], dark[:, 0], dark[:, -1]])
+    return dark if dark.mean() >= DARK_FRACTION and border.mean() >= 0.5 and not dark.all() else None
+
+
+def empty_pixels(dark: np.ndarray) -> np.ndarray:
+    """Return those of the dark pixels, bool [H, W], between which and the camera nothing stands.
+
+    They are joined to the border over others, sideways or up and down, or make up `HOLE` of the image together.
+    """
+    import cv2
+
+    _, labels, found, _ = cv2.connectedComponentsWithStats(dark.astype(np.uint8), connectivity=4)
+    empty = found[:, cv2.CC_STAT_AREA] >= HOLE * dark.size
+    empty[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = True
+    pixels: np.ndarray = dark & empty[labels]
+    return pixels
+
+
+def cut_from_black(views: list[View]) -> tuple[list[View], str]:
+    """Give views that all show an object on black an opacity: 0 for the dark pixels around it and in its holes, else 1.
+
+    Specks and cracks that the object encloses stay opaque. Views of which any has an opacity or a mask, or shows something
+    else, stay as they are.
+
+    Args:
+        views: The views of a scene.
+
+    Returns:
+        The views, and a note for the user; empty where nothing is changed.
+    """
+    done, empty = [], 0.0
+    for v in views:
+        dark = dark_pixels(v.image) if v.alpha is None and v.mask is None else None
+        if dark is None:
+            return views, ""
+        nothing = empty_pixels(dark)
+        empty += float(nothing.mean()) / len(views)
+        alpha = 1 - nothing.astype(np.float32)
+        done.append(replace(v, image=v.image * alpha[..., None], alpha=alpha))
+    return done, (
+        f"every image shows an object on black: {empty:.1%} of the pixels, dark ones around it and in its holes, are taken for "
+        "transparent; --no-black-is-empty leaves them black"
+    )

@@ -1,0 +1,178 @@
+"""The visual hull: the largest object that explains all silhouettes (Laurentini 1994), carved from an octree.
+
+Where views stand far apart a sweep finds little, but the opacity of each view says which space is empty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from warpgs import geometry
+from warpgs.pipeline.metrics.region import fitted_region
+from warpgs.pipeline.model.depth_points import focal_length, merge, merge_cells
+from warpgs.scene import Camera, PointCloud, View
+
+MARGIN = 1.5
+"""Distance from the nearest opaque pixel at which a point lies in the empty region of a view [px]."""
+FINEST = 1.5
+"""Largest width of the finest cells in the views, their median [px]."""
+PROJECTIONS = 2**25
+"""Projections of a cell into a view that one level of the octree may take: a few seconds."""
+MAX_LEVELS = 20
+"""Most levels: the finest cells are a millionth of the first one."""
+TOLERANT = 12
+"""Views for each one that may err: with so many, a cell is empty if two say so, with twice as many, three."""
+SEEN = 0.9
+"""Fraction of the views that must have a cell in their image: space that few look into cannot be carved."""
+OPAQUE_COLOR = 0.9
+"""Opacity from which on a pixel shows the object alone, and gives its colour."""
+LEAST_VIEWS = 2
+"""Views that must see a cell: what none sees lies inside, or behind, where nothing was photographed."""
+LIKE = 0.15
+"""Standard deviation of the colours that views see a cell in, up to which they are like, of the channel that differs most."""
+BEHIND_CELLS = 3.0
+"""Distance behind the first cell of a pixel from which on a cell is hidden, as a multiple of the width of a cell."""
+
+
+class Silhouette:
+    """The opaque pixels of a view, and their number in any rectangle."""
+
+    def __init__(self, view: View):
+        """Sum up the pixels: those of `fitted_region`, all where a view has no such region."""
+        region, _ = fitted_region(view)
+        opaque = np.ones(view.image.shape[:2], bool) if region is None else region
+        self.view, self.size = view, np.array([view.camera.width, view.camera.height])
+        self.sums = np.zeros((opaque.shape[0] + 1, opaque.shape[1] + 1), np.int64)
+        self.sums[1:, 1:] = opaque.cumsum(0, dtype=np.int64).cumsum(1)
+        border = np.concatenate([opaque[0], opaque[-1], opaque[:, 0], opaque[:, -1]])
+        self.cut = bool(border.any())
+        """True where the object reaches the border of the image, so that it may go on outside."""
+
+    def look(self, points: np.ndarray, radius: np.ndarray | float, pixels: float = 0.0) -> tuple[np.ndarray, ...]:
+        """Return three masks [N] of balls around points [N, 3]: before empty pixels alone; before opaque ones; perhaps seen.
+
+        Args:
+            points: Centres of the balls [u].
+            radius: Radius of each [u], shape [N], or of all.
+            pixels: Distance that is added to each radius in the image [px].
+        """
+        at, z = geometry.project_points(self.view.camera, points)
+        before = z > radius  # the camera is not in the ball, and the ball not behind it
+        reach = pixels + focal_length(self.view.camera) * radius / np.where(before, z - radius, 1)
+        at = np.where(before[:, None], at, 0)
+        low, high = np.floor(at - reach[:, None]), np.floor(at + reach[:, None]) + 1
+        inside = (low >= 0).all(1) & (high <= self.size).all(1)
+        (left, top), (right, bottom) = (np.clip(e, 0, self.size).astype(np.int64).T for e in (low, high))
+        count = self.sums[bottom, right] - self.sums[top, right] - self.sums[bottom, left] + self.sums[top, left]
+        area = (right - left) * (bottom - top)
+        empty = before & (count == 0) & (inside | (not self.cut))
+        there = np.where(before, area > 0, z > -radius)  # a ball around the camera may be in the image
+        return empty, before & inside & (count == area), there
+
+
+def silhouettes(views: Sequence[View]) -> list[Silhouette]:
+    """Return the silhouettes of the views that know their opacity."""
+    return [Silhouette(v) for v in views if v.alpha is not None]
+
+
+def in_empty_region(shapes: Sequence[Silhouette], points: np.ndarray) -> np.ndarray:
+    """Return a mask [N], True where a point [N, 3] lies at least `MARGIN` px from what more views show than may err."""
+    votes = sum((s.look(points, 0.0, MARGIN)[0].astype(int) for s in shapes), np.zeros(len(points), int))
+    return votes > len(shapes) // TOLERANT
+
+
+def carve(shapes: Sequence[Silhouette]) -> tuple[np.ndarray, float]:
+    """Return the centres [N, 3] [u] of the finest cells on the surface of the hull, and their width [u].
+
+    A cell is empty where more views than may err show nothing there, and inside where all that see it show nothing else; what
+    is neither is divided, until cells are `FINEST` px wide in the views, or as many as `PROJECTIONS` allows.
+
+    Args:
+        shapes: At least two silhouettes.
+    """
+    cameras = [s.view.camera for s in shapes]
+    focus = geometry.focus_point(cameras)
+    half = max(float(np.linalg.norm(c.center - focus)) for c in cameras) or 1.0
+    cells = focus[None]
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    for _ in range(MAX_LEVELS):
+        cells = _surface((cells[:, None] + 0.5 * half * corners).reshape(-1, 3), 0.5 * half, shapes)
+        half *= 0.5
+        if not len(cells) or 2 * half <= FINEST * _footprint(cameras, cells) or 8 * len(cells) * len(shapes) > PROJECTIONS:
+            break
+    return cells, 2 * half
+
+
+def _footprint(cameras: Sequence[Camera], points: np.ndarray) -> float:
+    """Return the width of a pixel at points [N, 3] before the cameras, the median over both [u]."""
+    widths = np.stack([geometry.project_points(c, points)[1] / focal_length(c) for c in cameras])
+    return float(np.median(widths[widths > 0])) if (widths > 0).any() else 0.0
+
+
+def _surface(cells: np.ndarray, half: float, shapes: Sequence[Silhouette]) -> np.ndarray:
+    """Return the cells [N, 3] of ``half`` their width [u] that are neither empty nor inside."""
+    empty, inside, seen = (np.zeros(len(cells), int) for _ in range(3))
+    at = np.arange(len(cells))
+    for k, shape in enumerate(shapes):
+        nothing, full, there = shape.look(cells[at], 3**0.5 * half)
+        empty[at] += nothing
+        inside[at] += full | ~there
+        seen[at] += there
+        at = at[empty[at] <= len(shapes) // TOLERANT]
+        if k + 1 == len(shapes):
+            break
+    kept = (seen[at] >= max(2.0, SEEN * len(shapes))) & (inside[at] < len(shapes))
+    return cells[at[kept]]
+
+
+def _seen_colors(shapes: Sequence[Silhouette], cells: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean colours [N, 3] of cells of that width [u] where they are seen, and the cells that are kept, bool [N].
+
+    A cell is kept where at least `LEAST_VIEWS` see it at an opaque pixel with none before it, and in like colours: the others
+    are parts of the hull that the object need not fill.
+    """
+    total, squares, counts = np.zeros((len(cells), 3)), np.zeros((len(cells), 3)), np.zeros(len(cells), int)
+    for shape in shapes:
+        view = shape.view
+        at, z = geometry.project_points(view.camera, cells)
+        there = np.nonzero(geometry.in_image(view.camera, cells))[0]
+        columns, rows = np.floor(at[there]).astype(int).T
+        # blocks as wide as two cells: no hole between the cells of a surface
+        block = max(1, int(np.ceil(2 * width / _footprint([view.camera], cells))))
+        first = np.full((view.camera.height // block + 1, view.camera.width // block + 1), np.inf)
+        np.minimum.at(first, (rows // block, columns // block), z[there])
+        free = z[there] <= first[rows // block, columns // block] + BEHIND_CELLS * width
+        sure = free & (view.alpha[rows, columns] >= OPAQUE_COLOR)
+        seen, colors = there[sure], view.image[rows[sure], columns[sure]].astype(float)
+        total[seen] += colors
+        squares[seen] += colors**2
+        counts[seen] += 1
+    mean = total / np.maximum(counts, 1)[:, None]
+    variance = squares / np.maximum(counts, 1)[:, None] - mean**2
+    return mean, (counts >= LEAST_VIEWS) & (variance.max(1) <= LIKE**2)
+
+
+def hull_points(views: Sequence[View], merge_px: float) -> tuple[PointCloud, str]:
+    """Return points on the surface of the visual hull with the colours of the views that see them, and a sentence on them.
+
+    Args:
+        views: Training views; those that know their opacity carve.
+        merge_px: Width of the cells in which points become one [px]; 0 keeps one for every pixel.
+
+    Returns:
+        The cloud, empty where fewer than two views know their opacity or nothing is in all of them.
+    """
+    shapes = silhouettes(views)
+    nothing = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+    if len(shapes) < 2:
+        return nothing, f"no hull: {len(shapes)} of {len(views)} views know their opacity, and two are the least"
+    cells, width = carve(shapes)
+    if not len(cells):
+        return nothing, "no hull: the silhouettes have no place in common; do the poses belong to the images?"
+    colors, kept = _seen_colors(shapes, cells, width)
+    total, cells, colors = len(cells), cells[kept], colors[kept]
+    wide = max(width, merge_px * _footprint([s.view.camera for s in shapes], cells))
+    cloud = merge(cells, colors, merge_cells(cells, np.full(len(cells), wide)))
+    return cloud, f"{len(cloud):,} points on the hull of {len(shapes)} silhouettes, from {len(cells):,} of its {total:,} cells"

@@ -1,0 +1,173 @@
+"""Limits of the size and the shape of every Gaussian, held by the steps of a fit; and figures of what a model holds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from warpgs import geometry
+from warpgs.errors import UsageError
+from warpgs.scene import Camera, Gaussians, PointCloud
+
+WITHIN = 0.9
+"""Fraction of the first points that the radius of a scene holds; the farthest are often wrong."""
+NEEDLE = 30.0
+"""Longest over middle axis above which a Gaussian is counted as a needle."""
+ROUNDING = 1e-5
+"""Distance of logarithms up to which an axis at its limit is within it: ten times what float32 rounds them by."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits that one step holds every Gaussian to."""
+
+    largest: float = math.inf
+    """Largest standard deviation of an axis [u]."""
+    ratio: float = math.inf
+    """Largest ratio of the longest axis to the middle one."""
+    decay: float = 1.0
+    """Factor of every opacity, in (0, 1]."""
+
+    @torch.no_grad()
+    def hold(self, log_scales: torch.Tensor, going: torch.Tensor | None = None) -> None:
+        """Bring logarithms of axes [N, 3] within the limits, in place; a second time changes nothing.
+
+        Axes are cut to the largest size; where the longest is then too long for the middle one, the middle one grows. A flat
+        disk stays one. ``going`` is as in `apply`; None for True.
+        """
+        if self.largest == math.inf and self.ratio == math.inf:
+            return
+        old = log_scales.detach()
+        new = torch.where(old.isinf(), old, old.clamp(max=math.log(self.largest)))  # what is not finite is not hidden
+        if self.ratio < math.inf:
+            longest, middle = (x[:, None] for x in long_axes(new))
+            new = torch.where(new == middle, torch.maximum(new, longest - math.log(self.ratio)), new)
+        old.copy_(new if going is None else torch.where(going, new, old))
+
+    @torch.no_grad()
+    def apply(self, params: dict[str, torch.Tensor], going: torch.Tensor) -> None:
+        """Bring parameters within the limits, and lower opacities, in place; it may be part of a captured step.
+
+        Moments of Adam stay.
+
+        Args:
+            params: ``log_scales`` [N, 3] and ``logit_opacities`` [N] of `Gaussians`.
+            going: Whether the step is taken, bool, shape [1]; where it is not, nothing changes.
+        """
+        self.hold(params["log_scales"], going)
+        if self.decay < 1:
+            old = params["logit_opacities"].detach()
+            old.copy_(torch.where(going, decayed(old, self.decay), old))
+
+
+NO_LIMITS = Limits()
+"""Limits that change nothing."""
+
+
+@dataclass(frozen=True)
+class LimitConfig:
+    """Limits of every Gaussian of a fit, and the decay of opacities."""
+
+    max_size: float = 1.0
+    """Largest standard deviation of an axis, as a fraction of the scene's radius; 0 for no limit."""
+    max_ratio: float = NEEDLE
+    """Largest ratio of the longest axis to the middle one, at least 1; 0 for no limit."""
+    ratio_from: float = 0.7
+    """Fraction of the steps after which that ratio is held, in [0, 1]. Long Gaussians help the first steps."""
+    opacity_decay: float = 1.0
+    """Factor of every opacity after each step, above 0 and at most 1; 1 for none, 0.995 in Binocular3DGS (arXiv 2410.18822)."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.max_size <= 1e6:
+            raise UsageError(f"limits max-size must be 0, for no limit, or at most 1e6, not {self.max_size}")
+        if self.max_ratio != 0 and not 1 <= self.max_ratio <= 1e6:
+            raise UsageError(f"limits max-ratio must be 0, for no limit, or lie between 1 and 1e6, not {self.max_ratio}")
+        if not 0 <= self.ratio_from <= 1:
+            raise UsageError(f"limits ratio-from must lie between 0 and 1, not {self.ratio_from}")
+        if not 0 < self.opacity_decay <= 1:
+            raise UsageError(f"limits opacity-decay must be above 0 and at most 1, not {self.opacity_decay}")
+
+    def at(self, progress: float, radius: float) -> Limits:
+        """Return the limits of a step.
+
+        Args:
+            progress: Fraction of the fit that is done before it, in [0, 1]; 1 for the last step, which has all of them.
+            radius: Result of `scene_radius` [u].
+        """
+        held = self.max_ratio > 0 and (progress > self.ratio_from or progress == 1)
+        largest = self.max_size * radius if self.max_size > 0 else math.inf
+        return Limits(largest, self.max_ratio if held else math.inf, self.opacity_decay)
+
+
+def long_axes(log_scales: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the logarithms of the longest and of the middle axis, shape [N] each, of those of all three, shape [N, 3]."""
+    a, b, c = log_scales.unbind(1)
+    low, high = torch.minimum(a, b), torch.maximum(a, b)
+    return torch.maximum(high, c), torch.maximum(low, torch.minimum(high, c))
+
+
+def decayed(logits: torch.Tensor, factor: float) -> torch.Tensor:
+    """Return the logits [N] of opacities times a factor in (0, 1): l + ln d - ln(1 + (1 - d) e^l) for a logit l.
+
+    No opacity near 1 is rounded on the way.
+    """
+    exact = logits.double()  # float32's exponential has other last digits on other processors
+    lower = exact + math.log(factor) - torch.nn.functional.softplus(exact + math.log1p(-factor))
+    return lower.to(logits.dtype)
+
+
+def scene_radius(cameras: list[Camera], cloud: PointCloud) -> float:
+    """Return the radius of the scene around the mean of its cameras [u]: it holds them, and 90 % of the first points.
+
+    It is not `scene_extent`, the size of the camera set alone, beside which what is photographed may be large or small.
+    """
+    center = np.mean([c.center for c in cameras], axis=0)
+    reach = float(np.quantile(np.linalg.norm(cloud.points - center, axis=1), WITHIN)) if len(cloud) else 0.0
+    return max(reach, geometry.camera_extent(cameras), 1e-6)
+
+
+def shape_figures(gaussians: Gaussians, config: LimitConfig, radius: float, extent: float) -> dict[str, Any]:
+    """Return the figures of size and shape of a model for metrics.json.
+
+    Args:
+        gaussians: N Gaussians.
+        config: Limits; those that are 0 count nothing as beyond them.
+        radius: Result of `scene_radius` [u].
+        extent: Result of `scene_extent` [u].
+
+    Returns:
+        ``radius`` and ``extent`` [u]; the ``largest`` standard deviation [u], over the radius and over the extent; ``needles``,
+        the fraction of Gaussians whose longest axis is more than `NEEDLE` times the middle one, ``needles_by_opacity`` with
+        each counted by its opacity, and ``thin``, the fraction whose longest axis is more than so many times the shortest; the
+        number ``beyond`` the limits.
+    """
+    scales = gaussians.log_scales.detach().cpu().double()
+    longest, middle = long_axes(scales)
+    opacities = gaussians.logit_opacities.detach().cpu().double().sigmoid()
+    needle = longest - middle > math.log(NEEDLE) + ROUNDING
+    thin = longest - scales.amin(1) > math.log(NEEDLE) + ROUNDING
+    at = config.at(1.0, radius)
+    largest = math.log(at.largest) + ROUNDING, math.log(at.ratio) + ROUNDING
+    beyond = (longest > largest[0]) | (longest - middle > largest[1])
+    count, sigma = max(1, len(gaussians)), float(longest.max().exp()) if len(gaussians) else 0.0
+    # exactly rounded sums, which no number of threads changes
+    weight = math.fsum(opacities[needle].tolist()) / max(math.fsum(opacities.tolist()), 1e-30)
+    return {
+        "radius": radius, "extent": extent, "largest": sigma, "largest_over_radius": sigma / radius,
+        "largest_over_extent": sigma / extent, "needles": int(needle.sum()) / count, "needles_by_opacity": weight,
+        "thin": int(thin.sum()) / count, "beyond": int(beyond.sum()),
+    }  # fmt: skip
+
+
+def shape_summary(figures: dict[str, Any]) -> str:
+    """Return one line for people from the figures of `shape_figures`."""
+    f = figures
+    return (
+        f"shape: the largest axis is {f['largest_over_radius']:.2g} of the scene's radius, "
+        f"{f['largest_over_extent']:.2g} of the cameras' extent; {f['needles']:.1%} of the Gaussians are needles, more than "
+        f"{NEEDLE:g} times as long as wide ({f['needles_by_opacity']:.1%} by opacity); {f['beyond']:,} beyond the limits"
+    )

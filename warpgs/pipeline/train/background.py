@@ -1,0 +1,105 @@
+"""Colour behind a scene: that of its files, the mean of its photographs, or one that the user names."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+
+import numpy as np
+
+from warpgs.errors import UsageError
+from warpgs.pipeline.metrics.region import counted_region
+from warpgs.scene import Scene, View
+
+Color = tuple[float, float, float]
+"""Red, green and blue in [0, 1]."""
+NAMED: dict[str, Color] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+CHOSEN = ("auto", "mean", "scene")
+"""Names of colours that follow from the scene."""
+LEVELS = 2**16 - 1
+"""Levels that colours are rounded to before they are added: sums of whole numbers are exact in any order."""
+
+
+def color_of(text: str) -> Color | None:
+    """Return the colour that a word names; None for one that follows from the scene.
+
+    Args:
+        text: auto, mean, scene, black, white, ``#rrggbb``, or three numbers in [0, 1] as ``r,g,b``.
+
+    Raises:
+        UsageError: It is none of them.
+    """
+    if text in CHOSEN:
+        return None
+    if text in NAMED:
+        return NAMED[text]
+    if re.fullmatch(r"#[0-9a-fA-F]{6}", text):
+        red, green, blue = bytes.fromhex(text[1:])
+        return red / 255, green / 255, blue / 255
+    parts = text.split(",")
+    if len(parts) == 3 and all(re.fullmatch(r" *([01]|[01]?\.[0-9]{1,17}|[01]\.) *", p) for p in parts):
+        red, green, blue = map(float, parts)
+        if max(red, green, blue) <= 1:
+            return red, green, blue
+    raise UsageError(
+        f"background {text[:60]!r} is no colour: give auto, mean, scene, black, white, #rrggbb, or r,g,b with numbers in [0, 1]"
+    )
+
+
+def mean_color(views: list[View]) -> Color:
+    """Return the mean colour of the pixels that the masks of views keep, over all of them; the same bits on every machine."""
+    total, count = np.zeros(3, np.int64), 0
+    for v in views:
+        pixels = v.image.reshape(-1, 3) if v.mask is None else v.image[v.mask]
+        total += np.rint(pixels.astype(np.float64) * LEVELS).astype(np.int64).sum(axis=0)
+        count += len(pixels)
+    red, green, blue = (int(t) / (LEVELS * max(count, 1)) for t in total)
+    return red, green, blue
+
+
+def choose_background(wish: str, scene: Scene, train: list[View]) -> tuple[Color, str]:
+    """Return the colour behind a scene, and a note for the user; no note where opaque views stay before the scene's own.
+
+    Args:
+        wish: As `FitConfig.background`.
+        scene: The scene.
+        train: Its training views.
+
+    Raises:
+        UsageError: The wish is no colour.
+    """
+    color = color_of(wish)
+    if color is not None:
+        return color, f"background: {wish}, {_words(color)}"
+    if wish == "mean":
+        color = mean_color(train)
+        return color, f"background: the mean colour of the training views, {_words(color)}"
+    cut_out = any(v.alpha is not None or counted_region(v)[1] == "foreground" for v in train)
+    if wish == "auto" and not cut_out:
+        color = mean_color(train)
+        return color, (
+            f"background: where no Gaussian lies, renders show the mean colour of the training views, {_words(color)}; "
+            "--background names another"
+        )
+    if wish == "auto":
+        return scene.background, f"background: {_words(scene.background)}, since the views show an object cut out"
+    return scene.background, f"background: {_words(scene.background)}, that of the scene" if cut_out else ""
+
+
+def over_background(scene: Scene, color: Color) -> Scene:
+    """Return the scene over another background [3]: where views are transparent, their images change."""
+    if color == scene.background:
+        return scene
+    shift = np.float32(color) - np.float32(scene.background)
+
+    def moved(v: View) -> View:
+        if v.alpha is None:
+            return v
+        return dataclasses.replace(v, image=np.clip(v.image + (1 - v.alpha[..., None]) * shift, 0, 1))
+
+    return dataclasses.replace(scene, background=color, views=tuple(map(moved, scene.views)))
+
+
+def _words(color: Color) -> str:
+    """Return a colour for people, as #rrggbb."""
+    return "#" + "".join(f"{round(255 * c):02x}" for c in color)

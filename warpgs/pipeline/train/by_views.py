@@ -1,0 +1,86 @@
+"""Settings that follow from the number of training views and their size: one rule from 3 photographs to 300, on any device.
+
+The constants were chosen by leaving training views out (docs/decisions/013-any-capture.md).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.scene import View
+
+MIN_STEPS = 3000
+"""Steps of a fit of up to `FEW` views at most."""
+FEW, STEPS_POWER, MAX_STEPS = 4, 0.75, 30_000
+"""Views up to which steps are `MIN_STEPS`; the power of their number with which they grow beyond; and their bound."""
+SCALES_LR, SCALES_VIEWS, SCALES_POWER = 0.1, 8, 0.6
+"""Learning rate of the log scales up to so many views, and the power of their number with which it falls beyond."""
+OPACITIES_LR, MAX_OPACITIES_LR = 0.0125, 0.05
+"""Learning rate of the opacities at 3 views, which rises with the square root of their number, and its bound."""
+HALF_RESOLUTION, HALF_VIEWS = 0.5, 4
+"""Fraction of the steps at half size up to so many views; beyond it falls with their number."""
+DEGREES = (9, 12)
+"""Training views from which colours have spherical harmonics of degree 2, and of degree 3; with fewer they have degree 1."""
+CPU_PIXELS = 1e6
+"""Pixels that two cores of a processor of 2.5 GHz train a second: 190 ms a step at 504 x 378 px."""
+CPU_SECONDS = 60.0, 5.0, 1200.0
+"""Time that a fit on a CPU may take by default [s]: at least, for each view, and at most."""
+
+
+def steps_by_views(views: int) -> int:
+    """Return the most steps of a fit of so many views: 3000 up to 4, 5511 for 9, 21,129 for 54, 30,000 from 87 on."""
+    return min(MAX_STEPS, round(MIN_STEPS * max(1.0, views / FEW) ** STEPS_POWER))
+
+
+def cpu_seconds(views: int) -> float:
+    """Return the time that the steps of a fit on a CPU are limited to by default [s]."""
+    least, each, most = CPU_SECONDS
+    return min(least + each * views, most)
+
+
+def pixels_of_steps(steps: int, half_resolution: float, pixels: int) -> float:
+    """Return how many pixels so many steps render; views have ``pixels``, and a quarter of them in steps at half size."""
+    return steps * pixels * (1 - 0.75 * half_resolution)
+
+
+def settings_by_views(config: FitConfig, train: list[View], device: str) -> tuple[FitConfig, list[str]]:
+    """Return the settings with every one chosen that is left open (None), and sentences on the choices.
+
+    Args:
+        config: Settings.
+        train: Training views.
+        device: Kind of device, cpu or cuda: on a CPU the steps are limited to a time, unless ``cpu_limit`` is off.
+    """
+    views, notes = len(train), []
+    optimizer, init = config.optimizer, config.init
+    if optimizer.scales_lr is None:
+        lr = SCALES_LR * min(1.0, SCALES_VIEWS / views) ** SCALES_POWER
+        optimizer = dataclasses.replace(optimizer, scales_lr=float(f"{lr:.3g}"))
+    if optimizer.opacities_lr is None:
+        lr = min(MAX_OPACITIES_LR, OPACITIES_LR * math.sqrt(views / 3))
+        optimizer = dataclasses.replace(optimizer, opacities_lr=float(f"{lr:.3g}"))
+    if init.max_sh_degree is None:
+        init = dataclasses.replace(init, max_sh_degree=1 + sum(views >= n for n in DEGREES))
+    half = config.half_resolution
+    if half is None:
+        half = float(f"{HALF_RESOLUTION * min(1.0, HALF_VIEWS / views):.2g}")
+    steps = config.steps
+    if steps is None:
+        steps = steps_by_views(views)
+        notes.append(
+            f"by the number of views, {views}: at most {steps:,} steps, colours of degree {init.max_sh_degree}, learning rates "
+            f"of scales {optimizer.scales_lr:g} and opacities {optimizer.opacities_lr:g}, half size in the first {half:.0%} of "
+            "the steps"
+        )
+        pixels = max(v.camera.width * v.camera.height for v in train)
+        seconds = pixels_of_steps(steps, half, pixels) / CPU_PIXELS
+        if device == "cpu" and config.cpu_limit and seconds > cpu_seconds(views):
+            most, wanted = cpu_seconds(views), steps
+            steps = max(1, int(steps * most / seconds))
+            notes.append(
+                f"on a CPU {steps:,} of the {wanted:,} steps are taken by default, about {most / 60:.1f} min on two cores; "
+                f"--no-cpu-limit takes all, about {seconds / 60:.0f} min"
+            )
+    return dataclasses.replace(config, steps=steps, half_resolution=half, optimizer=optimizer, init=init), notes

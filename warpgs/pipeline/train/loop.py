@@ -1,0 +1,69 @@
+"""The loop around the training steps: reports, checkpoints, stops, and a second try where memory ran out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from warpgs.errors import OutOfMemoryError, ResourceError
+from warpgs.pipeline.train.trainer import StepReport, Trainer
+from warpgs.scene import Scene, View
+
+
+def train_views(scene: Scene, names: tuple[str, ...]) -> list[View]:
+    """Return the named views of a scene, in the order named."""
+    return [scene.view(n) for n in names]
+
+
+def run(
+    trainer: Trainer,
+    on_step: Callable[[StepReport], None],
+    save: Callable[[Trainer], None],
+    stopped: Callable[[], bool],
+    restore: Callable[[Trainer], bool] = lambda _: False,
+) -> None:
+    """Take all remaining steps, reporting each and saving now and then and at the end.
+
+    A step that runs out of memory is tried once more with less (`Trainer.spare_memory`), from the last saved state where the
+    set of Gaussians was being changed.
+
+    Args:
+        trainer: The fit.
+        on_step: Called after each step.
+        save: Saves the state.
+        stopped: Whether to end after a step.
+        restore: Loads the state that was saved last; returns False where there is none.
+
+    Raises:
+        NotFiniteError: The loss or, when it is to be saved, a number of the state is not finite; nothing of it is saved.
+        OutOfMemoryError: A step ran out of memory twice; the state before it is saved where it is whole.
+        KeyboardInterrupt: ``stopped`` returned True after a step; the state after it is saved.
+    """
+    every, saved, ran_out = trainer.config.checkpoint_every, time.monotonic(), -1
+    while trainer.step < trainer.steps:
+        reports, failure = [], None
+        try:
+            reports = trainer.advance(every - trainer.step % every)
+        except OutOfMemoryError as e:
+            failure = e.with_traceback(None)  # whose frames hold tensors
+            failure.__cause__ = failure.__context__ = None
+        if failure is not None:
+            again, ran_out = trainer.step > ran_out, trainer.step
+            try:
+                if not again or not (failure.intact or restore(trainer)):
+                    raise failure
+                trainer.spare_memory()
+            except ResourceError:
+                if failure.intact:
+                    save(trainer)
+                raise
+            continue
+        for report in reports:
+            on_step(report)
+        stop = stopped()
+        due = trainer.step % every == 0 and time.monotonic() - saved >= trainer.config.checkpoint_seconds
+        if stop or due or trainer.step == trainer.steps:
+            save(trainer)
+            saved = time.monotonic()
+        if stop:
+            raise KeyboardInterrupt

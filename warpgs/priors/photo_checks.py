@@ -1,0 +1,214 @@
+"""Faults of photographs that explain a bad model: blur, and light or colours that differ from photograph to photograph.
+
+Photographs are compared at the places that two of them show: SIFT matches that agree with the poses. So it does not count
+what a photograph shows, only how (docs/scenes.md, "Photographs with faults").
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from warpgs.priors.matches import Features, agreeing_matches, sift_features
+from warpgs.priors.opencv import single_threaded_opencv, without_ipp
+from warpgs.scene import View
+
+MIN_SHARPNESS = 0.87
+"""Sharpness below which a photograph is named: untouched ones of five scenes have 0.88 and more, those blurred by a disk of 3
+px 0.5 to 0.85 (docs/scenes.md)."""
+MAX_BRIGHTNESS = 1.2
+"""Factor of brightness, up or down, beyond which a photograph is named; below 1.1 where the exposure does not change."""
+MAX_TINT = 1.1
+"""Largest factor between the brightness of one channel and of all three up to which the white balance counts as the same."""
+NEIGHBORS = 4
+"""Photographs taken nearest by that each photograph is compared with; each may itself be chosen by others."""
+MIN_MATCHES = 10
+"""Fewest matches from which two photographs are compared."""
+MAX_FEATURES = 1000
+"""Most features of a photograph; they bound the time of a comparison."""
+MAX_PIXELS = 100_000
+"""Number of pixels to which a photograph is reduced for the search of features; sharpness is measured at its full size."""
+FINE, COARSE = 1.0, 2.0
+"""Standard deviations of the Gaussian filters that part fine detail from coarse [px]."""
+PATCH = 15
+"""Side of the square around a match in which detail and colour are measured [px]."""
+NOISE = 0.1 / 255**2
+"""Mean square that is added to both bands of detail: less than a level of an 8-bit image tells nothing."""
+DARKEST, BRIGHTEST = 0.04, 0.94
+"""Colours in [0, 1] between which brightness is compared: outside, a photograph is black or clipped."""
+MAX_NAMED = 6
+"""Photographs that one sentence names."""
+PROGRESS_INTERVAL = 5.0
+"""Seconds between two lines of progress."""
+
+
+@dataclass(frozen=True)
+class PhotoCheck:
+    """One photograph beside others, at the places that both show; None where too few places matched."""
+
+    name: str
+    """Name of the view."""
+    compared_with: int
+    """Number of photographs that it could be compared with."""
+    sharpness: float | None
+    """Fine detail relative to coarse, as a fraction of what the other photographs have; 1 where it is as sharp as they are."""
+    brightness: float | None
+    """Factor to the brightness of the other photographs, the mean of the three channels."""
+    channels: tuple[float, float, float] | None
+    """Factor of red, green and blue."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures by name, as metrics.json holds them."""
+        return asdict(self)
+
+    @property
+    def blurred(self) -> bool:
+        """True where the photograph is less sharp than others beyond doubt."""
+        return self.sharpness is not None and self.sharpness < MIN_SHARPNESS
+
+    @property
+    def exposed_otherwise(self) -> bool:
+        """True where the photograph is darker or brighter than others beyond doubt."""
+        return self.brightness is not None and not 1 / MAX_BRIGHTNESS <= self.brightness <= MAX_BRIGHTNESS
+
+    @property
+    def tinted(self) -> bool:
+        """True where the white balance differs from that of others."""
+        if self.channels is None or self.brightness is None:
+            return False
+        return any(not 1 / MAX_TINT <= c / self.brightness <= MAX_TINT for c in self.channels)
+
+
+class _Places(NamedTuple):
+    """What a photograph looks like at its features."""
+
+    features: Features
+    detail: np.ndarray
+    """Logarithm of fine over coarse detail, shape [N]."""
+    colors: np.ndarray
+    """Mean colours around them in [0, 1], shape [N, 3]."""
+
+
+def _places(view: View) -> _Places:
+    import cv2
+
+    features = sift_features(view, MAX_PIXELS, MAX_FEATURES)
+    columns, rows = features.pixels.astype(int).T
+    gray = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
+    fine, coarse = (cv2.GaussianBlur(gray, (0, 0), sigma) for sigma in (FINE, COARSE))
+    bands = [cv2.blur((a - b) ** 2, (PATCH, PATCH))[rows, columns].astype(float) for a, b in ((gray, fine), (fine, coarse))]
+    colors = cv2.blur(view.image, (PATCH, PATCH))[rows, columns].astype(float)
+    return _Places(features, 0.5 * np.log((bands[0] + NOISE) / (bands[1] + NOISE)), colors)
+
+
+def _difference(views: Sequence[View], places: Sequence[_Places], i: int, j: int) -> np.ndarray | None:
+    """Return by how much photograph i exceeds photograph j: logarithms of the factors of detail, red, green and blue.
+
+    A factor is NaN where it is unknown; None where too few places match.
+    """
+    a, b = places[i], places[j]
+    ids, _ = agreeing_matches(views[i], views[j], a.features, b.features, min_angle=0.0)
+    if len(ids) < MIN_MATCHES:
+        return None
+    detail = np.median(a.detail[ids[:, 0]] - b.detail[ids[:, 1]])
+    both = np.stack([a.colors[ids[:, 0]], b.colors[ids[:, 1]]])
+    usable = ((both > DARKEST) & (both < BRIGHTEST)).all((0, 2))
+    if usable.sum() < MIN_MATCHES:
+        return np.array([detail, np.nan, np.nan, np.nan])
+    return np.array([detail, *np.median(np.log(both[0, usable] / both[1, usable]), axis=0)])
+
+
+def _pairs(views: Sequence[View]) -> list[tuple[int, int]]:
+    """Return each photograph with those taken nearest by, every pair once: their number is bounded per photograph."""
+    centers, pairs = np.array([v.camera.center for v in views]), set()
+    for i in range(len(views)):
+        order = np.argsort(((centers - centers[i]) ** 2).sum(1), kind="stable")
+        pairs |= {(min(i, j), max(i, j)) for j in order[order != i][:NEIGHBORS].tolist()}
+    return sorted(pairs)
+
+
+def _typical(differences: list[float]) -> float | None:
+    """Return the median; of an even number the middle value nearer to 0: a suspect one differs from most others."""
+    known = sorted(d for d in differences if np.isfinite(d))
+    if not known:
+        return None
+    middle = known[(len(known) - 1) // 2], known[len(known) // 2]
+    return 0.0 if middle[0] < 0 < middle[1] else min(middle, key=abs)
+
+
+def check_photos(views: Sequence[View], progress: Callable[[str], object] = lambda line: None) -> list[PhotoCheck]:
+    """Compare each photograph with those taken nearest by.
+
+    Args:
+        views: All views of the scene, those held out, too: at least one.
+        progress: Called now and then with a line for the user.
+
+    Returns:
+        One check per view, in order.
+    """
+    count, began = len(views), time.monotonic()
+    pairs = _pairs(views)
+    with single_threaded_opencv(), ThreadPoolExecutor(torch.get_num_threads(), initializer=without_ipp) as pool:
+        places = []
+        for place in pool.map(_places, views):
+            places.append(place)
+            if time.monotonic() - began > PROGRESS_INTERVAL:
+                began = time.monotonic()
+                progress(f"comparing photographs: {len(places)} of {count}")
+        found = list(pool.map(lambda pair: _difference(views, places, *pair), pairs))
+    differences: list[list[np.ndarray]] = [[] for _ in views]
+    for (i, j), difference in zip(pairs, found, strict=True):
+        if difference is not None:
+            differences[i].append(difference)
+            differences[j].append(-difference)
+    return [_check(v.name, d) for v, d in zip(views, differences, strict=True)]
+
+
+def _check(name: str, differences: list[np.ndarray]) -> PhotoCheck:
+    """Return the check of a photograph from its differences to others, as `_difference` gives them."""
+    if not differences:
+        return PhotoCheck(name, 0, None, None, None)
+    detail, *colors = (_typical([float(d[k]) for d in differences]) for k in range(4))
+    factor = None if detail is None else round(math.exp(detail), 3)
+    known = [c for c in colors if c is not None]
+    if len(known) < 3:
+        return PhotoCheck(name, len(differences), factor, None, None)
+    channels = tuple(round(math.exp(c), 3) for c in known)
+    return PhotoCheck(name, len(differences), factor, round(math.exp(sum(known) / 3), 3), channels)
+
+
+def photo_notes(checks: Sequence[PhotoCheck]) -> list[str]:
+    """Return the sentences that name photographs with faults, and how many could not be compared; none where all is well."""
+    notes = []
+    blurred = sorted((c for c in checks if c.blurred), key=lambda c: c.sharpness)
+    if blurred:
+        notes.append(
+            f"looks blurred, by the fine detail it has of what other photographs show in the same places: "
+            f"{_listed([f'{c.name} ({c.sharpness:.2f})' for c in blurred])}; take such photographs out, or expect soft places"
+        )
+    exposed = sorted((c for c in checks if c.exposed_otherwise), key=lambda c: -abs(math.log(c.brightness)))
+    if exposed:
+        notes.append(
+            "exposure differs from that of the photographs beside it: "
+            f"{_listed([f'{c.name} ({c.brightness:.2f} x as bright)' for c in exposed])}; fix it in the camera, or even it out"
+        )
+    tinted = [c for c in checks if c.tinted]
+    if tinted:
+        factors = [f"{c.name} (red {c.channels[0]:.2f}, green {c.channels[1]:.2f}, blue {c.channels[2]:.2f} x)" for c in tinted]
+        notes.append(f"white balance differs from that of the photographs beside it: {_listed(factors)}; fix it in the camera")
+    alone = [c.name for c in checks if not c.compared_with]
+    if alone:
+        notes.append(f"blur and exposure are unknown where too little matches the photographs beside it: {_listed(alone)}")
+    return notes
+
+
+def _listed(words: list[str]) -> str:
+    """Return words as a list; of more than `MAX_NAMED` the first, and how many more there are."""
+    return ", ".join(words[:MAX_NAMED]) + (f" and {len(words) - MAX_NAMED} more" if len(words) > MAX_NAMED else "")

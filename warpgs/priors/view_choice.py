@@ -1,0 +1,114 @@
+"""Choice of views by what they see: neighbours to compare a view with, and few views that together see most."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from warpgs import geometry
+from warpgs.geometry import check_pinhole
+from warpgs.scene import Camera
+
+SAMPLES = 4
+"""Pixels along either side of an image at which sight is sampled."""
+DEPTHS = 3
+"""Depths at each of them."""
+LEAST_ANGLE, MOST_ANGLE, LOST_ANGLE = 1.0, 30.0, 60.0
+"""Angles between two rays to a point [deg]: below the first depth is uncertain, from the second on a surface looks different
+to both views, and at the third they are taken to share nothing."""
+
+
+class Sight(NamedTuple):
+    """Sight that pairs of V views share, as fractions of what the first one sees."""
+
+    overlap: np.ndarray
+    """Fraction of the first view's sight that the second shares, evenly less with the angle, in [0, 1], shape [V, V]."""
+    matching: np.ndarray
+    """The same by how well the angle lets depth be found, 0 for a view and itself, shape [V, V]."""
+
+
+def _sampled(camera: Camera, bounds: tuple[float, float]) -> np.ndarray:
+    """Return points [S, 3] that a camera may see: at a grid of pixels, and depths evenly spaced in their logarithm."""
+    check_pinhole(camera)
+    along = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    x, y = (a.ravel() for a in np.meshgrid(along * camera.width, along * camera.height))
+    near, far = bounds
+    depths = [near * (far / near) ** ((k + 0.5) / DEPTHS) for k in range(DEPTHS)]
+    pixels = np.tile(np.stack([x, y], 1), (DEPTHS, 1))
+    return geometry.back_project(camera, pixels, np.repeat(depths, len(x)))
+
+
+def shared_sight(cameras: Sequence[Camera], bounds: Sequence[tuple[float, float]]) -> Sight:
+    """Return what pairs of views share, by projecting points sampled in each camera's frustum into all others.
+
+    After the view selection of multi-view stereo (Goesele et al. 2007; Yao et al. 2018 weigh the angle), with sampled points in
+    place of a reconstruction's.
+
+    Args:
+        cameras: Pinhole cameras of V views.
+        bounds: Nearest and farthest depth of each [u], 0 < near < far.
+    """
+    turns, shifts = np.stack([c.viewmat[:3, :3] for c in cameras]), np.stack([c.viewmat[:3, 3] for c in cameras])
+    K, centers = np.stack([c.K for c in cameras]), np.stack([c.center for c in cameras])
+    sides = np.array([(c.width, c.height) for c in cameras], float)
+    least, most, lost = (1 - np.cos(np.radians(a)) for a in (LEAST_ANGLE, MOST_ANGLE, LOST_ANGLE))
+    overlap, matching = np.zeros((2, len(cameras), len(cameras)))
+    for i, (camera, near_far) in enumerate(zip(cameras, bounds)):
+        points = _sampled(camera, near_far)
+        local = (turns[:, None] * points[None, :, None, :]).sum(3) + shifts[:, None]  # [V, S, 3]
+        ahead = local[..., 2] > 1e-9
+        z = np.where(ahead, local[..., 2], 1)
+        u = (K[:, None, 0] * local).sum(2) / z
+        v = (K[:, None, 1] * local).sum(2) / z
+        seen = ahead & (u >= 0) & (v >= 0) & (u < sides[:, :1]) & (v < sides[:, 1:])
+        rays = points[None] - centers[:, None]
+        rays /= np.maximum(np.sqrt((rays**2).sum(2, keepdims=True)), 1e-12)
+        turned = 1 - (rays * rays[i]).sum(2)  # 1 - cosine grows with the square of a small angle
+        alike = np.clip((lost - turned) / (lost - most), 0, 1)
+        close = np.clip(1 - np.sqrt(np.maximum(turned, 0) / lost), 0, 1)
+        overlap[i] = (seen * close).mean(1)
+        matching[i] = (seen * alike * np.clip(turned / least, 0, 1)).mean(1)
+        matching[i, i] = 0
+    return Sight(np.round(overlap, 9), np.round(matching, 9))  # last digits must not decide
+
+
+def matching_views(sight: Sight, cameras: Sequence[Camera], index: int, count: int, among: Sequence[int]) -> list[int]:
+    """Return the views to compare one with: the nearest cameras (ties by order) of those that share sight, at most ``count``.
+
+    Those too near for depths to be found are passed over: their angles take half of what they share. Where no view is left,
+    sampled points may have missed it, and the nearest cameras are returned. To take the views that share most at the best
+    angles instead finds fewer depths, and fits were 0.1 to 0.3 dB worse (docs/decisions/013-any-capture.md).
+
+    Args:
+        sight: What pairs of views share.
+        cameras: Cameras of all views.
+        index: The view.
+        count: Number of views wanted.
+        among: Views to choose from; the view itself is left out.
+    """
+    rest = [j for j in among if j != index]
+    matching, overlap = sight.matching[index], sight.overlap[index]
+    good = [j for j in rest if matching[j] > 0 and matching[j] >= 0.5 * overlap[j]]
+    away = {j: float(np.linalg.norm(cameras[j].center - cameras[index].center)) for j in rest}
+    return sorted(good or rest, key=away.get)[:count]
+
+
+def spread_views(sight: Sight, most: int) -> list[int]:
+    """Return at most that many views, ascending, that together see most of what all see.
+
+    One by one the view is taken by which the views' best overlap with any view taken grows most: the greedy choice for a
+    submodular sum, at least 1 - 1/e of the best (Nemhauser et al. 1978).
+    """
+    count = len(sight.overlap)
+    if count <= most:
+        return list(range(count))
+    shared = np.where(np.eye(count, dtype=bool), 1, sight.overlap)
+    covered, taken = np.zeros(count), []
+    while len(taken) < most:
+        gains = np.maximum(shared - covered[:, None], 0).sum(0).round(9)
+        gains[taken] = -1
+        taken.append(int(gains.argmax()))
+        covered = np.maximum(covered, shared[:, taken[-1]])
+    return sorted(taken)
