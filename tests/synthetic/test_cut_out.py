@@ -8,6 +8,7 @@ import pytest
 
 from warpgs.errors import UsageError
 from warpgs.geometry import rotation_matrices
+from warpgs.io.load import load_scene
 from warpgs.synthetic import cut_out, raycast
 
 SIZE = {"views": 9, "width": 48, "height": 40}
@@ -35,6 +36,10 @@ def test_two_formats_show_the_same_object_to_the_same_cameras(tmp_path):
         np.testing.assert_allclose(-R.T @ np.array(row.split()[5:8], float), pose[:3, 3], atol=1e-9)
         assert 0.05 < alpha.mean() < 0.5 and ((alpha > 0) & (alpha < 1)).mean() > 0.02  # edges are soft
     assert len((tmp_path / "colmap/sparse/0/points3D.txt").read_text().splitlines()) > 10
+    a, b = (load_scene(tmp_path / form, masks="cutout").views for form in cut_out.FORMATS)
+    for left, right in zip(a, b, strict=True):
+        np.testing.assert_array_equal(left.alpha, right.alpha)
+        np.testing.assert_allclose(left.image, right.image, atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(6))
