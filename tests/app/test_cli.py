@@ -272,4 +272,7 @@ def test_demo_command_tells_the_next_step(tmp_path, capsys):
     """The printed command uses the split that the scene was made for."""
     assert main(["demo", str(tmp_path / "d"), "--views", "8", "--width", "48", "--height", "36"]) == 0
     assert f"--split '{split_spec(8)}'" in capsys.readouterr().out
+    size = ["--views", "9", "--width", "32", "--height", "32"]
+    assert main(["demo", str(tmp_path / "o"), "--object", "--format", "colmap", *size]) == 0
+    assert "test=008.png' --masks cutout --out" in capsys.readouterr().out
     assert main(["--version"]) == 0
