@@ -86,12 +86,13 @@ def with_strategy(config: FitConfig, name: str) -> FitConfig:
 
 def with_holdout(config: FitConfig) -> FitConfig:
     """Return the settings with the size of the model decided by held-out blocks."""
-    return with_strategy(config, "holdout")
+    own = dataclasses.replace(config.holdout, bounds=True, degrees=True, trim_db=0.1, stop_db=0)
+    return dataclasses.replace(with_strategy(config, "holdout"), holdout=own)
 
 
 def without_density(config: FitConfig) -> FitConfig:
     """Return the settings with the set of Gaussians left as it starts."""
-    return dataclasses.replace(config, density=dataclasses.replace(config.density, start=config.steps))
+    return dataclasses.replace(config, density=dataclasses.replace(config.density, start=10**9))
 
 
 @dataclass(frozen=True)
