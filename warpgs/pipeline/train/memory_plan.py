@@ -98,7 +98,7 @@ class Layout:
         upstream = FLOAT * pixels * (3 if self.cuda and not (self.depth_supervised or self.cutout) else 5)
         # three partials for each colour and the gradient; masked copies; the two maps that are correlated, with gradients
         # the difference of opacities and its gradient
-        loss = FLOAT * pixels * ((36 if self.masked else 12) + 4 * self.depth_supervised + 3 * self.cutout)
+        loss = FLOAT * pixels * ((19 if self.masked else 12) + 4 * self.depth_supervised + 3 * self.cutout)
         if not self.cuda:
             loss += 5 * FLOAT * (3 * self.width + 30) * -(-self.height // 8)
         # an event keeps image, scores and gate of each view until its end
