@@ -1,10 +1,10 @@
 """Size against quality: the default, a fixed set, the same without harmonics, and that pruned, paired by scene and seed.
 
-usage: python -m bench.sizes DATA [--rows fern:3 ...] [--default default] [--fixed paper] [--seeds 5] [--jobs 1] [--seconds S]
+usage: python -m bench.sizes DATA [--rows fern:3 ...] [--default default] [--fixed default] [--seeds 5] [--jobs 1] [--seconds S]
            [--device auto] --out FILE.json
 ``--default`` and ``--fixed`` are presets with settings if need be, as bench.presets takes them: while the default is the fixed
-fit, ``--default paper:strategy=holdout`` is the adaptive one. The file goes on where it was stopped, and
-`python -m bench.presets --table` reads it, too.
+fit, ``--default default:holdout.degrees=true,holdout.trim_db=0.1`` is the adaptive one. The file goes on where it was
+stopped, and `python -m bench.presets --table` reads it, too.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class Sprout(warpgs.Strategy):
 
     def due(self, step: int) -> bool:
         """Return whether the set changes after a step; the last fifth of the fit is left alone."""
-        return step % self.config.every == 0 and step <= 0.8 * self.trainer.config.steps
+        return step % self.config.every == 0 and step <= 0.8 * self.trainer.steps
 
     def update(self, step: int) -> Iterator[DensityUpdate]:
         """Add and remove."""

@@ -1,6 +1,6 @@
 """Settings of a fit compared by leaving out one training view at a time: the only evidence by which they may be chosen.
 
-usage: python -m bench.experiments.leave_one_out SCENE... --trials paper paper:optimizer.scales_decay=0.1 [--split llff:3]
+usage: python -m bench.experiments.leave_one_out SCENE... --trials default default:optimizer.scales_decay=0.1 [--split llff:3]
            [--seeds 3] [--jobs 1] [--downscale 1] [--device auto] [--seconds S] --out FILE.json
 Each training view of the split is fitted without and scored once; its held-out views are never read. A trial is a preset and,
 after a colon, settings with commas between. Several fits at a time say nothing of speed, so no times are kept.

@@ -14,6 +14,7 @@ def ring(i):
     image[6:30, 12:36] = 200 - 10 * i
     image[12:24, 18:30] = 0
     image[9, 15] = 3
+    image[:2, :2] = [[[4] * 3, [90] * 3], [[90] * 3] * 2]  # what lies in the corner is joined to the border alone
     return image
 
 
@@ -30,11 +31,12 @@ def test_dark_pixels_around_objects_and_in_holes_are_transparent(tmp_path):
     alpha = np.zeros((36, 48), np.float32)
     alpha[6:30, 12:36] = 1
     alpha[12:24, 18:30] = 0
+    alpha[:2, :2] = [[0, 1], [1, 1]]
     for v, before in zip(scene.views, plain.views):
         assert (v.alpha == alpha).all() and v.alpha.dtype == np.float32 and not v.image[alpha == 0].any()
         assert (v.image[alpha == 1] == before.image[alpha == 1]).all() and before.alpha is None
         assert (counted_region(v)[0] == counted_region(before)[0]).all()
-    note = "every image shows an object on black: 75.0% of the pixels, dark ones around it and in its holes, are taken for"
+    note = "every image shows an object on black: 74.8% of the pixels, dark ones around it and in its holes, are taken for"
     assert any(n.startswith(note) and "--no-black-is-empty" in n for n in scene.notes)
     assert not any("object on black" in n for n in plain.notes) and scene.fingerprint != plain.fingerprint
 

@@ -291,7 +291,7 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
         c.rule,
         scene.background,
         seed=c.seed,
-        half_resolution=c.half_resolution,
+        half_resolution=trainer.half_resolution,
         max_instances=trainer.max_instances,
     )
     shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.extent)
@@ -331,10 +331,11 @@ def _train(job: _Job, trainer: Trainer, images_written: Callable[[], None]) -> N
         log.rewind(current.step)
         return True
 
-    with Progress(trainer.config.steps, trainer.step) if job.verbose else contextlib.nullcontext() as progress:
+    with Progress(trainer.steps, trainer.step) if job.verbose else contextlib.nullcontext() as progress:
 
         def on_step(r: StepReport) -> None:
             if progress is not None:
+                progress.total = trainer.steps  # fewer, once the fit is known to end earlier
                 progress.update(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count)
             if log is not None:
                 log.write(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=round(r.seconds, 6))

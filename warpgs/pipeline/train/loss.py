@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from warpgs.errors import UsageError
-from warpgs.kernels.ssim import differences, ssim
+from warpgs.kernels.ssim import differences
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.plugins import Registry
 from warpgs.scene import Gaussians, Prior, Render
@@ -80,25 +80,24 @@ def photometric_loss(
     Args:
         rgb: Rendered colours, shape [H, W, 3].
         target: Photographed colours in [0, 1], shape [H, W, 3].
-        mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count. Masked pixels are black to the window.
+        mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count. Masked pixels are black to the
+            window of SSIM, in which they count where it reaches pixels that do.
         ssim_weight: lambda, in [0, 1].
 
     Returns:
         The loss, shape []; 0 where no pixel counts.
     """
-    fraction = ssim_weight
-    if mask is None and fraction > 0:
+    pixels = target.shape[0] * target.shape[1]
+    if mask is not None:
+        kept = mask[..., None] > 0
+        rgb, target = torch.where(kept, rgb, 0), torch.where(kept, target, 0)
+    if ssim_weight > 0:
         sums = differences(rgb, target)
         # one product and one sum, where terms one by one would be a dozen kernels on a GPU
-        return (sums * _weights(fraction, target.numel(), sums.dtype, sums.device)).sum()
-    if mask is not None:
-        rgb, target = rgb * mask[..., None], target * mask[..., None]
-    pixels = target.shape[0] * target.shape[1] if mask is None else mask.sum().clamp_min(1)
-    l1 = _total((rgb - target).abs()) / (3 * pixels)
-    if mask is None or fraction == 0:
-        return l1
-    structural = _total((1 - ssim(rgb, target)) * mask[..., None]) / (3 * pixels)
-    return (1 - fraction) * l1 + fraction * structural
+        loss = (sums * _weights(ssim_weight, target.numel(), sums.dtype, sums.device)).sum()
+    else:
+        loss = _total((rgb - target).abs()) / (3 * pixels)
+    return loss if mask is None else loss * (pixels / mask.sum().clamp_min(1))
 
 
 def depth_disagreement(

@@ -103,7 +103,10 @@ class Trainer:
         self.radius = scene_radius(cameras, cloud)
         """Radius of the scene [u], as `scene_radius` measures it."""
         self.scene_background, self.background = background, torch.tensor(background, dtype=torch.float32, device=device)
+        assert config.steps is not None and config.half_resolution is not None  # `settings_by_views` has chosen
         self.phases = plan_phases(config.phases, config.steps)
+        self.half_resolution = config.half_resolution
+        """Fraction of the planned steps, from the first, in which views are half their size."""
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
         """Dropout probability at the last step."""
         self.cutout = any(v.alpha is not None for v in train)  # some know their opacity: all have one then
@@ -151,14 +154,14 @@ class Trainer:
 
     def end_growth(self) -> None:
         """Begin phase 3 after the step that was just taken, where it is not there yet."""
-        if self.step < self.phases.stable_start < self.config.steps:
+        if self.step < self.phases.stable_start < self.phases.planned:
             self.phases = self.phases.stable_from(self.step)
 
     def plan_of(self, step: int) -> StepPlan:
         """Return the plan of a step, counted from 1."""
         c = self.config
-        terms = tuple(t for t in self.terms if t.active(step, c.steps))
-        strategy, half = self.strategy, step <= c.half_resolution * c.steps
+        terms = tuple(t for t in self.terms if t.active(step, self.phases.planned))
+        strategy, half = self.strategy, step <= self.half_resolution * self.phases.planned
         limits = c.limits.at(1.0 if step >= self.steps else self.progress(step), self.radius)
         return StepPlan(strategy.sh_degree(step), half, terms, strategy.phase(step), limits)
 
@@ -286,7 +289,7 @@ class Trainer:
     def lrs(self, step: int) -> dict[str, float]:
         """Return the learning rate of each parameter of the Gaussians at a step."""
         c, phases = self.config, self.phases
-        stable_start = phases.stable_start / c.steps if phases.stable_start < c.steps else 0.0
+        stable_start = phases.stable_start / phases.planned if phases.stable_start < phases.planned else 0.0
         return c.optimizer.lrs(self.progress(step), self.extent, stable_start)
 
     def settings(self, step: int) -> tuple[float, ...]:
@@ -313,7 +316,7 @@ class Trainer:
         """Train on these views from here on, and plan the memory that steps need."""
         c = self.config
         self._forget_graphs()
-        shown = [*views, *(half_size(v) for v in views if c.half_resolution > 0)]
+        shown = [*views, *(half_size(v) for v in views if self.half_resolution > 0)]
         shown, self.stacks, self.places = stack_views(shown, len(views))
         self.views = shown[: len(views)]
         layout = layout_of(
@@ -350,7 +353,7 @@ class Trainer:
         Raises:
             DataError: They are not what `state` returns.
         """
-        check_state(tensors, plain, views=len(self.views), steps=self.config.steps, strategy=self.strategy.STATE)
+        check_state(tensors, plain, views=len(self.views), steps=self.phases.planned, strategy=self.strategy.STATE)
         self.step, self.order = plain["step"], list(plain["order"])
         self.phases = dataclasses.replace(self.phases, stable_start=plain["stable_start"], steps=plain["steps"])
         self.extent, self.notes = plain["extent"], plain["notes"]

@@ -77,7 +77,9 @@ class Strategy:
 
     def sh_degree(self, step: int) -> int:
         """Return the spherical-harmonics degree in use at a step."""
-        return sh_degree(step, self.trainer.config.sh_every, self.trainer.config.init.max_sh_degree)
+        highest = self.trainer.config.init.max_sh_degree
+        assert highest is not None  # `settings_by_views` has chosen
+        return sh_degree(step, self.trainer.config.sh_every, highest)
 
     def dropout(self, step: int) -> float:
         """Return the probability that a Gaussian is hidden in a step, in [0, 1); asked only if `FitConfig.dropout` is not 0."""
