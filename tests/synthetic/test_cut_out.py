@@ -9,7 +9,8 @@ import pytest
 from warpgs.errors import UsageError
 from warpgs.geometry import rotation_matrices
 from warpgs.io.load import load_scene
-from warpgs.synthetic import cut_out, raycast
+from warpgs.scene import Camera
+from warpgs.synthetic import cut_out, demo, raycast
 
 SIZE = {"views": 9, "width": 48, "height": 40}
 
@@ -64,3 +65,15 @@ def test_seeds_differ_and_wishes_are_checked(tmp_path):
         cut_out.write_object(tmp_path / "a", form="llff", **SIZE)
     with pytest.raises(UsageError, match="9 views or more"):
         cut_out.write_object(tmp_path / "a", views=8)
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("angle", [0.3, 3.1, np.pi])
+def test_poses_of_half_a_turn_are_written(axis, angle):
+    s, c = np.sin(angle / 2) * np.eye(3)[axis], np.cos(angle / 2)
+    R = rotation_matrices(np.array([c, *s]))
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = R
+    text = demo.colmap_text([Camera(viewmat, np.eye(3), 8, 8)], np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 1), bool))
+    quat = np.array(text["images.txt"].splitlines()[3].split()[1:5], float)
+    np.testing.assert_allclose(rotation_matrices(quat), R, atol=1e-9)
