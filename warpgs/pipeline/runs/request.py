@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -65,16 +66,18 @@ class FitRequest:
 
 
 def choose_device(name: str | torch.device) -> tuple[torch.device, str]:
-    """Return the device for auto, cpu or cuda, or a device itself, and a phrase that names it.
+    """Return the device for auto, cpu, cuda or cuda:N, or a device itself, and a phrase that names it.
 
     Raises:
         ResourceError: CUDA was asked for and is not there.
-        UsageError: The name is none of the three.
+        UsageError: The name is none of these.
     """
     if isinstance(name, torch.device):
         device = name
+    elif re.fullmatch(r"cuda:[0-9]{1,3}", name):
+        device = torch.device(name)
     elif name not in ("auto", "cpu", "cuda"):
-        raise UsageError(f"device {name!r} is not one of auto, cpu, cuda")
+        raise UsageError(f"device {name!r} is not one of auto, cpu, cuda, cuda:N")
     else:
         device = torch.device("cuda" if name == "auto" and torch.cuda.is_available() else name.replace("auto", "cpu"))
     if device.type == "cpu":

@@ -25,7 +25,7 @@ DEGREES = (9, 12)
 """Training views from which colours have spherical harmonics of degree 2, and of degree 3; with fewer they have degree 1."""
 CPU_PIXELS = 1e6
 """Pixels that two cores of a processor of 2.5 GHz train a second: 190 ms a step at 504 x 378 px."""
-CPU_SECONDS = 60.0, 5.0, 1200.0
+CPU_SECONDS = 40.0, 5.0, 1200.0
 """Time that a fit on a CPU may take by default [s]: at least, for each view, and at most."""
 
 

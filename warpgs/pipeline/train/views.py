@@ -70,14 +70,20 @@ def with_alpha(views: Sequence[View]) -> list[View]:
     return [replace(v, alpha=np.ones(v.image.shape[:2], np.float32)) if v.alpha is None else v for v in views]
 
 
+def half_size_camera(c: Camera) -> Camera:
+    """Return the camera with both sides of its image halved, rounded down but to at least one pixel."""
+    width, height = max(1, c.width // 2), max(1, c.height // 2)
+    scale = torch.tensor([width / c.width, height / c.height, 1.0], dtype=c.K.dtype, device=c.K.device)
+    return replace(c, K=scale[:, None] * c.K, width=width, height=height)
+
+
 def half_size(view: TrainingView) -> TrainingView:
     """Return the view with both sides halved, rounded down but to at least one pixel; without scores.
 
     Colours, opacities and maps are means over what a pixel covers, and a pixel counts where all of that does.
     """
-    c = view.camera
-    width, height = max(1, c.width // 2), max(1, c.height // 2)
-    scale = torch.tensor([width / c.width, height / c.height, 1.0], dtype=c.K.dtype, device=c.K.device)
+    camera = half_size_camera(view.camera)
+    width, height = camera.width, camera.height
 
     def mean(channels: torch.Tensor) -> torch.Tensor:
         return interpolate(channels[None], (height, width), mode="area")[0]
@@ -86,7 +92,6 @@ def half_size(view: TrainingView) -> TrainingView:
         return mean(t[None])[0] if t.ndim == 2 else mean(t.permute(2, 0, 1)).permute(1, 2, 0).contiguous()
 
     mask = None if view.mask is None else (mean(view.mask[None])[0] > 1 - 1e-4).to(view.mask.dtype)
-    camera = replace(c, K=scale[:, None] * c.K, width=width, height=height)
     maps, alpha = {n: smaller(t) for n, t in view.maps.items()}, None if view.alpha is None else smaller(view.alpha)
     return TrainingView(camera, smaller(view.image), mask, maps=maps, alpha=alpha)
 
