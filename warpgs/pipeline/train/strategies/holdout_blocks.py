@@ -35,7 +35,7 @@ class HoldoutConfig:
 
     fraction: float = 0.03
     """Fraction of the pixels that is held out until growth ends."""
-    levels: int = 8
+    levels: int = 4
     """Number of levels of growth, of equal length; after each its gain is measured."""
     noise: float = 1.0
     """Standard errors of the mean gain over the blocks that count as its noise."""

@@ -152,8 +152,9 @@ class MCMC(Strategy):
     def regularisation(self, phase, gaussians):
         """Return the weighted mean opacity plus the weighted mean axis length, shape [], by which unneeded Gaussians die."""
         c = self.config
-        opacity, scale = gaussians.logit_opacities.sigmoid().mean(), gaussians.log_scales.exp().mean()
-        return c.opacity_weight * opacity + c.scale_weight * scale
+        # by way of float64: float32's functions have other last digits on other processors
+        opacity, scale = gaussians.logit_opacities.double().sigmoid().mean(), gaussians.log_scales.double().exp().mean()
+        return (c.opacity_weight * opacity + c.scale_weight * scale).to(gaussians.log_scales.dtype)
 
     def after_step(self, phase, settings, going):
         """Perturb the means; ``settings`` [3] holds step and learning rate, nothing changes where ``going`` [1] is False."""
