@@ -36,7 +36,13 @@ def advanced(config: FitConfig, steps: int) -> Trainer:
 
 
 def finished(views: list[View], points: PointCloud | None = None, steps: int = PRESETS["quick"].steps, **holdout) -> Trainer:
-    quick = dataclasses.replace(PRESETS["quick"], holdout=HoldoutConfig(**holdout))
+    """A fit as its sizes below were measured, whose settings do not follow from the number of views."""
+    quick = PRESETS["quick"]
+    lrs = dataclasses.replace(quick.optimizer, scales_lr=0.1, opacities_lr=0.05)
+    quick = dataclasses.replace(
+        quick, holdout=HoldoutConfig(**holdout), half_resolution=0.0, optimizer=lrs,
+        init=dataclasses.replace(quick.init, max_sh_degree=1),
+    )  # fmt: skip
     start = quick.init if points is None else dataclasses.replace(quick.init, source="points")
     fit = Trainer(
         views, points, dataclasses.replace(quick, steps=steps, strategy="holdout", init=start), CPU, priors=priors(views)
