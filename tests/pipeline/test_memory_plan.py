@@ -17,6 +17,7 @@ from warpgs.pipeline.train.loss import LossConfig
 from warpgs.pipeline.train.memory_plan import Layout, instance_bytes, most_instances, plan
 from warpgs.pipeline.train.schedule import PhaseConfig
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.strategies.holdout_blocks import HoldoutConfig
 from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig
 from warpgs.pipeline.train.trainer import Trainer
@@ -138,7 +139,7 @@ def test_plan_counts_what_lasts(strategy):
 def test_plan_covers_held_out_blocks():
     """Whole views beside those without their blocks, bounds and levels, through growth, its end and trims."""
     views = photos(4, 200, 150)
-    config = dataclasses.replace(GROWING, steps=30, strategy="holdout", sh_every=15)
+    config = dataclasses.replace(GROWING, steps=30, strategy="holdout", sh_every=15, holdout=HoldoutConfig(levels=8))
     fit = Trainer(views, seeds(1500), config, CPU)
     fit.advance()
     assert fit.strategy.measuring
