@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from warpgs.app.cli import main
-from warpgs.app.cli_fit import fit
+from warpgs.app.commands.fit import request_of
 from warpgs.app.flags import field_docs, flags_of, settings_of
 from warpgs.pipeline.train.config import PRESETS, FitConfig
 from warpgs.pipeline.train.loss import DepthCorrelation
@@ -56,7 +56,7 @@ class Opaque(loss.LossTerm):
 
 def parsed(*flags):
     """The settings that a command line leads to."""
-    return fit([*BASE, *flags], "").config
+    return request_of([*BASE, *flags], "").config
 
 
 def squeezed(text):
@@ -79,7 +79,7 @@ def test_every_setting_is_a_flag_with_its_own_help(capsys, monkeypatch):
     """Whatever FitConfig and its parts hold is in the help, word for word, without a second text."""
     monkeypatch.setenv("COLUMNS", "110")
     with pytest.raises(SystemExit) as end:
-        fit(["--help", "--strategy", "mcmc", "--loss-terms", "depth_correlation"], "")
+        request_of(["--help", "--strategy", "mcmc", "--loss-terms", "depth_correlation"], "")
     text = squeezed(capsys.readouterr().out)
     flags = [*leaves(FitConfig), *leaves(MCMCConfig, "mcmc."), *leaves(DepthCorrelation, "depth-correlation.")]
     assert end.value.code == 0 and len(flags) > 80

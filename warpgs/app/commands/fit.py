@@ -1,7 +1,7 @@
-"""Flags of `warpgs fit`, derived from `FitConfig`: names, defaults and help texts are those of its fields.
+"""`warpgs fit`: flags derived from `FitConfig`: names, defaults and help texts are those of its fields.
 
 Defaults depend on the preset; a strategy and loss terms bring settings of their own. So the few flags that decide which others
-there are, are looked up first. This module parses and prints; it holds no logic of a fit.
+there are, are looked up first. Parses, calls, prints; no logic.
 """
 
 import dataclasses
@@ -23,6 +23,7 @@ from warpgs.pipeline.train.time_budget import check_budget
 from warpgs.plugins import Registry
 from warpgs.render.rule_costs import select_rule
 from warpgs.runtime.byte_units import parse_bytes
+from warpgs.runtime.imports import fast_imports
 from warpgs.runtime.interop import set_threads
 from warpgs.runtime.terminal import say
 
@@ -202,7 +203,7 @@ def _chosen(a: Any, arguments: list[str], config: FitConfig) -> tuple[FitConfig,
     return dataclasses.replace(config, rule=rule), (note,)
 
 
-def fit(arguments: list[str], description: str) -> FitRequest:
+def request_of(arguments: list[str], about: str) -> FitRequest:
     """Return the request that the words of a command line make.
 
     Raises:
@@ -210,7 +211,7 @@ def fit(arguments: list[str], description: str) -> FitRequest:
     """
     base = _preset(arguments)
     terms = _terms(arguments, base)
-    a: Any = parse_flags(_flags(base, terms), arguments, "warpgs fit", f"{description}\n\n{_presets()}")
+    a: Any = parse_flags(_flags(base, terms), arguments, "warpgs fit", f"{about}\n\n{_presets()}")
     if a.reader is not None:
         _load(READERS, a.reader)
     check_range("--threads", a.threads, 0, MAX_THREADS)
@@ -225,3 +226,12 @@ def fit(arguments: list[str], description: str) -> FitRequest:
         a.max_pixels,
     )  # fmt: skip
     return FitRequest(scene, a.out, config, a.device, a.resume, a.lpips_weights, a.time_budget, notes)
+
+
+def run(arguments: list[str], about: str) -> int:
+    """Run the command; ``about`` heads its help."""
+    request = request_of(arguments, about)
+    with fast_imports():
+        from warpgs.pipeline.runs.fit import fit_request
+    fit_request(request)
+    return 0

@@ -1,0 +1,1 @@
+"""Commands, a module each with ``run(arguments, about)``: parse, call, print; no logic."""

@@ -1,0 +1,24 @@
+"""`warpgs ablate`: a preset with its parts off one at a time. Parses, calls, prints; no logic."""
+
+from dataclasses import dataclass
+
+from warpgs.app.commands.study import run_study_of, study_flags
+from warpgs.app.flags import parse_flags
+
+
+def run(arguments: list[str], about: str) -> int:
+    """Run the command; ``about`` heads its help."""
+    from warpgs.pipeline.train.config import DEFAULT_PRESET
+
+    base = study_flags()
+
+    @dataclass(frozen=True, kw_only=True)
+    class Ablate(base):
+        preset: str = DEFAULT_PRESET
+        """Preset whose parts are switched off one at a time."""
+
+    a = parse_flags(Ablate, arguments, "warpgs ablate", about)
+    from warpgs.pipeline.study.compare import ablation_variants, preset_variants
+
+    (config,) = preset_variants([a.preset], a.steps).values()
+    return run_study_of(a, *ablation_variants(config))

@@ -1,0 +1,48 @@
+"""`warpgs demo`: write a synthetic scene. Parses, calls, prints; no logic."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from warpgs.app.flags import check_range, parse_flags
+from warpgs.runtime.terminal import say
+
+
+def run(arguments: list[str], about: str) -> int:
+    """Run the command; ``about`` heads its help."""
+    import tyro
+
+    @dataclass(frozen=True)
+    class Demo:
+        folder: tyro.conf.Positional[Path]
+        """Folder to write; must not exist yet."""
+        views: int = 24
+        """Number of photographs."""
+        width: int = 320
+        """Image width [px]."""
+        height: int = 240
+        """Image height [px]."""
+        seed: int = 0
+        """Decides the textures; of an object also its shape."""
+        object: bool = False
+        """Instead of a still life, an object with nothing around it: RGBA images, eight of them to fit."""
+        format: str = "transforms"
+        """Of an object: transforms (transforms.json with RGBA images) or colmap (RGB images with cut-out masks)."""
+
+    a = parse_flags(Demo, arguments, "warpgs demo", about)
+    check_range("--views", a.views, 8, 10_000)
+    check_range("--width", a.width, 8, 8192)
+    check_range("--height", a.height, 8, 8192)
+    check_range("--seed", a.seed, 0, 2**31 - 1)
+    size = {"views": a.views, "width": a.width, "height": a.height, "seed": a.seed}
+    if a.object:
+        from warpgs.synthetic.cut_out import write_object
+
+        split, masks = write_object(a.folder, form=a.format, **size), " --masks cutout" if a.format == "colmap" else ""
+    else:
+        from warpgs.synthetic.demo import write_demo
+
+        split, masks = write_demo(a.folder, **size), ""
+    form = "transforms.json" if a.object and a.format == "transforms" else "COLMAP"
+    say(f"{a.folder}: {a.views} views of {a.width} x {a.height} px as a {form} folder")
+    say(f"next: warpgs fit {a.folder} --split '{split}'{masks} --out run")
+    return 0

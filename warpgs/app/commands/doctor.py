@@ -1,0 +1,37 @@
+"""`warpgs doctor`: say what this machine has. Parses, calls, prints; no logic."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from warpgs.app.flags import parse_flags
+from warpgs.runtime.imports import fast_imports
+from warpgs.runtime.terminal import say
+
+
+def run(arguments: list[str], about: str) -> int:
+    """Run the command; ``about`` heads its help."""
+
+    @dataclass(frozen=True)
+    class Doctor:
+        warm: bool = False
+        """Instead, compile all kernels that a fit uses on this machine's devices, so that none waits for it."""
+        repeat: Path | None = None
+        """Instead, compute a step again whose loss was not finite, and say what is not: not_finite.safetensors of a run."""
+        device: str = "auto"
+        """Device for --repeat: auto, cpu or cuda."""
+
+    a = parse_flags(Doctor, arguments, "warpgs doctor", about)
+    if a.repeat is not None:
+        from warpgs.pipeline.runs.commands import repeat_failed_step
+
+        for line in repeat_failed_step(a.repeat, a.device):
+            say(line)
+        return 0
+    if a.warm:
+        with fast_imports():
+            from warpgs.app.precompile import print_warming
+        print_warming()
+        return 0
+    from warpgs.app.doctor import diagnose, print_report
+
+    return print_report(diagnose())

@@ -1,0 +1,32 @@
+"""`warpgs eval`: score a run again. Parses, calls, prints; no logic."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from warpgs.app.flags import parse_flags
+from warpgs.runtime.terminal import say
+
+
+def run(arguments: list[str], about: str) -> int:
+    """Run the command; ``about`` heads its help."""
+    import tyro
+
+    @dataclass(frozen=True)
+    class Eval:
+        run: tyro.conf.Positional[Path]
+        """Run folder of `warpgs fit`."""
+        device: str = "auto"
+        """auto, cpu or cuda."""
+        lpips_weights: Path | None = None
+        """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
+        reader: str | None = None
+        """Reader from outside warpgs, as `warpgs fit --reader` was given it."""
+        by_coverage: bool = False
+        """Split the scores by how many training views saw what a pixel shows: none, one, two or more."""
+
+    a = parse_flags(Eval, arguments, "warpgs eval", about)
+    from warpgs.pipeline.runs.commands import evaluate
+
+    for line in evaluate(a.run, a.device, a.lpips_weights, a.reader, a.by_coverage):
+        say(line)
+    return 0

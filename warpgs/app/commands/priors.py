@@ -1,0 +1,80 @@
+"""`warpgs priors`: look at what is known before a fit, or write networks as ONNX. Parses, calls, prints; no logic."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from warpgs.app.flags import MAX_THREADS, check_range, parse_flags
+from warpgs.errors import UsageError
+from warpgs.runtime.terminal import say
+
+
+def run(arguments: list[str], about: str) -> int:
+    """Run the command; ``about`` heads its help.
+
+    Raises:
+        UsageError: It is neither show nor export.
+    """
+    kinds = {"show": _show, "export": _export}
+    if not arguments or arguments[0] not in kinds:
+        if arguments and arguments[0] in ("-h", "--help"):
+            say("usage: warpgs priors show SCENE --out DIR [flags]")
+            say("       warpgs priors export --model MODEL --out FILE.onnx [flags]")
+            return 0
+        raise UsageError("priors: say show or export; `warpgs priors show --help` lists flags")
+    return kinds[arguments[0]](arguments[1:], about)
+
+
+def _show(arguments: list[str], about: str) -> int:
+    import tyro
+
+    from warpgs.io.decoding import MAX_PIXELS
+    from warpgs.priors.view_prior import PriorConfig
+
+    @dataclass(frozen=True)
+    class Show:
+        scene: tyro.conf.Positional[Path]
+        """Scene folder."""
+        out: Path
+        """Folder for a PNG sheet per training view."""
+        split: str | None = None
+        """As for `warpgs fit`."""
+        downscale: int = 1
+        """Factor by which both image sides shrink."""
+        allow_outside: bool = False
+        """Let names and links of the scene lead to images and masks outside its folder."""
+        max_pixels: int = MAX_PIXELS
+        """Largest number of pixels that an image or a mask may have as stored."""
+        threads: int = 0
+        """CPU threads of the networks; 0 for as many as there are cores."""
+        source: str = "sweep"
+        """How depth is found in the other views where no depth network is named: sweep or flow, as --init.source of a fit."""
+        priors: tyro.conf.OmitArgPrefixes[PriorConfig] = field(default_factory=PriorConfig)
+
+    a = parse_flags(Show, arguments, "warpgs priors show", about)
+    from warpgs.pipeline.runs.preview import show_priors
+    from warpgs.pipeline.runs.request import SceneRequest
+
+    check_range("--threads", a.threads, 0, MAX_THREADS)
+    scene = SceneRequest(str(a.scene), a.split, a.downscale, allow_outside=a.allow_outside, max_pixels=a.max_pixels)
+    for line in show_priors(scene, a.priors, a.source, a.out, a.threads):
+        say(line)
+    return 0
+
+
+def _export(arguments: list[str], about: str) -> int:
+    import tyro
+
+    from warpgs.priors.export import ExportRequest
+
+    @dataclass(frozen=True)
+    class Export:
+        request: tyro.conf.OmitArgPrefixes[ExportRequest]
+        out: Path
+        """ONNX file to write; FILE.onnx.json beside it says how to feed it."""
+
+    a = parse_flags(Export, arguments, "warpgs priors export", about)
+    from warpgs.priors.export import export_network
+
+    for line in export_network(a.request, a.out):
+        say(line)
+    return 0

@@ -1,0 +1,32 @@
+"""`warpgs prune`: shrink a finished model. Parses, calls, prints; no logic."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from warpgs.app.flags import parse_flags
+from warpgs.runtime.terminal import say
+
+
+def run(arguments: list[str], about: str) -> int:
+    """Run the command; ``about`` heads its help."""
+    import tyro
+
+    @dataclass(frozen=True)
+    class Prune:
+        run: tyro.conf.Positional[Path]
+        """Run folder of `warpgs fit`; it stays as it is."""
+        keep_psnr: float = 0.1
+        """PSNR that the mean over the training views may fall by [dB]."""
+        out: Path | None = None
+        """Run folder to write; RUN-pruned where not given; must not exist yet."""
+        device: str = "auto"
+        """auto, cpu or cuda."""
+        reader: str | None = None
+        """Reader from outside warpgs, as `warpgs fit --reader` was given it."""
+
+    a = parse_flags(Prune, arguments, "warpgs prune", about)
+    from warpgs.pipeline.runs.prune import prune
+
+    for line in prune(a.run, a.keep_psnr, a.out, a.device, a.reader):
+        say(line)
+    return 0

@@ -1,0 +1,51 @@
+"""`warpgs compare` and `warpgs ablate`: what they share. Parses, calls, prints; no logic."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from warpgs.runtime.terminal import say
+
+
+def study_flags() -> type:
+    """Return the dataclass of the flags that `compare` and `ablate` share."""
+    import tyro
+
+    from warpgs.io.decoding import MAX_PIXELS
+
+    @dataclass(frozen=True, kw_only=True)
+    class Study:
+        scenes: tyro.conf.Positional[tuple[Path, ...]]
+        """Scene folders."""
+        out: Path
+        """Folder of the study; the same command on it goes on where it stopped."""
+        seeds: int = 5
+        """Runs of each setting on each scene, seeds 0, 1, ..."""
+        split: str | None = None
+        """As in `warpgs fit`, for all scenes."""
+        downscale: int = 1
+        """Factor by which both image sides shrink."""
+        allow_outside: bool = False
+        """Let names and links of the scenes lead to images and masks outside their folders."""
+        max_pixels: int = MAX_PIXELS
+        """Largest number of pixels that an image or a mask may have as stored."""
+        steps: int | None = None
+        """Optimisation steps of every run; as in `warpgs fit` where not given."""
+        device: str = "auto"
+        """auto, cpu or cuda."""
+        lpips_weights: Path | None = None
+        """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
+
+    return Study
+
+
+def run_study_of(a, variants: dict, marks: dict) -> int:
+    """Run the study that parsed flags ask for."""
+    from warpgs.pipeline.runs.request import SceneRequest
+    from warpgs.pipeline.study.compare import run_study
+    from warpgs.pipeline.study.study import StudyRequest
+
+    options = {"allow_outside": a.allow_outside, "max_pixels": a.max_pixels}
+    scenes = tuple(SceneRequest(str(s), a.split, a.downscale, **options) for s in a.scenes)
+    for line in run_study(StudyRequest(scenes, variants, a.seeds, a.out, a.device, a.lpips_weights, marks)):
+        say(line)
+    return 0
