@@ -60,6 +60,9 @@ class View:
     alpha: np.ndarray | None = None
     """Opacity of what was photographed, in [0, 1], float32, shape [H, W]; ``image`` shows it over the scene's background. None
     where the image is opaque."""
+    alpha_estimated: bool = False
+    """True where ``alpha`` was estimated from a black background: it says where Gaussians start and what is scored. The loss
+    does not use it, since dark parts of the object may be taken for background."""
 
 
 @dataclass(frozen=True)

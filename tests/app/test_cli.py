@@ -29,7 +29,25 @@ def scene(tmp_path_factory):
 def run(scene):
     """A short run on it."""
     out = scene.parent / "run"
-    assert main(["fit", str(scene), "--split", split_spec(9), "--steps", "40", "--out", str(out), "--device", "cpu"]) == 0
+    assert (
+        main(
+            [
+                "fit",
+                str(scene),
+                "--split",
+                split_spec(9),
+                "--steps",
+                "40",
+                "--phases.least",
+                "5",
+                "--out",
+                str(out),
+                "--device",
+                "cpu",
+            ]
+        )
+        == 0
+    )
     return out
 
 

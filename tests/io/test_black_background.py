@@ -34,6 +34,7 @@ def test_dark_pixels_around_objects_and_in_holes_are_transparent(tmp_path):
     alpha[:2, :2] = [[0, 1], [1, 1]]
     for v, before in zip(scene.views, plain.views):
         assert (v.alpha == alpha).all() and v.alpha.dtype == np.float32 and not v.image[alpha == 0].any()
+        assert v.alpha_estimated and not before.alpha_estimated
         assert (v.image[alpha == 1] == before.image[alpha == 1]).all() and before.alpha is None
         assert (counted_region(v)[0] == counted_region(before)[0]).all()
     note = "every image shows an object on black: 74.8% of the pixels, dark ones around it and in its holes, are taken for"

@@ -135,6 +135,14 @@ def test_a_continued_fit_equals_an_uninterrupted_one():
     assert [t.name for t in opaque.terms] == ["photometric"]
 
 
+def test_an_estimated_opacity_is_no_target():
+    """It says where Gaussians start and are sampled; the loss is that of opaque views."""
+    views = [dataclasses.replace(v, alpha_estimated=True) for v in cutouts()]
+    fit = fitted(views, LossConfig(), 1)
+    assert [t.name for t in fit.terms] == ["photometric"] and fit.settings(5)[3:] == (0, 0, 0)
+    assert fit.views[0].countable is not None and fit.layout.cutout
+
+
 def test_a_failed_step_has_the_colour_behind_it():
     """The file's losses add up to what the next step reports."""
     fit = fitted(cutouts(), LossConfig(), 18)

@@ -80,6 +80,9 @@ def test_short_fit_has_all_phases():
     phases = plan_phases(PhaseConfig(2000, 3000), 300)
     assert (phases.refine, phases.stable_start) == (60, 210) and phases.events[0] == 60 and len(phases.events) == 21
     assert plan_phases(PhaseConfig(), 100).stable_start == 100
+    few = plan_phases(PhaseConfig(2000, 3000, least=20), 300).events
+    assert few[:2] == (60, 80) and 4 <= len(few) <= 6 and few[-1] < 210
+    assert plan_phases(PhaseConfig(2000, 3000, least=20), 3000) == plan_phases(PhaseConfig(2000, 3000), 3000)
 
 
 def test_protected_gaussian_survives_its_protection_and_no_step_longer():

@@ -136,10 +136,11 @@ def test_plan_counts_what_lasts(strategy):
     assert fit.layout.held(500) == bytes_of_tensors(tensors)
 
 
-def test_plan_covers_held_out_blocks():
+@pytest.mark.parametrize("levels", [4, 8])
+def test_plan_covers_held_out_blocks(levels):
     """Whole views beside those without their blocks, bounds and levels, through growth, its end and trims."""
     views = photos(4, 200, 150)
-    config = dataclasses.replace(GROWING, steps=30, strategy="holdout", sh_every=15, holdout=HoldoutConfig(levels=8))
+    config = dataclasses.replace(GROWING, steps=30, strategy="holdout", sh_every=15, holdout=HoldoutConfig(levels=levels))
     fit = Trainer(views, seeds(1500), config, CPU)
     fit.advance()
     assert fit.strategy.measuring

@@ -8,6 +8,7 @@ from warpgs.errors import DataError
 from warpgs.priors.preprocess import Preprocessing
 from warpgs.priors.semantics import (
     SemanticMaps,
+    _fast_length,
     boundary_weight,
     class_probabilities,
     classical_semantics,
@@ -25,6 +26,13 @@ def shapes(height=32, width=64):
     image[8:20, 6:24, 0], labels[8:20, 6:24] = 0.9, 3
     image[12:30, 40:58, 2], labels[12:30, 40:58] = 0.7, 15
     return image, labels
+
+
+def test_sides_of_reduced_images_are_quick_to_transform():
+    """The largest product of 2, 3 and 5 up to a length."""
+    products = sorted(2**a * 3**b * 5**c for a in range(10) for b in range(6) for c in range(4))
+    for length in (1, 7, 193, 258, 511, 997):
+        assert _fast_length(length) == max(p for p in products if p <= length)
 
 
 def brute_boundary(labels):

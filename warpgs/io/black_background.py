@@ -61,7 +61,7 @@ def cut_from_black(views: list[View]) -> tuple[list[View], str]:
         nothing = empty_pixels(dark)
         empty += float(nothing.mean()) / len(views)
         alpha = 1 - nothing.astype(np.float32)
-        done.append(replace(v, image=v.image * alpha[..., None], alpha=alpha))
+        done.append(replace(v, image=v.image * alpha[..., None], alpha=alpha, alpha_estimated=True))
     return done, (
         f"every image shows an object on black: {empty:.1%} of the pixels, dark ones around it and in its holes, are taken for "
         "transparent; --no-black-is-empty leaves them black"

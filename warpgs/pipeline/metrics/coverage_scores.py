@@ -23,8 +23,8 @@ CLASSES = {
 """Classes of pixels, with what each is for people. Where no view of a scene has an alpha, nothing is background."""
 BINS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, np.inf)
 """Upper ends of the classes of depth difference by which an error is expected; the last holds all that is beyond."""
-PROBED = 12
-"""Most training views whose photographs are compared with each other, evenly spaced: 132 pairs."""
+PROBED = 6
+"""Most training views whose photographs are compared with each other, evenly spaced: 30 pairs."""
 
 
 @torch.no_grad()

@@ -155,7 +155,8 @@ def _compose(kind: type, values: dict[str, Any]) -> Any:
 
 _DEFAULT = FitConfig(
     preset="default", background="auto", steps=None, half_resolution=None, sh_every=500, dropout=0.6, strategy="holdout",
-    phases=PhaseConfig(coarse=2000, stable=3000), init=InitConfig(sweep_up_to=1000, max_sh_degree=None, merge_px=8, fill_px=32),
+    phases=PhaseConfig(coarse=2000, stable=3000, least=20),
+    init=InitConfig(sweep_up_to=1000, max_sh_degree=None, merge_px=8, fill_px=32),
     optimizer=OptimizerConfig(scales_lr=None, scales_decay=0.1, opacities_lr=None), density=DensityConfig(gradient=5e-4),
     holdout=HoldoutConfig(bounds=False, degrees=False, trim_db=0, levels=12, stop_db=0.1),
     method=MethodConfig(

@@ -70,6 +70,8 @@ class Layout:
     """CUDA graphs that exist at a time, one for each size of view; 0 where steps are taken one by one."""
     cutout: bool = False
     """True where views know their opacity."""
+    trimmed: bool = False
+    """True where the strategy trims the model: with lower degrees, merged and tried, it then stands there three times more."""
 
     @property
     def row(self) -> int:
@@ -136,7 +138,8 @@ class Layout:
 
     def step(self, count: int, instances: int, chunked: bool = False) -> int:
         """Return the bytes at the heaviest moment of a step; each CUDA graph keeps memory of its own."""
-        return self.held(count) + max(1, self.graphs) * max(self.moments(count, instances, chunked).values())
+        heaviest = max(1, self.graphs) * max(self.moments(count, instances, chunked).values())
+        return self.held(count) + heaviest + 3 * self.row * count * self.trimmed
 
     def smallest(self, count: int) -> int:
         """Return the bytes of the smallest step: a tile is not divided, and has at most as many instances as Gaussians."""
@@ -229,6 +232,7 @@ def layout_of(
     scored: bool = False,
     captured: bool = False,
     depth_supervised: bool = False,
+    trimmed: bool = False,
 ) -> Layout:
     """Return the layout of steps of a fit.
 
@@ -239,6 +243,7 @@ def layout_of(
         scored: True where fine Gaussians are sampled by scores.
         captured: True to capture steps as CUDA graphs where the device can.
         depth_supervised: True where the loss has its depth term.
+        trimmed: True where the strategy trims the model.
     """
     largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
     cuda = table.device.type == "cuda"
@@ -246,7 +251,7 @@ def layout_of(
         table.gaussians.sh.shape[1], largest.width, largest.height, view_bytes([*views, *kept]),
         sum(c.element_size() for c in table.columns.values()), len(views), any(v.mask is not None for v in views),
         scored, depth_supervised, cuda, len({v.kind for v in views}) if cuda and captured else 0,
-        any(v.alpha is not None for v in views),
+        any(v.alpha is not None for v in views), trimmed,
     )  # fmt: skip
 
 

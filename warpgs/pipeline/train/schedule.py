@@ -90,10 +90,14 @@ class PhaseConfig:
     """Steps from the first sampling event to the second (T_base, which the paper leaves open)."""
     growth: float = 4.0
     """Growth of that interval over phase 2 (gamma, with the time t from 0 to 1): T_sample(t) = T_base (1 + gamma t)."""
+    least: float = 1.0
+    """Least T_base [steps] to which a short fit shortens it: on a CPU an event takes as long as ten steps."""
 
     def __post_init__(self):
-        if self.coarse < 0 or self.stable < 0 or not 1 <= self.every < math.inf or not 0 <= self.growth < math.inf:
-            raise UsageError("phases: coarse, stable and growth must be at least 0, every at least 1, and all finite")
+        if self.coarse < 0 or self.stable < 0 or not 0 <= self.growth < math.inf:
+            raise UsageError("phases: coarse, stable and growth must be at least 0, and growth finite")
+        if not 1 <= self.every < math.inf or not 1 <= self.least < math.inf:
+            raise UsageError("phases: every and least must be at least 1 and finite")
 
 
 @dataclass(frozen=True)
@@ -136,5 +140,5 @@ def plan_phases(config: PhaseConfig, steps: int) -> Phases:
     length, at, events = stable_start - refine, 0.0, []
     while at < length:
         events.append(max(1, refine + int(at)))
-        at += max(1.0, shrink * config.every) * (1 + config.growth * at / length)
+        at += max(min(config.least, config.every), shrink * config.every) * (1 + config.growth * at / length)
     return Phases(refine, stable_start, tuple(events), steps, steps)

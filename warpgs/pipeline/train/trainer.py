@@ -109,7 +109,7 @@ class Trainer:
         """Fraction of the planned steps, from the first, in which views are half their size."""
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
         """Dropout probability at the last step."""
-        self.cutout = any(v.alpha is not None for v in train)  # some know their opacity: all have one then
+        self.cutout = any(v.alpha is not None and not v.alpha_estimated for v in train)  # all have an opacity then
         self.terms = (*built_in_terms(config.loss, self.cutout), *config.loss_terms)
         self.step = 0
         """Steps taken."""
@@ -321,7 +321,7 @@ class Trainer:
         self.views = shown[: len(views)]
         layout = layout_of(
             self.table, shown, kept=self.strategy.kept_views(), scored=self.strategy.samples(c), captured=self.captured,
-            depth_supervised=c.loss.depth_weight > 0,
+            depth_supervised=c.loss.depth_weight > 0, trimmed=self.strategy.shrinks(c),
         )  # fmt: skip
         cameras = [v.camera for v in shown]
         self.memory, self.layout = plan(

@@ -56,6 +56,11 @@ class Strategy:
         return False
 
     @classmethod
+    def shrinks(cls, config: FitConfig) -> bool:
+        """Return whether the model is made smaller by tries, for which the memory plan counts copies of it."""
+        return False
+
+    @classmethod
     def warmup_config(cls, own: Any) -> Any:
         """Return the own settings for a warm-up of three steps, in which everything that a fit uses should come once."""
         return own

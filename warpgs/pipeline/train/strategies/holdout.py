@@ -92,6 +92,11 @@ class Holdout(ImportanceSampling):
         bounds = bound_columns(self.trainer.config.init.max_sh_degree)
         return {**super().columns(), **bounds, "growth_level": Column(0, torch.int32, inherited=False)}
 
+    @classmethod
+    def shrinks(cls, config) -> bool:
+        """Return whether ``holdout.trim_db`` or ``holdout.degrees`` asks for tries."""
+        return config.holdout.trim_db > 0 or config.holdout.degrees
+
     def kept_views(self):
         """Return the whole views, from the time that blocks are hidden."""
         return self.whole
