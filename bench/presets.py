@@ -28,6 +28,7 @@ from bench.preset_table import tables
 from bench.rows import ROWS, Row, made, row_of, scene_at, shrunk
 from warpgs.errors import UsageError, WarpgsError
 from warpgs.pipeline.runs.request import choose_device
+from warpgs.pipeline.train.by_views import steps_by_views
 
 WHAT = "scores, sizes and times of fits by row, preset and seed"
 
@@ -37,7 +38,8 @@ def fits(a: argparse.Namespace, rows: dict[str, Row], folders: dict[str, str], d
 
     def work(fit: Fit) -> float:
         steps = a.peer_steps if fit.preset in PEERS else config_of(fit.preset, device).steps
-        return steps * (rows[fit.row].views + 20)  # roughly: more views mean more Gaussians and a longer start
+        views = rows[fit.row].views
+        return (steps or steps_by_views(views)) * (views + 20)  # roughly: more views mean more Gaussians and a longer start
 
     found = []
     for seed in range(a.first_seed, a.first_seed + a.seeds):
