@@ -104,6 +104,11 @@ def dropout(count: int) -> Cost:
     return Cost(REAL * count, 20 * count)
 
 
+def camera_reach(count: int, cameras: int) -> Cost:
+    """A squared distance to each camera and the least of them, then a root and a logarithm, for each Gaussian."""
+    return Cost(REAL * (4 * count + 3 * cameras), count * (9 * cameras + 12))
+
+
 def buffers(pixels: int) -> Cost:
     """A photograph in and out."""
     return Cost(6 * REAL * pixels, 0)

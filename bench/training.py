@@ -149,7 +149,7 @@ class Steps:
         self.buffers = StepBuffers(device, 3 * len(self.table.params))
         self._settings = _Settings()  # the strategy holds it by proxy
         strategy = Strategy(self._settings)  # of the base class: it changes nothing
-        self.learned = Learned(self.table, Table({}, {}, device, 1), strategy, None)
+        self.learned = Learned(self.table, Table({}, {}, device, 1), strategy, None, torch.zeros(1, 3, device=device))
         numbers = torch.zeros(1, dtype=torch.int64, device=device)
         self.views = ViewStack(camera.viewmat, camera.K, target[None], None, {}, numbers)
         self.plan = StepPlan(gaussians.sh_degree, False, tuple(built_in_terms(LossConfig())), None)

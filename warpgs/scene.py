@@ -80,11 +80,11 @@ class PointCloud:
         """Return the number of points."""
         return len(self.points)
 
-    def seen_by(self, names: set[str]) -> PointCloud:
-        """Return the points whose tracks touch at least one of the named views; all points where tracks are unknown."""
+    def seen_by(self, names: set[str], least: int = 1) -> PointCloud:
+        """Return the points whose tracks name at least ``least`` of the views; all points where tracks are unknown."""
         if self.tracks is None:
             return self
-        keep = np.array([not names.isdisjoint(t) for t in self.tracks], dtype=bool)
+        keep = np.array([len(names & t) >= least for t in self.tracks], dtype=bool)
         tracks = tuple(t for t, k in zip(self.tracks, keep) if k)
         return PointCloud(self.points[keep], self.colors[keep], tracks)
 

@@ -31,7 +31,7 @@ from warpgs.report.images import png, side_by_side
 from warpgs.scene import Camera, Scene
 
 WHAT = "size and shape of the Gaussians of fits without limits and with them"
-OFF = LimitConfig(max_size=0.0, max_ratio=0.0)
+OFF = LimitConfig(max_size=0.0, max_ratio=0.0, max_reach=0.0)
 FIGURES = ("largest_over_radius", "largest_over_extent", "needles", "needles_by_opacity", "thin", "beyond")
 
 
@@ -81,7 +81,7 @@ def measure(
     with torch.no_grad():
         image = warpgs.rasterize(fit.gaussians(), beside([cameras[n] for n in fit.train], aside), fit.options()).rgb
     row = {"psnr": m["test"].get("psnr"), "ssim": m["test"].get("ssim"), "train_psnr": m["train"]["psnr"]}
-    shape = shape_figures(fit.gaussians(), limits, m["shape"]["radius"], m["shape"]["extent"])
+    shape = shape_figures(fit.gaussians(), limits, m["shape"]["radius"], m["shape"]["extent"], [cameras[n] for n in fit.train])
     return row | {"gaussians": m["gaussians"]} | shape, image.clamp(0, 1).cpu().numpy()
 
 

@@ -7,10 +7,10 @@ from tests.priors.flo_files import write_flo
 from tests.priors.rigs import still_life
 from tests.scenes import photos, ring
 from warpgs.errors import UsageError
-from warpgs.geometry import in_image, project_points
+from warpgs.geometry import back_project, in_image, project_points
 from warpgs.pipeline.model.depth_points import coarse_points, depth_bounds, in_free_space, merge, merge_cells
 from warpgs.pipeline.model.init import InitConfig, initial_points
-from warpgs.scene import Camera, View, ViewDepth
+from warpgs.scene import Camera, PointCloud, View, ViewDepth
 
 
 def known(valid_fraction: float = 1.0, cut: int = 0) -> tuple[list[View], list[ViewDepth]]:
@@ -39,6 +39,29 @@ def test_every_confirmed_pixel_becomes_a_point():
     assert np.array_equal(cloud.colors[first], views[0].image[rows, columns])
     assert notes[0] == f"000.png: {100 * depths[0].coverage:.0f} % of pixels by flow"
     assert notes[-1] == f"{len(cloud):,} points of {len(cloud):,} pixels by flow, and 0 filled"
+
+
+def test_points_of_the_reconstruction_fill_what_no_depth_confirms():
+    """Those that two views saw, where there are none of the sweep's; the others and those seen once are left out."""
+    views, depths = known(cut=40)
+    names = [v.name for v in views]
+    rows, columns = np.mgrid[10:60:10, 5:35:10].reshape(2, -1)
+    z = known()[1][0].depth[rows, columns]
+    inside = back_project(views[0].camera, np.stack([columns, rows], 1) + 0.5, z)
+    seen = [sum(in_image(v.camera, p[None])[0] for v in views) >= 2 for p in inside]
+    points = np.concatenate([inside, inside + 0.01])
+    tracks = (*(frozenset(names) for _ in inside), *(frozenset(names[:1]) for _ in inside))
+    cloud = PointCloud(points, np.full((len(points), 3), 0.25, np.float32), tracks)
+    bare, _ = coarse_points(views, depths, merge_px=4, fill_px=0, source="sweep")
+    more, notes = coarse_points(views, depths, merge_px=4, fill_px=0, source="sweep", known=cloud)
+    added = more.points[len(bare) :]
+    assert 0 < len(added) <= sum(seen) and f"{len(added)} of the reconstruction where there were none" in notes[-1]
+    assert np.abs(added[:, None] - inside[None]).sum(2).min(1).max() < 1e-9
+    unknown = PointCloud(points, cloud.colors)
+    assert len(coarse_points(views, depths, merge_px=4, fill_px=0, source="sweep", known=unknown)[0]) == len(bare)
+    filled, _ = coarse_points(views, depths, merge_px=4, fill_px=8, source="sweep", known=cloud)
+    without, _ = coarse_points(views, depths, merge_px=4, fill_px=8, source="sweep")
+    assert len(filled) >= len(without)
 
 
 def test_merging_takes_the_mean_of_a_cell():

@@ -11,6 +11,7 @@ from tests import textured_planes
 from tests.scenes import photos, priors, seeds
 from warpgs.app.cli import main
 from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.model.scale_limits import LimitConfig
 from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.complexity import complexity_figures, complexity_summary
 from warpgs.pipeline.train.config import PRESETS, FitConfig
@@ -40,7 +41,7 @@ def finished(views: list[View], points: PointCloud | None = None, steps: int = P
     quick = PRESETS["quick"]
     lrs = dataclasses.replace(quick.optimizer, scales_lr=0.1, opacities_lr=0.05)
     quick = dataclasses.replace(
-        quick, holdout=HoldoutConfig(**holdout), half_resolution=0.0, optimizer=lrs,
+        quick, holdout=HoldoutConfig(**holdout), half_resolution=0.0, optimizer=lrs, limits=LimitConfig(max_reach=0),
         init=dataclasses.replace(quick.init, max_sh_degree=1),
     )  # fmt: skip
     start = quick.init if points is None else dataclasses.replace(quick.init, source="points")

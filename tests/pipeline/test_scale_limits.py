@@ -29,6 +29,7 @@ from warpgs.scene import Gaussians, PointCloud
 
 CPU = torch.device("cpu")
 YES, NO = torch.tensor([True]), torch.tensor([False])
+CENTERS, VIEWS = torch.zeros(1, 3), photos(4)
 
 
 def params(log_scales: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -39,11 +40,11 @@ def test_axes_are_cut_and_needles_thickened():
     """The middle axis follows the longest, the shortest stays; what is within the limits stays as it is; twice is as once."""
     found = params(torch.log(torch.tensor([[900.0, 1e-6, 1.0], [2.0, 1.0, 1e-9], [1e-3, 3.0, 0.05], [40.0, 40.0, 40.0]])))
     limits = Limits(30.0, 30.0)
-    limits.apply(found, YES)
+    limits.apply(found, CENTERS, YES)
     expected = torch.tensor([[30.0, 1e-6, 1.0], [2.0, 1.0, 1e-9], [1e-3, 3.0, 0.1], [30.0, 30.0, 30.0]])
     assert torch.allclose(found["log_scales"].exp(), expected, rtol=1e-5)
     once = found["log_scales"].clone()
-    limits.apply(found, YES)
+    limits.apply(found, CENTERS, YES)
     assert torch.equal(found["log_scales"], once)
 
 
@@ -53,7 +54,7 @@ def test_any_order_of_the_axes():
     ordered = scales.sort(1, descending=True).values
     longest, middle = long_axes(scales)
     assert torch.equal(longest, ordered[:, 0]) and torch.equal(middle, ordered[:, 1])
-    Limits(ratio=2.0).hold(scales)
+    Limits(ratio=2.0).hold({"log_scales": scales}, CENTERS)
     longest, middle = long_axes(scales)
     assert float((longest - middle).max()) <= math.log(2) + 1e-6 and torch.equal(longest, ordered[:, 0])
 
@@ -63,10 +64,25 @@ def test_a_step_that_is_not_taken_changes_nothing():
     found = params(torch.tensor([[9.0, 0.0, 0.0], [math.nan, 0.0, 1.0]]))
     before = {n: t.clone() for n, t in found.items()}
     limits = Limits(1.0, 2.0, 0.5)
-    limits.apply(found, NO)
+    limits.apply(found, CENTERS, NO)
     assert all(torch.equal(t.nan_to_num(7), before[n].nan_to_num(7)) for n, t in found.items())
-    limits.apply(found, YES)
+    limits.apply(found, CENTERS, YES)
     assert bool(found["log_scales"][1].isnan().any()) and float(found["log_scales"][0].max()) == 0
+
+
+def test_no_gaussian_reaches_a_camera():
+    """Its longest axis is at most a third of the distance to the nearest of two cameras; a small one stays as it is."""
+    found = params(torch.log(torch.tensor([[9.0, 1.0, 1e-3], [0.5, 0.2, 0.1], [math.inf, 1.0, 1.0]])))
+    found["means"] = torch.tensor([[0.0, 0, 6], [0, 0, 6], [0, 0, 6]])
+    limits, centers = LimitConfig(max_ratio=0).at(1.0, 100.0), torch.tensor([[0.0, 0, 0], [0, 0, 20]])
+    limits.apply(found, centers, YES)
+    sizes = found["log_scales"].exp()
+    assert torch.allclose(sizes[:2], torch.tensor([[2.0, 1.0, 1e-3], [0.5, 0.2, 0.1]])) and sizes[2, 0].isinf()
+    model = Gaussians(**(cloud(2).tensors() | {n: t[:2] for n, t in found.items()}))
+    cameras = ring(4)
+    over = shape_figures(model, LimitConfig(), 100.0, 1.0, cameras)["largest_over_distance"]
+    nearest = min(np.linalg.norm(c.center - [0, 0, 6]) for c in cameras)
+    assert over == pytest.approx(2 / nearest, rel=1e-5)
 
 
 def test_opacities_decay():
@@ -94,11 +110,11 @@ def test_figures_count_needles_and_what_is_beyond():
     scales = torch.log(torch.tensor([[62.0, 2.0, 2.0], [3.0, 3.0, 0.01], [9.0, 1.0, 1.0]]))
     logits = torch.logit(torch.tensor([0.1, 0.5, 0.4]))
     model = Gaussians(**(cloud(3).tensors() | {"log_scales": scales, "logit_opacities": logits}))
-    f = shape_figures(model, LimitConfig(max_size=1.0, max_ratio=8.0), radius=50.0, extent=2.0)
+    f = shape_figures(model, LimitConfig(max_size=1.0, max_ratio=8.0, max_reach=0), 50.0, 2.0, ring(4))
     assert f["needles"] == pytest.approx(1 / 3) and f["needles_by_opacity"] == pytest.approx(0.1, rel=1e-5)
     assert f["thin"] == pytest.approx(2 / 3) and f["beyond"] == 2
     assert f["largest_over_radius"] == pytest.approx(62 / 50) and f["largest_over_extent"] == pytest.approx(31)
-    assert shape_figures(model, LimitConfig(max_size=0, max_ratio=0), 50.0, 2.0)["beyond"] == 0
+    assert shape_figures(model, LimitConfig(max_size=0, max_ratio=0, max_reach=0), 50.0, 2.0, ring(4))["beyond"] == 0
     assert "33.3%" in shape_summary(f) and "2 beyond" in shape_summary(f)
 
 
@@ -109,20 +125,20 @@ def test_a_fit_ends_within_its_limits(strategy):
         steps=40, init=InitConfig(source="points"), strategy=strategy, optimizer=OptimizerConfig(scales_lr=0.5),
         density=DensityConfig(start=5, every=10), limits=LimitConfig(max_size=0.2, max_ratio=3.0),
     )  # fmt: skip
-    free = dataclasses.replace(config, limits=LimitConfig(0.0, 0.0))
+    free = dataclasses.replace(config, limits=LimitConfig(0.0, 0.0, 0.0))
     beyond = []
     for c in (config, free):
-        fit = Trainer(photos(4), seeds(), c, CPU)
+        fit = Trainer(VIEWS, seeds(), c, CPU)
         while fit.step < c.steps:
             fit.advance()
-        beyond.append(shape_figures(fit.gaussians, config.limits, fit.radius, fit.extent)["beyond"])
+        beyond.append(shape_figures(fit.gaussians, config.limits, fit.radius, fit.extent, [v.camera for v in VIEWS])["beyond"])
     assert beyond[0] == 0 < beyond[1]
 
 
 def test_what_a_change_of_the_set_adds_is_within_the_limits():
     """A strategy that adds a needle after the last step leaves none."""
     config = FitConfig(steps=2, init=InitConfig(source="points"))
-    fit = Trainer(photos(2), seeds(), config, CPU)
+    fit = Trainer(VIEWS, seeds(), config, CPU)
     fit.strategy.due = lambda step: step == config.steps
 
     def update(step):
@@ -134,7 +150,7 @@ def test_what_a_change_of_the_set_adds_is_within_the_limits():
     fit.advance()
     fit.advance()
     assert len(fit.gaussians) == len(seeds()) + 1
-    assert shape_figures(fit.gaussians, config.limits, fit.radius, fit.extent)["beyond"] == 0
+    assert shape_figures(fit.gaussians, config.limits, fit.radius, fit.extent, [v.camera for v in VIEWS])["beyond"] == 0
 
 
 def test_the_ratio_is_held_from_its_time_on_and_at_the_last_step():
@@ -142,7 +158,14 @@ def test_the_ratio_is_held_from_its_time_on_and_at_the_last_step():
     config = LimitConfig(ratio_from=0.5)
     assert [config.at(p, 2.0).ratio for p in (0.0, 0.5, 0.6, 1.0)] == [math.inf, math.inf, 30, 30]
     assert LimitConfig(ratio_from=1.0).at(1.0, 2.0).ratio == 30 and config.at(0.0, 3.0).largest == 3.0
-    assert LimitConfig(0.0, 0.0).at(1.0, 2.0) == Limits()
-    for wrong in ({"max_size": -1}, {"max_ratio": 0.5}, {"ratio_from": 1.1}, {"opacity_decay": 0}, {"max_size": math.nan}):
+    assert LimitConfig(0.0, 0.0, 0.0).at(1.0, 2.0) == Limits()
+    for wrong in (
+        {"max_size": -1},
+        {"max_reach": -1},
+        {"max_ratio": 0.5},
+        {"ratio_from": 1.1},
+        {"opacity_decay": 0},
+        {"max_size": math.nan},
+    ):
         with pytest.raises(UsageError, match="limits"):
             LimitConfig(**wrong)

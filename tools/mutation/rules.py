@@ -53,6 +53,7 @@ OPS = {
     "step_buffers": ["kernels/test_step_buffers.py"],
     "interop": [CUTS, "kernels/test_adam.py", "kernels/test_sh.py", "kernels/test_tiles.py"],
     "compiler": ["kernels/test_blend.py"],
+    "camera_reach": ["kernels/test_camera_reach.py"],
     "dropout": ["kernels/test_dropout.py"],
     "falloff": [SPANS, "kernels/test_blend.py", LIMITS_BLEND],
     "functions": ["kernels/test_project.py", SPANS, LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "render/test_window.py"],

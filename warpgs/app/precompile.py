@@ -18,6 +18,7 @@ from warpgs.kernels import (
     blend,
     blend_cpu,
     blend_cuda,
+    camera_reach,
     dropout,
     knn,
     project,
@@ -52,6 +53,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         (project.make_forward(real, cuda, CAMERA_MODEL), THREADS), (project.make_backward(real, cuda, CAMERA_MODEL), BLOCK),
         (tiles.make_kernels(real, cuda).pack_counts, THREADS), (tiles.make_kernels(real, cuda).find_ranges, THREADS),
         (tiles.make_emit(real, cuda), THREADS), (knn.make_kernels(real).search, THREADS), (dropout.make_kernel(), THREADS),
+        (camera_reach.make_kernel(), THREADS),
         (step_buffers.make_kernels().end_step, THREADS), (mcmc.make_kernel(), THREADS),
     ]  # fmt: skip
     if not cuda:

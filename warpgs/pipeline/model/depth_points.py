@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from warpgs.pipeline.metrics.region import fitted_region
 from warpgs.priors.completion import complete
 from warpgs.scene import Camera, PointCloud, View, ViewDepth
 
+NOTHING = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+"""No points."""
 FREE_SPACE = 0.95
 """A filled point nearer to another view than this fraction of the depth found there would hide what that view sees."""
 NEAR_FRACTION, FAR_FRACTION = 1 / 1.3, 3.0
@@ -94,9 +97,49 @@ def focal_length(camera: Camera) -> float:
     return float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
 
 
+@dataclass(frozen=True)
+class KnownPoints:
+    """Points of a reconstruction that at least two views saw, as one of them sees each."""
+
+    cloud: PointCloud
+    """Points and colours, N of them."""
+    widths: np.ndarray
+    """Width of a pixel at each in the nearest view that saw it [u], shape [N]."""
+    pixels: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
+    """Rows and columns of the points that each view saw, and their z-depths [u], the farthest first; shape [S] each."""
+
+    @staticmethod
+    def of(points: PointCloud, views: Sequence[View]) -> KnownPoints:
+        """Return those of the points whose tracks name two of the views; none where tracks are unknown."""
+        names = {v.name for v in views}
+        keep = [t is not None and len(names & t) >= 2 for t in points.tracks or ()] or [False] * len(points)
+        chosen, tracks = np.nonzero(keep)[0], [t for t, k in zip(points.tracks or (), keep) if k]
+        cloud = PointCloud(points.points[chosen], points.colors[chosen])
+        widths, pixels = np.full(len(cloud), np.inf), []
+        for view in views:
+            tracked = np.array([view.name in t for t in tracks], bool)
+            seen = np.nonzero(tracked & geometry.in_image(view.camera, cloud.points))[0]
+            at, z = geometry.project_points(view.camera, cloud.points[seen])
+            widths[seen] = np.minimum(widths[seen], z / focal_length(view.camera))
+            columns, rows = np.floor(at).astype(int).T
+            order = np.argsort(-z, kind="stable")  # of two in one pixel the nearer is written last
+            pixels.append((rows[order], columns[order], z[order]))
+        inside = np.isfinite(widths)
+        return KnownPoints(PointCloud(cloud.points[inside], cloud.colors[inside]), widths[inside], pixels)
+
+    def with_depths(self, i: int, depth: np.ndarray, sure: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return depth and mask of view ``i``, both [H, W], with the depths of these points where the mask was False."""
+        rows, columns, z = self.pixels[i]
+        new = ~sure[rows, columns]
+        depth, more = depth.copy(), sure.copy()
+        depth[rows[new], columns[new]], more[rows[new], columns[new]] = z[new], True
+        return depth, more
+
+
 def coarse_points(
-    views: Sequence[View], depths: Sequence[ViewDepth], *, merge_px: float, fill_px: float, source: str
-) -> tuple[PointCloud, list[str]]:
+    views: Sequence[View], depths: Sequence[ViewDepth], *, merge_px: float, fill_px: float, source: str,
+    known: PointCloud = NOTHING,
+) -> tuple[PointCloud, list[str]]:  # fmt: skip
     """Return the points of the coarse start, and notes on them.
 
     Args:
@@ -106,14 +149,20 @@ def coarse_points(
         fill_px: Width of the cells of points where no depth is consistent [px]; 0 leaves those places empty. Their depths are
             those of `complete`; none lies in space that another view looks through, nor beside a consistent point.
         source: Name of the source in the notes, sweep or flow.
+        known: Points of a reconstruction. Those that two of the views saw are taken where no depth is consistent, and their
+            depths are filled in around them.
 
     Returns:
-        The cloud, consistent points first, empty where no depth is valid; and notes: one per view ("image001.png: 71 % of
-        pixels by flow, 20 % filled") and one on the merged cloud.
+        The cloud, consistent points first, then those of the reconstruction, empty where there are none; and notes: one per
+        view ("image001.png: 71 % of pixels by flow, 20 % filled") and one on the merged cloud.
     """
     regions = [fitted_region(v) for v in views]
     consistent = [d.valid if r is None else d.valid & r for d, (r, _) in zip(depths, regions)]
-    completed = [complete(d.depth, s, v.image) for v, d, s in zip(views, depths, consistent)] if fill_px > 0 else []
+    seen = KnownPoints.of(known, views)
+    completed = []
+    if fill_px > 0:
+        seeds = [seen.with_depths(i, d.depth, s) for i, (d, s) in enumerate(zip(depths, consistent))]
+        completed = [complete(*seed, v.image) for v, seed in zip(views, seeds)]
     found, filled_in, notes = [], [], []
     for i, (view, depth, sure, (region, name)) in enumerate(zip(views, depths, consistent, regions)):
         found.append(_lift(view, depth.depth, sure))
@@ -128,14 +177,30 @@ def coarse_points(
         notes.append("; ".join((text, *depth.notes)))
     points, colors, widths = (np.concatenate(a) for a in zip(*found))
     cloud = merge(points, colors, merge_cells(points, merge_px * widths) if merge_px > 0 else np.arange(len(points)))
-    filled = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+    pixels, added, filled = len(points), NOTHING, NOTHING
+    if merge_px > 0:
+        own = (seen.cloud.points, seen.cloud.colors, seen.widths)
+        added, new = _elsewhere(points, widths, *own, merge_px)
+        points, widths = np.concatenate([points, own[0][new]]), np.concatenate([widths, own[2][new]])
     if fill_px > 0:
-        more, more_colors, more_widths = (np.concatenate(a) for a in zip(*filled_in))
-        cells = merge_cells(np.concatenate([points, more]), fill_px * np.concatenate([widths, more_widths]))
-        alone = ~np.isin(cells[len(points) :], cells[: len(points)])
-        filled = merge(more[alone], more_colors[alone], cells[len(points) :][alone])
-    notes.append(f"{len(cloud):,} points of {len(points):,} pixels by {source}, and {len(filled):,} filled")
-    return PointCloud(np.concatenate([cloud.points, filled.points]), np.concatenate([cloud.colors, filled.colors])), notes
+        filled, _ = _elsewhere(points, widths, *(np.concatenate(a) for a in zip(*filled_in)), fill_px)
+    more = f"{len(added):,} of the reconstruction where there were none, " if len(added) else ""
+    notes.append(f"{len(cloud):,} points of {pixels:,} pixels by {source}, {more}and {len(filled):,} filled")
+    parts = (cloud, added, filled)
+    return PointCloud(np.concatenate([c.points for c in parts]), np.concatenate([c.colors for c in parts])), notes
+
+
+def _elsewhere(
+    points: np.ndarray, widths: np.ndarray, more: np.ndarray, colors: np.ndarray, more_widths: np.ndarray, cell: float
+) -> tuple[PointCloud, np.ndarray]:
+    """Return more points [M, 3], merged, where no point [N, 3] lies in their cells; and which of them are in it, bool [M].
+
+    Widths [N] and [M] [u] are those of a pixel, and ``cell`` is the width of a cell [px].
+    """
+    cells = merge_cells(np.concatenate([points, more]), cell * np.concatenate([widths, more_widths]))
+    cells, taken = cells[len(points) :], cells[: len(points)]
+    alone = ~np.isin(cells, taken)
+    return merge(more[alone], colors[alone], cells[alone]), alone
 
 
 def _fraction(part: int, whole: int) -> str:

@@ -15,7 +15,7 @@ from warpgs.errors import DataError, UsageError
 from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.sh import C0, MAX_DEGREE, coefficient_count
 from warpgs.pipeline.metrics.region import fitted_region
-from warpgs.pipeline.model.depth_points import coarse_points, depth_bounds
+from warpgs.pipeline.model.depth_points import NOTHING, coarse_points, depth_bounds
 from warpgs.pipeline.model.hull import hull_points, in_empty_region, silhouettes
 from warpgs.priors.epipolar import EpipolarConfig, flow_depth
 from warpgs.priors.flow import RANGES, flow_between
@@ -251,7 +251,9 @@ def consistent_points(
     reason, depths = "a single view has no other to compare with", None
     if len(views) > 1:
         depths = consistent_depths(views, points, config, device, progress)
-        cloud, notes = coarse_points(views, depths, merge_px=config.merge_px, fill_px=config.fill_px, source=config.source)
+        cloud, notes = coarse_points(
+            views, depths, merge_px=config.merge_px, fill_px=config.fill_px, source=config.source, known=points
+        )
         if len(cloud) >= MIN_POINTS:
             return Start(cloud, "\n    ".join((notes[-1], *notes[:-1])), depths)
         reason = f"only {len(cloud)} points survived the checks ({' | '.join(notes[:-1])}); do the views overlap?"
@@ -260,9 +262,11 @@ def consistent_points(
 
 
 def seen_points(views: list[View], points: PointCloud | None) -> PointCloud:
-    """Return the reconstruction's points that the views saw; none where there is no reconstruction."""
-    nothing = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
-    return nothing if points is None else points.seen_by({v.name for v in views})
+    """Return the reconstruction's points that two of the views saw, or the only one; none where there is no reconstruction.
+
+    A point that one of them saw was placed with the help of views that are held out.
+    """
+    return NOTHING if points is None else points.seen_by({v.name for v in views}, min(2, len(views)))
 
 
 def sweeps(config: InitConfig, views: int) -> bool:

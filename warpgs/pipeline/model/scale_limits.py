@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,12 +12,15 @@ import torch
 
 from warpgs import geometry
 from warpgs.errors import UsageError
+from warpgs.kernels.camera_reach import camera_reach
 from warpgs.scene import Camera, Gaussians, PointCloud
 
 WITHIN = 0.9
 """Fraction of the first points that the radius of a scene holds; the farthest are often wrong."""
 NEEDLE = 30.0
 """Longest over middle axis above which a Gaussian is counted as a needle."""
+MAX_CENTERS = 32
+"""Most cameras that a Gaussian's distance is measured to in every step."""
 ROUNDING = 1e-5
 """Distance of logarithms up to which an axis at its limit is within it: ten times what float32 rounds them by."""
 
@@ -31,34 +35,40 @@ class Limits:
     """Largest ratio of the longest axis to the middle one."""
     decay: float = 1.0
     """Factor of every opacity, in (0, 1]."""
+    reach: float = 0.0
+    """Largest standard deviation of an axis, as a fraction of the distance to the nearest camera; 0 for no such limit."""
 
     @torch.no_grad()
-    def hold(self, log_scales: torch.Tensor, going: torch.Tensor | None = None) -> None:
+    def hold(self, params: dict[str, torch.Tensor], centers: torch.Tensor, going: torch.Tensor | None = None) -> None:
         """Bring logarithms of axes [N, 3] within the limits, in place; a second time changes nothing.
 
         Axes are cut to the largest size; where the longest is then too long for the middle one, the middle one grows. A flat
-        disk stays one. ``going`` is as in `apply`; None for True.
+        disk stays one. Arguments are those of `apply`; ``going`` None stands for True.
         """
-        if self.largest == math.inf and self.ratio == math.inf:
+        if self.largest == math.inf and self.ratio == math.inf and self.reach == 0:
             return
-        old = log_scales.detach()
-        new = torch.where(old.isinf(), old, old.clamp(max=math.log(self.largest)))  # what is not finite is not hidden
+        old = params["log_scales"].detach()
+        new = old.clamp(max=math.log(self.largest))
+        if self.reach > 0:
+            new = torch.minimum(new, camera_reach(params["means"].detach(), centers, self.reach)[:, None])
+        new = torch.where(old.isinf(), old, new)  # what is not finite is not hidden
         if self.ratio < math.inf:
             longest, middle = (x[:, None] for x in long_axes(new))
             new = torch.where(new == middle, torch.maximum(new, longest - math.log(self.ratio)), new)
         old.copy_(new if going is None else torch.where(going, new, old))
 
     @torch.no_grad()
-    def apply(self, params: dict[str, torch.Tensor], going: torch.Tensor) -> None:
+    def apply(self, params: dict[str, torch.Tensor], centers: torch.Tensor, going: torch.Tensor) -> None:
         """Bring parameters within the limits, and lower opacities, in place; it may be part of a captured step.
 
         Moments of Adam stay.
 
         Args:
-            params: ``log_scales`` [N, 3] and ``logit_opacities`` [N] of `Gaussians`.
+            params: ``means`` [N, 3], ``log_scales`` [N, 3] and ``logit_opacities`` [N] of `Gaussians`.
+            centers: Positions of training cameras [u], as `camera_centers` gives them, shape [C, 3].
             going: Whether the step is taken, bool, shape [1]; where it is not, nothing changes.
         """
-        self.hold(params["log_scales"], going)
+        self.hold(params, centers, going)
         if self.decay < 1:
             old = params["logit_opacities"].detach()
             old.copy_(torch.where(going, decayed(old, self.decay), old))
@@ -76,6 +86,9 @@ class LimitConfig:
     """Largest standard deviation of an axis, as a fraction of the scene's radius; 0 for no limit."""
     max_ratio: float = NEEDLE
     """Largest ratio of the longest axis to the middle one, at least 1; 0 for no limit."""
+    max_reach: float = 1 / 3
+    """Largest standard deviation of an axis, as a fraction of the distance to the nearest training camera; 0 for no limit. With
+    a third, three of them reach no camera; larger ones beside or behind training cameras are a fog before other views."""
     ratio_from: float = 0.7
     """Fraction of the steps after which that ratio is held, in [0, 1]. Long Gaussians help the first steps."""
     opacity_decay: float = 1.0
@@ -86,6 +99,8 @@ class LimitConfig:
             raise UsageError(f"limits max-size must be 0, for no limit, or at most 1e6, not {self.max_size}")
         if self.max_ratio != 0 and not 1 <= self.max_ratio <= 1e6:
             raise UsageError(f"limits max-ratio must be 0, for no limit, or lie between 1 and 1e6, not {self.max_ratio}")
+        if not 0 <= self.max_reach <= 1e6:
+            raise UsageError(f"limits max-reach must be 0, for no limit, or at most 1e6, not {self.max_reach}")
         if not 0 <= self.ratio_from <= 1:
             raise UsageError(f"limits ratio-from must lie between 0 and 1, not {self.ratio_from}")
         if not 0 < self.opacity_decay <= 1:
@@ -100,7 +115,13 @@ class LimitConfig:
         """
         held = self.max_ratio > 0 and (progress > self.ratio_from or progress == 1)
         largest = self.max_size * radius if self.max_size > 0 else math.inf
-        return Limits(largest, self.max_ratio if held else math.inf, self.opacity_decay)
+        return Limits(largest, self.max_ratio if held else math.inf, self.opacity_decay, self.max_reach)
+
+
+def camera_centers(cameras: Sequence[Camera], device: torch.device) -> torch.Tensor:
+    """Return the positions of at most `MAX_CENTERS` of the cameras, evenly chosen [u], float32, shape [C, 3]."""
+    chosen = cameras[:: -(-len(cameras) // MAX_CENTERS)]
+    return torch.as_tensor(np.stack([c.center for c in chosen]), dtype=torch.float32, device=device)
 
 
 def long_axes(log_scales: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -130,7 +151,9 @@ def scene_radius(cameras: list[Camera], cloud: PointCloud) -> float:
     return max(reach, geometry.camera_extent(cameras), 1e-6)
 
 
-def shape_figures(gaussians: Gaussians, config: LimitConfig, radius: float, extent: float) -> dict[str, Any]:
+def shape_figures(
+    gaussians: Gaussians, config: LimitConfig, radius: float, extent: float, cameras: Sequence[Camera]
+) -> dict[str, Any]:
     """Return the figures of size and shape of a model for metrics.json.
 
     Args:
@@ -138,9 +161,11 @@ def shape_figures(gaussians: Gaussians, config: LimitConfig, radius: float, exte
         config: Limits; those that are 0 count nothing as beyond them.
         radius: Result of `scene_radius` [u].
         extent: Result of `scene_extent` [u].
+        cameras: Training cameras, at least one.
 
     Returns:
-        ``radius`` and ``extent`` [u]; the ``largest`` standard deviation [u], over the radius and over the extent; ``needles``,
+        ``radius`` and ``extent`` [u]; the ``largest`` standard deviation [u], over the radius and over the extent, and the
+        largest over the distance to the nearest camera, of those that `camera_centers` chooses; ``needles``,
         the fraction of Gaussians whose longest axis is more than `NEEDLE` times the middle one, ``needles_by_opacity`` with
         each counted by its opacity, and ``thin``, the fraction whose longest axis is more than so many times the shortest; the
         number ``beyond`` the limits.
@@ -152,13 +177,18 @@ def shape_figures(gaussians: Gaussians, config: LimitConfig, radius: float, exte
     thin = longest - scales.amin(1) > math.log(NEEDLE) + ROUNDING
     at = config.at(1.0, radius)
     largest = math.log(at.largest) + ROUNDING, math.log(at.ratio) + ROUNDING
+    means, centers = gaussians.means.detach().cpu().float(), camera_centers(cameras, torch.device("cpu"))
+    over = longest - camera_reach(means, centers, 1.0).double()
     beyond = (longest > largest[0]) | (longest - middle > largest[1])
+    if at.reach > 0:
+        beyond |= over > math.log(at.reach) + ROUNDING
     count, sigma = max(1, len(gaussians)), float(longest.max().exp()) if len(gaussians) else 0.0
     # exactly rounded sums, which no number of threads changes
     weight = math.fsum(opacities[needle].tolist()) / max(math.fsum(opacities.tolist()), 1e-30)
     return {
         "radius": radius, "extent": extent, "largest": sigma, "largest_over_radius": sigma / radius,
-        "largest_over_extent": sigma / extent, "needles": int(needle.sum()) / count, "needles_by_opacity": weight,
+        "largest_over_extent": sigma / extent, "largest_over_distance": float(over.max().exp()) if len(over) else 0.0,
+        "needles": int(needle.sum()) / count, "needles_by_opacity": weight,
         "thin": int(thin.sum()) / count, "beyond": int(beyond.sum()),
     }  # fmt: skip
 
@@ -168,6 +198,7 @@ def shape_summary(figures: dict[str, Any]) -> str:
     f = figures
     return (
         f"shape: the largest axis is {f['largest_over_radius']:.2g} of the scene's radius, "
-        f"{f['largest_over_extent']:.2g} of the cameras' extent; {f['needles']:.1%} of the Gaussians are needles, more than "
+        f"{f['largest_over_extent']:.2g} of the cameras' extent, and {f['largest_over_distance']:.2g} of the distance to the "
+        f"nearest camera; {f['needles']:.1%} of the Gaussians are needles, more than "
         f"{NEEDLE:g} times as long as wide ({f['needles_by_opacity']:.1%} by opacity); {f['beyond']:,} beyond the limits"
     )

@@ -294,7 +294,7 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
         half_resolution=trainer.half_resolution,
         max_instances=trainer.max_instances,
     )
-    shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.extent)
+    shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.extent, [v.camera for v in train])
     options = options_for(c.rule, scene.background, gaussians, trainer.max_instances)
     fractions = moved_fractions(train, (Rendered(*render_view(gaussians, v, options)) for v in train))
     moved = {v.name: f for v, f in zip(train, fractions, strict=True)}

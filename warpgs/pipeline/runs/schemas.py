@@ -82,7 +82,7 @@ def check_record(record: Any) -> None:
 MODEL_STATE = fields({"step": whole(0)})
 """Schema of the plain values in a checkpoint that a model is read from."""
 _SHAPE = fields(
-    {n: number(0) for n in ("largest", "largest_over_radius", "largest_over_extent")}
+    {n: number(0) for n in ("largest", "largest_over_radius", "largest_over_extent", "largest_over_distance")}
     | {n: number(0) for n in ("needles", "needles_by_opacity", "thin")}
     | {"radius": number(above=0), "extent": number(above=0), "beyond": whole(0)}
 )

@@ -168,10 +168,10 @@ _DEFAULT = FitConfig(
 PRESETS: dict[str, FitConfig] = {
     "default": _DEFAULT,
     "quick": dataclasses.replace(_DEFAULT, preset="quick", steps=600),
-    "3dgs": FitConfig(limits=LimitConfig(max_size=0, max_ratio=0)),
+    "3dgs": FitConfig(limits=LimitConfig(max_size=0, max_ratio=0, max_reach=0)),
     "mcmc": FitConfig(
         preset="mcmc", strategy="mcmc", init=InitConfig(opacity=0.5, scale_factor=0.1),
-        optimizer=OptimizerConfig(scales_lr=0.005), limits=LimitConfig(max_size=0, max_ratio=0),
+        optimizer=OptimizerConfig(scales_lr=0.005), limits=LimitConfig(max_size=0, max_ratio=0, max_reach=0),
     ),
     "paper-literal": FitConfig(
         preset="paper-literal", strategy="importance_sampling", steps=30_000, sh_every=500,

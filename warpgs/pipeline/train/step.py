@@ -161,6 +161,8 @@ class Learned:
     """Density strategy, which gathers gradients and follows updates."""
     dropout_seed: int | None
     """Seed of the opacity dropout; None for none."""
+    centers: torch.Tensor
+    """Positions of training cameras [u], which limits of sizes refer to, shape [C, 3]."""
 
 
 def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer) -> None:
@@ -199,7 +201,7 @@ def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPla
         table.adam_step(dict(zip(table.params, gradients)), lrs[:split], buffers.stop, strategy.lr_factors(plan.phase))
         learned.views.adam_step(dict(zip(learned.views.params, gradients[len(table.params) :])), lrs[split:], buffers.stop)
         strategy.after_step(plan.phase, settings[:3], going)
-        plan.limits.apply(table.params, going)
+        plan.limits.apply(table.params, learned.centers, going)
         size = (views.size["width"], views.size["height"])
         strategy.after_backward(plan.phase, v_projected, rendered.visible, size, going)
 

@@ -15,7 +15,7 @@ from warpgs.errors import DataError, NotFiniteError, OutOfMemoryError, ResourceE
 from warpgs.kernels.step_buffers import NOT_FINITE
 from warpgs.pipeline.metrics.psnr import psnr_of
 from warpgs.pipeline.model.init import initial_gaussians, scene_extent
-from warpgs.pipeline.model.scale_limits import scene_radius
+from warpgs.pipeline.model.scale_limits import camera_centers, scene_radius
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import FitConfig
@@ -125,7 +125,8 @@ class Trainer:
         self.view_table = Table(first, {}, device, len(train))
         self.view_lrs = {n: p.lr for n, p in own.items()}
         self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(first)))
-        self.learned = Learned(self.table, self.view_table, self.strategy, config.seed if self.dropout > 0 else None)
+        dropout_seed, centers = config.seed if self.dropout > 0 else None, camera_centers(cameras, device)
+        self.learned = Learned(self.table, self.view_table, self.strategy, dropout_seed, centers)
         self.graphs = StepGraphs(self.learned, self.buffers, config.rule, self.background) if device.type == "cuda" else None
         self.layout: Layout
         self.max_instances: int | None = None
@@ -306,7 +307,7 @@ class Trainer:
         for change in self.strategy.update(self.step):
             self.table.apply(change)
             self.count_changed()
-        self.plan_of(self.step).limits.hold(self.table.params["log_scales"])
+        self.plan_of(self.step).limits.hold(self.table.params, self.learned.centers)
 
     def _forget_graphs(self) -> None:
         if self.graphs is not None:

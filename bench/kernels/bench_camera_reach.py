@@ -1,0 +1,16 @@
+"""Time of the sizes at which N Gaussians reach none of 32 cameras."""
+
+import torch
+
+from bench import roofline
+from bench.harness import OURS, Task
+from warpgs.kernels.camera_reach import camera_reach
+
+AXES = ("count",)
+PROGRAMS = {OURS: ("forward",)}
+CAMERAS = 32
+
+
+def tasks(point, device, wanted):
+    means, centers = torch.randn(point.count, 3, device=device), torch.randn(CAMERAS, 3, device=device)
+    yield Task(OURS, "forward", lambda: camera_reach(means, centers, 1 / 3), roofline.camera_reach(point.count, CAMERAS))

@@ -1,0 +1,55 @@
+"""Sizes at which Gaussians do not reach a camera: a fraction of the distance to the nearest one."""
+
+import functools
+
+import torch
+import warp as wp
+
+from warpgs.runtime import interop
+
+SMALLEST = 1e-12
+"""Smallest size [u]: that of a Gaussian at a camera."""
+
+
+@functools.cache
+def make_kernel():
+    """Make the kernel."""
+
+    @wp.kernel(enable_backward=False, module="warpgs.kernels.camera_reach")
+    def bound(
+        begin: int, means: wp.array(dtype=wp.vec3), centers: wp.array(dtype=wp.vec3), fraction: float,
+        # outputs
+        log_sizes: wp.array(dtype=float),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        nearest = wp.length_sq(means[i] - centers[0])
+        for j in range(1, centers.shape[0]):
+            nearest = wp.min(nearest, wp.length_sq(means[i] - centers[j]))
+        # in float64: logarithms of float32 have other last digits on other processors
+        size = wp.sqrt(wp.float64(nearest)) * wp.float64(fraction)
+        log_sizes[i] = wp.float32(wp.log(wp.max(size, wp.float64(1e-12))))
+
+    return bound
+
+
+def camera_reach(means: torch.Tensor, centers: torch.Tensor, fraction: float) -> torch.Tensor:
+    """Return the logarithm of a fraction of the distance from each mean to the nearest camera, at least that of `SMALLEST`.
+
+    Args:
+        means: Positions [u], float32, shape [N, 3]; distances up to 1e18 u have a square.
+        centers: Positions of at least one camera [u], float32, shape [C, 3].
+        fraction: Positive factor.
+
+    Returns:
+        Logarithms of sizes [u], float32, shape [N].
+
+    Raises:
+        ValueError: A shape or a type is not what it must be.
+    """
+    interop.check(means=(means, "N 3"), centers=(centers, "C 3"))
+    log_sizes = torch.empty(len(means), dtype=torch.float32, device=means.device)
+    inputs = [
+        interop.view(means, wp.vec3), interop.view(centers, wp.vec3), float(fraction), interop.view(log_sizes, wp.float32)
+    ]  # fmt: skip
+    interop.launch(make_kernel(), len(means), inputs, means.device)
+    return log_sizes
