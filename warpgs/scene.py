@@ -226,6 +226,9 @@ class Render:
     overflow: torch.Tensor | None = None
     """1 where the instances did not fit into the capacity, and the images must not be used; else 0. Int32, shape [1]; only
     where a capacity was given."""
+    median_depth: torch.Tensor | None = None
+    """z-depth [u] of the Gaussian at which transmittance falls to one half, shape [..., H, W]; 0 where alpha is below 1/2. No
+    gradients flow into it; only where it was requested."""
 
     @property
     def visible(self) -> torch.Tensor:
