@@ -96,6 +96,16 @@ def test_the_layer_that_crosses_the_stop(device, dtype, inclusive, depth):
     assert bool((median_depth(projected, tiles, width=5, height=3, rule=dataclasses.replace(rule, alpha_max=0.4)) == 2).all())
 
 
+@pytest.mark.parametrize(
+    ("rule", "opacities", "depth"),
+    [(Rule("cut", alpha_cut=0.5), [0.5], 1), (Rule("stop", transmittance_stop=0.75), [0.25, 0.5], 2)],
+)
+def test_alpha_and_transmittance_equal_to_a_cut_off(device, dtype, rule, opacities, depth):
+    """An alpha equal to the cut is blended, and a transmittance equal to the stop does not end a pixel, as in blending."""
+    projected, tiles = layers(opacities, device, dtype)
+    assert bool((median_depth(projected, tiles, width=16, height=16, rule=rule) == depth).all())
+
+
 def test_the_public_op_gives_it_on_request(device, dtype):
     """None by default; the same bits for windows, chunks, tile sizes, repeats and threads, and for a single camera."""
     gaussians, cam = cloud(400, dtype, device), camera(75, 53, cameras=2, dtype=dtype, device=device)

@@ -69,6 +69,7 @@ OPS = {
     "scanlines": ["kernels/test_scanlines.py"],
     "sh": ["kernels/test_sh.py", "kernels/test_project.py"],
     "ssim": ["kernels/test_ssim.py", LIMITS],
+    "tsdf": ["kernels/test_tsdf.py"],
     "tiles": ["kernels/test_tiles.py", LIMITS_BLEND, RECORDS, "render/test_rasterize.py", "render/test_window.py"],
 }  # fmt: skip
 """The tests of a file by the beginning of its name (of cameras: folder/name), the longest that fits; soonest failing first."""

@@ -4,8 +4,6 @@ A pass of its own beside `blend`, which pays nothing for it: it ends as soon as 
 alpha by the same operations as blending does, so that both agree to the pixel about what covers a half.
 """
 
-from __future__ import annotations
-
 import functools
 
 import torch
