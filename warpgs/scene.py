@@ -138,6 +138,18 @@ class Scene:
 
 
 @dataclass(frozen=True)
+class Mesh:
+    """A surface of triangles, coloured at its vertices."""
+
+    vertices: np.ndarray
+    """World positions [u], float64, shape [V, 3]."""
+    faces: np.ndarray
+    """Vertices of each triangle, counter-clockwise seen from outside, int32, shape [F, 3]."""
+    colors: np.ndarray
+    """Colours in [0, 1] (sRGB), float32, shape [V, 3]."""
+
+
+@dataclass(frozen=True)
 class Prior:
     """Evidence on the pixels of one view from before the fit; every map is float32, shape [H, W], in [0, 1]."""
 
