@@ -18,8 +18,8 @@ RESOLUTION = 256
 MIN_RESOLUTION, MAX_RESOLUTION = 8, 4096
 TRUNCATION = 4.0
 """Truncation in voxels."""
-FENCE = 1.5
-"""Interquartile ranges outside the quartiles from where a coordinate is an outlier (Tukey, 1977: Exploratory Data Analysis)."""
+FENCE = 3.0
+"""Interquartile ranges outside the quartiles from where a coordinate is far out (Tukey, 1977: Exploratory Data Analysis)."""
 QUANTILES = (0.005, 0.995)
 """Share of the surface points along an axis that the grid leaves out at either end, where the fences are wider."""
 GRID_BYTES = 8
