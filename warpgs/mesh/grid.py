@@ -21,7 +21,7 @@ TRUNCATION = 4.0
 FENCE = 3.0
 """Interquartile ranges outside the quartiles from where a coordinate is far out (Tukey, 1977: Exploratory Data Analysis)."""
 QUANTILES = (0.005, 0.995)
-"""Share of the surface points along an axis that the grid leaves out at either end, where the fences are wider."""
+"""Quantiles of the surface points along an axis that the grid lies between, where the fences are wider."""
 GRID_BYTES = 8
 """Bytes of a grid point on the device: distance and weight."""
 HOST_BYTES = 14

@@ -26,7 +26,7 @@ SAMPLES = 200_000
 
 @dataclass(frozen=True)
 class SurfaceView:
-    """What one camera sees."""
+    """Surface that one camera sees."""
 
     camera: Camera
     """Pinhole camera, arrays of numpy."""
