@@ -18,16 +18,18 @@ BOUND = {torch.float32: 2e-4, torch.float64: 1e-10}
 
 
 def cameras(count=2):
-    """Return numpy cameras at the origin, each turned and shifted a little more."""
+    """Return numpy cameras at the origin, each shifted a little more and turned about every axis."""
     batch = torch_camera(*SIZE, cameras=count)
-    return [Camera(v.numpy(), K.numpy(), *SIZE) for v, K in zip(batch.viewmat, batch.K)]
+    roll = np.array([[np.cos(0.2), -np.sin(0.2), 0, 0], [np.sin(0.2), np.cos(0.2), 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+    return [Camera(roll @ v.numpy(), K.numpy(), *SIZE) for v, K in zip(batch.viewmat, batch.K)]
 
 
 def maps(seed=0):
-    """Return a depth map with a step, holes and open sky, random weights with zeros, and an image."""
+    """Return a depth map with holes and open sky, the first with a step, the other smooth; random weights; an image."""
     rng = np.random.default_rng(seed)
     row, column = np.mgrid[: SIZE[1], : SIZE[0]]
-    depth = 3.0 + 0.01 * column - 0.02 * row + np.where(column > 22, 1.5, 0) + 0.02 * rng.random((SIZE[1], SIZE[0]))
+    depth = 3.0 + 0.02 * rng.random((SIZE[1], SIZE[0]))
+    depth += 0.1 * rng.random(depth.shape) if seed else 0.01 * column - 0.02 * row + np.where(column > 22, 1.5, 0)
     depth[rng.random(depth.shape) < 0.05] = 0
     depth[:4] = np.inf
     weights = np.where(rng.random(depth.shape) < 0.1, 0, rng.random(depth.shape))
@@ -35,7 +37,10 @@ def maps(seed=0):
 
 
 def tensors(arrays, dtype, device):
-    return [torch.as_tensor(np.ascontiguousarray(a), dtype=dtype, device=device) for a in arrays]
+    """Return tensors of arrays, with more numbers of the same kind behind their end, which nothing must read."""
+    longer = [np.concatenate([a, 3.1 + a[:2] * 0]) for a in (np.where(np.isfinite(a), a, 1e9) for a in arrays)]
+    found = [torch.as_tensor(a, dtype=dtype, device=device) for a in longer]
+    return [torch.where(t == 1e9, torch.inf, t)[: len(a)] for t, a in zip(found, arrays)]
 
 
 def test_distances_and_weights_equal_numpy(device, dtype):
@@ -71,28 +76,57 @@ def test_colors_equal_numpy(device, dtype):
     assert (np.abs(sums.cpu().numpy() - wanted_sums) > BOUND[dtype]).mean() <= limit
 
 
-def test_cosines_are_those_of_the_surface(device, dtype):
-    """Of a slanted plane everywhere, of a bowl by a cross product; 1 in the sky, 0 in holes, and edges do not bend a plane."""
-    c = cameras()[1]
+def test_cosines_equal_numpy(device, dtype):
+    """Of maps with steps, holes and sky, and of a single pixel."""
+    for i, c in enumerate(cameras()):
+        depth = maps(i)[0]
+        depth[10:15, 12] = depth[20, 5:9] = 0  # a column and a row of holes
+        found = face_cosines(*tensors([depth], dtype, device), c).cpu().numpy()
+        assert np.abs(found - reference.faced(depth, c)).max() < BOUND[dtype]
+    alone = face_cosines(*tensors([np.full((1, 1), 2.0)], dtype, device), dataclasses.replace(c, width=1, height=1))
+    assert float(alone) == pytest.approx(float(reference.faced(np.full((1, 1), 2.0), c)[0, 0]), abs=1e-5)
+
+
+def test_cosines_are_those_of_a_plane(device):
+    """A slanted plane is seen as it is, but for the curve of its depth from one pixel to the next; a step does not bend it."""
+    c, normal = cameras()[1], np.array([0.5, 0.3, -1.0])
     pixels = np.stack(np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1])), -1) + 0.5
     rays = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], -1) @ np.linalg.inv(c.K).T
-    normal = np.array([0.5, 0.3, -1.0])
     depth = -2.5 / (rays @ normal)
     wanted = np.abs(rays @ normal) / np.linalg.norm(normal) / np.linalg.norm(rays, axis=-1)
-    found = face_cosines(*tensors([depth], dtype, device), c).cpu().numpy()
-    assert np.abs(found - wanted).max() < 0.02  # differences of one pixel along a hyperbola
-    holes = depth.copy()
-    holes[5, 7], holes[9:12, 20], holes[:, 30:] = 0, np.inf, holes[:, 30:] + 2
-    cosines = face_cosines(*tensors([holes], dtype, device), c).cpu().numpy()
-    assert cosines[5, 7] == 0 and (cosines[9:12, 20] == 1).all()
-    keep = (holes > 0) & np.isfinite(holes)
-    keep[:, 30:] = False
-    assert np.abs(cosines - wanted)[keep].max() < 0.03
-    bowl = 3 + 0.001 * ((pixels - 17) ** 2).sum(-1)
-    found = face_cosines(*tensors([bowl], dtype, device), c).cpu().numpy()
-    assert np.abs(found - reference.faced(bowl[..., None] * rays))[1:-1, 1:-1].max() < 0.05
-    alone = face_cosines(*tensors([np.full((1, 1), 2.0)], dtype, device), dataclasses.replace(c, width=1, height=1))
-    assert 0.5 < float(alone) <= 1
+    depth[:, 30:] += 2
+    found = face_cosines(*tensors([depth], torch.float64, device), c).cpu().numpy()
+    assert np.abs(found - wanted)[:, :30].max() < 0.02
+
+
+def test_borders(device, dtype):
+    """Positions and differences that are exact: the left and upper border belong to the image, the others do not."""
+    c = Camera(np.eye(4), np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), 8, 8)
+    depth, one = tensors([np.full((8, 8), 2.0), np.ones((8, 8))], dtype, device)
+    image = one[..., None].expand(8, 8, 3).contiguous()
+    at = [(-0.5, 0), (0.5, 0), (0, -0.5), (0, 0.5), (0, 0)]
+    points = [(2 * x, 2 * y, 2.0) for x, y in at] + [(0, 0, 1.5), (0, 0, 2.5), (0, 0, 1.75)]
+    sums, weights = torch.zeros(8, 3, dtype=dtype, device=device), torch.zeros(8, dtype=dtype, device=device)
+    gather_colors(torch.tensor(points, dtype=dtype, device=device), 0.5, c, depth, one, image, sums, weights)
+    assert weights.tolist() == [1, 0, 1, 0, 1, 0, 0, 1] and torch.equal(sums, weights[:, None].expand(8, 3))
+    grid = empty_grid((-1.0, -1.0, 2.0), 1.0, (3, 3, 2), 1.0, depth)
+    integrate(grid, c, depth, one)
+    inside = [[1, 1, 0], [1, 1, 0], [0, 0, 0]]  # at depth 2; at depth 3, the truncation behind, the whole grid is
+    assert grid.weights[:, :, 0].tolist() == inside and bool((grid.weights[:, :, 1] == 1).all())
+    assert bool((grid.distances[:, :, 1] == -1).all()) and not bool(grid.distances[:, :, 0].any())
+
+
+def test_depths_as_far_apart_as_the_truncation_are_two_surfaces(device, dtype):
+    """A point between pixels of two depths has that of its pixel from there on, and what lies between below."""
+    c = Camera(np.eye(4), np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), 8, 8)
+    depth = np.full((8, 8), 2.0)
+    depth[4:] = 2.5
+    found = []
+    for truncation in (0.5, 0.5001):
+        grid = empty_grid((0.0, 0.0, 1.9), 0.1, (1, 1, 1), truncation, torch.empty(0, dtype=dtype, device=device))
+        integrate(grid, c, *tensors([depth, np.ones((8, 8))], dtype, device))
+        found.append(float(grid.distances) * truncation)
+    assert found == pytest.approx([0.5, 0.35], abs=1e-3)
 
 
 def test_a_wall_is_found_where_it_is(device):

@@ -64,8 +64,24 @@ def gathered(points, tolerance, views):
     return sums, weights
 
 
-def faced(points):
-    """Cosines [H, W] between rays and normals of a surface by a cross product; its points [H, W, 3] are in the camera."""
-    normals = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
-    lengths = np.linalg.norm(normals, axis=-1) * np.linalg.norm(points, axis=-1)
-    return np.abs((normals * points).sum(-1)) / lengths
+def _slope(depth, axis):
+    """Differences along an axis to the neighbour, before or behind, that differs less; 0 where neither has a depth."""
+    padded = np.pad(np.where(np.isfinite(depth), depth, 0), 1)
+    back, ahead = (np.roll(padded, shift, axis)[1:-1, 1:-1] for shift in (1, -1))
+    choices = np.stack([np.where(back > 0, depth - back, np.inf), np.where(ahead > 0, ahead - depth, np.inf)])
+    least = np.take_along_axis(choices, np.abs(choices).argmin(0)[None], 0)[0]
+    return np.where(np.isfinite(least), least, 0)
+
+
+def faced(depth, camera):
+    """Cosines [H, W] between rays and normals: the cross product of the tangents along rows and columns."""
+    height, width = depth.shape
+    pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
+    inverse = np.linalg.inv(camera.K)
+    rays = np.concatenate([pixels, np.ones((height, width, 1))], -1) @ inverse.T
+    met = (depth > 0) & np.isfinite(depth)
+    z = np.where(met, depth, 1)
+    along, down = (_slope(depth, axis)[..., None] * rays + z[..., None] * inverse[:, 1 - axis] for axis in (1, 0))
+    normals = np.cross(along, down)
+    cosines = np.abs((normals * rays).sum(-1)) / np.linalg.norm(normals, axis=-1) / np.linalg.norm(rays, axis=-1)
+    return np.where(met, cosines, np.where(depth > 0, 1, 0))

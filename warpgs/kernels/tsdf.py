@@ -159,8 +159,8 @@ def make_kernels(real):
                 row = int(v)
                 column = int(u)
                 if wp.abs(depth_at(depth, u, v, row, column, most) - p[2]) < most:
-                    left = wp.clamp(int(wp.floor(u - real(0.5))), 0, wp.max(depth.shape[1] - 2, 0))
-                    top = wp.clamp(int(wp.floor(v - real(0.5))), 0, wp.max(depth.shape[0] - 2, 0))
+                    left = wp.clamp(int(wp.floor(u - real(0.5))), 0, depth.shape[1] - 1)
+                    top = wp.clamp(int(wp.floor(v - real(0.5))), 0, depth.shape[0] - 1)
                     right = wp.min(left + 1, depth.shape[1] - 1)
                     bottom = wp.min(top + 1, depth.shape[0] - 1)
                     fx = wp.clamp(u - real(0.5) - real(left), real(0.0), real(1.0))

@@ -93,7 +93,7 @@ def decimate(mesh: Mesh, max_faces: int) -> Mesh:
         return mesh
     import pyvista
 
-    # in voxels around the middle, since VTK decides in float32
+    # around the middle and of size 1, since VTK decides in float32
     middle = mesh.vertices.mean(0)
     size = float(np.abs(mesh.vertices - middle).max()) or 1.0
     data = pyvista.PolyData.from_regular_faces(((mesh.vertices - middle) / size).astype(np.float32), mesh.faces)
