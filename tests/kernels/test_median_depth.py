@@ -87,6 +87,20 @@ def test_layers_that_halve_the_light(device, dtype, opacities, depth):
     assert bool((found == depth).all())
 
 
+def test_faint_gaussians_at_the_end_of_a_strip(device, dtype):
+    """Sixty of them at the first and the last pixel of a row: the ellipse is narrow, and each halves nothing by itself."""
+    projected, tiles = layers([0.02] * 120, device, dtype)
+    projected[..., 2] = projected[..., 4] = 1.8
+    projected[..., 10:] = 1.1
+    projected[..., 0] = torch.where(torch.arange(120, device=device) % 2 == 0, 0.5, 15.5).to(dtype)
+    projected[..., 1] = 7.5
+    size = {"width": 16, "height": 16, "rule": RULES["exact"]}
+    found = median_depth(projected, tiles, **size)[0]
+    alpha = blend(projected, tiles, projected.new_zeros(1, 3), **size)[1][0]
+    assert torch.equal(found > 0, alpha >= 0.5) and int((found > 0).sum()) == 2
+    assert float(found[7, 0]) == 69 and float(found[7, 15]) == 70  # 0.98^34 > 1/2 > 0.98^35
+
+
 @pytest.mark.parametrize(("inclusive", "depth"), [(True, 2), (False, 0)])
 def test_the_layer_that_crosses_the_stop(device, dtype, inclusive, depth):
     """It is blended under an inclusive rule; under an exclusive one the pixel ends before it, and before what lies behind."""
