@@ -99,6 +99,23 @@ def test_the_command_writes_in_units_of_the_files(stored, tmp_path, capsys):
     assert sorted(p.name for p in tmp_path.iterdir() if not p.name.startswith(".")) == ["a.ply"]
 
 
+def test_upright_where_the_cameras_agree(stored, tmp_path, capsys):
+    """A .glb file turns their mean upward direction to +y; cameras that are turned all ways have none, which is said."""
+    views = [c for c, d in zip(cameras(ALL_SIDES), ALL_SIDES) if abs(d[1]) < 0.9]
+    assert run_mesh.upwards(views) @ [0, -1, 0] > 0.7
+    half = np.diag([-1.0, -1, 1, 1])
+    assert run_mesh.upwards([*views, *(dataclasses.replace(c, viewmat=half @ c.viewmat) for c in views)]) is None
+    for upside_down in (False, True):
+        kept = {n: c for n, c in stored.scene_cameras.items() if n in stored.train}
+        for i, name in enumerate(kept if upside_down else ()):
+            kept[name] = dataclasses.replace(
+                kept[name], viewmat=np.diag([-1.0, -1, 1, 1] if i % 2 else np.ones(4)) @ kept[name].viewmat
+            )
+        stored.scene_cameras.update(kept)
+        assert main(["mesh", "run", "--out", str(tmp_path / "a.glb"), "--resolution", "24", "--device", "cpu"]) == 0
+        assert ("may lie on its side" in capsys.readouterr().out) == upside_down
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +18,10 @@ from warpgs.pipeline.runs.folder import open_run
 from warpgs.pipeline.runs.request import choose_device
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.folder_lock import hold_folder
+from warpgs.scene import Camera
+
+MIN_UP = 0.5
+"""Length of the mean of the cameras' upward directions, each of length 1, from which on they agree on one."""
 
 
 def mesh(
@@ -50,7 +54,6 @@ def mesh(
     if not run.train:
         raise DataError(f"{folder}: it has no training views, so nobody knows what was seen; fit again")
     cameras, scale = [run.scene_cameras[n] for n in run.train], run.normalization.scale
-    up = -np.mean([c.viewmat[1, :3] for c in cameras], axis=0)
     if options.voxel is not None:
         options = replace(options, voxel=options.voxel * scale)
 
@@ -63,8 +66,17 @@ def mesh(
     with hold_folder(target.parent) as notes:
         found = fuse(run.scene_gaussians, cameras, run.options(), options, stage=stage, planned=planned)
         made = convert_mesh(found.mesh, run.normalization, "scene", "file")
-        write_mesh(target, made, up if np.linalg.norm(up) > 1e-3 else None)
+        up = upwards(cameras)
+        write_mesh(target, made, up)
+    if up is None and target.suffix.lower() == ".glb":
+        notes = [*notes, "the cameras were not held upright together, so the mesh may lie on its side in a viewer"]
     return [*notes, *_lines(found, len(cameras)), f"{target}: {format_bytes(os.path.getsize(target))}"]
+
+
+def upwards(cameras: Sequence[Camera]) -> np.ndarray | None:
+    """Return the mean upward direction of cameras, of any length, shape [3]; None where they do not agree on one."""
+    up: np.ndarray = -np.mean([c.viewmat[1, :3] for c in cameras], axis=0)
+    return up if np.linalg.norm(up) >= MIN_UP else None
 
 
 def _lines(found: FusedMesh, views: int) -> list[str]:
