@@ -10,7 +10,7 @@ import torch
 from tests.mesh.balls import ALL_SIDES, CENTER, RADIUS, RED, ball, cameras
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
-from warpgs.mesh.fuse import MeshOptions, fuse
+from warpgs.mesh.fuse import MeshOptions, fuse, vertex_colors
 from warpgs.mesh.surface_views import sample_surface, surface_view
 from warpgs.pipeline.runs import mesh as run_mesh
 from warpgs.pipeline.runs.model_file import FittedModel
@@ -40,6 +40,15 @@ def test_colors_are_those_of_the_renders(fused):
     red = fused.mesh.colors[:, 0] > fused.mesh.colors[:, 2]
     assert (red == (x > 0))[np.abs(x) > 0.15].all()
     assert np.abs(fused.mesh.colors[x > 0.3] - RED).mean() < 0.05
+
+
+def test_a_vertex_that_nobody_sees_has_its_neighbours_colour(fused):
+    """The middle of the ball, and a point far behind every camera."""
+    hidden = CENTER + np.array([[0.2, 0, 0], [-99, 0, 0]])
+    more = dataclasses.replace(fused.mesh, vertices=np.concatenate([fused.mesh.vertices, hidden]))
+    colors, count = vertex_colors(more, ball(), cameras(ALL_SIDES), RENDER, fused.plan, "median", lambda line: None)
+    assert count == fused.uncolored + 2 and np.array_equal(colors[:-2], fused.mesh.colors)
+    assert colors[-2, 0] > 0.5 > colors[-2, 2] and colors[-1, 2] > 0.5 > colors[-1, 0]
 
 
 def test_the_back_that_nobody_saw_stays_open():

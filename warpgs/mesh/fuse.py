@@ -66,8 +66,7 @@ def integrate_views(
         stage: Function that shows a line of progress.
     """
     grid = empty_grid(plan.origin, plan.voxel, plan.shape, plan.truncation, gaussians.means)
-    for i, view in enumerate(surface_views(gaussians, cameras, render, depth), 1):
-        stage(f"fusing depth: view {i} of {len(cameras)}")
+    for view in surface_views(gaussians, cameras, render, depth, "fusing depth", stage):
         integrate(grid, view.camera, view.depth, view.weights)
     return grid
 
@@ -94,10 +93,8 @@ def fuse(
         ResourceError: The grid does not fit into memory.
         UsageError: A camera is no pinhole, or an option is out of range.
     """
-    samples = []
-    for i, view in enumerate(surface_views(gaussians, cameras, render, options.depth), 1):
-        stage(f"looking where surfaces are: view {i} of {len(cameras)}")
-        samples.append(sample_surface(view, SAMPLES // len(cameras)))
+    views = surface_views(gaussians, cameras, render, options.depth, "looking where surfaces are", stage)
+    samples = [sample_surface(v, max(1, SAMPLES // len(cameras))) for v in views]
     plan = plan_grid(*map(np.concatenate, zip(*samples)), options.voxel, options.resolution)
     planned(plan, check_memory(plan, gaussians.means.device))
     grid = integrate_views(gaussians, cameras, render, plan, options.depth, stage)
@@ -133,9 +130,8 @@ def vertex_colors(
     """
     points = torch.as_tensor(mesh.vertices, dtype=gaussians.means.dtype, device=gaussians.means.device)
     sums, weights = torch.zeros_like(points), torch.zeros_like(points[:, 0])
-    for i, view in enumerate(surface_views(gaussians, cameras, render, depth), 1):
-        stage(f"colouring: view {i} of {len(cameras)}")
-        tolerance = COLOR_TOLERANCE * plan.truncation
+    tolerance = COLOR_TOLERANCE * plan.truncation
+    for view in surface_views(gaussians, cameras, render, depth, "colouring", stage):
         gather_colors(points, tolerance, view.camera, view.depth, view.weights, view.image, sums, weights)
     known = (weights > 0).cpu().numpy()
     colors = sums.cpu().numpy() / np.maximum(weights.cpu().numpy(), np.finfo(np.float32).tiny)[:, None]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -61,8 +61,9 @@ def surface_view(gaussians: Gaussians, camera: Camera, options: RasterizeOptions
 
 
 def surface_views(
-    gaussians: Gaussians, cameras: Sequence[Camera], options: RasterizeOptions, depth: str = "median"
-) -> Iterator[SurfaceView]:
+    gaussians: Gaussians, cameras: Sequence[Camera], options: RasterizeOptions, depth: str, purpose: str,
+    stage: Callable[[str], object],
+) -> Iterator[SurfaceView]:  # fmt: skip
     """Yield what each camera sees of the surface, one after the other, so that one view is held at a time.
 
     Args:
@@ -70,11 +71,14 @@ def surface_views(
         cameras: Pinhole cameras, arrays of numpy.
         options: Settings of the rasterizer.
         depth: Depth that is taken, one of `DEPTHS`.
+        purpose: Words for the line of progress.
+        stage: Function that shows a line of progress, before each view.
 
     Raises:
         UsageError: A camera is no pinhole, or the depth is unknown.
     """
-    for camera in cameras:
+    for i, camera in enumerate(cameras, 1):
+        stage(f"{purpose}: view {i} of {len(cameras)}")
         yield surface_view(gaussians, camera, options, depth)
 
 

@@ -97,5 +97,5 @@ def decimate(mesh: Mesh, max_faces: int) -> Mesh:
     middle = mesh.vertices.mean(0)
     size = float(np.abs(mesh.vertices - middle).max()) or 1.0
     data = pyvista.PolyData.from_regular_faces(((mesh.vertices - middle) / size).astype(np.float32), mesh.faces)
-    fewer = data.decimate(1 - max_faces / len(mesh.faces), boundary_constraints=True)
+    fewer = data.decimate(1 - max_faces / len(mesh.faces))
     return _compact(_grey(np.asarray(fewer.points, np.float64) * size + middle, fewer.regular_faces))
