@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from warpgs.errors import DataError, UsageError
-from warpgs.scene import Camera, Gaussians, Normalization
+from warpgs.scene import Camera, Gaussians, Mesh, Normalization
 
 UNITS = ("scene", "file")
 
@@ -82,6 +82,27 @@ def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source
         means, log_scales = normalization.scale * (means - offset), log_scales + math.log(normalization.scale)
     kind = gaussians.means.dtype
     return dataclasses.replace(gaussians, means=means.to(kind), log_scales=log_scales.to(kind))
+
+
+def convert_mesh(mesh: Mesh, normalization: Normalization, source: str, target: str) -> Mesh:
+    """Return a mesh in other units: its vertices change, triangles and colours are shared.
+
+    Args:
+        mesh: The mesh in the units ``source``.
+        normalization: Similarity from file to scene units.
+        source: Units of the input: scene or file.
+        target: Units of the result: scene or file.
+
+    Raises:
+        UsageError: A name of units is unknown.
+    """
+    check_units(source)
+    check_units(target)
+    if source == target:
+        return mesh
+    scale, offset = normalization.scale, np.asarray(normalization.offset, np.float64)
+    vertices = mesh.vertices / scale + offset if target == "file" else scale * (mesh.vertices - offset)
+    return dataclasses.replace(mesh, vertices=vertices)
 
 
 def convert_camera(camera: Camera, normalization: Normalization, source: str, target: str) -> Camera:

@@ -141,6 +141,18 @@ class Scene:
 
 
 @dataclass(frozen=True)
+class Mesh:
+    """A surface of triangles, coloured at its vertices."""
+
+    vertices: np.ndarray
+    """World positions [u], float64, shape [V, 3]."""
+    faces: np.ndarray
+    """Vertices of each triangle, counter-clockwise seen from outside, int32, shape [F, 3]."""
+    colors: np.ndarray
+    """Colours in [0, 1] (sRGB), float32, shape [V, 3]."""
+
+
+@dataclass(frozen=True)
 class Prior:
     """Evidence on the pixels of one view from before the fit; every map is float32, shape [H, W], in [0, 1]."""
 
@@ -229,6 +241,9 @@ class Render:
     overflow: torch.Tensor | None = None
     """1 where the instances did not fit into the capacity, and the images must not be used; else 0. Int32, shape [1]; only
     where a capacity was given."""
+    median_depth: torch.Tensor | None = None
+    """z-depth [u] of the Gaussian at which transmittance falls to one half, shape [..., H, W]; 0 where alpha is below 1/2. No
+    gradients flow into it; only where it was requested."""
 
     @property
     def visible(self) -> torch.Tensor:

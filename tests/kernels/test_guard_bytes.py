@@ -8,6 +8,7 @@ from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.kernels.adam import adam_step
 from warpgs.kernels.blend import blend, contributions
+from warpgs.kernels.median_depth import median_depth
 from warpgs.kernels.project import project
 from warpgs.kernels.ssim import differences, ssim
 from warpgs.kernels.tiles import bin_tiles
@@ -60,7 +61,16 @@ def rendering(device, cameras, deterministic=True):
     of_rgb = torch.autograd.grad(images[0].sum(), inputs)
     count = len(made.slots)
     lists = [made.ranges, made.gaussian_ids, made.slots, spare.ranges, spare.gaussian_ids[:count]]
-    return [projected, counts, *lists, *images, *contributions(projected, made, **size), *of_all, *of_rgb]
+    return [
+        projected,
+        counts,
+        *lists,
+        *images,
+        *contributions(projected, made, **size),
+        median_depth(projected, made, **size),
+        *of_all,
+        *of_rgb,
+    ]
 
 
 def similarity(device, cameras):

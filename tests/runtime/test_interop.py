@@ -13,6 +13,7 @@ from warpgs.kernels.adam import adam_step
 from warpgs.kernels.blend import blend, contributions
 from warpgs.kernels.dropout import opacity_dropout
 from warpgs.kernels.knn import mean_square_distances
+from warpgs.kernels.median_depth import median_depth
 from warpgs.kernels.project import project
 from warpgs.kernels.ssim import differences, ssim
 from warpgs.kernels.tiles import bin_tiles
@@ -84,7 +85,7 @@ def everything():
     adam_step(*state, lr=0.1, step=1)
     factors = opacity_dropout(53, torch.tensor([0.3, 1.0]), 5)
     lists = [t for tiled in (tiles, capped) for t in (tiled.ranges, tiled.counts, tiled.gaussian_ids[: len(tiles.slots)])]
-    weights = contributions(projected, tiles, **size, rule=rule)
+    weights = (*contributions(projected, tiles, **size, rule=rule), median_depth(projected, tiles, **size, rule=rule))
     near = mean_square_distances(moved[:91])
     return [t.detach() for t in (projected, counts, *lists, *images, *gradients, *weights, *state, near, factors, maps, sums)]
 

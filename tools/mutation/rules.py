@@ -32,6 +32,7 @@ CUDA_FUNCTIONS = {
         "CapturedGraph", "GraphMemory", "GraphPool.capture", "GraphPool.pool", "GraphPool.release",
     ),
     "warpgs/kernels/adam.py": ("make_scheduled_kernel",),
+    "warpgs/kernels/median_depth.py": ("make_native",),
     "warpgs/kernels/ssim.py": ("make_kernels", "_Launcher.padded", "_Launcher.launch"),
 }  # fmt: skip
 """Code that only a CUDA device runs, beside what `sides` and `ends_cpu` find."""
@@ -59,6 +60,7 @@ OPS = {
     "functions": ["kernels/test_project.py", SPANS, LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "render/test_window.py"],
     "knn": ["kernels/test_knn.py", LIMITS],
     "allocator": ["runtime/test_allocator.py", "runtime/test_cuda_graph.py", "render/test_graphed.py"],
+    "median_depth": ["kernels/test_median_depth.py", "kernels/test_blend.py"],
     "native": [
         "kernels/test_project.py", "kernels/test_tiles.py", "render/test_rasterize.py", LIMITS_PROJECT, LIMITS_BLEND, RECORDS,
     ],
@@ -68,6 +70,7 @@ OPS = {
     "scanlines": ["kernels/test_scanlines.py"],
     "sh": ["kernels/test_sh.py", "kernels/test_project.py"],
     "ssim": ["kernels/test_ssim.py", LIMITS],
+    "tsdf": ["kernels/test_tsdf.py"],
     "tiles": ["kernels/test_tiles.py", LIMITS_BLEND, RECORDS, "render/test_rasterize.py", "render/test_window.py"],
 }  # fmt: skip
 """The tests of a file by the beginning of its name (of cameras: folder/name), the longest that fits; soonest failing first."""
@@ -75,7 +78,8 @@ OPS = {
 CUDA_OPS = {
     "adam": [GUARDS, "pipeline/test_step.py"], "blend_cuda": [BODIES, GUARDS], "cameras/": [GUARDS],
     "cuda_graph": ["render/test_graphed_cuda.py", "pipeline/test_step.py"],
-    "interop": [BODIES, "kernels/test_project.py", "pipeline/test_step.py"], "native": [BODIES, GUARDS], "project": [GUARDS],
+    "interop": [BODIES, "kernels/test_project.py", "pipeline/test_step.py"],
+    "median_depth": [GUARDS], "native": [BODIES, GUARDS], "project": [GUARDS],
     "project_backward": [GUARDS], "ssim": [GUARDS],
     "tiles": [BODIES, GUARDS, "pipeline/test_step.py"],
 }  # fmt: skip

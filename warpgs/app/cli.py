@@ -17,6 +17,7 @@ COMMANDS = {
     "eval": "score a run again on its held-out views",
     "render": "render a run: its views, an orbit or a spiral, as PNG and mp4",
     "export": "write a run's Gaussians to a PLY file",
+    "mesh": "make a mesh of the surfaces that a run's training views see, as .ply or .glb",
     "prune": "shrink a finished model as far as its training views allow, into a new run folder",
     "priors": "look at what is known before a fit (priors show), or write networks as ONNX (priors export)",
     "compare": "fit presets to scenes with several seeds; tables, plot and figure of the differences",

@@ -66,7 +66,8 @@ def _launch(kernel, tiles: int, inputs: list, device: torch.device) -> None:
     interop.launch(kernel, tiles, inputs, device, cost=10_000, block_dim=32)
 
 
-def _tile_inputs(projected: torch.Tensor, tiles: Tiles, real) -> list[interop.View]:
+def tile_inputs(projected: torch.Tensor, tiles: Tiles, real) -> list[interop.View]:
+    """Return what the generic kernels take first: projected Gaussians [C, N, 12], and the instances of each tile."""
     return [
         interop.view(projected.view(-1, projected.shape[-1]), real),
         interop.view(tiles.ranges, wp.int32),
@@ -105,7 +106,7 @@ def composite(
     transmittances, weights = (allocator.saved(shape, projected.dtype, device) for _ in range(2))
     ends = allocator.saved(shape, torch.int32, device)
     inputs = [
-        *_tile_inputs(projected, tiles, real), interop.view(backgrounds, real), *settings.window_inputs(tiles.size),
+        *tile_inputs(projected, tiles, real), interop.view(backgrounds, real), *settings.window_inputs(tiles.size),
         rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), rule.transmittance_stop, int(rule.inclusive_stop),
         interop.view(rgb.view(-1, 3), real),
         *(interop.view(t.view(-1), real) for t in (alpha, depth, transmittances, weights)),
@@ -126,7 +127,7 @@ def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_i
     for v in (v_alpha, v_depth):
         upstream.append(interop.view((torch.zeros_like(depth) if v is None else v.contiguous()).view(-1), real))
     inputs = [
-        *_tile_inputs(projected, tiles, real), interop.view(tiles.slots, wp.int32), interop.view(backgrounds, real),
+        *tile_inputs(projected, tiles, real), interop.view(tiles.slots, wp.int32), interop.view(backgrounds, real),
         *settings.window_inputs(tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
         *(interop.view(t.view(-1), real) for t in (transmittances, weights, depth)), interop.view(ends.view(-1), wp.int32),
         *upstream, interop.view(v_slots, real),
@@ -197,7 +198,13 @@ class _Blend(torch.autograd.Function):
         return v_projected, v_backgrounds, None, None
 
 
-def _check(projected: torch.Tensor, tiles: Tiles, width: int, height: int, **backgrounds) -> None:
+def check_tiles(projected: torch.Tensor, tiles: Tiles, width: int, height: int, **backgrounds) -> None:
+    """Check that tiles were made for an image of ``width`` x ``height`` px and go with projected Gaussians [C, N, 12].
+
+    Raises:
+        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        ValueError: A shape or device disagrees, or the tiles belong to another image size.
+    """
     sizes = interop.check(projected=(projected, "C N 12"), **backgrounds)
     columns, rows = grid(width, height, tiles.size)
     if len(tiles.ranges) != sizes["C"] * columns * rows:
@@ -242,7 +249,7 @@ def blend(
         TypeError: A scalar type is neither float32 nor float64, or they differ.
         ValueError: A shape or device disagrees, or the tiles belong to another image size.
     """
-    _check(projected, tiles, width, height, backgrounds=(backgrounds, "C 3"))
+    check_tiles(projected, tiles, width, height, backgrounds=(backgrounds, "C 3"))
     return _Blend.apply(projected, backgrounds, tiles, BlendSettings(origin, width, height, rule, deterministic))
 
 
@@ -266,7 +273,7 @@ def contributions(
         TypeError: The scalar type is neither float32 nor float64.
         ValueError: A shape disagrees, or the tiles belong to another image size.
     """
-    _check(projected, tiles, width, height)
+    check_tiles(projected, tiles, width, height)
     projected = projected.detach().contiguous()
     real, device = interop.real_of(projected), projected.device
     settings = BlendSettings(origin, width, height, rule)
@@ -276,7 +283,7 @@ def contributions(
     else:
         weights = projected.new_zeros(len(tiles.slots), 2)
         inputs = [
-            *_tile_inputs(projected, tiles, real), interop.view(tiles.slots, wp.int32),
+            *tile_inputs(projected, tiles, real), interop.view(tiles.slots, wp.int32),
             *settings.window_inputs(tiles.size),
             rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), interop.view(ends.view(-1), wp.int32),
             interop.view(weights, real),

@@ -10,6 +10,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from warpgs.kernels.blend import blend, contributions
+from warpgs.kernels.median_depth import median_depth
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
 from warpgs.render.settings import RenderSettings, Window
@@ -135,6 +136,27 @@ def contributions_chunked(
         sums += part
         maxima = torch.maximum(maxima, part_maxima)
     return sums, maxima
+
+
+def median_depth_chunked(projected: torch.Tensor, frame: ChunkedFrame, sources: tuple[torch.Tensor, ...]) -> torch.Tensor:
+    """Render the median depth chunk by chunk: the same bits as `median_depth` gives.
+
+    Args:
+        projected: Result of `project` for the frame's window, shape [C, N, 12].
+        frame: Settings.
+        sources: The seven tensors that ``projected`` was projected from, with their shapes [...], and the opacity factors [N]
+            if there were any.
+
+    Returns:
+        z-depth [u], 0 where alpha is below 1/2, shape [C, H, W].
+    """
+    x0, y0, width, height = frame.settings.window
+    depths = projected.new_empty(len(projected), height, width)
+    for (x, y, w, h), counts in chunks(frame, tuple(t.detach() for t in sources)):
+        options = {"width": w, "height": h, "rule": frame.settings.rule, "origin": (x, y)}
+        tiles = bin_tiles(projected, counts, tile_size=frame.settings.tile_size, **options)
+        depths[:, y - y0 : y - y0 + h, x - x0 : x - x0 + w] = median_depth(projected, tiles, **options)
+    return depths
 
 
 def blend_chunked(

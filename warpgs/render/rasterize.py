@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -11,10 +11,11 @@ from warpgs.constants import RULES, Rule
 from warpgs.errors import UsageError
 from warpgs.kernels.blend import blend, contributions
 from warpgs.kernels.cameras.base import CAMERA_MODELS
+from warpgs.kernels.median_depth import median_depth
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
 from warpgs.render import graphed
-from warpgs.render.chunked import ChunkedFrame, blend_chunked, contributions_chunked
+from warpgs.render.chunked import ChunkedFrame, blend_chunked, contributions_chunked, median_depth_chunked
 from warpgs.render.settings import RenderSettings, Window
 from warpgs.scene import Camera, Gaussians, Render
 
@@ -36,6 +37,8 @@ class RasterizeOptions:
     """Side of a tile [px]: 8 or 16. The image does not depend on it."""
     contributions: bool = False
     """True to report sum and maximum of each Gaussian's blending weight, too."""
+    median_depth: bool = False
+    """True to render the depth at which transmittance falls to one half, too."""
     memory_budget: int | None = None
     """Bytes that the (Gaussian, tile) instances may take; None for four fifths of the free memory."""
     deterministic: bool = True
@@ -53,13 +56,15 @@ class RasterizeOptions:
     gradients. That is the same image in less memory and more time. None for all at once. Not with ``capacity``."""
     record: bool = True
     """True to let CUDA graphs replay the calls that a loop repeats: the same bits in half the time. It applies to small calls
-    with gradients in a fixed order, without opacity factors, contributions and limits (docs/decisions/010-recorded-calls.md).
-    Choose False where other threads wait for the whole device, as torch.cuda.synchronize does."""
+    with gradients in a fixed order, without opacity factors, contributions, median depth and limits
+    (docs/decisions/010-recorded-calls.md). Choose False where other threads wait for the whole device, as
+    torch.cuda.synchronize does."""
 
     def repeatable(self) -> bool:
         """Return whether calls with these options may be captured as CUDA graphs."""
         others = (self.opacity_factors, self.memory_budget, self.capacity, self.max_instances)
-        return self.record and self.deterministic and not self.contributions and all(o is None for o in others)
+        plain = self.record and self.deterministic and not self.contributions and not self.median_depth
+        return plain and all(o is None for o in others)
 
 
 def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
@@ -145,13 +150,17 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
         if found is not None:
             return _as_render(camera, *found)
     backgrounds = _backgrounds(means.new_zeros(3), viewmats) if backgrounds is None else backgrounds
-    return _as_render(camera, *_rasterize(sources, backgrounds, settings, options))
+    *found, median = _rasterize(sources, backgrounds, settings, options)
+    return _as_render(camera, *found, median=median)
 
 
 def _rasterize(
     sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor, settings: RenderSettings, options: RasterizeOptions
 ) -> tuple[Any, ...]:
-    """Return the images as one tuple, and the further fields of `Render`, by kernels that are launched one by one."""
+    """Return the images as one tuple, and the further fields of `Render`, by kernels that are launched one by one.
+
+    The last is the median depth, shape [C, H, W], or None.
+    """
     projected, tile_counts = project(*sources, opacity_factors=options.opacity_factors, **settings.project_options())
     if options.max_instances is not None and int(tile_counts.sum()) > options.max_instances:
         frame = ChunkedFrame(settings, options.max_instances, options.deterministic)
@@ -159,7 +168,8 @@ def _rasterize(
         sources = (*sources, *factors)
         images = blend_chunked(projected, backgrounds, frame, sources)
         weights = contributions_chunked(projected, frame, sources) if options.contributions else (None, None)
-        return images, projected, tile_counts, *weights
+        median = median_depth_chunked(projected, frame, sources) if options.median_depth else None
+        return images, projected, tile_counts, *weights, None, median
     overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=projected.device)
     x, y, width, height = settings.window
     shared: dict[str, Any] = {"width": width, "height": height, "rule": settings.rule, "origin": (x, y)}
@@ -169,10 +179,13 @@ def _rasterize(
     )  # fmt: skip
     images = blend(projected, tiles, backgrounds, deterministic=options.deterministic, **shared)
     weights = contributions(projected, tiles, **shared) if options.contributions else (None, None)
-    return images, projected, tile_counts, *weights, overflow
+    median = median_depth(projected, tiles, **shared) if options.median_depth else None
+    return images, projected, tile_counts, *weights, overflow, median
 
 
-def _as_render(camera: Camera, images: tuple[torch.Tensor, ...], *rest: Any) -> Render:
+def _as_render(camera: Camera, images: tuple[torch.Tensor, ...], *rest: Any, median: torch.Tensor | None = None) -> Render:
     """Return the result; without a leading axis for a single camera."""
+    single = len(camera.viewmat.shape) == 2
     # not p[0], whose gradient would be a copy among zeros
-    return Render(*(p.squeeze(0) if len(camera.viewmat.shape) == 2 else p for p in images), *rest)
+    render = Render(*(p.squeeze(0) if single else p for p in images), *rest)
+    return render if median is None else replace(render, median_depth=median.squeeze(0) if single else median)

@@ -1,0 +1,134 @@
+"""Meshes as files: PLY, binary, and glTF 2.0 in one binary file."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from warpgs import __version__
+from warpgs.errors import DataError, UsageError
+from warpgs.files import write_bytes
+from warpgs.scene import Mesh
+
+SUFFIXES = (".ply", ".glb")
+"""Suffixes of the files that can be written."""
+MAX_BYTES = 2**32 - 1
+"""Largest glTF file: its lengths are 32-bit numbers."""
+
+
+def check_suffix(path: str | os.PathLike[str]) -> None:
+    """Check that a mesh can be written to such a file.
+
+    Raises:
+        UsageError: It cannot.
+    """
+    suffix = Path(path).suffix
+    if suffix.lower() not in SUFFIXES:
+        raise UsageError(f"{path}: format {suffix or '(none)'} is not supported; use {' or '.join(SUFFIXES)}")
+
+
+def write_mesh(path: str | os.PathLike[str], mesh: Mesh, up: np.ndarray | None = None) -> None:
+    """Write a mesh to a .ply or .glb file, which appears whole or not at all.
+
+    Args:
+        path: The file; an existing one is replaced.
+        mesh: The mesh.
+        up: Upward direction in the mesh's coordinates, any length, shape [3]: a .glb file carries the rotation that turns it to
+            +y, as glTF wants it. None for +y. PLY has no upward direction.
+
+    Raises:
+        DataError: A number is not finite, a triangle names a vertex that is not there, or the file would be too large.
+        ResourceError: The file cannot be written.
+        UsageError: The suffix is neither.
+    """
+    path = Path(path)
+    check_suffix(path)
+    if not (np.isfinite(mesh.vertices).all() and np.isfinite(mesh.colors).all()):
+        raise DataError(f"{path}: not written, the mesh holds numbers that are not finite; make it again")
+    if mesh.faces.size and not (mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices)):
+        raise DataError(f"{path}: not written, a triangle names a vertex that is not there; make the mesh again")
+    if path.suffix.lower() == ".ply":
+        write_bytes(path, *_ply(mesh))
+    else:
+        write_bytes(path, *_glb(path, mesh, up))
+
+
+def _ply(mesh: Mesh) -> list[bytes]:
+    """Return header, vertices and faces: float32 positions, 8-bit colours, lists of three int32."""
+    header = (
+        f"ply\nformat binary_little_endian 1.0\ncomment warpgs {__version__}\nelement vertex {len(mesh.vertices)}\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        "property uchar red\nproperty uchar green\nproperty uchar blue\n"
+        f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    vertices = np.empty(len(mesh.vertices), [("position", "<f4", 3), ("color", "u1", 3)])
+    vertices["position"], vertices["color"] = mesh.vertices, np.round(255 * np.clip(mesh.colors, 0, 1))
+    faces = np.empty(len(mesh.faces), [("count", "u1"), ("vertices", "<i4", 3)])
+    faces["count"], faces["vertices"] = 3, mesh.faces
+    return [header.encode("ascii"), vertices.tobytes(), faces.tobytes()]
+
+
+def linear(colors: np.ndarray) -> np.ndarray:
+    """Return sRGB colours in [0, 1] as linear ones, of the same shape (IEC 61966-2-1), in which glTF stores them."""
+    c = np.clip(colors.astype(np.float64), 0, 1)
+    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+
+
+def rotation_to_y(up: np.ndarray) -> list[float]:
+    """Return the shortest rotation that turns a direction [3], of any length, to +y, as a unit quaternion xyzw, shape [4]."""
+    x, y, z = np.asarray(up, np.float64) / np.linalg.norm(up)
+    if y < -1 + 1e-12:
+        return [1.0, 0.0, 0.0, 0.0]
+    q = np.array([-z, 0.0, x, 1.0 + y])  # cross product of up and +y, and 1 plus their product
+    unit: list[float] = (q / np.linalg.norm(q)).tolist()
+    return unit
+
+
+def _glb(path: Path, mesh: Mesh, up: np.ndarray | None) -> list[bytes]:
+    """Return the chunks of a glTF 2.0 file: one node, one unlit mesh, positions, colours and triangles.
+
+    Positions are float32 around their middle, which is the node's translation: far from the origin float32 is coarse.
+    """
+    middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2 if len(mesh.vertices) else np.zeros(3)
+    positions = (mesh.vertices - middle).astype("<f4")
+    colors = np.full((len(mesh.vertices), 4), 65535, "<u2")
+    colors[:, :3] = np.round(65535 * linear(mesh.colors))
+    arrays = [positions.tobytes(), colors.tobytes(), mesh.faces.astype("<u4").tobytes()]
+    starts = np.cumsum([0, *map(len, arrays)]).tolist()
+    rotation = [0.0, 0.0, 0.0, 1.0] if up is None else rotation_to_y(up)
+    extent = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()} if len(positions) else {}
+    kinds = [
+        (5126, "VEC3", len(positions), extent),
+        (5123, "VEC4", len(colors), {"normalized": True}),
+        (5125, "SCALAR", mesh.faces.size, {}),
+    ]
+    text = {
+        "asset": {"version": "2.0", "generator": f"warpgs {__version__}"},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0, "scenes": [{"nodes": [0]}],
+        "nodes": [{"children": [1], "rotation": rotation}, {"mesh": 0, "translation": middle.tolist()}],
+        "materials": [{"doubleSided": True, "extensions": {"KHR_materials_unlit": {}}}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2, "material": 0}]}],
+        "buffers": [{"byteLength": starts[-1]}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": begin, "byteLength": len(a), "target": target}
+            for begin, a, target in zip(starts, arrays, (34962, 34962, 34963))
+        ],
+        "accessors": [
+            {"bufferView": i, "componentType": kind, "type": form, "count": count, **more}
+            for i, (kind, form, count, more) in enumerate(kinds)
+        ],
+    }  # fmt: skip
+    document = json.dumps(text, separators=(",", ":")).encode()
+    document += b" " * (-len(document) % 4)
+    size = 12 + 8 + len(document) + 8 + starts[-1]
+    if size > MAX_BYTES:
+        raise DataError(
+            f"{path}: a mesh of {size:,} bytes is beyond the 4 GiB of a .glb file; ask for fewer triangles, or write .ply"
+        )
+    head = struct.pack("<4sII", b"glTF", 2, size) + struct.pack("<I4s", len(document), b"JSON")
+    return [head, document, struct.pack("<I4s", starts[-1], b"BIN\0"), *arrays]

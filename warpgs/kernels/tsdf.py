@@ -1,0 +1,283 @@
+"""Fusion of depth maps into a grid of truncated signed distances, and of images into colours of points.
+
+The method of Curless and Levoy 1996 ("A Volumetric Method for Building Complex Models from Range Images"): a grid point keeps
+the weighted mean of its distances before the surface along the rays of all views, cut off at a truncation. Nothing is
+differentiable.
+"""
+
+import functools
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import torch
+import warp as wp
+
+from warpgs.constants import NEAR
+from warpgs.geometry import check_pinhole
+from warpgs.runtime import interop
+from warpgs.scene import Camera
+
+
+@dataclass(frozen=True)
+class DistanceGrid:
+    """A grid of X x Y x Z points along the axes of the world, and what depth maps said about each."""
+
+    origin: tuple[float, float, float]
+    """Position of the first point [u]."""
+    voxel: float
+    """Distance from one point to the next [u]."""
+    truncation: float
+    """Largest distance from a surface that is told apart [u]."""
+    distances: torch.Tensor
+    """Mean distance before the surface over the truncation, in [-1, 1], shape [X, Y, Z]; of no meaning at weight 0."""
+    weights: torch.Tensor
+    """Sum of the weights of the views that saw the point, shape [X, Y, Z]; 0 where none did."""
+
+
+@functools.cache
+def make_kernels(real):
+    """Make the kernels for one scalar type."""
+    vec3 = wp.types.vector(3, real)
+    mat33 = wp.types.matrix((3, 3), real)
+    mat44 = wp.types.matrix((4, 4), real)
+    module = f"warpgs.kernels.tsdf.{real.__name__}"
+    near = wp.constant(real(NEAR))
+
+    @wp.func
+    def in_camera(view: mat44, point: vec3) -> vec3:
+        return vec3(
+            view[0, 0] * point[0] + view[0, 1] * point[1] + view[0, 2] * point[2] + view[0, 3],
+            view[1, 0] * point[0] + view[1, 1] * point[1] + view[1, 2] * point[2] + view[1, 3],
+            view[2, 0] * point[0] + view[2, 1] * point[1] + view[2, 2] * point[2] + view[2, 3],
+        )
+
+    @wp.func
+    def least_slope(before: real, here: real, after: real) -> real:
+        """Return the smaller of the two differences to the neighbours; 0 where neither has a depth."""
+        back = here - before
+        ahead = after - here
+        has_before = before > real(0.0) and wp.isfinite(before)
+        has_after = after > real(0.0) and wp.isfinite(after)
+        if has_before and (not has_after or wp.abs(back) < wp.abs(ahead)):
+            return back
+        return wp.where(has_after, ahead, real(0.0))
+
+    @wp.kernel(enable_backward=False, module=module)
+    def face(
+        begin: int, depth: wp.array2d(dtype=real), Ks: wp.array(dtype=mat33),
+        # outputs
+        cosines: wp.array2d(dtype=real),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        K = Ks[0]
+        row = i // depth.shape[1]
+        column = i - row * depth.shape[1]
+        z = depth[row, column]
+        cosine = real(0.0)
+        if z > real(0.0):
+            cosine = real(1.0)
+            if wp.isfinite(z):
+                last_row = depth.shape[0] - 1
+                last_column = depth.shape[1] - 1
+                left = wp.where(column > 0, depth[row, wp.max(column - 1, 0)], real(0.0))
+                right = wp.where(column < last_column, depth[row, wp.min(column + 1, last_column)], real(0.0))
+                above = wp.where(row > 0, depth[wp.max(row - 1, 0), column], real(0.0))
+                below = wp.where(row < last_row, depth[wp.min(row + 1, last_row), column], real(0.0))
+                along = least_slope(left, z, right)
+                down = least_slope(above, z, below)
+                x = real(column) + real(0.5) - K[0, 2]
+                y = real(row) + real(0.5) - K[1, 2]
+                # The normal of the surface z(x, y) in the camera; its product with the ray through the pixel is -z.
+                normal = vec3(K[0, 0] * along, K[1, 1] * down, -(z + x * along + y * down))
+                ray = vec3(x / K[0, 0], y / K[1, 1], real(1.0))
+                cosine = z / (wp.length(normal) * wp.length(ray))
+        cosines[row, column] = cosine
+
+    @wp.func
+    def depth_at(depth: wp.array2d(dtype=real), u: real, v: real, row: wp.int32, column: wp.int32, most: real) -> real:
+        """Return the depth between four pixels where they are of one surface, else that of the pixel itself."""
+        nearest = depth[row, column]
+        left = int(wp.floor(u - real(0.5)))
+        top = int(wp.floor(v - real(0.5)))
+        if left < 0 or top < 0 or left + 1 >= depth.shape[1] or top + 1 >= depth.shape[0]:
+            return nearest
+        a = depth[top, left]
+        b = depth[top, left + 1]
+        c = depth[top + 1, left]
+        d = depth[top + 1, left + 1]
+        low = wp.min(wp.min(a, b), wp.min(c, d))
+        high = wp.max(wp.max(a, b), wp.max(c, d))
+        if not (low > real(0.0) and high - low < most):  # of infinite depths the difference is a NaN
+            return nearest
+        fx = u - real(0.5) - real(left)
+        fy = v - real(0.5) - real(top)
+        upper = a + fx * (b - a)
+        return upper + fy * (c + fx * (d - c) - upper)
+
+    @wp.kernel(enable_backward=False, module=module)
+    def integrate(
+        begin: int, origins: wp.array(dtype=vec3), voxel: real, truncation: real, size_y: int, size_z: int,
+        viewmats: wp.array(dtype=mat44), Ks: wp.array(dtype=mat33),
+        depth: wp.array2d(dtype=real), pixel_weights: wp.array2d(dtype=real),
+        # outputs, read first
+        distances: wp.array(dtype=real), weights: wp.array(dtype=real),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        column_of_grid = i // size_z
+        x = column_of_grid // size_y
+        point = origins[0] + voxel * vec3(real(x), real(column_of_grid - x * size_y), real(i - column_of_grid * size_z))
+        K = Ks[0]
+        p = in_camera(viewmats[0], point)
+        if p[2] >= near:
+            u = K[0, 0] * p[0] / p[2] + K[0, 2]
+            v = K[1, 1] * p[1] / p[2] + K[1, 2]
+            if u >= real(0.0) and v >= real(0.0) and u < real(depth.shape[1]) and v < real(depth.shape[0]):
+                row = int(v)
+                column = int(u)
+                w = pixel_weights[row, column]
+                distance = depth_at(depth, u, v, row, column, truncation) - p[2]
+                if w > real(0.0) and distance >= -truncation:
+                    value = wp.min(distance / truncation, real(1.0))
+                    before = weights[i]
+                    distances[i] = (distances[i] * before + value * w) / (before + w)
+                    weights[i] = before + w
+
+    @wp.kernel(enable_backward=False, module=module)
+    def gather(
+        begin: int, points: wp.array(dtype=vec3), most: real, viewmats: wp.array(dtype=mat44), Ks: wp.array(dtype=mat33),
+        depth: wp.array2d(dtype=real), pixel_weights: wp.array2d(dtype=real), image: wp.array2d(dtype=vec3),
+        # outputs, added to
+        sums: wp.array(dtype=vec3), weights: wp.array(dtype=real),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        K = Ks[0]
+        p = in_camera(viewmats[0], points[i])
+        if p[2] >= near:
+            u = K[0, 0] * p[0] / p[2] + K[0, 2]
+            v = K[1, 1] * p[1] / p[2] + K[1, 2]
+            if u >= real(0.0) and v >= real(0.0) and u < real(depth.shape[1]) and v < real(depth.shape[0]):
+                row = int(v)
+                column = int(u)
+                if wp.abs(depth_at(depth, u, v, row, column, most) - p[2]) < most:
+                    left = wp.clamp(int(wp.floor(u - real(0.5))), 0, depth.shape[1] - 1)
+                    top = wp.clamp(int(wp.floor(v - real(0.5))), 0, depth.shape[0] - 1)
+                    right = wp.min(left + 1, depth.shape[1] - 1)
+                    bottom = wp.min(top + 1, depth.shape[0] - 1)
+                    fx = wp.clamp(u - real(0.5) - real(left), real(0.0), real(1.0))
+                    fy = wp.clamp(v - real(0.5) - real(top), real(0.0), real(1.0))
+                    upper = (real(1.0) - fx) * image[top, left] + fx * image[top, right]
+                    lower = (real(1.0) - fx) * image[bottom, left] + fx * image[bottom, right]
+                    w = pixel_weights[row, column]
+                    sums[i] = sums[i] + w * ((real(1.0) - fy) * upper + fy * lower)
+                    weights[i] = weights[i] + w
+
+    return SimpleNamespace(face=face, integrate=integrate, gather=gather, vec3=vec3, mat33=mat33, mat44=mat44)
+
+
+def empty_grid(
+    origin: tuple[float, float, float], voxel: float, shape: tuple[int, int, int], truncation: float, like: torch.Tensor
+) -> DistanceGrid:
+    """Allocate a grid that no view has seen, of the type and on the device of ``like`` [...]: two numbers for each point.
+
+    Args:
+        origin: Position of the first point [u].
+        voxel: Distance from one point to the next [u], above 0.
+        shape: Number of points along each axis.
+        truncation: Largest distance from a surface that is told apart [u], above 0.
+        like: Any tensor, of any shape.
+    """
+    return DistanceGrid(origin, voxel, truncation, like.new_zeros(shape), like.new_zeros(shape))
+
+
+def _pose(camera: Camera, like: torch.Tensor, kernels: SimpleNamespace) -> list[interop.View]:
+    """Return viewmat and intrinsics of a numpy camera as kernel arguments."""
+    views = (camera.viewmat, kernels.mat44), (camera.K, kernels.mat33)
+    return [interop.view(torch.as_tensor(a[None], dtype=like.dtype, device=like.device), kind) for a, kind in views]
+
+
+def face_cosines(depth: torch.Tensor, camera: Camera) -> torch.Tensor:
+    """Return the cosine of the angle between each pixel's ray and the normal of the surface that it meets.
+
+    Args:
+        depth: z-depth [u], infinite where nothing is met, 0 where nothing is known, contiguous, shape [H, W].
+        camera: Pinhole camera, arrays of numpy, of that size.
+
+    Returns:
+        In [0, 1], shape [H, W]: 1 where depth is infinite, and 0 where nothing is known.
+
+    Raises:
+        UsageError: The camera is no pinhole.
+    """
+    check_pinhole(camera)
+    real = interop.real_of(depth)
+    kernels, cosines = make_kernels(real), torch.empty_like(depth)
+    inputs = [interop.view(depth, real), _pose(camera, depth, kernels)[1], interop.view(cosines, real)]
+    interop.launch(kernels.face, depth.numel(), inputs, depth.device, cost=5)
+    return cosines
+
+
+def integrate(grid: DistanceGrid, camera: Camera, depth: torch.Tensor, pixel_weights: torch.Tensor) -> None:
+    """Add what one view says to a grid, in place: a point's distance before the surface, where it is not far behind.
+
+    Args:
+        grid: The grid.
+        camera: Pinhole camera, arrays of numpy.
+        depth: z-depth [u], infinite where nothing is met, contiguous, shape [H, W]. It is interpolated between the pixels of a
+            surface, and not across its edges.
+        pixel_weights: Weight of each pixel, at least 0, shape [H, W]; 0 where nothing is known.
+
+    Raises:
+        ResourceError: The grid has more points than kernels can number.
+        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        UsageError: The camera is no pinhole.
+        ValueError: A shape or device disagrees.
+    """
+    check_pinhole(camera)
+    interop.check(
+        depth=(depth, "H W"), pixel_weights=(pixel_weights, "H W"), distances=(grid.distances, "X Y Z"),
+        weights=(grid.weights, "X Y Z"),
+    )  # fmt: skip
+    real = interop.real_of(depth)
+    kernels, shape = make_kernels(real), grid.distances.shape
+    inputs = [
+        interop.view(depth.new_tensor([grid.origin]), kernels.vec3), grid.voxel, grid.truncation, shape[1], shape[2],
+        *_pose(camera, depth, kernels),
+        *(interop.view(t, real) for t in (depth, pixel_weights, grid.distances.view(-1), grid.weights.view(-1))),
+    ]  # fmt: skip
+    interop.launch(kernels.integrate, grid.distances.numel(), inputs, depth.device, cost=3)
+
+
+def gather_colors(
+    points: torch.Tensor, tolerance: float, camera: Camera, depth: torch.Tensor, pixel_weights: torch.Tensor,
+    image: torch.Tensor, sums: torch.Tensor, weights: torch.Tensor,
+) -> None:  # fmt: skip
+    """Add to each point the colour that one view sees there, in place, where the point lies on the surface that it sees.
+
+    Args:
+        points: Positions [u], shape [N, 3].
+        tolerance: Largest difference between a point's depth and that of the surface [u].
+        camera: Pinhole camera, arrays of numpy.
+        depth: z-depth [u], contiguous, shape [H, W].
+        pixel_weights: Weight of each pixel, at least 0, shape [H, W].
+        image: Colours, contiguous, shape [H, W, 3].
+        sums: Sums of weighted colours so far, shape [N, 3].
+        weights: Sums of weights so far, shape [N].
+
+    Raises:
+        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        UsageError: The camera is no pinhole.
+        ValueError: A shape or device disagrees.
+    """
+    check_pinhole(camera)
+    interop.check(
+        points=(points, "N 3"), depth=(depth, "H W"), pixel_weights=(pixel_weights, "H W"), image=(image, "H W 3"),
+        sums=(sums, "N 3"), weights=(weights, "N"),
+    )  # fmt: skip
+    real = interop.real_of(points)
+    kernels = make_kernels(real)
+    inputs = [
+        interop.view(points, kernels.vec3), tolerance, *_pose(camera, points, kernels),
+        interop.view(depth, real), interop.view(pixel_weights, real), interop.view(image, kernels.vec3),
+        interop.view(sums, kernels.vec3), interop.view(weights, real),
+    ]  # fmt: skip
+    interop.launch(kernels.gather, len(points), inputs, points.device, cost=5)

@@ -1,0 +1,142 @@
+"""Fusion of what all cameras see into a mesh: distances, then triangles, then their colours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from warpgs.kernels.tsdf import DistanceGrid, empty_grid, gather_colors, integrate
+from warpgs.mesh.grid import GridPlan, check_memory, plan_grid
+from warpgs.mesh.surface_views import SAMPLES, sample_surface, surface_views
+from warpgs.mesh.triangles import decimate, extract, remove_small_parts
+from warpgs.render.rasterize import RasterizeOptions
+from warpgs.scene import Camera, Gaussians, Mesh
+
+COLOR_TOLERANCE = 1.0
+"""Distance in truncations up to which a vertex counts as seen by a view that gives it colour."""
+
+
+@dataclass(frozen=True)
+class MeshOptions:
+    """Options of `fuse`."""
+
+    voxel: float | None = None
+    """Distance of the grid points [u]; None for one that follows from ``resolution``."""
+    resolution: int | None = None
+    """Voxels along the longest side of the grid; None for 256, or fewer where pixels show no more."""
+    max_faces: int = 200_000
+    """Most triangles of the result; what has more is simplified."""
+    depth: str = "median"
+    """Rendered depth that is fused: median, or mean (expected depth), which mixes surfaces at edges."""
+
+
+@dataclass(frozen=True)
+class FusedMesh:
+    """A mesh with what was found on the way."""
+
+    mesh: Mesh
+    """The mesh, in the units of the cameras."""
+    plan: GridPlan
+    """Grid that it was made with."""
+    unseen: float
+    """Fraction of the grid that no view saw."""
+    extracted: int
+    """Number of triangles before small parts were removed and the rest was simplified."""
+    removed: int
+    """Number of small parts that were removed."""
+    uncolored: int
+    """Number of vertices that no view saw, and that have the colour of the nearest that was seen."""
+
+
+def integrate_views(
+    gaussians: Gaussians, cameras: Sequence[Camera], render: RasterizeOptions, plan: GridPlan, depth: str,
+    stage: Callable[[str], object],
+) -> DistanceGrid:  # fmt: skip
+    """Return the grid after all views, in the order of the cameras.
+
+    Args:
+        gaussians: N Gaussians in the units of the cameras.
+        cameras: Pinhole cameras, arrays of numpy.
+        render: Settings of the rasterizer.
+        plan: The grid.
+        depth: Depth that is fused.
+        stage: Function that shows a line of progress.
+    """
+    grid = empty_grid(plan.origin, plan.voxel, plan.shape, plan.truncation, gaussians.means)
+    for view in surface_views(gaussians, cameras, render, depth, "fusing depth", stage):
+        integrate(grid, view.camera, view.depth, view.weights)
+    return grid
+
+
+def fuse(
+    gaussians: Gaussians, cameras: Sequence[Camera], render: RasterizeOptions, options: MeshOptions = MeshOptions(), *,
+    stage: Callable[[str], object] = lambda line: None, planned: Callable[[GridPlan, str], object] = lambda plan, memory: None,
+) -> FusedMesh:  # fmt: skip
+    """Make a mesh of the surfaces that cameras see of a model.
+
+    What no camera sees stays open. One view is held in memory at a time; it is rendered three times, for the extent of the
+    scene, for distances and for colours.
+
+    Args:
+        gaussians: N Gaussians in the units of the cameras.
+        cameras: Pinhole cameras, arrays of numpy, at least one.
+        render: Settings of the rasterizer, as the fit used them.
+        options: Options.
+        stage: Function that shows a line of progress.
+        planned: Function that is told the grid, and the memory that it takes as text, before the grid is made.
+
+    Raises:
+        DataError: No camera sees a surface.
+        ResourceError: The grid does not fit into memory.
+        UsageError: A camera is no pinhole, or an option is out of range.
+    """
+    views = surface_views(gaussians, cameras, render, options.depth, "looking where surfaces are", stage)
+    samples = [sample_surface(v, max(1, SAMPLES // len(cameras))) for v in views]
+    plan = plan_grid(*map(np.concatenate, zip(*samples)), options.voxel, options.resolution)
+    planned(plan, check_memory(plan, gaussians.means.device))
+    grid = integrate_views(gaussians, cameras, render, plan, options.depth, stage)
+    unseen = 1 - np.count_nonzero(grid.weights.cpu().numpy()) / plan.points
+    stage("finding triangles: marching cubes")
+    whole = extract(grid)
+    del grid
+    cleaned, removed = remove_small_parts(whole)
+    if len(cleaned.faces) > options.max_faces:
+        stage(f"simplifying: {len(cleaned.faces):,} triangles")
+    mesh = decimate(cleaned, options.max_faces)
+    colors, uncolored = vertex_colors(mesh, gaussians, cameras, render, plan, options.depth, stage)
+    return FusedMesh(replace(mesh, colors=colors), plan, unseen, len(whole.faces), removed, uncolored)
+
+
+def vertex_colors(
+    mesh: Mesh, gaussians: Gaussians, cameras: Sequence[Camera], render: RasterizeOptions, plan: GridPlan, depth: str,
+    stage: Callable[[str], object],
+) -> tuple[np.ndarray, int]:  # fmt: skip
+    """Return the weighted mean of the rendered colours that the views see at each vertex.
+
+    Args:
+        mesh: The mesh, V vertices.
+        gaussians: N Gaussians in the units of the cameras.
+        cameras: Pinhole cameras, arrays of numpy.
+        render: Settings of the rasterizer.
+        plan: Grid that the mesh was made with.
+        depth: Depth that was fused.
+        stage: Function that shows a line of progress.
+
+    Returns:
+        Colours in [0, 1], float32, shape [V, 3], and the number of vertices that no view sees.
+    """
+    points = torch.as_tensor(mesh.vertices, dtype=gaussians.means.dtype, device=gaussians.means.device)
+    sums, weights = torch.zeros_like(points), torch.zeros_like(points[:, 0])
+    tolerance = COLOR_TOLERANCE * plan.truncation
+    for view in surface_views(gaussians, cameras, render, depth, "colouring", stage):
+        gather_colors(points, tolerance, view.camera, view.depth, view.weights, view.image, sums, weights)
+    known = (weights > 0).cpu().numpy()
+    colors = sums.cpu().numpy() / np.maximum(weights.cpu().numpy(), np.finfo(np.float32).tiny)[:, None]
+    if known.any() and not known.all():
+        from scipy.spatial import cKDTree
+
+        colors[~known] = colors[known][cKDTree(mesh.vertices[known]).query(mesh.vertices[~known])[1]]
+    return np.clip(colors, 0, 1).astype(np.float32), int((~known).sum())

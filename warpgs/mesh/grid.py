@@ -1,0 +1,125 @@
+"""Choice of the grid: where the surfaces are, how fine they can be told apart, and the memory that takes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.runtime.byte_units import format_bytes
+from warpgs.runtime.device_memory import available_bytes
+from warpgs.runtime.interop import MAX_SIZE
+
+RESOLUTION = 256
+"""Voxels along the longest side of the grid, where neither a size nor a number is given."""
+MIN_RESOLUTION, MAX_RESOLUTION = 8, 4096
+TRUNCATION = 4.0
+"""Truncation in voxels."""
+FENCE = 3.0
+"""Interquartile ranges outside the quartiles from where a coordinate is far out (Tukey, 1977: Exploratory Data Analysis)."""
+QUANTILES = (0.005, 0.995)
+"""Quantiles of the surface points along an axis that the grid lies between, where the fences are wider."""
+GRID_BYTES = 8
+"""Bytes of a grid point on the device: distance and weight."""
+HOST_BYTES = 14
+"""Bytes of a grid point in the machine's memory while triangles are made: two copies of the distances, weights and masks."""
+
+
+@dataclass(frozen=True)
+class GridPlan:
+    """A grid of points along the axes of the world."""
+
+    origin: tuple[float, float, float]
+    """Position of the first point [u]."""
+    voxel: float
+    """Distance from one point to the next [u]."""
+    shape: tuple[int, int, int]
+    """Number of points along each axis."""
+    inside: float
+    """Fraction of the surface points that the grid holds."""
+
+    @property
+    def points(self) -> int:
+        """Number of points."""
+        return math.prod(self.shape)
+
+    @property
+    def truncation(self) -> float:
+        """Largest distance from a surface that is told apart [u]."""
+        return TRUNCATION * self.voxel
+
+
+def find_box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower and upper corner, shape [3] each, of the box around points without the outliers along each axis.
+
+    What lies far behind everything else, such as a background at infinity, is cut off.
+
+    Args:
+        points: Positions [u], shape [N, 3].
+    """
+    first, third = np.quantile(points, [0.25, 0.75], axis=0)
+    low, high = np.quantile(points, QUANTILES, axis=0)
+    return np.maximum(low, first - FENCE * (third - first)), np.minimum(high, third + FENCE * (third - first))
+
+
+def plan_grid(
+    points: np.ndarray, footprints: np.ndarray, voxel: float | None = None, resolution: int | None = None
+) -> GridPlan:
+    """Choose the grid that holds the surfaces which cameras see.
+
+    Args:
+        points: Points of the surfaces [u], shape [N, 3].
+        footprints: Width of a pixel at each [u], shape [N].
+        voxel: Distance of the grid points [u]; None for what ``resolution`` gives.
+        resolution: Voxels along the longest side; None for `RESOLUTION`, or fewer where a voxel would be smaller than half of
+            what the median pixel shows.
+
+    Raises:
+        DataError: No camera sees a surface.
+        UsageError: A number is out of range.
+    """
+    if not len(points):
+        raise DataError("no training view shows a surface: alpha is below 1/2 everywhere; fit again, with more steps")
+    if voxel is not None and resolution is not None:
+        raise UsageError("--voxel and --resolution say the same; give one of them")
+    if resolution is not None and not MIN_RESOLUTION <= resolution <= MAX_RESOLUTION:
+        raise UsageError(f"--resolution must be {MIN_RESOLUTION} to {MAX_RESOLUTION} voxels, not {resolution}")
+    low, high = find_box(points)
+    longest = float((high - low).max())
+    if voxel is None:
+        voxel = longest / (RESOLUTION if resolution is None else resolution)
+        if resolution is None:
+            voxel = max(voxel, float(np.median(footprints)) / 2)
+    if not (math.isfinite(voxel) and voxel > 0 and longest / voxel <= 2**20):
+        raise UsageError(f"--voxel must be above 0 and no smaller than a millionth of the scene, {longest:.3g}; not {voxel:g}")
+    margin = 2 * TRUNCATION * voxel
+    shape = tuple(int(n) for n in np.ceil((high - low + 2 * margin) / voxel) + 1)
+    inside = ((points >= low - margin) & (points <= high + margin)).all(1).mean()
+    x, y, z = low - margin
+    return GridPlan((float(x), float(y), float(z)), voxel, (shape[0], shape[1], shape[2]), float(inside))
+
+
+def check_memory(plan: GridPlan, device: torch.device) -> str:
+    """Return how much memory a grid takes, as text, before it is allocated.
+
+    Raises:
+        ResourceError: The device or the machine has less to spare, or kernels cannot number the points.
+    """
+    cpu = torch.device("cpu")
+    needs = {device: plan.points * GRID_BYTES}
+    needs[cpu] = needs.get(cpu, 0) + plan.points * HOST_BYTES
+    sizes = " x ".join(map(str, plan.shape))
+    remedy = "give a larger --voxel or a smaller --resolution"
+    if plan.points > MAX_SIZE:
+        raise ResourceError(f"a grid of {sizes} points is beyond the {MAX_SIZE:,} that kernels can number; {remedy}")
+    for where, needed in needs.items():
+        free = available_bytes(where)
+        if needed > 0.8 * free:
+            raise ResourceError(
+                f"a grid of {sizes} points takes {format_bytes(needed)} of memory on {where}, where {format_bytes(free)} are "
+                f"free; {remedy}"
+            )
+    return format_bytes(sum(needs.values()))

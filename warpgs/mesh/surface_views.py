@@ -1,0 +1,102 @@
+"""Surface that each camera sees of a model: depth, how much to trust it, and colour."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from warpgs.errors import UsageError
+from warpgs.geometry import back_project
+from warpgs.kernels.tsdf import face_cosines
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.scene import Camera, Gaussians
+
+DEPTHS = ("median", "mean")
+"""Depths that can be fused."""
+MIN_ALPHA = 0.5
+"""Least opacity of a pixel that shows a surface."""
+EMPTY = 0.02
+"""Opacity below which a pixel shows that nothing is there: five of 255 levels."""
+SAMPLES = 200_000
+"""Pixels of all views that are looked at to find where the surfaces are."""
+
+
+@dataclass(frozen=True)
+class SurfaceView:
+    """Surface that one camera sees."""
+
+    camera: Camera
+    """Pinhole camera, arrays of numpy."""
+    depth: torch.Tensor
+    """z-depth [u], shape [H, W]; infinite where nothing is met, 0 where that is uncertain."""
+    weights: torch.Tensor
+    """Trust in each pixel, in [0, 1], shape [H, W]: the cosine between ray and normal, times the opacity of a surface."""
+    image: torch.Tensor
+    """Colours, shape [H, W, 3]."""
+
+
+@torch.no_grad()
+def surface_view(gaussians: Gaussians, camera: Camera, options: RasterizeOptions, depth: str = "median") -> SurfaceView:
+    """Render what a camera sees of the surface.
+
+    Args:
+        gaussians: N Gaussians in the units of the camera.
+        camera: Pinhole camera, arrays of numpy.
+        options: Settings of the rasterizer.
+        depth: Depth that is taken, one of `DEPTHS`.
+
+    Raises:
+        UsageError: The camera is no pinhole, or the depth is unknown.
+    """
+    if depth not in DEPTHS:
+        raise UsageError(f"depth {depth!r} is not one of {', '.join(DEPTHS)}")
+    r = rasterize(gaussians, camera, replace(options, median_depth=depth == "median"))
+    z = r.depth if r.median_depth is None else r.median_depth
+    z = torch.where(r.alpha >= MIN_ALPHA, z, torch.where(r.alpha <= EMPTY, torch.inf, 0.0)).contiguous()
+    weights = face_cosines(z, camera) * torch.where(torch.isfinite(z), r.alpha, 1.0)
+    return SurfaceView(camera, z, weights, r.rgb.contiguous())
+
+
+def surface_views(
+    gaussians: Gaussians, cameras: Sequence[Camera], options: RasterizeOptions, depth: str, purpose: str,
+    stage: Callable[[str], object],
+) -> Iterator[SurfaceView]:  # fmt: skip
+    """Yield what each camera sees of the surface, one after the other, so that one view is held at a time.
+
+    Args:
+        gaussians: N Gaussians in the units of the cameras.
+        cameras: Pinhole cameras, arrays of numpy.
+        options: Settings of the rasterizer.
+        depth: Depth that is taken, one of `DEPTHS`.
+        purpose: Words for the line of progress.
+        stage: Function that shows a line of progress, before each view.
+
+    Raises:
+        UsageError: A camera is no pinhole, or the depth is unknown.
+    """
+    for i, camera in enumerate(cameras, 1):
+        stage(f"{purpose}: view {i} of {len(cameras)}")
+        yield surface_view(gaussians, camera, options, depth)
+
+
+def sample_surface(view: SurfaceView, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return points of the surface that a view sees, on an even grid of its pixels.
+
+    Args:
+        view: The view.
+        count: Number of pixels looked at, about.
+
+    Returns:
+        Positions [u], shape [N, 3], and the width of a pixel there [u], shape [N].
+    """
+    depth, camera = view.depth.cpu().numpy().astype(np.float64), view.camera
+    step = max(1, round((depth.size / count) ** 0.5))
+    row, column = np.mgrid[step // 2 : depth.shape[0] : step, step // 2 : depth.shape[1] : step].reshape(2, -1)
+    z = depth[row, column]
+    seen = (z > 0) & np.isfinite(z)
+    pixels = np.stack([column, row], 1)[seen] + 0.5
+    focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
+    return back_project(camera, pixels, z[seen]), z[seen] / focal

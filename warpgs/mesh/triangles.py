@@ -1,0 +1,101 @@
+"""Triangles from a grid of signed distances: marching cubes where the grid was seen, small parts removed, fewer triangles."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from warpgs.errors import DataError
+from warpgs.kernels.tsdf import DistanceGrid
+from warpgs.scene import Mesh
+
+MAX_JUMP = 1.1
+"""Largest difference of the distances at two neighbouring grid points, over the truncation, that a surface may lie between.
+With less, what is seen at a grazing angle is left out; with more, skirts hang behind the edges of what a view sees. Chosen, as
+the truncation was, on a demo scene of another seed than the one that is reported (docs/mesh.md)."""
+MIN_PART = 0.002
+"""Fraction of all triangles that a connected part has at least; smaller ones float in front of surfaces."""
+
+
+def _grey(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    """Return a mesh [V, 3], [F, 3] that has no colours yet."""
+    return Mesh(vertices, faces.astype(np.int32), np.full(vertices.shape, 0.5, np.float32))
+
+
+def extract(grid: DistanceGrid) -> Mesh:
+    """Return the surface where distances are 0, without colours.
+
+    It is left open where a view saw nothing: a triangle stays only where both grid points beside each of its vertices were
+    seen. Where distance jumps from before one surface to behind another, as at the edge of what a view sees, there is none.
+
+    Args:
+        grid: The grid.
+
+    Raises:
+        DataError: There is no surface in what was seen.
+    """
+    from skimage.measure import marching_cubes
+
+    distances, weights = grid.distances.cpu().numpy(), grid.weights.cpu().numpy()
+    seen = weights > 0
+    values = np.where(seen, distances, np.float32(1))
+    if not (values < 0).any() or min(values.shape) < 2:
+        raise DataError("the training views agree on no surface inside the grid; give a larger --voxel, or fit with more steps")
+    corners, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent", allow_degenerate=False)
+    # A vertex lies on an edge of the grid: between the points below and above.
+    below, above = (tuple(f(corners).astype(np.int64).T) for f in (np.floor, np.ceil))
+    kept = seen[below] & seen[above] & (np.abs(values[below] - values[above]) <= MAX_JUMP)
+    faces = faces[kept[faces].all(1)]
+    if not len(faces):
+        raise DataError("the training views agree on no surface inside the grid; give a larger --voxel, or fit with more steps")
+    return _compact(_grey(np.array(grid.origin) + grid.voxel * corners.astype(np.float64), faces))
+
+
+def _compact(mesh: Mesh) -> Mesh:
+    """Leave out vertices that no triangle has."""
+    used = np.zeros(len(mesh.vertices), bool)
+    used[mesh.faces] = True
+    numbers = np.cumsum(used) - 1
+    return Mesh(mesh.vertices[used], numbers[mesh.faces].astype(np.int32), mesh.colors[used])
+
+
+def parts(mesh: Mesh) -> tuple[int, np.ndarray]:
+    """Return the number of connected parts, and the part of each triangle, shape [F]."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    ends = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    count = len(mesh.vertices)
+    graph = coo_array((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), (count, count))
+    number, labels = connected_components(graph, directed=False)
+    return number, labels[mesh.faces[:, 0]]
+
+
+def remove_small_parts(mesh: Mesh, fraction: float = MIN_PART) -> tuple[Mesh, int]:
+    """Return a mesh without connected parts of fewer triangles than that fraction of all, and the number of parts removed."""
+    number, part = parts(mesh)
+    sizes = np.bincount(part, minlength=number)
+    keep = sizes >= max(1.0, fraction * len(mesh.faces))
+    left = Mesh(mesh.vertices, mesh.faces[keep[part]], mesh.colors)
+    return _compact(left), int((~keep).sum())
+
+
+def decimate(mesh: Mesh, max_faces: int) -> Mesh:
+    """Return a mesh of at most about ``max_faces`` triangles, without colours; open edges stay where they are.
+
+    Edges collapse in the order of the quadric error (Garland and Heckbert 1997), by VTK. This part of it needs no graphics
+    library.
+
+    Args:
+        mesh: The mesh, which is returned as it is where it has no more triangles.
+        max_faces: Number of triangles, at least 4.
+    """
+    if len(mesh.faces) <= max_faces:
+        return mesh
+    import pyvista
+
+    # around the middle and of size 1, since VTK decides in float32
+    middle = mesh.vertices.mean(0)
+    size = float(np.abs(mesh.vertices - middle).max()) or 1.0
+    data = pyvista.PolyData.from_regular_faces(((mesh.vertices - middle) / size).astype(np.float32), mesh.faces)
+    fewer = data.decimate(1 - max_faces / len(mesh.faces))
+    return _compact(_grey(np.asarray(fewer.points, np.float64) * size + middle, fewer.regular_faces))

@@ -1,0 +1,95 @@
+"""The mesh of a run: what its training views see, as a file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from warpgs.coordinates import convert_mesh
+from warpgs.errors import DataError, UsageError
+from warpgs.export.mesh import check_suffix, write_mesh
+from warpgs.mesh.fuse import FusedMesh, MeshOptions, fuse
+from warpgs.mesh.grid import GridPlan
+from warpgs.pipeline.runs.folder import open_run
+from warpgs.pipeline.runs.request import choose_device
+from warpgs.runtime.byte_units import format_bytes
+from warpgs.runtime.folder_lock import hold_folder
+from warpgs.scene import Camera
+
+MIN_UP = 0.5
+"""Length of the mean of the cameras' upward directions, each of length 1, from which on they agree on one."""
+
+
+def mesh(
+    folder: Path, target: Path, options: MeshOptions, device_name: str, *, stage: Callable[[str], object],
+    say: Callable[[str], object],
+) -> list[str]:  # fmt: skip
+    """Write the mesh of the surfaces that a run's training views see, in the units of the scene's files.
+
+    Args:
+        folder: The run folder.
+        target: .ply or .glb file to write.
+        options: Options; ``voxel`` is in units of the scene's files.
+        device_name: auto, cpu or cuda.
+        stage: Function that shows a line of progress.
+        say: Function that shows what was chosen, before the work starts.
+
+    Returns:
+        Lines for the user.
+
+    Raises:
+        DataError: The folder is no run, or its training views see no surface.
+        ResourceError: Memory does not suffice, the device is not there, or the file cannot be written.
+        UsageError: The suffix is not supported, or an option is out of range.
+    """
+    check_suffix(target)
+    if options.max_faces < 4:
+        raise UsageError(f"--max-faces must be at least 4, not {options.max_faces}")
+    device, _ = choose_device(device_name)
+    run = open_run(folder, device)
+    if not run.train:
+        raise DataError(f"{folder}: it has no training views, so nobody knows what was seen; fit again")
+    cameras, scale = [run.scene_cameras[n] for n in run.train], run.normalization.scale
+    if options.voxel is not None:
+        options = replace(options, voxel=options.voxel * scale)
+
+    def planned(plan: GridPlan, memory: str) -> None:
+        say(
+            f"grid of {' x '.join(map(str, plan.shape))} points {plan.voxel / scale:.4g} units of the scene's files apart, "
+            f"{memory}; {100 * (1 - plan.inside):.1f} % of what the training views see lies outside of it and is left out"
+        )
+
+    with hold_folder(target.parent) as notes:
+        found = fuse(run.scene_gaussians, cameras, run.options(), options, stage=stage, planned=planned)
+        made = convert_mesh(found.mesh, run.normalization, "scene", "file")
+        up = upwards(cameras)
+        write_mesh(target, made, up)
+    if up is None and target.suffix.lower() == ".glb":
+        notes = [*notes, "the cameras were not held upright together, so the mesh may lie on its side in a viewer"]
+    return [*notes, *_lines(found, len(cameras)), f"{target}: {format_bytes(os.path.getsize(target))}"]
+
+
+def upwards(cameras: Sequence[Camera]) -> np.ndarray | None:
+    """Return the mean upward direction of cameras, of any length, shape [3]; None where they do not agree on one."""
+    up: np.ndarray = -np.mean([c.viewmat[1, :3] for c in cameras], axis=0)
+    return up if np.linalg.norm(up) >= MIN_UP else None
+
+
+def _lines(found: FusedMesh, views: int) -> list[str]:
+    """Return what a mesh is made of, for people."""
+    mesh, lines = found.mesh, []
+    lines.append(
+        f"{len(mesh.faces):,} triangles, {len(mesh.vertices):,} vertices, of {found.extracted:,} triangles in all; "
+        f"{found.removed:,} small parts removed"
+    )
+    lines.append(
+        f"{100 * found.unseen:.1f} % of the grid, insides and backs of things among it, was seen by none of {views} training "
+        "views: the mesh is left open there"
+    )
+    if found.uncolored:
+        lines.append(f"{found.uncolored:,} vertices lie where no view sees a surface and have their nearest neighbour's colour")
+    return lines
