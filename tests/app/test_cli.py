@@ -112,7 +112,7 @@ def test_eval_measures_lpips(run, tmp_path, capsys):
     assert "warpgs convert-lpips" in failure(capsys, 3, "eval", str(run), "--lpips-weights", foreign)
 
 
-@pytest.mark.parametrize(("path", "pictures"), [("orbit", 4), ("spiral", 4), ("views", 9)])
+@pytest.mark.parametrize(("path", "pictures"), [("auto", 4), ("turntable", 4), ("spiral", 4), ("interpolate", 4), ("views", 9)])
 def test_render_paths(run, tmp_path, path, pictures):
     """Every path gives its pictures and a film."""
     flags = ["--path", path, "--frames", "4", "--out", str(tmp_path), "--device", "cpu"]
