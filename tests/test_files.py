@@ -166,6 +166,7 @@ ELSEWHERE = {
     ("report/film.py", "VideoWriter"): "into the temporary file of `replacing`, which decodes it",
     ("report/overview.py", "savez"): "into a temporary folder",
     ("report/sheet.py", "save"): "Pillow, into memory",
+    ("report/animation.py", "save"): "the same",
     ("report/events.py", "open ab"): "metrics.jsonl grows by lines",
     ("export/ply.py", "open xb"): "the temporary file of `replacing`",
     ("files.py", "open xb"): "the temporary file of `replacing`",

@@ -84,7 +84,7 @@ class FilmPlan:
     remedy: str
     """Advice for frames that show nothing."""
     notes: list[str]
-    """What was chosen, for the user."""
+    """Lines for the user on what was chosen."""
 
 
 @torch.no_grad()

@@ -30,7 +30,7 @@ def _ranges(numbers: list[int]) -> str:
 
 @dataclass
 class FrameCheck:
-    """What is wrong with the frames of a film, noticed while they are rendered."""
+    """Faults of the frames of a film, noticed while they are rendered."""
 
     coverage: float
     """Mean alpha of the training views' renders; 0 where that is not known."""

@@ -50,12 +50,12 @@ def _covered(image: np.ndarray, render: Render, camera: Camera, training: list[D
 
 @dataclass(frozen=True)
 class RenderedPath:
-    """What `render_film` wrote, and what the user should know of it."""
+    """Result of `render_film`: files, and lines for the user."""
 
     files: list[Path]
     """A PNG for each camera in order, unless only a film was asked for; then the film, if any."""
     notes: list[str]
-    """What was chosen, and what is wrong with the frames."""
+    """Lines for the user on what was chosen, and on frames that show nothing."""
 
 
 def _check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple[bool, bool]:

@@ -53,7 +53,7 @@ class Rig:
     """True where the photographs lie on their side, so that an upright film swaps width and height."""
 
     def describe(self) -> str:
-        """Say in a phrase what the cameras do."""
+        """Return a phrase on where the cameras look."""
         if self.span is None:
             return f"{NAMES[self.kind]}, from all sides" if self.kind == "ring" else NAMES[self.kind]
         degrees = math.degrees(self.span[1] - self.span[0])
