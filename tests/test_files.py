@@ -165,6 +165,7 @@ ELSEWHERE = {
     ("app/failures.py", "NamedTemporaryFile"): "details of a defect, in the folder for temporary files",
     ("report/film.py", "VideoWriter"): "into the temporary file of `replacing`, which decodes it",
     ("report/overview.py", "savez"): "into a temporary folder",
+    ("report/scene_plot.py", "savez"): "the same",
     ("report/sheet.py", "save"): "Pillow, into memory",
     ("report/animation.py", "save"): "the same",
     ("report/events.py", "open ab"): "metrics.jsonl grows by lines",

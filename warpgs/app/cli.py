@@ -16,6 +16,7 @@ COMMANDS = {
     "fit": "fit Gaussians to a scene folder and fill a run folder",
     "eval": "score a run again on its held-out views",
     "render": "render a run as a film: along a path that suits it, through its views, or along keyframes",
+    "plot": "show a run's cameras and Gaussians in one image",
     "export": "write a run's Gaussians to a PLY file",
     "prune": "shrink a finished model as far as its training views allow, into a new run folder",
     "priors": "look at what is known before a fit (priors show), or write networks as ONNX (priors export)",
