@@ -105,6 +105,15 @@ def test_a_ring_is_circled_level_whatever_way_the_photographs_lie(kind, roll):
     assert turned == pytest.approx((2 if kind == "spiral" else 1) * 2 * math.pi, rel=1e-6)
 
 
+@pytest.mark.parametrize("rolls", [(90, -90), (90, 90), (0, 180)])
+def test_up_is_the_side_that_people_stand_on(rolls):
+    """Where photographs do not agree on what is up, cameras stand above what they look at; also in a world upside down."""
+    cameras = [rolled(c, rolls[i % 2]) for i, c in enumerate(around(np.arange(0, 360, 24)))]
+    flip = np.diag([1.0, -1, -1, 1])
+    flipped = [Camera(c.viewmat @ flip, c.K, c.width, c.height) for c in cameras]
+    assert rig_of(cameras, 1.0).up @ UP > 0.999 and rig_of(flipped, 1.0).up @ (flip[:3, :3] @ UP) > 0.999
+
+
 @pytest.mark.parametrize("cameras", [around(np.arange(0, 190, 20)), around(np.arange(0, 50, 12))])
 def test_a_turntable_never_goes_where_no_camera_was(cameras):
     """It swings through the cameras' azimuths and back, with the object in every frame."""

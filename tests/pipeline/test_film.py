@@ -124,6 +124,10 @@ def test_empty_and_black_frames_are_noticed(model, tmp_path):
     dark = dataclasses.replace(model, scene_gaussians=dataclasses.replace(black, sh=torch.full_like(black.sh, -2.0)))
     done = render_film(dark, plan, tmp_path / "b.webp", FilmSettings())
     assert "4 of 6 frames are black, numbers 0 to 2 and 5" in done.notes[-1]
+    check = FrameCheck(0.5)
+    for alpha in (0.04, 0.06):  # a tenth of what a training view shows is nearly nothing, however much that is
+        check.look(np.ones((4, 4, 3)), np.full((4, 4), alpha))
+    assert check.empty == [0]
     check = FrameCheck(0.0)
     for i in range(40):
         check.look(np.ones((4, 4, 3)), np.full((4, 4), i % 3))

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.report.animation import MAX_FPS
+from warpgs.report.animation import MAX_FPS, _with_one_palette
 from warpgs.report.film import write_film
 
 
@@ -105,6 +105,12 @@ def test_animation_holds_all_frames_in_colour_and_time(tmp_path, suffix):
             assert np.abs(got.mean((0, 1)) - frame.mean((0, 1))).max() < 0.02
         assert abs(lasts - 7000 / 24) <= 10
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_all_frames_of_a_gif_have_one_palette():
+    """Else what stands still would flicker."""
+    frames = [np.full((6, 6, 3), 40 * i, np.uint8) for i in range(5)]
+    assert len({bytes(image.getpalette()) for image in _with_one_palette(frames)}) == 1
 
 
 def test_still_frames_of_an_animation_are_one(tmp_path):
