@@ -175,7 +175,7 @@ ELSEWHERE = {
     ("runtime/load_module.py", "open ab"): "a lock beside compiled kernels",
     ("runtime/folder_lock.py", "os.open"): "the lock of a folder",
     ("runtime/folder_lock.py", "open r+b"): "the same",
-    ("runtime/interop.py", "os.open"): "the null device",
+    ("runtime/native_output.py", "os.open"): "the null device",
     ("app/cli.py", "os.open"): "the null device",
     ("files.py", "os.open"): "a folder, to sync it",
 }

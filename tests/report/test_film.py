@@ -13,12 +13,12 @@ from warpgs.report.film import write_film
 
 
 @pytest.mark.parametrize(("name", "shape"), [("a.mp4", (48, 64)), ("a.webm", (49, 65))])
-def test_video_holds_all_frames_in_colour_and_time(tmp_path, name, shape):
-    """VP9, all frames, and odd sides cut."""
+def test_video_holds_all_frames_in_colour_and_time(tmp_path, capfd, name, shape):
+    """VP9, all frames, odd sides cut, and not a word of the encoder's on the terminal."""
     path = tmp_path / name
     colors = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
     frames = (np.broadcast_to(colors[i // 4], (*shape, 3)) for i in range(12))
-    assert write_film(path, frames, fps=24) == 12
+    assert write_film(path, frames, fps=24) == 12 and capfd.readouterr().err == ""
     film = cv2.VideoCapture(str(path))
     assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 12 and film.get(cv2.CAP_PROP_FPS) == pytest.approx(24)
     assert int(film.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").lower() in (b"vp09", b"vp90")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.files import replacing
 from warpgs.report.animation import ANIMATIONS, write_animation
+from warpgs.runtime.native_output import hidden_stderr
 
 VIDEOS = (".mp4", ".webm")
 SUFFIXES = (*VIDEOS, *ANIMATIONS)
@@ -62,7 +64,8 @@ def _encode(path: Path, temporary: Path, frames: Iterable[np.ndarray], fps: int,
             height, width = (s // 2 * 2 for s in frame.shape[:2])
             if writer is None:
                 # for .webm OpenCV says on stderr that there is no such tag, and takes VP9 all the same
-                writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter_fourcc(*"vp09"), fps, (width, height))
+                with hidden_stderr() if path.suffix.lower() == ".webm" else contextlib.nullcontext():
+                    writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter_fourcc(*"vp09"), fps, (width, height))
                 if not writer.isOpened():
                     raise ResourceError(f"{path}: cannot be written; the folder is not writable, or OpenCV lacks a VP9 encoder")
             sizes.append((width, height))
