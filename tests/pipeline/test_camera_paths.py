@@ -139,6 +139,15 @@ def test_a_spiral_to_one_side_looks_at_one_point_and_closes():
     assert max(steps) < 0.5
 
 
+@pytest.mark.parametrize(("roll", "azimuths"), [(0, [0, 110, 235]), (90, [0, 110, 235]), (-90, [10, 80, 150, 290])])
+def test_three_photographs_are_enough_to_know_what_is_up(roll, azimuths):
+    """Any three centres lie in a plane, which says nothing where the photographs were taken from different heights."""
+    rig = rig_of([rolled(c, roll) for c in around(azimuths)], 1.0)
+    assert rig.turned == (roll != 0) and rig.up @ UP > 0.999
+    heights = [around([a], e)[0] for a, e in zip(azimuths, (0, 50, 10, 40))]
+    assert not rig_of(heights, 1.0).turned and rig_of(heights, 1.0).up @ UP > 0.9
+
+
 def test_in_a_room_a_film_looks_around():
     """From the middle, level, all the way round."""
     cameras = room()

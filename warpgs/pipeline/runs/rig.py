@@ -107,11 +107,12 @@ def _upward(cameras: list[Camera], looked_at: np.ndarray) -> tuple[np.ndarray, b
     centers = np.array([c.center for c in cameras])
     mean = ups.mean(0)
     length = math.sqrt((mean * mean).sum())
-    normal = _plane_normal(centers) if len(cameras) > 3 else None
+    normal = _plane_normal(centers) if len(cameras) > 2 else None
     if normal is not None and np.abs(matmul(forwards, normal)).mean() < 0.9:
         upright, lying = matmul(ups, normal), matmul(rights, normal)
-        turned = float(np.abs(lying).mean()) > 0.8
-        if turned or np.abs(upright).mean() > 0.5:
+        few = len(cameras) < 5  # any three centres lie in a plane: it must be that of the photographs, too
+        turned = bool((np.abs(lying) > 0.9).all()) if few else float(np.abs(lying).mean()) > 0.8
+        if turned or (not few and np.abs(upright).mean() > 0.5):
             sign = float(upright.mean())
             if abs(sign) < 0.3:  # of some photographs the other side is up: people photograph from above
                 height = float(matmul(centers - looked_at, normal).mean())
