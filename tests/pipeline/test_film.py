@@ -19,6 +19,7 @@ from warpgs.pipeline.runs.frame_check import FrameCheck
 from warpgs.pipeline.runs.keyframes import read_keyframes
 from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.pipeline.runs.paths import render_film
+from warpgs.pipeline.runs.rig import rig_of
 from warpgs.scene import Normalization
 
 UNITS = Normalization(np.array([1.0, 2.0, 3.0]), 0.5)
@@ -48,6 +49,10 @@ def test_keyframes_of_a_viewer_give_back_its_cameras(model, tmp_path):
     for got, wanted in ((cameras[0], 0), (cameras[10], 1), (cameras[-1], 4)):
         assert np.allclose(got.viewmat, model.cameras()[f"{wanted}.png"].viewmat, atol=1e-9)
     assert 2 * math.atan(0.5 * cameras[-1].height / cameras[-1].K[1, 1]) == pytest.approx(0.3)
+    center = rig_of(list(model.cameras().values()), 2.2).center
+    for camera in cameras:  # all three look at one point, and so does every frame between them
+        seen = camera.viewmat[:3, :3] @ center + camera.viewmat[:3, 3]
+        assert np.abs(seen[:2]).max() < 0.15 and 2 < seen[2] < 2.5
     with pytest.raises(UsageError, match="fields of view of their own"):
         plan_film(model, str(path), FilmSettings(fov_y=1.0))
 

@@ -134,7 +134,7 @@ def render_plot(plot: ScenePlot, size: tuple[int, int], background: str) -> byte
     arrays = {"train": frusta(plot.train, length), "test": frusta(plot.test, length), "points": points.astype(np.float32)}
     if plot.axes is not None:
         lengths = np.sqrt((plot.axes[inside] ** 2).sum(1))
-        shrink = np.minimum(1.0, 0.03 * reach / np.maximum(SHOWN_SIGMAS * lengths, 1e-30))  # the far background would hide all
+        shrink = np.minimum(1.0, 0.02 * reach / np.maximum(SHOWN_SIGMAS * lengths, 1e-30))  # the far background would hide all
         arrays["axes"] = (SHOWN_SIGMAS * shrink[:, None] * plot.axes[inside]).astype(np.float32)
     entries = [("training cameras", TRAIN_COLOR)] * bool(plot.train) + [("held-out cameras", TEST_COLOR)] * bool(plot.test)
     entries += plot.legend

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -116,11 +116,13 @@ def _tour(rig: Rig, train: list[Camera], settings: FilmSettings) -> tuple[list[C
     return cameras, f"path interpolate: through {count} of {len(train)} training views {words}{back}"
 
 
-def _keyframes(model: FittedModel, path: Path, first: Camera, settings: FilmSettings) -> tuple[list[Camera], str]:
+def _keyframes(model: FittedModel, path: Path, rig: Rig, first: Camera, settings: FilmSettings) -> tuple[list[Camera], str]:
     """Return the cameras of a film through the keyframes of a file, and how it goes."""
     if settings.fov_y is not None:
         raise UsageError(f"{path}: keyframes have fields of view of their own; leave out --fov")
     keyframes = read_keyframes(path, framed(first, settings.size), model.normalization)
+    if rig.is_watched([k.camera for k in keyframes]):  # then the path goes around it, and not across
+        keyframes = [replace(k, reach=rig.reach(k.camera)) for k in keyframes]
     last = keyframes[-1].seconds
     cameras = through(keyframes, settings.count(last + 1 / settings.fps))
     return cameras, f"path of {len(keyframes)} keyframes over {last:g} s"
@@ -147,11 +149,11 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
         names = image_names(scene)
         shown = [(names[n], framed(c, settings.size, settings.fov_y)) for n, c in scene.items()]
         return FilmPlan(shown, coverage, "the model shows nothing there: `warpgs eval` scores each view", [])
+    rig = rig_of(train, depth)
     if path.lower().endswith(".json"):
-        cameras, words = _keyframes(model, Path(path), train[0], settings)
+        cameras, words = _keyframes(model, Path(path), rig, train[0], settings)
         remedy = "c2w of keyframes is camera-to-world in OpenCV axes, in the units of the scene's files"
         return FilmPlan(_numbered(cameras), coverage, remedy, [words])
-    rig = rig_of(train, depth)
     notes = [f"{len(train)} training cameras look {rig.describe()}"]
     if rig.turned:
         notes.append("the photographs lie on their side; the film is upright, by the plane that the cameras stand in")

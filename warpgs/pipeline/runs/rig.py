@@ -64,6 +64,12 @@ class Rig:
         level = math.cos(azimuth) * self.first + math.sin(azimuth) * np.cross(self.up, self.first)
         return math.cos(elevation) * level + math.sin(elevation) * self.up
 
+    def is_watched(self, cameras: list[Camera]) -> bool:
+        """Return whether cameras all look at the point that matters."""
+        to_center = [self.center - c.center for c in cameras]
+        cosines = [(d * c.viewmat[2, :3]).sum() / max(math.sqrt((d * d).sum()), 1e-12) for c, d in zip(cameras, to_center)]
+        return self.kind in ("ring", "forward") and min(cosines) > MIN_COSINE
+
     def reach(self, camera: Camera) -> float:
         """Return the distance along a camera's axis to what it looks at [u]; 0 where the rig has no such point."""
         if self.kind not in ("ring", "forward"):
