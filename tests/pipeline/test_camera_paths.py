@@ -213,10 +213,11 @@ def test_a_closed_spline_has_no_corner_where_it_closes():
 
 
 def test_size_and_field_of_view():
-    """A new size keeps the vertical field of view, and square pixels stay square."""
+    """A new size keeps the vertical field of view and where the axis meets the image, and square pixels stay square."""
     camera = ring(1)[0]
     wide = framed(camera, (160, 64), None)
     assert wide.K[0, 0] == wide.K[1, 1] == pytest.approx(2 * camera.K[1, 1]) and (wide.width, wide.height) == (160, 64)
+    assert framed(camera, (80, 64)).K == pytest.approx(camera.K * [[2], [2], [1]])
     near = framed(camera, None, math.radians(40))
     assert 2 * math.degrees(math.atan(0.5 * near.height / near.K[1, 1])) == pytest.approx(40)
     assert framed(camera) == camera

@@ -48,6 +48,7 @@ def test_keyframes_of_a_viewer_give_back_its_cameras(model, tmp_path):
     cameras = [c for _, c in plan.cameras]
     for got, wanted in ((cameras[0], 0), (cameras[10], 1), (cameras[-1], 4)):
         assert np.allclose(got.viewmat, model.cameras()[f"{wanted}.png"].viewmat, atol=1e-9)
+    assert cameras[0].K[0, 2] == 20 and cameras[0].K[1, 2] == 16  # a viewer's axis is the middle of its image
     assert 2 * math.atan(0.5 * cameras[-1].height / cameras[-1].K[1, 1]) == pytest.approx(0.3)
     center = rig_of(list(model.cameras().values()), 2.2).center
     for camera in cameras:  # all three look at one point, and so does every frame between them

@@ -28,8 +28,7 @@ def framed(camera: Camera, size: tuple[int, int] | None = None, fov_y: float | N
     Args:
         camera: Camera of a photograph; its pose and camera model stay.
         size: Width and height [px]; None for those of the photograph.
-        fov_y: Vertical field of view [rad]; None for that of the photograph. With either the principal point is the middle of
-            the image.
+        fov_y: Vertical field of view [rad], as of a principal point in the middle; None for that of the photograph.
         turned: Whether the photograph lies on its side, so that width and height are swapped.
 
     Raises:
@@ -46,9 +45,11 @@ def framed(camera: Camera, size: tuple[int, int] | None = None, fov_y: float | N
         fy = 0.5 * new_height / math.tan(0.5 * fov_y)
     else:
         fy = K[1, 1] * new_height / height
-    fx = fy * K[0, 0] / K[1, 1]
-    middle = np.array([[fx, 0, 0.5 * new_width], [0, fy, 0.5 * new_height], [0, 0, 1.0]])
-    return replace(camera, K=middle, width=new_width, height=new_height)
+    fx, zoom = fy * K[0, 0] / K[1, 1], fy / K[1, 1]
+    cx, cy = (
+        0.5 * new + zoom * (K[i, 2] - 0.5 * old) for i, (new, old) in enumerate(((new_width, width), (new_height, height)))
+    )
+    return replace(camera, K=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), width=new_width, height=new_height)
 
 
 def upright(rig: Rig, camera: Camera) -> Camera:

@@ -126,7 +126,7 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
 
     Args:
         path: The file.
-        template: Camera that gives image size and camera model.
+        template: Camera that gives the image size and the shape of a pixel.
         normalization: Similarity from file to scene units.
 
     Returns:
@@ -147,7 +147,8 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
         ) from e
     if not 1 <= len(values) <= MAX_KEYFRAMES:
         raise DataError(f"{path}: holds {len(values)} keyframes; a path takes 1 to {MAX_KEYFRAMES:,}")
-    result = []
+    K = np.array([[template.K[0, 0], 0, 0.5 * template.width], [0, template.K[1, 1], 0.5 * template.height], [0, 0, 1.0]])
+    template, result = replace(template, K=K, model="pinhole"), []
     for i, value in enumerate(values):
         matrix = np.array(value["c2w"], np.float64)
         rotation = np.clip(matrix[:3, :3], -2, 2)  # so that no square overflows
