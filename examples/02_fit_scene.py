@@ -3,7 +3,7 @@
     python examples/02_fit_scene.py path/to/scene --out result
 
 The scene is a folder of images with cameras (COLMAP, transforms.json, LLFF, DTU or Middlebury); without one a synthetic scene
-is written and fitted. Prints the held-out PSNR; writes an orbit as PNG files and film, the PLY file for viewers, and the model.
+is written and fitted. Prints the held-out PSNR; writes a turntable as images and film, the PLY file for viewers, and the model.
 """
 
 import argparse
@@ -19,7 +19,7 @@ def main(arguments: list[str] | None = None) -> float:
     parser.add_argument("scene", type=Path, nargs="?", help="scene folder; a synthetic one where not given")
     parser.add_argument("--out", type=Path, default=Path("result"), help="folder to write")
     parser.add_argument("--steps", type=int, default=300, help="optimisation steps")
-    parser.add_argument("--frames", type=int, default=24, help="frames of the orbit")
+    parser.add_argument("--frames", type=int, default=24, help="frames of the film")
     parser.add_argument("--width", type=int, default=96, help="width of the synthetic images [px]")
     a = parser.parse_args(arguments)
 
@@ -34,7 +34,7 @@ def main(arguments: list[str] | None = None) -> float:
     config = dataclasses.replace(warpgs.PRESETS["quick"], steps=a.steps)
     result = warpgs.fit(scene, config, split=split, on_step=lambda report: None)
 
-    files = warpgs.render_path(result, "orbit", out=a.out / "orbit", frames=a.frames)
+    files = warpgs.render_path(result, "turntable", out=a.out / "turntable", frames=a.frames)
     # a fit works in scene units; files for other programs are in those of the scene's own files
     warpgs.write_ply(a.out / "scene.ply", result.gaussians("file"), units="file")
     warpgs.save(a.out / "model.safetensors", result.gaussians(), result.normalization, units="scene")
@@ -43,7 +43,9 @@ def main(arguments: list[str] | None = None) -> float:
 
     gain = float(result.metrics["test"]["psnr"] - result.metrics["baselines"]["mean_photo"])
     print(f"held-out PSNR {result.metrics['test']['psnr']:.2f} dB, {gain:+.2f} dB over the mean training image")
-    print(f"{len(files)} files of an orbit in {a.out / 'orbit'}; model and PLY agree within {float(moved):.1g} file units")
+    print(
+        f"{len(files)} files of a turntable in {a.out / 'turntable'}; model and PLY agree within {float(moved):.1g} file units"
+    )
     return gain
 
 

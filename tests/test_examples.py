@@ -11,7 +11,7 @@ from PIL import Image
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SMALL = {
     "01_fit_image": (["--steps", "40", "--count", "150", "--size", "40"], "fitted.png", lambda gain: gain > 3),
-    "02_fit_scene": (["--steps", "20", "--frames", "3", "--width", "48"], "orbit/0001.png", lambda gain: gain > -6),
+    "02_fit_scene": (["--steps", "20", "--frames", "3", "--width", "48"], "turntable/0001.png", lambda gain: gain > -6),
     "03_camera_pose": (["--steps", "100"], "pose.png", lambda left: left < 0.2),
     "04_own_loss": (["--steps", "20", "--width", "48", "--weight", "5"], "smooth.png", lambda left: left < 0.9),
     "05_own_strategy": (["--steps", "200", "--width", "48", "--start", "100"], "sprout.png", lambda gain: gain > 0.2),

@@ -165,7 +165,9 @@ ELSEWHERE = {
     ("app/failures.py", "NamedTemporaryFile"): "details of a defect, in the folder for temporary files",
     ("report/film.py", "VideoWriter"): "into the temporary file of `replacing`, which decodes it",
     ("report/overview.py", "savez"): "into a temporary folder",
+    ("report/scene_plot.py", "savez"): "the same",
     ("report/sheet.py", "save"): "Pillow, into memory",
+    ("report/animation.py", "save"): "the same",
     ("report/events.py", "open ab"): "metrics.jsonl grows by lines",
     ("export/ply.py", "open xb"): "the temporary file of `replacing`",
     ("files.py", "open xb"): "the temporary file of `replacing`",
@@ -173,7 +175,7 @@ ELSEWHERE = {
     ("runtime/load_module.py", "open ab"): "a lock beside compiled kernels",
     ("runtime/folder_lock.py", "os.open"): "the lock of a folder",
     ("runtime/folder_lock.py", "open r+b"): "the same",
-    ("runtime/interop.py", "os.open"): "the null device",
+    ("runtime/native_output.py", "os.open"): "the null device",
     ("app/cli.py", "os.open"): "the null device",
     ("files.py", "os.open"): "a folder, to sync it",
 }

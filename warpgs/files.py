@@ -18,7 +18,7 @@ from warpgs.errors import ResourceError
 
 LOCK = ".warpgs.lock"
 """Name of the file that a process holds while it writes into a folder."""
-OWN_NAMES = re.compile(r"\.warpgs-[0-9a-f]{16}\.tmp(\.mp4)?")
+OWN_NAMES = re.compile(r"\.warpgs-[0-9a-f]{16}\.tmp(\.(mp4|webm))?")
 """Names of temporary files and folders: short and of ASCII letters, so that they fit wherever the file itself does."""
 WINDOWS = sys.platform == "win32"
 PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)
@@ -40,7 +40,7 @@ def replacing(
         path: File to write or to replace.
         check: Function that reads the temporary file back and raises where it is not whole.
         size: Bytes that will be written, which must be there at the end; None where nobody knows.
-        suffix: End of the temporary file's name, for libraries that take the format from it: none, or .mp4.
+        suffix: End of the temporary file's name, for libraries that take the format from it: none, .mp4 or .webm.
 
     Raises:
         ResourceError: The disk is full, the folder is not writable, or the old file is open in another program on Windows.

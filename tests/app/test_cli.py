@@ -7,6 +7,7 @@ import stat
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -130,12 +131,35 @@ def test_eval_measures_lpips(run, tmp_path, capsys):
     assert "warpgs convert-lpips" in failure(capsys, 3, "eval", str(run), "--lpips-weights", foreign)
 
 
-@pytest.mark.parametrize(("path", "pictures"), [("orbit", 4), ("spiral", 4), ("views", 9)])
+@pytest.mark.parametrize(("path", "pictures"), [("auto", 4), ("turntable", 4), ("spiral", 4), ("interpolate", 4), ("views", 9)])
 def test_render_paths(run, tmp_path, path, pictures):
     """Every path gives its pictures and a film."""
     flags = ["--path", path, "--frames", "4", "--out", str(tmp_path), "--device", "cpu"]
     assert main(["render", str(run), *flags]) == 0
     assert len(list(tmp_path.glob("*.png"))) == pictures and (tmp_path / "film.mp4").stat().st_size > 0
+
+
+def test_plot(run, tmp_path, capsys):
+    """A PNG of the size asked for, or, where this machine cannot render, what to install."""
+    target = tmp_path / "a.png"
+    code = main(["plot", str(run), "--out", str(target), "--color", "coverage", "--size", "320", "240", "--device", "cpu"])
+    if code:
+        assert code == 4 and "libegl1" in capsys.readouterr().err and not target.exists()
+    else:
+        assert cv2.imread(str(target)).shape == (240, 320, 3) and "Gaussians, " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["--points", "stars"], "gaussians, start"), (["--color", "red"], "own, coverage"),
+        (["--size", "9", "9"], "64 to 8192"),
+        (["--background", "red"], "white, black"), (["--points", "start", "--color", "coverage"], "coverage is measured"),
+        (["--out", "a.jpg"], "a plot is a .png"),
+    ],
+)  # fmt: skip
+def test_plots_that_cannot_be_are_refused(run, capsys, words, why):
+    assert why in failure(capsys, 2, "plot", str(run), *words)
 
 
 def test_export_equals_the_run(run, tmp_path):

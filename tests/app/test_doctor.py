@@ -47,7 +47,7 @@ def test_this_machine_can_fit():
         "Memory",
         "Kernel cache",
         "3D overview",
-        "MP4 encoder",
+        "Film encoder",
         "Disk",
     ):
         assert topic in topics

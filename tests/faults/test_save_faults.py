@@ -29,7 +29,7 @@ from warpgs.pipeline.runs.folder import StoredRun, open_run
 from warpgs.pipeline.runs.paths import render_path
 from warpgs.pipeline.runs.prune import _write
 from warpgs.report.events import EventLog
-from warpgs.report.film import write_mp4
+from warpgs.report.film import write_film
 from warpgs.runtime.folder_lock import hold_folder
 
 pytestmark = pytest.mark.fault
@@ -88,7 +88,7 @@ def save_log(s: Saved) -> None:
 
 
 def save_film(s: Saved) -> None:
-    write_mp4(s.folder / "film.mp4", (np.full((36, 48, 3), (i + s.number) / 8, np.float32) for i in range(4)))
+    write_film(s.folder / "film.mp4", (np.full((36, 48, 3), (i + s.number) / 8, np.float32) for i in range(4)))
 
 
 def save_path(s: Saved) -> None:

@@ -46,7 +46,7 @@ def words_of(command: str, scene: Path, work: Path) -> list[str]:
     return {
         "fit": fit,
         "resume": [*fit, "--resume"],
-        "render": ["render", run, "--path", "orbit", "--frames", str(FRAMES), "--out", str(work / "film"), *cpu],
+        "render": ["render", run, "--path", "turntable", "--frames", str(FRAMES), "--out", str(work / "film"), *cpu],
         "export": ["export", run, "--to", str(work / "a.ply")],
         "prune": ["prune", run, "--keep-psnr", "3", *cpu],
         "eval": ["eval", run, *cpu],

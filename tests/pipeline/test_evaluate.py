@@ -7,13 +7,11 @@ import pytest
 import torch
 
 from tests.scenes import photos, ring
-from warpgs.errors import UsageError
-from warpgs.geometry import back_project, camera_extent, focus_point, in_image, look_at, project_points
+from warpgs.geometry import back_project, camera_extent, focus_point, in_image, project_points
 from warpgs.pipeline.metrics.evaluate import baselines, score, summarize, to_8_bit, variants
 from warpgs.pipeline.metrics.psnr import psnr
 from warpgs.pipeline.metrics.region import counted_region
-from warpgs.pipeline.runs.camera_paths import camera_path
-from warpgs.scene import Camera, View
+from warpgs.scene import View
 
 
 def test_psnr_of_known_errors():
@@ -124,37 +122,3 @@ def test_geometry_round_trip():
         assert in_image(c, np.zeros((1, 3)))[0] and not in_image(c, 3 * c.center[None])[0]
     assert np.linalg.norm(focus_point(cameras)) < 1e-4
     assert 1.0 < camera_extent(cameras) < 2.2 and camera_extent(cameras[:1]) == 0
-
-
-@pytest.mark.parametrize("kind", ["orbit", "spiral"])
-def test_paths_look_at_one_point_and_close(kind):
-    """All cameras see the middle of the scene, and the last is near the first."""
-    path = camera_path(kind, ring(5), 2.2, 40)
-    assert len(path) == 40
-    for c in path:
-        pixels, z = project_points(c, np.zeros((1, 3)))
-        assert z[0] > 0 and abs(pixels[0] - c.K[:2, 2]).max() < 0.5 * c.width
-        assert np.allclose(c.viewmat[:3, :3] @ c.viewmat[:3, :3].T, np.eye(3), atol=1e-12)
-    steps = [np.linalg.norm(a.center - b.center) for a, b in zip(path, path[1:] + path[:1])]
-    assert max(steps) < 0.5
-
-
-@pytest.mark.parametrize("kind", ["orbit", "spiral"])
-def test_cameras_all_round_are_circled_about_what_they_look_at(kind):
-    """A ring of cameras about a point away from the origin: every frame has the point at its centre, from as far away."""
-    target, K = np.array([3.0, -1.0, 7.0]), np.array([[50.0, 0, 20], [0, 50, 20], [0, 0, 1]])
-    angles = np.linspace(0, 2 * np.pi, 13)[:12]
-    eyes = [target + 4 * np.array([np.cos(a), -0.3, np.sin(a)]) for a in angles]
-    cameras = [Camera(look_at(eye, target, np.array([0, -1.0, 0])), K, 40, 40) for eye in eyes]
-    for camera in camera_path(kind, cameras, 1.0, 9):
-        seen = camera.viewmat[:3, :3] @ target + camera.viewmat[:3, 3]
-        # focus_point is pulled to the mean centre by a millionth of the distance between them
-        assert np.abs(seen[:2]).max() < 1e-5 and seen[2] == pytest.approx(4 * np.hypot(1, 0.3), rel=1e-5)
-
-
-def test_unknown_path_is_refused():
-    """The message lists what there is."""
-    with pytest.raises(UsageError, match="views, orbit, spiral"):
-        camera_path("zigzag", ring(3), 1.0, 5)
-    with pytest.raises(UsageError, match="at least 1 frame"):
-        camera_path("orbit", ring(3), 1.0, 0)

@@ -149,7 +149,7 @@ def test_no_command_fails_on_what_the_schema_allows(made, run, tmp_path, capsys)
             ]
             if path[-1:] not in (("width",), ("height",)):  # an image of 2^16 px takes too long
                 codes += [
-                    main(["render", str(run), "--path", p, "--frames", "1", "--device", "cpu"]) for p in ("views", "orbit")
+                    main(["render", str(run), "--path", p, "--frames", "1", "--device", "cpu"]) for p in ("views", "turntable")
                 ]
             assert not set(codes) - {0, 2, 3, 4}, (path, value, capsys.readouterr().err)
     assert tried > 100

@@ -93,7 +93,7 @@ def test_renders_are_transparent_unless_a_colour_is_named(run, tmp_path, capsys)
     images = {}
     for name in ("auto", "white", "#0000ff"):
         out = tmp_path / name.strip("#")
-        assert main(["render", str(run), "--out", str(out), "--device", "cpu", "--background", name]) == 0
+        assert main(["render", str(run), "--out", str(out), "--path", "views", "--device", "cpu", "--background", name]) == 0
         file = sorted(out.rglob("*.png"))[0]
         images[name] = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)[..., ::-1] / 255.0
     assert [i.shape[2] for i in images.values()] == [4, 3, 3]

@@ -41,7 +41,7 @@ def test_overview_is_an_image_or_a_reason_with_a_remedy():
 
 def test_frusta_start_at_the_camera_and_pass_through_the_image_corners():
     c = camera(0.3)
-    lines = module._frusta([c], 0.5)
+    lines = module.frusta([c], 0.5)
     assert lines.shape == (8, 2, 3)
     np.testing.assert_allclose(lines[:4, 0], np.repeat(c.center[None], 4, 0))
     in_camera = lines[:4, 1] @ c.viewmat[:3, :3].T + c.viewmat[:3, 3]
@@ -80,13 +80,14 @@ def test_nothing_to_draw_is_a_note():
         assert data is None and "no points or no training cameras" in why
 
 
+@pytest.mark.parametrize("aspect", [2.0, 0.5])
 @pytest.mark.parametrize("direction", [[0.3, -1, 2], [0, 5, 0], [0, 0, -1e-15], [1, 1, 1]])
-def test_everything_shown_is_in_the_image_and_fills_it(direction):
+def test_everything_shown_is_in_the_image_and_fills_it(direction, aspect):
     shown = np.random.default_rng(1).normal(size=(300, 3)) * [5, 1, 2] + [10, -20, 3]
-    eye, focus, up = module._framing(shown, np.array(direction, float), np.array([0.0, 1, 0]))
+    eye, focus, up = module.framing(shown, np.array(direction, float), np.array([0.0, 1, 0]), aspect)
     forward = (focus - eye) / np.linalg.norm(focus - eye)
     assert abs(forward @ up) < 1e-9 and np.linalg.norm(up) == pytest.approx(1)
     x, y, z = ((shown - eye) @ np.stack([np.cross(forward, up), up, forward]).T).T
     slope = np.tan(np.radians(module.VIEW_ANGLE / 2))
-    reach = np.maximum(np.abs(y / z) / slope, np.abs(x / z) / (slope * module.WIDTH / module.HEIGHT))
-    assert (z > 0).all() and 0.6 < reach.max() < 1
+    reach = np.maximum(np.abs(y / z) / slope, np.abs(x / z) / (slope * aspect))
+    assert (z > 0).all() and 0.85 < reach.max() < 1

@@ -91,7 +91,8 @@ def test_no_command_runs_what_lies_beside_a_scene(trap, tmp_path, program):
         (folder / f"{name}.py").write_text((folder / "json.py").read_text())
     commands = {
         "help": (0, ["--help"]), "fit": (0, ["fit", ".", *FIT, "--out", out]), "eval": (0, ["eval", out, "--device", "cpu"]),
-        "render": (0, ["render", out, "--frames", "2", "--path", "orbit", "--device", "cpu"]),
+        "render": (0, ["render", out, "--frames", "2", "--path", "turntable", "--device", "cpu"]),
+        "plot": (0, ["plot", out, "--device", "cpu"]),
         "export": (0, ["export", out, "--to", str(tmp_path / "a.ply")]), "prune": (0, ["prune", out, "--device", "cpu"]),
         "priors": (0, ["priors", "show", ".", "--out", str(tmp_path / "priors"), "--split", split_spec(8)]),
         "priors export": (2, ["priors", "export", "--model", "none", "--out", str(tmp_path / "a.onnx")]),

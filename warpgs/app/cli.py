@@ -15,7 +15,8 @@ from warpgs.runtime.terminal import accept_all_letters, say
 COMMANDS = {
     "fit": "fit Gaussians to a scene folder and fill a run folder",
     "eval": "score a run again on its held-out views",
-    "render": "render a run: its views, an orbit or a spiral, as PNG and mp4",
+    "render": "render a run as a film: along a path that suits it, through its views, or along keyframes",
+    "plot": "show a run's cameras and Gaussians in one image",
     "export": "write a run's Gaussians to a PLY file",
     "mesh": "make a mesh of the surfaces that a run's training views see, as .ply or .glb",
     "prune": "shrink a finished model as far as its training views allow, into a new run folder",

@@ -253,15 +253,15 @@ def _rendering() -> Iterable[Finding]:
 
 def _video() -> Iterable[Finding]:
     """Encode a few frames for real: a build of OpenCV may accept the codec and still write nothing."""
-    topic = "MP4 encoder"
+    topic = "Film encoder"
     try:
         import numpy as np
 
-        from warpgs.report.film import write_mp4
+        from warpgs.report.film import write_film
 
         with tempfile.TemporaryDirectory() as folder:
-            write_mp4(Path(folder) / "probe.mp4", (np.full((64, 64, 3), level) for level in (0, 0.5, 1)), 10)
-        yield Finding(topic, OK, "mp4v through OpenCV")
+            write_film(Path(folder) / "probe.mp4", (np.full((64, 64, 3), level) for level in (0, 0.5, 1)), 10)
+        yield Finding(topic, OK, "VP9 through OpenCV")
         return
     except Exception as e:
         why = _reason(e)

@@ -1,28 +1,43 @@
-"""Writing of frames as an mp4 film."""
+"""Writing of frames as a film: VP9 in .mp4 or .webm, or an animated .webp or .gif."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
-from warpgs.errors import DataError, ResourceError
+from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.files import replacing
+from warpgs.report.animation import ANIMATIONS, write_animation
+from warpgs.runtime.native_output import hidden_stderr
+
+VIDEOS = (".mp4", ".webm")
+SUFFIXES = (*VIDEOS, *ANIMATIONS)
+"""Formats of films."""
 
 
-def write_mp4(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
-    """Write frames [H, W, 3] in [0, 1], all of one size, as an MPEG-4 film; odd sides lose a row or column.
+def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
+    """Write frames [H, W, 3] in [0, 1], all of one size, as a film in the format that the path's suffix names.
 
-    The film is decoded before it takes the place of an older one: the encoder does not say that a disk was full.
+    A video (.mp4, .webm) is VP9, which OpenCV's wheels bring and current browsers play; its odd sides lose a row or column. An
+    animated image (.webp, .gif) runs in a loop. The film is decoded before it takes the place of an older one: the encoder
+    does not say that a disk was full.
 
     Returns:
         The number of frames.
 
     Raises:
         DataError: There are no frames, or they differ in size.
-        ResourceError: This OpenCV has no MPEG-4 encoder, or the file cannot be written.
+        ResourceError: This OpenCV has no VP9 encoder, or the file cannot be written.
+        UsageError: The suffix is none of `SUFFIXES`, or an animated image would be too large or too fast.
     """
+    suffix = path.suffix.lower()
+    if suffix in ANIMATIONS:
+        return write_animation(path, frames, fps)
+    if suffix not in VIDEOS:
+        raise UsageError(f"{path}: a film is one of {', '.join(SUFFIXES)}, not {suffix or 'a file without suffix'}")
     sizes: list[tuple[int, int]] = []
 
     def check(film: Path) -> None:
@@ -34,7 +49,7 @@ def write_mp4(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
                 "write elsewhere"
             )
 
-    with replacing(path, check, suffix=".mp4") as temporary:
+    with replacing(path, check, suffix=suffix) as temporary:
         _encode(path, temporary, frames, fps, sizes)
     return len(sizes)
 
@@ -48,11 +63,11 @@ def _encode(path: Path, temporary: Path, frames: Iterable[np.ndarray], fps: int,
         for frame in frames:
             height, width = (s // 2 * 2 for s in frame.shape[:2])
             if writer is None:
-                writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter_fourcc(*"mp4v"), fps, (width, height))
+                # for .webm OpenCV says on stderr that there is no such tag, and takes VP9 all the same
+                with hidden_stderr() if path.suffix.lower() == ".webm" else contextlib.nullcontext():
+                    writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter_fourcc(*"vp09"), fps, (width, height))
                 if not writer.isOpened():
-                    raise ResourceError(
-                        f"{path}: cannot be written; the folder is not writable, or OpenCV lacks an MPEG-4 encoder"
-                    )
+                    raise ResourceError(f"{path}: cannot be written; the folder is not writable, or OpenCV lacks a VP9 encoder")
             sizes.append((width, height))
             # OpenCV drops a frame of another size without a word.
             if sizes[-1] != sizes[0]:

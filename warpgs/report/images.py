@@ -76,3 +76,11 @@ def side_by_side(images: list[np.ndarray], gap: int = 4) -> np.ndarray:
     bar = np.ones((height, gap, 3), np.float32)
     row = [part for image in images for part in (image, bar)][:-1]
     return np.concatenate(row, axis=1)
+
+
+def frame_sheet(frames: list[np.ndarray], columns: int = 3, gap: int = 4) -> np.ndarray:
+    """Return frames [H, W, 3] of one size in rows of ``columns``, with ``gap`` white pixels between them."""
+    frames = frames + [np.ones_like(frames[0])] * (-len(frames) % columns)
+    rows = [side_by_side(frames[i : i + columns], gap) for i in range(0, len(frames), columns)]
+    bar = np.ones((gap, rows[0].shape[1], 3), np.float32)
+    return np.concatenate([part for row in rows for part in (row, bar)][:-1])

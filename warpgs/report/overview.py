@@ -21,7 +21,7 @@ PROBE = (
 )
 
 
-def _python(code: str, *arguments: str) -> tuple[bool, str]:
+def run_pyvista(code: str, *arguments: str) -> tuple[bool, str]:
     """Run Python code in a process of its own, since VTK ends the process where it cannot render; return success and reason."""
     try:
         done = run_python(code, *arguments, timeout=TIMEOUT, environment={"VTK_DEFAULT_OPENGL_WINDOW": "vtkEGLRenderWindow"})
@@ -35,17 +35,18 @@ def _python(code: str, *arguments: str) -> tuple[bool, str]:
     return False, f"pyvista ended with code {done.returncode}" + (f" ({last[-1][:100]})" if last else "")
 
 
-def _remedy(why: str) -> str:
+def remedy_for(why: str) -> str:
+    """Return how to help against the reason that `run_pyvista` gave."""
     return "`pip install pyvista`" if "No module named" in why else REMEDY
 
 
 def probe_rendering() -> tuple[bool, str]:
     """Return whether pyvista can render on this machine, and how; or the reason why not, with a remedy."""
-    works, why = _python(PROBE)
-    return works, "off-screen through EGL" if works else f"{why}; {_remedy(why)}"
+    works, why = run_pyvista(PROBE)
+    return works, "off-screen through EGL" if works else f"{why}; {remedy_for(why)}"
 
 
-def _frusta(cameras: list[Camera], size: float) -> np.ndarray:
+def frusta(cameras: list[Camera], size: float) -> np.ndarray:
     """Return line segments [S, 2, 3] of camera pyramids whose image planes lie ``size`` [u] away."""
     lines = []
     for c in cameras:
@@ -73,13 +74,14 @@ p.screenshot(sys.argv[2])
 """
 
 
-def _framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray) -> np.ndarray:
+def framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray, aspect: float = WIDTH / HEIGHT) -> np.ndarray:
     """Return eye, focal point and up vector, shape [3, 3], from which all points of ``shown`` are in the image.
 
     Args:
         shown: Points that must be seen [u], shape [N, 3].
         direction: Direction from the scene to the eye, any length, shape [3].
         up: Rough upward direction, shape [3]; replaced by any perpendicular where it lies along ``direction``.
+        aspect: Width of the image over its height.
     """
     length = np.linalg.norm(direction)
     forward = -direction / length if length > 0 else np.array([0.0, 0.0, 1.0])
@@ -88,14 +90,21 @@ def _framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray) -> np.nda
         right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
     axes = np.stack([right / np.linalg.norm(right), np.zeros(3), forward])
     axes[1] = np.cross(axes[0], forward)
+    slope = np.tan(np.radians(VIEW_ANGLE / 2)) / 1.06
     seen = shown @ axes.T
-    middle = (seen.min(0) + seen.max(0)) / 2
-    x, y, z = np.abs(seen[:, 0] - middle[0]), np.abs(seen[:, 1] - middle[1]), seen[:, 2] - middle[2]
-    # Near content fills more of the image: every point asks for its own distance, and the largest serves all.
-    slope = np.tan(np.radians(VIEW_ANGLE / 2))
-    distance = 1.06 * max(float((np.maximum(y / slope, x / (slope * WIDTH / HEIGHT)) - z).max()), 1e-6)
-    focus = middle @ axes
-    return np.stack([focus - distance * forward, focus, axes[1]])
+    low, high = seen.min(0), seen.max(0)
+    eye, focus = (low + high) / 2, (low + high) / 2
+    eye[2] -= max(float((high - low).max()), 1e-6) * 2
+    for _ in range(20):  # near content fills more of the image: move aside and to or fro until what is seen touches the edges
+        depth = np.maximum(seen[:, 2] - eye[2], 1e-9)
+        x, y = (seen[:, 0] - eye[0]) / depth, (seen[:, 1] - eye[1]) / depth
+        nearest, middle = float(depth.min()), float(np.median(depth))
+        half = max((y.max() - y.min()) / slope, (x.max() - x.min()) / (slope * aspect)) / 2
+        eye[:2] += 0.5 * middle * np.array([x.max() + x.min(), y.max() + y.min()]) / 2
+        eye[2] -= max((half - 1) * middle, -0.5 * nearest)
+    focus[:2] = eye[:2]
+    focus[2] = max(focus[2], eye[2] + 1e-6)
+    return np.stack([eye @ axes, focus @ axes, axes[1]])
 
 
 def render_overview(
@@ -119,19 +128,19 @@ def render_overview(
     side = np.cross(forward, up)
     direction = 1.5 * back + 0.7 * reach * side / max(np.linalg.norm(side), 1e-9) + 0.5 * reach * up
     size = 0.12 * max(reach, 1e-6)
-    frusta = {"train": _frusta(train, size), "test": _frusta(test, size)}
+    lines = {"train": frusta(train, size), "test": frusta(test, size)}
     core = points[((points >= low) & (points <= high)).all(1)]
-    view = _framing(np.concatenate([core, *(f.reshape(-1, 3) for f in frusta.values())]), direction, up)
+    view = framing(np.concatenate([core, *(f.reshape(-1, 3) for f in lines.values())]), direction, up)
     try:
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             source, target = (Path(folder).resolve() / name for name in ("scene.npz", "overview.png"))
             np.savez(
                 source, points=points[inside].astype(np.float32),
-                colors=np.round(255 * np.clip(colors[inside], 0, 1)).astype(np.uint8), view=view, **frusta,
+                colors=np.round(255 * np.clip(colors[inside], 0, 1)).astype(np.uint8), view=view, **lines,
             )  # fmt: skip
-            works, why = _python(RENDER_SCRIPT, str(source), str(target))
+            works, why = run_pyvista(RENDER_SCRIPT, str(source), str(target))
             if works and target.is_file():
                 return target.read_bytes(), ""
     except OSError as e:
         return None, f"no overview image: temporary files cannot be written ({e.strerror or e}); free some disk space"
-    return None, f"no overview image: {why}; {_remedy(why)}"
+    return None, f"no overview image: {why}; {remedy_for(why)}"

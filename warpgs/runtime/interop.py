@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import os
-import sys
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +15,7 @@ import warp as wp
 from warpgs.errors import ResourceError
 from warpgs.runtime.kernel_cache import prepare_kernel_cache
 from warpgs.runtime.load_module import load_module
+from warpgs.runtime.native_output import hidden_stderr
 
 wp.config.log_level = wp.LOG_WARNING  # its banner and compile notes are not for users
 
@@ -24,18 +23,8 @@ wp.config.log_level = wp.LOG_WARNING  # its banner and compile notes are not for
 @contextlib.contextmanager
 def _without_driver_notice():
     """Hide the warning that Warp's native code prints where there is no CUDA driver."""
-    if torch.cuda.is_available():
+    with contextlib.nullcontext() if torch.cuda.is_available() else hidden_stderr():
         yield
-        return
-    sys.stderr.flush()
-    saved, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(sink, 2)
-    try:
-        yield
-    finally:
-        os.dup2(saved, 2)
-        os.close(saved)
-        os.close(sink)
 
 
 prepare_kernel_cache()

@@ -15,26 +15,38 @@ def run(arguments: list[str], about: str) -> int:
     class Render:
         run: tyro.conf.Positional[Path]
         """Run folder of `warpgs fit`."""
-        path: str = "views"
-        """views (every view of the scene), orbit or spiral."""
+        path: str = "auto"
+        """auto (what suits how the photographs were taken), turntable, spiral, interpolate (through the training views), views
+        (every view of the scene), or a .json file of keyframes."""
         out: Path | None = None
-        """Folder for the images and the film; RUN/path-PATH where not given."""
-        frames: int = 90
-        """Number of frames of an orbit or a spiral."""
+        """Folder for the images and film.mp4; or a film alone: .mp4, .webm, .webp or .gif. RUN/path-PATH where not given."""
+        seconds: float | None = None
+        """Duration of the film [s]; what suits the path where not given."""
         fps: int = 30
         """Frames per second of the film."""
+        frames: int | None = None
+        """Number of frames; seconds times fps where not given."""
+        size: tuple[int, int] | None = None
+        """Width and height of the frames [px]; those of the photographs where not given."""
+        fov: float | None = None
+        """Vertical field of view [deg]; that of the photographs where not given."""
         background: str = "auto"
         """auto (that of the fit; images of objects cut out are transparent PNGs), black, white, #rrggbb, or r,g,b in [0, 1]."""
+        sheet: bool = False
+        """Write six frames in one image, too: sheet.png."""
         device: str = "auto"
         """auto, cpu or cuda."""
         coverage: bool = False
         """Write images of what no training view saw, too, into the subfolder coverage."""
 
     a = parse_flags(Render, arguments, "warpgs render", about)
-    check_range("--frames", a.frames, 1, 1_000_000)
     check_range("--fps", a.fps, 1, 1000)
-    from warpgs.pipeline.runs.commands import render
+    from math import radians
 
-    for line in render(a.run, a.path, a.out, a.frames, a.fps, a.device, a.coverage, background=a.background):
+    from warpgs.pipeline.runs.commands import render
+    from warpgs.pipeline.runs.film_plan import FilmSettings
+
+    settings = FilmSettings(a.frames, a.seconds, a.fps, a.size, None if a.fov is None else radians(a.fov))
+    for line in render(a.run, a.path, a.out, settings, a.device, background=a.background, coverage=a.coverage, sheet=a.sheet):
         say(line)
     return 0

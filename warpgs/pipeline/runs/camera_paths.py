@@ -1,79 +1,134 @@
-"""Camera paths for films, made from the training cameras."""
+"""Camera paths for films, made from how the training cameras stand."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
 from warpgs.errors import UsageError
-from warpgs.geometry import focus_point, look_at
+from warpgs.geometry import check_pinhole, look_at, matmul
+from warpgs.pipeline.runs.rig import MIN_SWING, Rig
 from warpgs.scene import Camera
 
-PATHS = ("views", "orbit", "spiral")
-MAX_RING_FORWARD = 0.5
-"""Length of the mean viewing direction below which cameras stand around what they look at: 0.15 for 16 about an object, 0.82
-and more for scenes photographed from one side."""
+BY_KIND = {"forward": "spiral", "ring": "turntable", "room": "turntable", "free": "interpolate"}
+"""Path of each kind of rig where none was asked for."""
+SWING = 0.9
+"""Fraction of the cameras' range that a film swings through: at its ends fewer views saw what comes into the frame."""
+MAX_ELEVATION = math.radians(80)
+"""Largest elevation of a film: above it, the upward direction is lost."""
+LIMITS = {"width": (16, 8192), "fov": (1.0, 170.0)}
+"""Smallest and largest side of a film [px], and vertical field of view [deg]."""
 
 
-def camera_path(kind: str, cameras: list[Camera], depth: float, frames: int) -> list[Camera]:
-    """Return cameras along a path with the size and intrinsics of the first camera.
+def framed(camera: Camera, size: tuple[int, int] | None = None, fov_y: float | None = None, turned: bool = False) -> Camera:
+    """Return a camera with the size and field of view of a film.
 
     Args:
-        kind: ``orbit``, an ellipse through the region that the cameras span; ``spiral``, two turns that open and close
-            again while moving in and out. Both look at one point.
+        camera: Camera of a photograph; its pose and camera model stay.
+        size: Width and height [px]; None for those of the photograph.
+        fov_y: Vertical field of view [rad], as of a principal point in the middle; None for that of the photograph.
+        turned: Whether the photograph lies on its side, so that width and height are swapped.
+
+    Raises:
+        UsageError: A field of view is given for a camera that is no pinhole.
+    """
+    K, width, height = camera.K, camera.width, camera.height
+    if turned:
+        K, width, height = K[[1, 0, 2]][:, [1, 0, 2]], height, width
+    if size is None and fov_y is None:
+        return replace(camera, K=K, width=width, height=height)
+    new_width, new_height = size or (width, height)
+    if fov_y is not None:
+        check_pinhole(camera)
+        fy = 0.5 * new_height / math.tan(0.5 * fov_y)
+    else:
+        fy = K[1, 1] * new_height / height
+    fx, zoom = fy * K[0, 0] / K[1, 1], fy / K[1, 1]
+    cx, cy = (
+        0.5 * new + zoom * (K[i, 2] - 0.5 * old) for i, (new, old) in enumerate(((new_width, width), (new_height, height)))
+    )
+    return replace(camera, K=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), width=new_width, height=new_height)
+
+
+def upright(rig: Rig, camera: Camera) -> Camera:
+    """Return a camera with its centre and axis turned upright, for a rig whose photographs lie on their side."""
+    if not rig.turned:
+        return camera
+    pose = look_at(camera.center, camera.center + camera.viewmat[2, :3], rig.up)
+    return replace(framed(camera, turned=True), viewmat=pose)
+
+
+def _spiral_to_one_side(rig: Rig, cameras: list[Camera], frames: int) -> list[np.ndarray]:
+    """Return poses of two turns that open and close again while moving in and out, all looking at the rig's centre."""
+    center = np.mean([c.center for c in cameras], axis=0)
+    forward = rig.center - center
+    depth = math.sqrt((forward * forward).sum())
+    forward = forward / depth
+    side = np.cross(forward, rig.up)
+    side /= math.sqrt((side * side).sum())
+    up = np.cross(side, forward)
+    offsets = np.array([c.center for c in cameras]) - center
+    spans = [max(0.7 * float(np.abs(matmul(offsets, axis)).max()), 0.03 * depth) for axis in (side, up)]
+    poses = []
+    for t in np.arange(frames) / frames:
+        angle, radius, push = 4 * np.pi * t, np.sin(np.pi * t), 0.15 * depth * np.sin(2 * np.pi * t)
+        eye = center + radius * (spans[0] * np.cos(angle) * side + spans[1] * np.sin(angle) * up) + push * forward
+        poses.append(look_at(eye, rig.center, up))
+    return poses
+
+
+def _turn(rig: Rig, frames: int, turns: int, rise: float) -> list[np.ndarray]:
+    """Return poses on a circle about the rig's centre, or turning round in it; there and back where a circle is too far.
+
+    Args:
+        rig: The rig.
+        frames: Number of poses.
+        turns: Number of times around.
+        rise: Amplitude of the elevation, one wave over the film [rad].
+    """
+    poses = []
+    for t in np.arange(frames) / frames:
+        azimuth = 2 * np.pi * turns * t
+        if rig.span is not None:
+            reach = SWING * max(rig.span[1] - rig.span[0], MIN_SWING)
+            azimuth = 0.5 * (rig.span[0] + rig.span[1]) + 0.5 * reach * math.sin(azimuth)
+        elevation = float(np.clip(rig.elevation + rise * math.sin(2 * np.pi * t), -MAX_ELEVATION, MAX_ELEVATION))
+        direction = rig.direction(azimuth, elevation)
+        if rig.kind == "room":
+            poses.append(look_at(rig.center, rig.center + direction, rig.up))
+        else:
+            poses.append(look_at(rig.center + rig.distance * direction, rig.center, rig.up))
+    return poses
+
+
+def camera_path(kind: str, rig: Rig, cameras: list[Camera], frames: int) -> list[Camera]:
+    """Return cameras along a path, closed to a loop, with the size and intrinsics of the first camera.
+
+    Args:
+        kind: ``turntable``: a level circle at the cameras' distance and elevation, or a swing through their range and back
+            where they stand on one side; in a room a turn on the spot. ``spiral``: two turns that rise and fall; of cameras
+            that look to one side, two turns that open and close again while moving in and out.
+        rig: How the training cameras stand.
         cameras: Training cameras, at least one.
-        depth: Distance from the mean camera to the point looked at [u].
         frames: Number of cameras.
 
     Returns:
-        The cameras, closed to a loop.
+        The cameras; all but those in a room look at the rig's centre.
 
     Raises:
         UsageError: The kind is unknown, or there are no frames.
     """
-    if kind not in ("orbit", "spiral"):
-        raise UsageError(f"path {kind!r} is not one of {', '.join(PATHS)}")
+    if kind not in ("turntable", "spiral"):
+        raise UsageError(f"path {kind!r} is neither turntable nor spiral")
     if frames < 1:
         raise UsageError(f"a film needs at least 1 frame, not {frames}")
-    if np.linalg.norm(np.mean([c.viewmat[2, :3] for c in cameras], axis=0)) < MAX_RING_FORWARD:
-        return _around(kind, cameras, frames)
-    center = np.mean([c.center for c in cameras], axis=0)
-    forward = np.mean([c.viewmat[2, :3] for c in cameras], axis=0)
-    forward = forward / np.linalg.norm(forward)
-    up = -np.mean([c.viewmat[1, :3] for c in cameras], axis=0)
-    side = np.cross(forward, up)
-    side /= np.linalg.norm(side)
-    up = np.cross(side, forward)
-    offsets = np.array([c.center for c in cameras]) - center
-    spans = [max(0.7 * float(np.abs(offsets @ axis).max()), 0.03 * depth) for axis in (side, up)]
-    target = center + depth * forward
-    result = []
-    for t in np.arange(frames) / frames:
-        angle, radius, push = 2 * np.pi * t, 1.0, 0.0
-        if kind == "spiral":
-            angle, radius, push = 4 * np.pi * t, np.sin(np.pi * t), 0.15 * depth * np.sin(2 * np.pi * t)
-        eye = center + radius * (spans[0] * np.cos(angle) * side + spans[1] * np.sin(angle) * up) + push * forward
-        result.append(replace(cameras[0], viewmat=look_at(eye, target, up)))
-    return result
-
-
-def _around(kind: str, cameras: list[Camera], frames: int) -> list[Camera]:
-    """Return cameras on a circle about what cameras all round look at; a spiral makes two turns and rises and falls."""
-    target = focus_point(cameras)
-    offsets = np.array([c.center for c in cameras]) - target
-    up = -np.mean([c.viewmat[1, :3] for c in cameras], axis=0)
-    up /= np.linalg.norm(up)
-    heights = offsets @ up
-    level = offsets - heights[:, None] * up
-    radius = float(np.linalg.norm(level, axis=1).mean())
-    first = level[0] / np.linalg.norm(level[0])
-    second = np.cross(up, first)
-    result = []
-    for t in np.arange(frames) / frames:
-        angle, height = 2 * np.pi * t, heights.mean()
-        if kind == "spiral":
-            angle, height = 4 * np.pi * t, height + heights.std() * np.sin(2 * np.pi * t)
-        eye = target + radius * (np.cos(angle) * first + np.sin(angle) * second) + height * up
-        result.append(replace(cameras[0], viewmat=look_at(eye, target, up)))
-    return result
+    if kind == "turntable":
+        poses = _turn(rig, frames, 1, 0.0)
+    elif rig.kind == "forward":
+        poses = _spiral_to_one_side(rig, cameras, frames)
+    else:
+        poses = _turn(rig, frames, 2, rig.rise)
+    template = framed(cameras[0], turned=rig.turned)
+    return [replace(template, viewmat=pose) for pose in poses]

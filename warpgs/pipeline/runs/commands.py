@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +15,18 @@ from warpgs.files import write_json
 from warpgs.io.splits import Split
 from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.model.compress import drop_unused_sh
-from warpgs.pipeline.runs.camera_paths import PATHS
 from warpgs.pipeline.runs.coverage_report import coverage_lines, coverage_of_run
 from warpgs.pipeline.runs.failed_step import findings, read_failed_step
+from warpgs.pipeline.runs.film_plan import FilmSettings, plan_film
 from warpgs.pipeline.runs.folder import IMAGE_FOLDERS, StoredRun, open_run
 from warpgs.pipeline.runs.image_names import image_names, renaming_notes
-from warpgs.pipeline.runs.paths import COVERAGE, FILM, render_path
+from warpgs.pipeline.runs.paths import COVERAGE, FILM, render_film, sheet_path
 from warpgs.pipeline.runs.request import choose_device, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line
 from warpgs.pipeline.train.background import color_of, over_background
 from warpgs.pipeline.train.loop import train_views
 from warpgs.report.coverage_image import LEGEND
+from warpgs.report.progress import Stages
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Scene, View
 
@@ -103,33 +105,33 @@ def _view_line(row: dict[str, Any]) -> str:
 
 
 def render(
-    folder: Path, kind: str, out: Path | None, frames: int, fps: int, device_name: str, coverage: bool = False, *,
-    background: str = "auto",
+    folder: Path, path: str, out: Path | None, settings: FilmSettings, device_name: str, *,
+    background: str = "auto", coverage: bool = False, sheet: bool = False,
 ) -> list[str]:  # fmt: skip
-    """Render a run along a path to PNG files and a film; returns lines for the user.
+    """Render a run along a path to PNG files and a film, or to a film alone; returns lines for the user.
 
     Args:
         folder: The run folder.
-        kind: views, orbit or spiral.
-        out: Folder to write; None for `path-KIND` in the run folder.
-        frames: Number of frames of an orbit or a spiral.
-        fps: Frames per second of the film.
+        path: One of `PATHS`, or a JSON file of keyframes.
+        out: Folder or film to write; None for `path-PATH` in the run folder.
+        settings: Settings of the film; their background is not looked at.
         device_name: auto, cpu or cuda.
-        coverage: Whether to write images of what no training view saw, too.
         background: Colour behind the scene; auto for that of the fit, and transparent images of cut-out objects.
+        coverage: Whether to write images of what no training view saw, too.
+        sheet: Whether to write six frames in one image, too.
 
     Raises:
-        DataError: The folder is no run.
+        DataError: The folder is no run, or the keyframes cannot be read.
         ResourceError: A file cannot be written.
-        UsageError: The path is unknown, or the background is no colour.
+        UsageError: The path is unknown, the background is no colour, or a number is out of its range.
     """
     color = color_of(background)
     if color is None and background != "auto":
         raise UsageError(f"--background {background}: a render takes auto, black, white, #rrggbb or r,g,b")
-    if kind not in PATHS:
-        raise UsageError(f"path {kind!r} is not one of {', '.join(PATHS)}")
-    out = folder / f"path-{kind}" if out is None else out
-    stored = open_run(folder, device_name)
+    out = folder / f"path-{Path(path).stem}" if out is None else out
+    stored, tell = open_run(folder, device_name), Stages()
+    settings = replace(settings, background=color)
+    plan = plan_film(stored, path, settings)
     training: list[View] | bool = False
     notes = []
     if coverage:
@@ -139,7 +141,11 @@ def render(
             training = True
             notes.append(f"what masks of training views hide counts as seen, since the scene cannot be read: {e}")
         notes.append(f"images in {out / COVERAGE}: {LEGEND}")
-    *files, last = render_path(stored, kind, out=out, frames=frames, fps=fps, background=color, coverage=training)
+    done = render_film(stored, plan, out, settings, coverage=training, sheet=sheet, tell=tell)
+    *files, last = done.files
+    notes += done.notes + ([f"six frames in {sheet_path(out)}"] if sheet else [])
+    if last == out:
+        return [*notes, f"{len(plan.cameras)} frames in {out}"]
     if last.name == FILM:
         return [*notes, f"{len(files)} images and {FILM} in {out}"]
     return [*notes, f"{len(files) + 1} images in {out}; no film, since the views differ in size"]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,43 +15,23 @@ from warpgs.errors import UsageError
 from warpgs.files import make_folder, write_bytes
 from warpgs.pipeline.metrics.coverage_map import MIN_ALPHA, DepthView, coverage_map, depth_views
 from warpgs.pipeline.metrics.coverage_scores import classes_of
-from warpgs.pipeline.runs.camera_paths import PATHS, camera_path
-from warpgs.pipeline.runs.image_names import image_names
+from warpgs.pipeline.runs.film_plan import FilmPlan, FilmSettings, plan_film
+from warpgs.pipeline.runs.frame_check import FrameCheck
 from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.report.coverage_image import coverage_image
-from warpgs.report.film import write_mp4
-from warpgs.report.images import png, straight_alpha
+from warpgs.report.film import SUFFIXES, write_film
+from warpgs.report.images import frame_sheet, png, straight_alpha
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.runtime.terminal import say
-from warpgs.scene import Camera, Gaussians, Render, View
+from warpgs.scene import Camera, Render, View
 
 FILM = "film.mp4"
+SHEET = "sheet.png"
+SHEET_FRAMES = 6
+"""Frames of a sheet, evenly spaced."""
 COVERAGE = "coverage"
 """Subfolder for the images of what training views saw."""
-
-
-@torch.no_grad()
-def _median_depth(gaussians: Gaussians, cameras: list[Camera]) -> float:
-    """Return the median rendered depth [u] over covered pixels of at most five cameras; 1 where nothing is covered."""
-    depths = []
-    for camera in cameras[:: max(1, len(cameras) // 5)]:
-        r = rasterize(gaussians, camera)
-        depths.append(r.depth[r.alpha > 0.5].flatten().cpu().numpy())
-    values = np.concatenate(depths)
-    return float(np.median(values)) if len(values) else 1.0
-
-
-def _named_cameras(model: FittedModel, path: str, frames: int) -> list[tuple[str, Camera]]:
-    """Return the cameras of a path in scene units [u], with the stems of their files."""
-    if path not in PATHS:
-        raise UsageError(f"path {path!r} is not one of {', '.join(PATHS)}")
-    if path == "views":
-        names = image_names(model.scene_cameras)
-        return [(names[n], c) for n, c in model.cameras().items()]
-    train = [model.cameras()[n] for n in model.train]
-    cameras = camera_path(path, train, _median_depth(model.gaussians(), train), frames)
-    return [(f"{i:04d}", c) for i, c in enumerate(cameras)]
 
 
 def _training_depths(model: FittedModel, views: bool | Sequence[View], options: RasterizeOptions) -> list[DepthView]:
@@ -67,29 +48,144 @@ def _covered(image: np.ndarray, render: Render, camera: Camera, training: list[D
     return png(coverage_image(image, classes["0"], classes["1"]))
 
 
+@dataclass(frozen=True)
+class RenderedPath:
+    """Result of `render_film`: files, and lines for the user."""
+
+    files: list[Path]
+    """A PNG for each camera in order, unless only a film was asked for; then the film, if any."""
+    notes: list[str]
+    """Lines for the user on what was chosen, and on frames that show nothing."""
+
+
+def _check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple[bool, bool]:
+    """Return whether ``out`` is a film and not a folder, and whether all frames have one size.
+
+    Raises:
+        UsageError: There is no camera, or something was asked for that cannot be made of these frames or put into that place.
+    """
+    if not plan.cameras:
+        raise UsageError("there is no camera to render; give at least one")
+    alone = out.suffix.lower() in SUFFIXES
+    one_size = len({(c.width, c.height) for _, c in plan.cameras}) == 1
+    if (alone or sheet) and not one_size:
+        raise UsageError(f"{out}: the views differ in size, and a film or a sheet has one; give a size for all, or a folder")
+    if alone and coverage:
+        raise UsageError(f"{out}: images of coverage are PNG files; give a folder")
+    return alone, one_size
+
+
+def sheet_path(out: Path) -> Path:
+    """Return the path of the sheet: in the folder, or beside the film."""
+    return out.with_name(f"{out.stem}-{SHEET}") if out.suffix.lower() in SUFFIXES else out / SHEET
+
+
+def _renders(
+    model: FittedModel, plan: FilmPlan, options: RasterizeOptions, tell: Callable[[str], object] | None
+) -> Iterator[tuple[np.ndarray, Render]]:
+    """Render the frames of a plan; gives the image [H, W, 3] of each, and its render."""
+    gaussians = model.gaussians()
+    for i, (_, camera) in enumerate(plan.cameras):
+        if tell is not None:
+            tell(f"rendering: {i + 1} of {len(plan.cameras)} frames")
+        with torch.no_grad():
+            r = rasterize(gaussians, camera, options)
+        yield r.rgb.cpu().numpy(), r
+
+
+def render_film(
+    model: FittedModel,
+    plan: FilmPlan,
+    out: Path,
+    settings: FilmSettings,
+    *,
+    coverage: bool | Sequence[View] = False,
+    sheet: bool = False,
+    tell: Callable[[str], object] | None = None,
+) -> RenderedPath:
+    """Render the cameras of a plan to files.
+
+    Args:
+        model: The model.
+        plan: The frames.
+        out: Folder for a PNG of each frame and film.mp4; or a film with one of the suffixes of `warpgs.report.film`, which is
+            then all that is written.
+        settings: Settings of the film.
+        coverage: As in `render_path`; of a folder only.
+        sheet: Whether to write six frames in one image, too: sheet.png in the folder, or beside the film.
+        tell: Takes a line on each frame before it is rendered.
+
+    Raises:
+        ResourceError: A file cannot be written, or another process writes into the folder.
+        UsageError: There is no camera, or one film was asked for of images that differ in size.
+    """
+    alone, one_size = _check_plan(plan, out, bool(coverage), sheet)
+    folder, film = (out.parent, out) if alone else (out, out / FILM)
+    options = model.options()
+    if settings.background is not None:
+        options = dataclasses.replace(options, background=model.gaussians().means.new_tensor(settings.background))
+    check, chosen, count = FrameCheck(plan.coverage), [], len(plan.cameras)
+    training = _training_depths(model, coverage, options) if coverage else None
+    cut_out = isinstance(coverage, Sequence) and any(v.alpha is not None for v in coverage)
+    in_sheet = {i * count // SHEET_FRAMES for i in range(SHEET_FRAMES)} if sheet else set()
+    files = [] if alone else [folder / f"{name}.png" for name, _ in plan.cameras]
+
+    def images() -> Iterator[np.ndarray]:
+        for i, (image, r) in enumerate(_renders(model, plan, options, tell)):
+            alpha = r.alpha.cpu().numpy()
+            check.look(image, alpha)
+            if files:
+                straight = model.transparent and settings.background is None
+                write_bytes(files[i], png(straight_alpha(image, alpha, model.background) if straight else image))
+            if training is not None:
+                write_bytes(out / COVERAGE / files[i].name, _covered(image, r, plan.cameras[i][1], training, cut_out))
+            if i in in_sheet:
+                chosen.append(image)
+            yield image
+
+    with hold_folder(folder, *([] if alone else [COVERAGE])) as notes:
+        if training is not None:
+            make_folder(out / COVERAGE)
+        if one_size:
+            write_film(film, images(), settings.fps)
+        else:
+            for _ in images():
+                pass
+        if sheet:
+            write_bytes(sheet_path(out), png(frame_sheet(chosen)))
+    return RenderedPath([*files, film] if one_size else files, [*notes, *plan.notes, *check.notes(plan.remedy)])
+
+
 def render_path(
     model: FittedModel,
-    path: str | Sequence[Camera] = "orbit",
+    path: str | Sequence[Camera] = "auto",
     *,
     out: str | Path,
     units: str = "scene",
-    frames: int = 90,
+    frames: int | None = None,
     fps: int = 30,
+    seconds: float | None = None,
+    size: tuple[int, int] | None = None,
+    fov_y: float | None = None,
     background: tuple[float, float, float] | None = None,
     coverage: bool | Sequence[View] = False,
 ) -> list[Path]:
     """Render a model along a path of cameras to PNG files and, where all images have one size, to a film.
 
     Images of a model whose scene knows its opacity are transparent, with straight alpha, unless a background is named; a film
-    never is.
+    never is. What was chosen, and frames that show nothing, are said on stderr.
 
     Args:
         model: Result of `fit` or `open_run`.
-        path: views (every view of the scene), orbit or spiral; or cameras of your own.
-        out: Folder to write; it may exist.
+        path: views (every view of the scene); turntable, spiral or interpolate (through the training views); auto for what
+            suits how the training cameras stand; the name of a JSON file of keyframes; or cameras of your own.
+        out: Folder to write, which may exist; or a film, .mp4, .webm, .webp or .gif, which is then all that is written.
         units: Units of your own cameras: scene or file.
-        frames: Number of frames of an orbit or a spiral.
+        frames: Number of frames; None for ``seconds`` times ``fps``.
         fps: Frames per second of the film.
+        seconds: Duration of the film; None for what suits the path.
+        size: Width and height of the frames [px]; None for those of the photographs. Not of your own cameras.
+        fov_y: Vertical field of view [rad]; None for that of the photographs. Not of your own cameras.
         background: Colour behind the scene, in [0, 1]; None for that of the fit.
         coverage: Whether to write, into the subfolder coverage, each image with what no training view saw striped in magenta
             and what one saw in amber; or the training views, whose masks then count.
@@ -98,42 +194,17 @@ def render_path(
         The files written: a PNG for each camera in order, then the film, if any; the images of coverage are not among them.
 
     Raises:
+        DataError: A file of keyframes cannot be read.
         ResourceError: A file cannot be written, or another process writes into the folder.
-        UsageError: The path or the units are unknown, or there are no frames.
+        UsageError: The path or the units are unknown, or a number is out of its range.
     """
+    settings = FilmSettings(frames, seconds, fps, size, fov_y, background)
     if isinstance(path, str):
-        cameras = _named_cameras(model, path, frames)
+        plan = plan_film(model, path, settings)
     else:
-        cameras = [(f"{i:04d}", convert_camera(c, model.normalization, units, "scene")) for i, c in enumerate(path)]
-    if not cameras:
-        raise UsageError("there is no camera to render; give at least one")
-    out, gaussians, options = Path(out), model.gaussians(), model.options()
-    files = [out / f"{name}.png" for name, _ in cameras]
-    transparent = model.transparent and background is None
-    if background is not None:
-        options = dataclasses.replace(options, background=gaussians.means.new_tensor(background))
-
-    training = _training_depths(model, coverage, options) if coverage else None
-    cut_out = isinstance(coverage, Sequence) and any(v.alpha is not None for v in coverage)
-
-    def images() -> Iterator[np.ndarray]:
-        for file, (_, camera) in zip(files, cameras):
-            with torch.no_grad():
-                r = rasterize(gaussians, camera, options)
-            image = r.rgb.cpu().numpy()
-            write_bytes(file, png(straight_alpha(image, r.alpha.cpu().numpy(), model.background) if transparent else image))
-            if training is not None:
-                write_bytes(out / COVERAGE / file.name, _covered(image, r, camera, training, cut_out))
-            yield image
-
-    with hold_folder(out, COVERAGE) as notes:
-        if training is not None:
-            make_folder(out / COVERAGE)
-        for note in notes:
-            say(f"warpgs: {note}", error=True)
-        if len({(c.width, c.height) for _, c in cameras}) == 1:
-            write_mp4(out / FILM, images(), fps)
-            return [*files, out / FILM]
-        for _ in images():
-            pass
-    return files
+        own = [(f"{i:04d}", convert_camera(c, model.normalization, units, "scene")) for i, c in enumerate(path)]
+        plan = FilmPlan(own, 0.0, "look at the poses and the units of the cameras", [])
+    done = render_film(model, plan, Path(out), settings, coverage=coverage)
+    for note in done.notes:
+        say(f"warpgs: {note}", error=True)
+    return done.files

@@ -1,0 +1,149 @@
+"""Films: VP9 and animated images hold what they were given, and what is not whole never takes the place of what was there."""
+
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.report.animation import MAX_FPS, _with_one_palette
+from warpgs.report.film import write_film
+
+
+@pytest.mark.parametrize(("name", "shape"), [("a.mp4", (48, 64)), ("a.webm", (49, 65))])
+def test_video_holds_all_frames_in_colour_and_time(tmp_path, capfd, name, shape):
+    """VP9, all frames, odd sides cut, and not a word of the encoder's on the terminal."""
+    path = tmp_path / name
+    colors = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+    frames = (np.broadcast_to(colors[i // 4], (*shape, 3)) for i in range(12))
+    assert write_film(path, frames, fps=24) == 12 and capfd.readouterr().err == ""
+    film = cv2.VideoCapture(str(path))
+    assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 12 and film.get(cv2.CAP_PROP_FPS) == pytest.approx(24)
+    assert int(film.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").lower() in (b"vp09", b"vp90")
+    read = []
+    while (got := film.read())[0]:
+        read.append(got[1][..., ::-1])
+    film.release()
+    assert len(read) == 12 and read[0].shape == (48, 64, 3)
+    assert [int(f.mean((0, 1)).argmax()) for f in read] == [i // 4 for i in range(12)]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_film_without_frames_or_folder_says_so(tmp_path):
+    with pytest.raises(DataError, match="no frames"):
+        write_film(tmp_path / "a.mp4", [])
+    with pytest.raises(ResourceError, match="cannot be written"):
+        write_film(tmp_path / "no" / "a.mp4", [np.zeros((16, 16, 3))])
+
+
+def test_a_film_that_breaks_off_leaves_the_old_one(tmp_path):
+    path = tmp_path / "a.mp4"
+    path.write_bytes(b"old")
+
+    def frames():
+        yield np.zeros((16, 16, 3))
+        raise RuntimeError("renderer")
+
+    with pytest.raises(RuntimeError, match="renderer"):
+        write_film(path, frames())
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_frames_of_two_sizes_are_refused(tmp_path):
+    with pytest.raises(DataError, match="frame 1 is 32 x 32 px, the first 16 x 16 px"):
+        write_film(tmp_path / "a.mp4", [np.zeros((16, 16, 3)), np.zeros((32, 32, 3))])
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_film_that_did_not_fit_on_the_disk_leaves_the_old_one(tmp_path):
+    """The encoder reports nothing when a write fails; a limit on the size of files stands for a full disk."""
+    resource = pytest.importorskip("resource", reason="Windows has no limit on the size of files")
+    path, noise = tmp_path / "a.mp4", np.random.default_rng(0).uniform(size=(20, 64, 64, 3))
+    write_film(path, np.zeros((3, 16, 16, 3)))
+    old, limits = path.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    try:
+        with pytest.raises(ResourceError, match=r"a\.mp4: cannot be written.* of 20 frames"):
+            write_film(path, noise)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_bytes() == old and list(tmp_path.iterdir()) == [path]
+    assert write_film(path, noise) == 20 and path.read_bytes() != old
+
+
+def test_an_encoder_that_drops_frames_is_noticed(tmp_path, monkeypatch):
+    """A frame that never reaches the file is missed when the film is read back."""
+    path, made = tmp_path / "a.mp4", cv2.VideoWriter
+    path.write_bytes(b"old")
+
+    def forgetful(*arguments):
+        writer, seen = made(*arguments), []
+        write = lambda frame: seen.append(1) or len(seen) == 2 or writer.write(frame)  # noqa: E731
+        return SimpleNamespace(isOpened=writer.isOpened, release=writer.release, write=write)
+
+    monkeypatch.setattr(cv2, "VideoWriter", forgetful)
+    with pytest.raises(ResourceError, match="3 of 4 frames"):
+        write_film(path, np.zeros((4, 16, 16, 3)))
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".gif"])
+def test_animation_holds_all_frames_in_colour_and_time(tmp_path, suffix):
+    """It loops for ever, lasts as long as it should, and its colours are near; odd sides stay."""
+    path, ramp = tmp_path / f"a{suffix}", np.linspace(0.2, 0.9, 65, dtype=np.float32)
+    frames = [np.stack([ramp * (i + 1) / 7, ramp[::-1], np.full(65, 0.3)], 1)[None].repeat(49, 0) for i in range(7)]
+    assert write_film(path, iter(frames), fps=24) == 7
+    with Image.open(path) as image:
+        assert image.n_frames == 7 and image.size == (65, 49) and image.info["loop"] == 0
+        lasts = 0
+        for i, frame in enumerate(frames):
+            image.seek(i)
+            got = np.asarray(image.convert("RGB"), np.float32) / 255
+            lasts += image.info["duration"]
+            assert np.abs(got.mean((0, 1)) - frame.mean((0, 1))).max() < 0.02
+        assert abs(lasts - 7000 / 24) <= 10
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_all_frames_of_a_gif_have_one_palette():
+    """Else what stands still would flicker."""
+    frames = [np.full((6, 6, 3), 40 * i, np.uint8) for i in range(5)]
+    assert len({bytes(image.getpalette()) for image in _with_one_palette(frames)}) == 1
+
+
+def test_still_frames_of_an_animation_are_one(tmp_path):
+    """What does not move is no fault."""
+    assert write_film(tmp_path / "a.gif", np.zeros((3, 8, 8, 3))) == 3
+    assert write_film(tmp_path / "a.webp", np.zeros((3, 8, 8, 3))) == 3
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".gif"])
+def test_an_animation_that_breaks_off_leaves_the_old_one(tmp_path, monkeypatch, suffix):
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(b"old")
+
+    def broken(self, target, **options):
+        target.write(b"half")
+        raise OSError("encoder")
+
+    monkeypatch.setattr(Image.Image, "save", broken)
+    with pytest.raises(ResourceError, match="could not be encoded"):
+        write_film(path, np.zeros((2, 8, 8, 3)))
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_films_that_cannot_be_are_refused(tmp_path, monkeypatch):
+    with pytest.raises(UsageError, match=r"one of .mp4, .webm, .webp, .gif, not .avi"):
+        write_film(tmp_path / "a.avi", np.zeros((2, 8, 8, 3)))
+    with pytest.raises(UsageError, match=f"at most {MAX_FPS} frames per second"):
+        write_film(tmp_path / "a.gif", np.zeros((2, 8, 8, 3)), fps=MAX_FPS + 1)
+    with pytest.raises(DataError, match="no frames"):
+        write_film(tmp_path / "a.webp", [])
+    with pytest.raises(DataError, match="frame 1 is 32 x 32 px, the first 16 x 16 px"):
+        write_film(tmp_path / "a.gif", [np.zeros((16, 16, 3)), np.zeros((32, 32, 3))])
+    monkeypatch.setattr("warpgs.report.animation.MAX_BYTES", 500)
+    with pytest.raises(UsageError, match="at most 2 frames of this size"):
+        write_film(tmp_path / "a.gif", np.zeros((9, 8, 8, 3)))
+    assert not list(tmp_path.iterdir())

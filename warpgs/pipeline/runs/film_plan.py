@@ -1,0 +1,174 @@
+"""Plans of films: which cameras a path has for a model, and what was chosen for the user."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from warpgs.errors import UsageError
+from warpgs.pipeline.runs.camera_paths import BY_KIND, LIMITS, camera_path, framed, upright
+from warpgs.pipeline.runs.image_names import image_names
+from warpgs.pipeline.runs.keyframes import read_keyframes, through
+from warpgs.pipeline.runs.model_file import FittedModel
+from warpgs.pipeline.runs.rig import Rig, rig_of
+from warpgs.pipeline.runs.view_tour import tour_of
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.scene import Camera, Gaussians
+
+PATHS = ("auto", "views", "turntable", "spiral", "interpolate")
+"""Names of paths; the name of a JSON file of keyframes is one, too."""
+SECONDS = 3.0
+"""Duration of a film where none is given."""
+VIEW_SECONDS, MAX_SECONDS = 0.5, 20.0
+"""Duration of a film through training views: for each view, and at most."""
+MIN_FRAMES_PER_VIEW = 4
+"""Frames from one training view to the next; where a film has fewer, it passes through some of the views only."""
+MAX_FRAMES = 1_000_000
+
+
+@dataclass(frozen=True)
+class FilmSettings:
+    """Settings of a film."""
+
+    frames: int | None = None
+    """Number of frames; None for seconds times fps. The views of a scene and cameras of one's own are as many as they are."""
+    seconds: float | None = None
+    """Duration [s]; None for what suits the path."""
+    fps: int = 30
+    """Frames per second."""
+    size: tuple[int, int] | None = None
+    """Width and height [px]; None for those of the photographs."""
+    fov_y: float | None = None
+    """Vertical field of view [rad]; None for that of the photographs."""
+    background: tuple[float, float, float] | None = None
+    """Colour behind the scene, in [0, 1]; None for that of the fit."""
+
+    def __post_init__(self) -> None:
+        """Check what can be checked before any work.
+
+        Raises:
+            UsageError: A number is out of its range.
+        """
+        low, high = LIMITS["width"]
+        if self.size is not None and not all(low <= s <= high for s in self.size):
+            raise UsageError(f"a film of {self.size[0]} x {self.size[1]} px: each side takes {low} to {high} px")
+        narrow, wide = (math.radians(v) for v in LIMITS["fov"])
+        if self.fov_y is not None and not narrow <= self.fov_y <= wide:
+            raise UsageError(
+                f"a field of view of {math.degrees(self.fov_y):g} degrees: give {LIMITS['fov'][0]:g} to {LIMITS['fov'][1]:g}"
+            )
+        if self.seconds is not None and not 0 < self.seconds * self.fps <= MAX_FRAMES:
+            raise UsageError(f"a film of {self.seconds:g} s: give more than 0, and at most {MAX_FRAMES:,} frames")
+        if self.frames is not None and not 1 <= self.frames <= MAX_FRAMES:
+            raise UsageError(f"a film needs at least 1 frame and takes at most {MAX_FRAMES:,}, not {self.frames}")
+
+    def count(self, seconds: float) -> int:
+        """Return the number of frames of a film that lasts ``seconds`` where no duration is given."""
+        if self.frames is not None:
+            return self.frames
+        return min(max(1, round((self.seconds or seconds) * self.fps)), MAX_FRAMES)
+
+
+@dataclass(frozen=True)
+class FilmPlan:
+    """The frames of a film before they are rendered."""
+
+    cameras: list[tuple[str, Camera]]
+    """Stem of the file and camera of each frame, in scene units [u]."""
+    coverage: float
+    """Fraction of a training view's pixels that the model covers; 0 where that is not known."""
+    remedy: str
+    """Advice for frames that show nothing."""
+    notes: list[str]
+    """Lines for the user on what was chosen."""
+
+
+@torch.no_grad()
+def depth_and_coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> tuple[float, float]:
+    """Return the median rendered depth [u] over covered pixels and the median alpha of at most five cameras' images.
+
+    The depth is 1 where nothing is covered.
+    """
+    depths, alphas = [], []
+    for camera in cameras[:: max(1, len(cameras) // 5)]:
+        r = rasterize(gaussians, camera, options)
+        alpha = r.alpha.cpu().numpy()
+        depths.append(r.depth.cpu().numpy()[alpha > 0.5])
+        alphas.append(float(alpha.mean(dtype=np.float64)))
+    values = np.concatenate(depths)
+    return float(np.median(values)) if len(values) else 1.0, float(np.median(alphas))
+
+
+def _tour(rig: Rig, train: list[Camera], settings: FilmSettings) -> tuple[list[Camera], str]:
+    """Return the cameras of a film through training views, and how it goes in words."""
+    frames = settings.count(min(max(SECONDS, VIEW_SECONDS * len(train)), MAX_SECONDS))
+    cameras = [upright(rig, c) for c in train]
+    reaches = [rig.reach(c) for c in train]
+    tour = tour_of(cameras, reaches, frames / settings.fps, max(2, frames // MIN_FRAMES_PER_VIEW))
+    count = len(tour.keyframes) - tour.closed
+    words = "in the order of their names" if tour.by_name else "from neighbour to neighbour"
+    back = ", and back to the first" if tour.closed else ""
+    cameras = through(tour.keyframes, frames, closed=tour.closed)
+    return cameras, f"path interpolate: through {count} of {len(train)} training views {words}{back}"
+
+
+def _keyframes(model: FittedModel, path: Path, rig: Rig, first: Camera, settings: FilmSettings) -> tuple[list[Camera], str]:
+    """Return the cameras of a film through the keyframes of a file, and how it goes."""
+    if settings.fov_y is not None:
+        raise UsageError(f"{path}: keyframes have fields of view of their own; leave out --fov")
+    keyframes = read_keyframes(path, framed(first, settings.size), model.normalization)
+    if rig.is_watched([k.camera for k in keyframes]):  # then the path goes around it, and not across
+        keyframes = [replace(k, reach=rig.reach(k.camera)) for k in keyframes]
+    last = keyframes[-1].seconds
+    cameras = through(keyframes, settings.count(last + 1 / settings.fps))
+    return cameras, f"path of {len(keyframes)} keyframes over {last:g} s"
+
+
+def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan:
+    """Return the cameras of a path for a model.
+
+    Args:
+        model: The model.
+        path: One of `PATHS`, or the name of a JSON file of keyframes.
+        settings: Settings of the film.
+
+    Raises:
+        DataError: The file of keyframes cannot be read.
+        UsageError: The path is unknown.
+    """
+    if path not in PATHS and not path.lower().endswith(".json"):
+        raise UsageError(f"path {path!r} is not one of {', '.join(PATHS)}, and no .json file of keyframes")
+    scene = model.cameras()
+    train = [scene[n] for n in model.train]
+    depth, coverage = depth_and_coverage(model.gaussians(), train, model.options())
+    if path == "views":
+        names = image_names(scene)
+        shown = [(names[n], framed(c, settings.size, settings.fov_y)) for n, c in scene.items()]
+        return FilmPlan(shown, coverage, "the model shows nothing there: `warpgs eval` scores each view", [])
+    rig = rig_of(train, depth)
+    if path.lower().endswith(".json"):
+        cameras, words = _keyframes(model, Path(path), rig, train[0], settings)
+        remedy = "c2w of keyframes is camera-to-world in OpenCV axes, in the units of the scene's files"
+        return FilmPlan(_numbered(cameras), coverage, remedy, [words])
+    notes = [f"{len(train)} training cameras look {rig.describe()}"]
+    if rig.turned:
+        notes.append("the photographs lie on their side; the film is upright, by the plane that the cameras stand in")
+    kind = BY_KIND[rig.kind] if path == "auto" else path
+    if kind == "interpolate":
+        cameras, words = _tour(rig, train, settings)
+        remedy = "the model shows nothing there: `warpgs eval` scores each view"
+    else:
+        cameras = camera_path(kind, rig, train, settings.count(SECONDS))
+        there_and_back = " there and back over what the cameras saw" if rig.span is not None and kind == "turntable" else ""
+        words = f"path {kind}{there_and_back}"
+        remedy = "--path interpolate stays at the training views"
+    cameras = [framed(c, settings.size, settings.fov_y) for c in cameras]
+    return FilmPlan(_numbered(cameras), coverage, remedy, [*notes, words])
+
+
+def _numbered(cameras: list[Camera]) -> list[tuple[str, Camera]]:
+    return [(f"{i:04d}", c) for i, c in enumerate(cameras)]

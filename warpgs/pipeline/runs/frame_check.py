@@ -1,0 +1,61 @@
+"""Frames of a film that show nothing, noticed while they are rendered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+EMPTY = 0.1
+"""Mean alpha of a frame that shows nearly nothing, as a fraction of that of the training views' renders."""
+MIN_COVERAGE = 0.002
+"""Mean alpha below which any frame shows nearly nothing."""
+BLACK = 1 / 255
+"""Mean of the brightest channel below which a frame is black."""
+
+
+def _ranges(numbers: list[int]) -> str:
+    """Return rising numbers in words: 3 to 7, 9 and 12 to 20; after five ranges the rest is counted."""
+    runs: list[list[int]] = []
+    for n in numbers:
+        if runs and n == runs[-1][1] + 1:
+            runs[-1][1] = n
+        else:
+            runs.append([n, n])
+    words = [str(a) if a == b else f"{a} to {b}" for a, b in runs[:5]]
+    if len(runs) > 5:
+        words.append(f"{sum(b - a + 1 for a, b in runs[5:])} more")
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+@dataclass
+class FrameCheck:
+    """Faults of the frames of a film, noticed while they are rendered."""
+
+    coverage: float
+    """Mean alpha of the training views' renders; 0 where that is not known."""
+    empty: list[int] = field(default_factory=list)
+    """Numbers of the frames that show nearly nothing."""
+    black: list[int] = field(default_factory=list)
+    """Numbers of the other frames that are black."""
+    count: int = 0
+    """Number of frames looked at."""
+
+    def look(self, image: np.ndarray, alpha: np.ndarray) -> None:
+        """Look at the next frame, image [H, W, 3] and alpha [H, W] in [0, 1]."""
+        if float(alpha.mean(dtype=np.float64)) < max(EMPTY * self.coverage, MIN_COVERAGE):
+            self.empty.append(self.count)
+        elif float(image.max(2).mean(dtype=np.float64)) < BLACK:
+            self.black.append(self.count)
+        self.count += 1
+
+    def notes(self, remedy: str) -> list[str]:
+        """Return a line for the user on each fault, with what to do."""
+        return [
+            f"{len(numbers)} of {self.count} frames {words}, numbers {_ranges(numbers)}: {advice}"
+            for numbers, words, advice in (
+                (self.empty, "show nearly nothing", f"the path leaves what the photographs saw; {remedy}"),
+                (self.black, "are black", f"something black stands before the camera, or nothing is lit there; {remedy}"),
+            )
+            if numbers
+        ]

@@ -1,0 +1,139 @@
+"""Plots of a run: its cameras among its Gaussians or start points, in their colours or by how many views saw them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from warpgs.errors import DataError, UsageError
+from warpgs.files import write_bytes
+from warpgs.geometry import rotation_matrices
+from warpgs.kernels.sh import C0
+from warpgs.pipeline.model.coverage import coverage
+from warpgs.pipeline.runs.commands import scene_of
+from warpgs.pipeline.runs.film_plan import depth_and_coverage
+from warpgs.pipeline.runs.folder import StoredRun, open_run
+from warpgs.pipeline.runs.rig import Rig, rig_of
+from warpgs.report.scene_plot import ScenePlot, render_plot
+from warpgs.runtime.folder_lock import hold_folder
+from warpgs.scene import Camera
+
+PLOT = "plot.png"
+POINTS, COLORS, BACKGROUNDS = ("gaussians", "start"), ("own", "coverage"), ("white", "black")
+SIZES = (64, 8192)
+"""Smallest and largest side of a plot [px]."""
+MIN_OPACITY = 0.1
+"""Least opacity of a Gaussian that is shown: fainter ones are seen by nobody."""
+MAX_POINTS = {"gaussians": 50_000, "start": 300_000}
+"""Number of Gaussians and of points shown; of more, a sample."""
+CLASSES = (
+    (0, "seen by no training view", "#d6219c"), (1, "by 1", "#f0a020"), (2, "by 2", "#a6bf3a"), (3, "by 3 to 5", "#2fa37c"),
+    (6, "by 6 and more", "#2878b5"),
+)  # fmt: skip
+"""Least number of training views, words and colour of each class of coverage."""
+
+
+@dataclass(frozen=True)
+class PlotSettings:
+    """Settings of a plot."""
+
+    points: str = "gaussians"
+    """Points shown: gaussians, or start (the points of the scene's reconstruction)."""
+    color: str = "own"
+    """Colour of the points: own, or coverage (how many training views see a Gaussian)."""
+    background: str = "white"
+    """Background: white or black."""
+    size: tuple[int, int] = (1600, 1000)
+    """Width and height [px]."""
+    cameras: bool = True
+    """True where cameras are shown."""
+
+    def __post_init__(self) -> None:
+        """Check what can be checked before any work.
+
+        Raises:
+            UsageError: A value is none of those there are.
+        """
+        for flag, value, known in (
+            ("--points", self.points, POINTS), ("--color", self.color, COLORS), ("--background", self.background, BACKGROUNDS),
+        ):  # fmt: skip
+            if value not in known:
+                raise UsageError(f"{flag} {value}: give one of {', '.join(known)}")
+        if not all(SIZES[0] <= s <= SIZES[1] for s in self.size):
+            raise UsageError(f"--size {self.size[0]} {self.size[1]}: each side takes {SIZES[0]} to {SIZES[1]} px")
+        if self.points == "start" and self.color == "coverage":
+            raise UsageError("--color coverage: coverage is measured of Gaussians; leave out --points start")
+
+
+def _gaussians(stored: StoredRun, train: list[Camera], by_coverage: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return positions [N, 3], colours [N, 3] and axes [N, 3, 3] of the Gaussians that can be seen."""
+    gaussians = stored.gaussians()
+    shown = (torch.sigmoid(gaussians.logit_opacities) >= MIN_OPACITY).cpu()
+    if not by_coverage:
+        colors = np.clip(C0 * gaussians.sh[:, 0].cpu().numpy() + 0.5, 0, 1)
+    else:
+        tensors = [replace(c, viewmat=gaussians.means.new_tensor(c.viewmat), K=gaussians.means.new_tensor(c.K)) for c in train]
+        views = coverage(gaussians, tensors, stored.options()).views.cpu().numpy()
+        lowest, palette = np.array([c[0] for c in CLASSES]), [c[2] for c in CLASSES]
+        values = np.array([[int(c[i : i + 2], 16) / 255 for i in (1, 3, 5)] for c in palette])
+        colors = values[np.searchsorted(lowest, views, side="right") - 1]
+    means, quats, log_scales = (t.detach().cpu().double() for t in (gaussians.means, gaussians.quats, gaussians.log_scales))
+    rotations = rotation_matrices(torch.nn.functional.normalize(quats[shown], dim=1).numpy())
+    return means[shown].numpy(), colors[shown.numpy()], rotations * np.exp(log_scales[shown].numpy())[:, None]
+
+
+def _start(stored: StoredRun) -> tuple[np.ndarray, np.ndarray, None]:
+    """Return positions [N, 3] and colours [N, 3] of the points of the scene's reconstruction."""
+    scene, _, _ = scene_of(stored)
+    if scene.points is None or not len(scene.points):
+        raise DataError(f"{scene.path}: its format ({scene.format}) brings no points; leave out --points start")
+    return scene.points.points, scene.points.colors, None
+
+
+def _eye(rig: Rig) -> np.ndarray:
+    """Return the direction [3] from the scene to the eye: aslant from above, behind cameras that look to one side."""
+    azimuth = 0.0 if rig.span is None else 0.5 * (rig.span[0] + rig.span[1])
+    return rig.direction(azimuth + 0.7, max(rig.elevation + 0.35, 0.5))
+
+
+def plot(folder: Path, out: Path | None, settings: PlotSettings, device_name: str = "auto") -> list[str]:
+    """Write a plot of a run as PNG; returns lines for the user.
+
+    Args:
+        folder: The run folder.
+        out: File to write, .png; None for plot.png in the run folder.
+        settings: Contents and looks.
+        device_name: auto, cpu or cuda.
+
+    Raises:
+        DataError: The folder is no run, or the scene has no points to show.
+        ResourceError: This machine cannot render, or the file cannot be written.
+        UsageError: The file is no .png.
+    """
+    out = folder / PLOT if out is None else out
+    if out.suffix.lower() != ".png":
+        raise UsageError(f"{out}: a plot is a .png file; name one")
+    stored = open_run(folder, device_name)
+    cameras = stored.cameras()
+    train, test = ([cameras[n] for n in names] for names in (stored.train, stored.test))
+    depth, _ = depth_and_coverage(stored.gaussians(), train, stored.options())
+    rig = rig_of(train, depth)
+    by_coverage = settings.color == "coverage"
+    points, colors, axes = _start(stored) if settings.points == "start" else _gaussians(stored, train, by_coverage)
+    if not len(points):
+        raise DataError(f"{folder}: no Gaussian has an opacity of {MIN_OPACITY} or more; there is nothing to show")
+    most = MAX_POINTS[settings.points]
+    notes = [] if len(points) <= most else [f"a sample of {most:,} of {len(points):,} is shown"]
+    chosen = np.sort(np.random.default_rng(0).permutation(len(points))[:most])
+    shown = (train, test) if settings.cameras else ([], [])
+    legend = [(words, color) for _, words, color in CLASSES] if by_coverage else []
+    axes = None if axes is None else axes[chosen]
+    contents = ScenePlot(points[chosen], colors[chosen], axes, *shown, rig.up, _eye(rig), legend)
+    data = render_plot(contents, settings.size, settings.background)
+    with hold_folder(out.parent) as held:
+        write_bytes(out, data)
+    what = "points of the reconstruction" if settings.points == "start" else "Gaussians"
+    return [*held, *notes, f"{len(points):,} {what}, {len(train)} training and {len(test)} held-out cameras in {out}"]
