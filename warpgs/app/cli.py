@@ -18,6 +18,7 @@ COMMANDS = {
     "render": "render a run: its views, an orbit or a spiral, as PNG and mp4",
     "export": "write a run's Gaussians to a PLY file",
     "prune": "shrink a finished model as far as its training views allow, into a new run folder",
+    "poses": "find camera poses of photographs or a video, and write them as a scene folder",
     "priors": "look at what is known before a fit (priors show), or write networks as ONNX (priors export)",
     "compare": "fit presets to scenes with several seeds; tables, plot and figure of the differences",
     "ablate": "fit a preset with its parts off one at a time; the same tables, plot and figure",
