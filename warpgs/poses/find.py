@@ -133,8 +133,8 @@ def _prepared(
     if len(paths) < MIN_PHOTOGRAPHS:
         what = "frame" if is_video(source) else "photograph"
         raise DataError(
-            f"{source}: has {len(paths)} {what}{'s' if len(paths) != 1 else ''}; poses need at least {MIN_PHOTOGRAPHS}, better 8 "
-            "to 20 that overlap by two thirds"
+            f"{source}: has {len(paths)} {what}{'s' if len(paths) != 1 else ''}; poses need at least {MIN_PHOTOGRAPHS}, "
+            "better 8 to 20 that overlap by two thirds"
         )
     photographs, names = [], []
     for i, path in enumerate(paths):

@@ -17,6 +17,7 @@ import numpy as np
 
 import warpgs
 from warpgs.errors import ResourceError, UsageError
+from warpgs.files import write_json
 from warpgs.poses.photographs import MATCHING_SIDE, Photograph
 
 EXHAUSTIVE = 60
@@ -53,7 +54,7 @@ class FoundCamera:
 
 @dataclass(frozen=True)
 class Mapping:
-    """What structure from motion made of photographs; these are known by their number in the order of their names."""
+    """Result of structure from motion; photographs are known by their number in the order of their names."""
 
     keypoints: tuple[int, ...]
     """Number of SIFT keypoints of each photograph."""
@@ -115,7 +116,7 @@ def _job(photographs: list[Photograph], names: list[str], kind: str, folder: Pat
 def _lines(job: dict[str, Any], folder: Path) -> Iterator[dict[str, Any]]:
     """Yield what the worker says, and end it where nobody listens any more."""
     path = folder / "job.json"
-    path.write_text(json.dumps(job), "utf-8")
+    write_json(path, job)
     home = str(Path(warpgs.__file__).parent.parent)
     search = os.pathsep.join(p for p in (home, os.environ.get("PYTHONPATH", "")) if p)
     environment = os.environ | {

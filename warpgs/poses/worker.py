@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from warpgs.files import write_text
 from warpgs.poses.pairs import choose_pairs
 
 SEED = 0
@@ -67,8 +68,7 @@ def match(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
     step = max(1, len(pairs) // 20)
     for begin in range(0, len(pairs), step):
         _say(progress=f"matching: pair {begin + 1} of {len(pairs)}")
-        with listed.open("w", encoding="utf-8") as f:
-            f.write("".join(f"{job['names'][i]} {job['names'][j]}\n" for i, j in pairs[begin : begin + step]))
+        write_text(listed, "".join(f"{job['names'][i]} {job['names'][j]}\n" for i, j in pairs[begin : begin + step]))
         pycolmap.match_image_pairs(job["database"], matching, chosen, verification, pycolmap.Device.cpu)
     _say(progress="checking matches against the motion of a camera")
     verifier = pycolmap.GeometricVerifierOptions()
@@ -149,7 +149,7 @@ def main(path: str) -> None:
     """Run the job in a file."""
     import pycolmap
 
-    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value) if hasattr(pycolmap.logging.FATAL, "value") else 3
+    pycolmap.logging.minloglevel = 2  # errors
     job = json.loads(Path(path).read_text("utf-8"))
     pycolmap.set_random_seed(SEED)
     extract(pycolmap, job)
