@@ -36,7 +36,7 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
     if request.reader is not None or not request.path or not needs_poses(source):
         return request, []
     if out is None:
-        raise UsageError(f"{source}: no cameras there; those found stay in the run folder: give out, or use `warpgs poses`")
+        raise UsageError(f"{source}: holds no cameras; those found stay in the run: give out, or use `warpgs poses`")
     scene = out / POSED_SCENE
     if (scene / JSON).is_file():
         record = read_record(scene)

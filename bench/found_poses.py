@@ -1,0 +1,129 @@
+"""Fits with found poses beside fits with given ones: held-out PSNR of the same photographs, and how far the poses are apart.
+
+usage: python -m bench.found_poses SCENE [--train 17 6 3] [--seeds 0 1 2] [--preset quick] [--downscale 4] --out FILE.json
+SCENE is a COLMAP folder whose poses count as given, such as colmap/fern. Every eighth photograph is held out; of the others
+so many train, evenly spaced. Poses are found twice: jointly, of training and held-out photographs, as the given ones were; and of the
+training photographs alone, where held-out cameras are the given ones, brought over by the similarity of the training cameras.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import statistics
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import warpgs
+from bench import result_file
+from warpgs.pipeline.runs.request import choose_device
+from warpgs.poses.find import find_poses
+from warpgs.scene import Camera, Scene, View
+
+HOLD_EVERY = 8
+
+
+def chosen(names: list[str], train: int) -> tuple[list[str], list[str]]:
+    """Return the names of training and held-out photographs."""
+    test, pool = names[::HOLD_EVERY], [n for i, n in enumerate(names) if i % HOLD_EVERY]
+    return [pool[round(x)] for x in np.linspace(0, len(pool) - 1, train)], test
+
+
+def found_scene(images: Path, names: list[str], downscale: int) -> tuple[Scene, dict]:
+    """Return the scene found from some photographs, the record of its poses, and the seconds it took in it."""
+    with tempfile.TemporaryDirectory() as folder:
+        source, began = Path(folder) / "in", time.perf_counter()
+        source.mkdir()
+        for name in names:
+            (source / name).write_bytes((images / name).read_bytes())
+        record = find_poses(source, Path(folder) / "scene", threads=2)
+        record["seconds"] = time.perf_counter() - began
+        return warpgs.load_scene(Path(folder) / "scene", downscale=downscale), record
+
+
+def similarity(of: dict[str, View], to: dict[str, View]) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return scale, rotation [3, 3] and translation [3] that bring cameras of one scene to those of the same name elsewhere."""
+    names = sorted(of.keys() & to.keys())
+    turns = sum(to[n].camera.viewmat[:3, :3].T @ of[n].camera.viewmat[:3, :3] for n in names)
+    u, _, vt = np.linalg.svd(turns)
+    R = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    a, b = (np.array([views[n].camera.center for n in names]) for views in (of, to))
+    s = float(((b - b.mean(0)) * ((a - a.mean(0)) @ R.T)).sum() / ((a - a.mean(0)) ** 2).sum())
+    return s, R, b.mean(0) - s * R @ a.mean(0)
+
+
+def moved(camera: Camera, transform: tuple[float, np.ndarray, np.ndarray]) -> Camera:
+    """Return a camera after a similarity."""
+    s, R, t = transform
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = camera.viewmat[:3, :3] @ R.T
+    viewmat[:3, 3] = -viewmat[:3, :3] @ (s * R @ camera.center + t)
+    return replace(camera, viewmat=viewmat)
+
+
+def errors(of: dict[str, View], to: dict[str, View]) -> dict[str, float]:
+    """Return how far cameras are from those of another scene after the similarity: degrees, and parts of the mean distance."""
+    names, transform = sorted(of.keys() & to.keys()), similarity(of, to)
+    cameras = {n: moved(of[n].camera, transform) for n in names}
+    centers = np.array([to[n].camera.center for n in names])
+    spread = np.linalg.norm(centers - centers.mean(0), axis=1).mean()
+    cosines = [(np.trace(to[n].camera.viewmat[:3, :3] @ cameras[n].viewmat[:3, :3].T) - 1) / 2 for n in names]
+    angles = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    offsets = np.linalg.norm([cameras[n].center - to[n].camera.center for n in names], axis=1) / spread
+    return {"degrees": float(np.median(angles)), "degrees_max": float(angles.max()), "offset": float(np.median(offsets))}
+
+
+def psnr(scene: Scene, train: list[str], test: list[str], preset: str, seed: int, device: str) -> float:
+    """Return the held-out PSNR of one fit [dB]."""
+    config = replace(warpgs.PRESETS[preset], seed=seed)
+    split = f"train={','.join(train)};test={','.join(test)}"
+    return float(warpgs.fit(scene, config, split=split, device=device, verbose=False).metrics["test"]["psnr"])
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--train", type=int, nargs="+", default=[17, 6, 3])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--preset", default="quick")
+    parser.add_argument("--downscale", type=int, default=4)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--out", type=Path)
+    a = parser.parse_args()
+    given, rows = warpgs.load_scene(a.scene, downscale=a.downscale), []
+    reference = {v.name: v for v in given.views}
+    for count in a.train:
+        train, test = chosen(list(reference), count)
+        joint, joint_record = found_scene(a.scene / "images", [*train, *test], a.downscale)
+        alone, alone_record = found_scene(a.scene / "images", train, a.downscale)
+        mine = {v.name: v for v in alone.views}
+        over = similarity({n: reference[n] for n in train}, mine)
+        aligned = replace(
+            alone, views=(*alone.views, *(replace(reference[n], camera=moved(reference[n].camera, over)) for n in test))
+        )
+        for poses, scene, record in (
+            ("given", given, None),
+            ("joint", joint, joint_record),
+            ("aligned", aligned, alone_record),
+        ):
+            scores = [psnr(scene, train, test, a.preset, seed, a.device) for seed in a.seeds]
+            row = {"poses": poses, "train": count, "held_out": len(test), "psnr": scores, "preset": a.preset, "seeds": a.seeds,
+                   "downscale": a.downscale}  # fmt: skip
+            if record is not None:
+                row |= errors({v.name: v for v in (joint if poses == "joint" else alone).views}, reference)
+                row |= {k: record[k] for k in ("mean_reprojection_error_px", "points", "seconds")}
+                row["registered"] = sum(p["registered"] for p in record["photographs"])
+            rows.append(row)
+            deviation = statistics.stdev(scores) if len(scores) > 1 else math.nan
+            print(f"{count} views, {poses} poses: {statistics.mean(scores):.2f} dB (sd {deviation:.2f})", flush=True)
+            what = "held-out PSNR with given and with found poses of the same photographs"
+            result_file.write(a.out, result_file.result(what, choose_device(a.device)[0], rows))
+
+
+if __name__ == "__main__":
+    main()
