@@ -2,8 +2,9 @@
 
 usage: python -m bench.found_poses SCENE [--train 17 6 3] [--seeds 0 1 2] [--preset quick] [--downscale 4] --out FILE.json
 SCENE is a COLMAP folder whose poses count as given, such as colmap/fern. Every eighth photograph is held out; of the others
-so many train, evenly spaced. Poses are found twice: jointly, of training and held-out photographs, as the given ones were; and of the
-training photographs alone, where held-out cameras are the given ones, brought over by the similarity of the training cameras.
+so many train, evenly spaced. Poses are found twice: jointly, of training and held-out photographs, as the given ones were; and
+of the training photographs alone, where held-out cameras are the given ones, brought over by the similarity of the training
+cameras.
 """
 
 from __future__ import annotations

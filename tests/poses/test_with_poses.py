@@ -38,5 +38,5 @@ def test_poses_are_kept_in_the_run_folder(tmp_path, photographs, found, monkeypa
 def test_other_requests_stay_as_they_are(tmp_path, photographs, found):
     for request in (SceneRequest(str(found[0])), SceneRequest(str(photographs), reader="llff"), SceneRequest("")):
         assert with_poses(request, tmp_path, print) == (request, [])
-    with pytest.raises(UsageError, match="those found stay in the run"):
+    with pytest.raises(UsageError, match="kept in a run folder; give out"):
         with_poses(SceneRequest(str(photographs)), None, print)

@@ -61,7 +61,7 @@ def match(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
         found = [] if few else [database.read_descriptors(i).data for i in order]
     pairs = choose_pairs(found, job["kind"], SEED) if found else [(i, j) for j in range(len(order)) for i in range(j)]
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
-    matching.num_threads, matching.use_gpu, matching.skip_geometric_verification = job["threads"], False, True
+    matching.num_threads, matching.use_gpu = job["threads"], False
     verification.ransac.random_seed, verification.min_num_inliers = SEED, MIN_INLIERS
     listed, chosen = Path(job["pairs"]), pycolmap.ImportedPairingOptions()
     chosen.match_list_path = str(listed)
@@ -70,10 +70,6 @@ def match(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
         _say(progress=f"matching: pair {begin + 1} of {len(pairs)}")
         write_text(listed, "".join(f"{job['names'][i]} {job['names'][j]}\n" for i, j in pairs[begin : begin + step]))
         pycolmap.match_image_pairs(job["database"], matching, chosen, verification, pycolmap.Device.cpu)
-    _say(progress="checking matches against the motion of a camera")
-    verifier = pycolmap.GeometricVerifierOptions()
-    verifier.num_threads = job["threads"]
-    pycolmap.geometric_verification(job["database"], verifier, pycolmap.ExistingMatchedPairingOptions(), verification)
     index = {number: i for i, number in enumerate(order)}
     with pycolmap.Database.open(job["database"]) as database:
         ids, geometries = database.read_two_view_geometries()

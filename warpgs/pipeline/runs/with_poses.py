@@ -29,14 +29,14 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
 
     Raises:
         DataError: The photographs do not fit together, or are too few.
-        UsageError: There is no run folder to keep the poses in, pycolmap is not installed, or the photographs of a continued run
-            are others.
+        UsageError: There is no run folder to keep the poses in, pycolmap is not installed, or a continued run has other
+            photographs.
     """
     source = Path(request.path)
     if request.reader is not None or not request.path or not needs_poses(source):
         return request, []
     if out is None:
-        raise UsageError(f"{source}: holds no cameras; those found stay in the run: give out, or use `warpgs poses`")
+        raise UsageError(f"{source}: has no cameras, and those found are kept in a run folder; give out")
     scene = out / POSED_SCENE
     if (scene / JSON).is_file():
         record = read_record(scene)
