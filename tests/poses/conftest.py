@@ -41,13 +41,15 @@ def write_png(path: Path, image: np.ndarray) -> None:
 
 @pytest.fixture(scope="session")
 def photographs(still_life_views, tmp_path_factory):
-    """Six photographs: one lies on its side in its file and says where it was taken, one is smaller than the others."""
+    """Six photographs: two of a phone say where they were taken, one of those lies on its side; one is of another size."""
     folder = tmp_path_factory.mktemp("photographs")
     for i, image in enumerate(still_life_views[1]):
         if i == 2:
             (folder / "2.jpg").write_bytes(with_exif(np.ascontiguousarray(np.rot90(image)), 6))
         elif i == 3:
             write_png(folder / "3.png", cv2.resize(image, (200, 150), interpolation=cv2.INTER_AREA))
+        elif i == 5:
+            (folder / "5.jpg").write_bytes(with_exif(image, 1))
         else:
             write_png(folder / f"{i}.png", image)
     return folder

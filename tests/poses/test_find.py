@@ -22,7 +22,7 @@ def test_all_photographs_get_the_poses_that_they_were_taken_from(found, still_li
     """Up to a similarity: rotations, and the shape of the cameras' path."""
     out, record = found
     scene, cameras = load_scene(out), still_life_views[0]
-    assert [v.name for v in scene.views] == ["0.png", "1.png", "2.jpg", "3.png", "4.png", "5.png"]
+    assert [v.name for v in scene.views] == ["0.png", "1.png", "2.jpg", "3.png", "4.png", "5.jpg"]
     assert all(p["registered"] for p in record["photographs"]) and record["mean_reprojection_error_px"] < 0.6
     mine = np.stack([v.camera.viewmat[:3, :3] for v in scene.views])
     true = np.stack([c.viewmat[:3, :3] for c in cameras])
@@ -54,8 +54,10 @@ def test_nothing_personal_is_written(found, photographs):
         assert not [word for word in personal if word in path.read_bytes()], path
 
 
-def test_the_same_bits_on_any_number_of_threads(found, photographs, tmp_path):
-    find_poses(photographs, tmp_path / "again", threads=1)
+def test_the_command_gives_the_same_bits_on_another_number_of_threads(found, photographs, tmp_path, capsys):
+    """It prints the report that poses.txt holds."""
+    assert main(["poses", str(photographs), "--out", str(tmp_path / "again"), "--threads", "1"]) == 0
+    assert (tmp_path / "again" / "poses.txt").read_text("utf-8") in capsys.readouterr().out
     for path in (p for p in found[0].rglob("*") if p.is_file()):
         assert path.read_bytes() == (tmp_path / "again" / path.relative_to(found[0])).read_bytes(), path
 
@@ -126,6 +128,8 @@ def test_a_worker_that_fails_is_reported_and_leaves_nothing(sfm, tmp_path, photo
 
 
 def test_folders_that_need_poses(tmp_path, photographs, found):
+    with pytest.raises(DataError, match="images without cameras: `warpgs poses` finds those"):
+        load_scene(photographs)
     assert needs_poses(photographs) and not needs_poses(found[0]) and not needs_poses(tmp_path)
     (tmp_path / "film.MP4").touch()
     assert needs_poses(tmp_path / "film.MP4")

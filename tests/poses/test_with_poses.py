@@ -1,12 +1,13 @@
 """A fit of photographs without cameras: poses are found once, kept in the run folder, and found there again."""
 
 import shutil
+from types import SimpleNamespace
 
 import pytest
 
 from warpgs.errors import UsageError
 from warpgs.pipeline.runs import with_poses as module
-from warpgs.pipeline.runs.folder import run_folder
+from warpgs.pipeline.runs.folder import StoredRun, run_folder
 from warpgs.pipeline.runs.request import SceneRequest
 from warpgs.pipeline.runs.with_poses import with_poses
 
@@ -40,3 +41,13 @@ def test_other_requests_stay_as_they_are(tmp_path, photographs, found):
         assert with_poses(request, tmp_path, print) == (request, [])
     with pytest.raises(UsageError, match="kept in a run folder; give out"):
         with_poses(SceneRequest(str(photographs)), None, print)
+
+
+def test_a_run_that_was_moved_finds_its_scene(tmp_path, found):
+    """The record holds where the scene lay; where nothing is there any more, the run's own scene is read."""
+    options = {"path": str(tmp_path / "gone" / "scene"), "downscale": 2}
+    run = SimpleNamespace(folder=tmp_path, record={"scene": options})
+    assert StoredRun.scene_request(run).path == options["path"]
+    (tmp_path / "scene").mkdir()
+    shutil.copy(found[0] / "poses.json", tmp_path / "scene")
+    assert StoredRun.scene_request(run) == SceneRequest(str(tmp_path / "scene"), downscale=2)
