@@ -20,7 +20,7 @@ def with_exif(image: np.ndarray, orientation: int) -> bytes:
     exif = Image.Exif()
     exif[0x0112], exif[MAKE], exif[MODEL], exif[0x013B] = orientation, "ACME", "Phone 7", "Jane Owner"
     exif.get_ifd(GPS).update({1: "N", 2: (48.0, 8.0, 30.0)})
-    exif.get_ifd(0x8769)[0xA405] = 41
+    exif.get_ifd(0x8769)[0xA405] = 34
     stored = io.BytesIO()
     Image.fromarray(image).save(stored, "JPEG", quality=95, exif=exif)
     return stored.getvalue()

@@ -9,6 +9,7 @@ from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.io.load import load_scene
 from warpgs.poses import find, mapping
+from warpgs.poses import photographs as module_of_photographs
 from warpgs.poses.find import find_poses, needs_poses
 from warpgs.poses.photographs import prepare
 
@@ -98,10 +99,14 @@ def test_a_video_of_one_frame(sfm, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.avi"]
 
 
-def test_pairs_are_chosen_where_all_would_be_too_many(sfm, tmp_path, photographs, monkeypatch):
+def test_pairs_are_chosen_and_copies_are_small(sfm, tmp_path, photographs, found, monkeypatch):
+    """As for many and large photographs: copies of less than their size are matched; cameras are of full size."""
     monkeypatch.setattr(mapping, "EXHAUSTIVE", 5)
+    for module in (mapping, module_of_photographs):
+        monkeypatch.setattr(module, "MATCHING_SIDE", 216)
     record = find_poses(photographs, tmp_path / "out")
     assert all(p["registered"] for p in record["photographs"]) and record["pairs_tried"] == 15
+    assert [c["width"] for c in record["cameras"]] == [c["width"] for c in found[1]["cameras"]]
 
 
 def test_what_is_there_is_not_overwritten(sfm, tmp_path, photographs):

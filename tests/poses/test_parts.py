@@ -56,11 +56,11 @@ def test_a_png_without_its_metadata_has_the_same_pixels():
 
 
 def test_what_exif_says_of_the_lens(tmp_path):
-    """The equivalent focal length is by the diagonal: 41 mm of 43.3 on 4:3 is 1.18 longer sides; the size is that upright."""
+    """The equivalent focal length is by the diagonal: 34 mm of 43.3 on 4:3 is 0.98 longer sides; the size is that upright."""
     (tmp_path / "a.jpg").write_bytes(with_exif(np.zeros((80, 60, 3), np.uint8), 8))
     p = prepare(tmp_path / "a.jpg", tmp_path, tmp_path / "small.png")
-    assert (p.width, p.height, p.orientation, p.device) == (80, 60, 8, "ACME Phone 7 41 mm")
-    assert p.focal == pytest.approx(41 / np.hypot(36, 24) * 100 / 80)
+    assert (p.width, p.height, p.orientation, p.device) == (80, 60, 8, "ACME Phone 7 34 mm")
+    assert p.focal == pytest.approx(34 / np.hypot(36, 24) * 100 / 80)
     assert cv2.imread(str(tmp_path / "small.png")).shape == (60, 80, 3)
 
 
