@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from warpgs.app.flags import MAX_THREADS, check_range, parse_flags
+from warpgs.io.decoding import MAX_PIXELS
 from warpgs.runtime.terminal import say
 
 
@@ -11,24 +12,25 @@ def run(arguments: list[str], about: str) -> int:
     """Run the command; ``about`` heads its help."""
     import tyro
 
+    from warpgs.poses.find import FRAMES, find_poses
+
     @dataclass(frozen=True)
     class Poses:
         photographs: tyro.conf.Positional[Path]
         """Folder of photographs, or a video file."""
         out: Path
         """Scene folder to make; must not exist yet."""
-        frames: int = 60
+        frames: int = FRAMES
         """Frames that are taken of a video, evenly spaced and sharp."""
         threads: int = 0
         """CPU threads; 0 for as many as there are cores."""
-        max_pixels: int = 100_000_000
+        max_pixels: int = MAX_PIXELS
         """Largest number of pixels that an image may have."""
 
     a = parse_flags(Poses, arguments, "warpgs poses", about)
     check_range("--frames", a.frames, 3, 1000)
     check_range("--threads", a.threads, 0, MAX_THREADS)
     check_range("--max-pixels", a.max_pixels, 1, 2**40)
-    from warpgs.poses.find import find_poses
     from warpgs.poses.record import TEXT, report_lines
     from warpgs.report.progress import Stages
 

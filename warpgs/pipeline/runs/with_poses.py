@@ -48,11 +48,11 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
         progress(f"{source} holds no cameras: finding poses, which {scene} keeps")
         threads = torch.get_num_threads()
         record = find_poses(source, scene, threads=threads, max_pixels=request.max_pixels, progress=progress)
-    return replace(request, path=str(scene)), _notes(record, scene)
+    return replace(request, path=str(scene)), _notes(record)
 
 
-def _notes(record: dict[str, Any], scene: Path) -> list[str]:
+def _notes(record: dict[str, Any]) -> list[str]:
     """Return what the report says of found poses: how they were found, and who has none."""
     lost = [f"no pose: {p['name']} {p['reason']}" for p in record["photographs"] if not p["registered"]]
-    where = [f"what to photograph next stands in {scene / TEXT}"] if record["advice"] else []
+    where = [f"what to photograph next stands in {POSED_SCENE}/{TEXT} of the run"] if record["advice"] else []
     return [*record["notes"], *lost[:5], *([f"and {len(lost) - 5} more without a pose"] if len(lost) > 5 else []), *where]
