@@ -139,3 +139,4 @@ def test_folders_that_need_poses(tmp_path, photographs, found):
     (tmp_path / "film.MP4").touch()
     assert needs_poses(tmp_path / "film.MP4")
     assert needs_poses(found[0] / "images") and not needs_poses(tmp_path / "none")
+    assert not needs_poses(tmp_path / ("x" * 5000))

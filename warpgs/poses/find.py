@@ -28,9 +28,12 @@ MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.
 
 def needs_poses(path: Path) -> bool:
     """Return whether a path is a video, or a folder of images that holds no scene format."""
-    if is_video(path):
-        return True
-    return path.is_dir() and bool(find_photographs(path)) and all(r.probe(path) is None for r in all_readers())
+    try:
+        if is_video(path):
+            return True
+        return path.is_dir() and all(r.probe(path) is None for r in all_readers()) and bool(find_photographs(path))
+    except OSError:  # who reads it as a scene says what is wrong
+        return False
 
 
 def source_digest(source: Path) -> str:
