@@ -4,7 +4,8 @@ usage: python -m bench.found_poses SCENE [--train 17 6 3] [--seeds 0 1 2] [--pre
 SCENE is a COLMAP folder whose poses count as given, such as colmap/fern. Every eighth photograph is held out; of the others
 so many train, evenly spaced. Poses are found twice: jointly, of training and held-out photographs, as the given ones were; and
 of the training photographs alone, where held-out cameras are the given ones, brought over by the similarity of the training
-cameras. Since that similarity is not exact, each held-out camera is also scored where its photograph fits the model best.
+cameras, with the lens that was found. Since that similarity is not exact, each held-out camera is also scored where its
+photograph fits the model best.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import torch
 
 import warpgs
 from bench import result_file
+from warpgs.io.images import Lens, load_image
 from warpgs.pipeline.runs.request import choose_device
 from warpgs.poses.find import find_poses
 from warpgs.scene import Camera, Scene, View
@@ -66,6 +68,15 @@ def moved(camera: Camera, transform: tuple[float, np.ndarray, np.ndarray]) -> Ca
     viewmat[:3, :3] = camera.viewmat[:3, :3] @ R.T
     viewmat[:3, 3] = -viewmat[:3, :3] @ (s * R @ camera.center + t)
     return replace(camera, viewmat=viewmat)
+
+
+def held_out(view: View, image: Path, found: dict, transform: tuple[float, np.ndarray, np.ndarray], downscale: int) -> View:
+    """Return a held-out view after a similarity, seen through the lens that was found: poses and focal length go together."""
+    f, width, height = found["focal"], found["width"], found["height"]
+    K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
+    loaded = load_image(image, Lens(K, width, height, (found["distortion"], 0.0, 0.0, 0.0)), downscale=downscale)
+    camera = replace(moved(view.camera, transform), K=loaded.K)
+    return View(view.name, camera, loaded.image, loaded.mask)
 
 
 def errors(of: dict[str, View], to: dict[str, View]) -> dict[str, float]:
@@ -135,9 +146,9 @@ def main() -> None:
         alone, alone_record = found_scene(a.scene / "images", train, a.downscale)
         mine = {v.name: v for v in alone.views}
         over = similarity({n: reference[n] for n in train}, mine)
-        aligned = replace(
-            alone, views=(*alone.views, *(replace(reference[n], camera=moved(reference[n].camera, over)) for n in test))
-        )
+        (lens,) = alone_record["cameras"]
+        tests = [held_out(reference[n], a.scene / "images" / n, lens, over, a.downscale) for n in test]
+        aligned = replace(alone, views=(*alone.views, *tests))
         for poses, scene, record in (
             ("given", given, None),
             ("joint", joint, joint_record),
