@@ -1,5 +1,7 @@
 """Parts of the search for poses that need no pycolmap: pairs, metadata, frames of a video, advice."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -10,7 +12,8 @@ from warpgs.poses.advice import advice, reason
 from warpgs.poses.mapping import FoundCamera, FoundView, Mapping
 from warpgs.poses.metadata import without_jpeg_metadata, without_png_metadata
 from warpgs.poses.pairs import choose_pairs, similarity
-from warpgs.poses.photographs import find_photographs, prepare
+from warpgs.poses.photographs import Photograph, find_photographs, prepare
+from warpgs.poses.record import record_of, report_lines
 from warpgs.poses.video import sharpest, write_frames
 
 
@@ -96,6 +99,17 @@ def mapping(**values) -> Mapping:
         "method": "incremental", "version": "4",
     }  # fmt: skip
     return Mapping(**(given | values))
+
+
+def test_a_record_says_what_does_not_repeat_and_who_has_no_pose():
+    """Its lines name the photographs without a pose, why, and what to do."""
+    photographs = [Photograph(f"{n}.png", Path(n), 320, 240, 1, "", None, "0") for n in "abcde"]
+    assert not any("run to run" in n for n in record_of(mapping(), photographs, "0", [])["notes"])
+    record = record_of(mapping(method="global"), photographs, "0", ["a note"])
+    assert record["notes"][0] == "a note" and record["notes"][-1].endswith("from run to run")
+    lines = report_lines(record)
+    assert "poses found for 3 of 5 photographs" in lines[1] and "What to photograph next:" in lines
+    assert lines[7].startswith("d.png  NO POSE: it has 600 keypoints and 9 matches with c.png")
 
 
 def test_reasons_and_advice():

@@ -49,8 +49,10 @@ def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, no
             "matches": {names[j]: n for j, n in partners(found, i)[:SHOWN_PARTNERS]},
             "reason": None if registered else reason(found, i, names),
         })  # fmt: skip
+    again = ["global mapping joined more photographs than incremental mapping; its results differ a little from run to run"]
     return {
-        "format": FORMAT, "source_sha256": digest, "photographs": rows, "notes": [*notes, summary(found, len(names))],
+        "format": FORMAT, "source_sha256": digest, "photographs": rows,
+        "notes": [*notes, summary(found, len(names)), *(again if found.method == "global" else [])],
         "advice": advice(found, names), "mean_reprojection_error_px": found.error, "points": found.points,
         "method": found.method, "pairs_tried": found.tried, "pairs_matched": len([n for n in found.matches.values() if n]),
         "cameras": [dict(vars(c)) for c in found.cameras], "pycolmap": found.version,
