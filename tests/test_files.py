@@ -12,7 +12,7 @@ import pytest
 
 from warpgs import files
 from warpgs.errors import DataError, ResourceError
-from warpgs.files import LOCK, OWN_NAMES, is_empty, make_folder, remove_leftovers, replacing, write_bytes
+from warpgs.files import LOCK, OWN_NAMES, filling, is_empty, make_folder, remove_leftovers, replacing, write_bytes
 
 ROOT = Path(__file__).parent.parent
 LEFT = ".warpgs-0123456789abcdef.tmp"
@@ -145,6 +145,24 @@ def test_leftovers_are_files_and_folders_under_our_own_names(tmp_path):
         (tmp_path / LEFT.replace("0", "1")).symlink_to("own", target_is_directory=True)
     remove_leftovers(tmp_path)
     assert [p.name for p in tmp_path.rglob("*")] == ["own", "kept"]
+
+
+def test_a_folder_appears_whole_or_not_at_all(tmp_path, monkeypatch):
+    """Also in the place of an empty one; an error of the block goes on, and one of the disk says what to do."""
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / LEFT).touch()
+    for name in ("a", "b/c"):
+        with filling(tmp_path / name) as temporary:
+            assert OWN_NAMES.fullmatch(temporary.name) and temporary.parent == (tmp_path / name).parent
+            (temporary / "x").touch()
+        assert [p.name for p in (tmp_path / name).iterdir()] == ["x"] and not temporary.exists()
+    with pytest.raises(KeyboardInterrupt), filling(tmp_path / "d") as temporary:
+        (temporary / "x").touch()
+        raise KeyboardInterrupt
+    monkeypatch.setattr(files.os, "rename", full)
+    with pytest.raises(ResourceError, match="d: cannot be made"), filling(tmp_path / "d"):
+        pass
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "b"]
 
 
 def test_a_folder_that_cannot_be_made(tmp_path):

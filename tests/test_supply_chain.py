@@ -49,7 +49,8 @@ def test_the_lock_is_of_this_project():
 
 def test_every_package_stands_in_the_table_with_its_use():
     wanted = {n: "indirect" for n in locked() if not n.startswith(NVIDIA)}
-    wanted |= {plain(r): "export" for r in PROJECT["optional-dependencies"]["export"]}
+    for extra in PROJECT["optional-dependencies"].keys() - {"dev"}:
+        wanted |= {plain(r): extra for r in PROJECT["optional-dependencies"][extra]}
     wanted |= {plain(r): "tests and documents" for r in PROJECT["optional-dependencies"]["dev"]}
     wanted |= {plain(r): "fit" for r in PROJECT["dependencies"]}
     assert {n: use for n, (_, use) in table().items()} == wanted

@@ -66,6 +66,36 @@ def replacing(
     sync_folder(path.parent)
 
 
+@contextlib.contextmanager
+def filling(folder: Path) -> Iterator[Path]:
+    """Give the path of a temporary folder beside ``folder``; once the block has filled it, it becomes that folder, whole.
+
+    Where anything fails, an error of the block included, the temporary folder goes and nothing is left of it.
+
+    Args:
+        folder: Folder to make; it may exist if it is empty.
+
+    Raises:
+        ResourceError: The disk is full, or the folder above is not writable.
+    """
+    target = Path(os.path.realpath(folder))
+    make_folder(target.parent)
+    temporary = target.parent / f".warpgs-{secrets.token_hex(8)}.tmp"
+    make_folder(temporary)
+    try:
+        yield temporary
+        try:
+            if target.is_dir():
+                remove_leftovers(target)
+                target.rmdir()
+            os.rename(temporary, target)
+        except OSError as e:
+            raise ResourceError(f"{folder}: cannot be made ({e.strerror or e}). {_remedy(e)}") from e
+        sync_folder(target.parent)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
 def _replace(temporary: Path, path: Path) -> None:
     """Put a file in the place of another; on Windows, where no open file can be replaced, a few times."""
     for pause in PAUSES if WINDOWS else ():

@@ -20,6 +20,7 @@ COMMANDS = {
     "export": "write a run's Gaussians to a PLY file",
     "mesh": "make a mesh of the surfaces that a run's training views see, as .ply or .glb",
     "prune": "shrink a finished model as far as its training views allow, into a new run folder",
+    "poses": "find camera poses of photographs or a video, and write them as a scene folder",
     "priors": "look at what is known before a fit (priors show), or write networks as ONNX (priors export)",
     "compare": "fit presets to scenes with several seeds; tables, plot and figure of the differences",
     "ablate": "fit a preset with its parts off one at a time; the same tables, plot and figure",

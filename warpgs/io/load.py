@@ -13,6 +13,7 @@ from warpgs.errors import DataError, UsageError
 from warpgs.io.black_background import cut_from_black
 from warpgs.io.decoding import MAX_PIXELS
 from warpgs.io.folders import SceneFolder
+from warpgs.io.images import list_images
 from warpgs.io.normalize import fingerprint, normalization_of, normalize_points, normalize_view
 from warpgs.io.poses import rigid
 from warpgs.io.readers import Reader, ReadOptions, all_readers, find_reader
@@ -96,7 +97,8 @@ def detect(root: Path) -> tuple[Reader, list[str]]:
     if not complete and broken:
         raise DataError(f"{root}: {broken[0]}, and there is no other format. Copy the whole reconstruction")
     if not complete:
-        raise DataError(f"{root}: no scene format found. Looked for: {', '.join(r.description for r in readers)}")
+        images = ". It holds images without cameras: `warpgs poses` finds those" if list_images(root) else ""
+        raise DataError(f"{root}: no scene format found. Looked for: {', '.join(r.description for r in readers)}{images}")
     taken, *others = complete
     notes = [f"{lack}; passed over, {taken.name} is complete" for lack in broken]
     if others:

@@ -35,7 +35,7 @@ def _request_type() -> type:
     @dataclass(frozen=True, kw_only=True)
     class Request:
         scene: tyro.conf.Positional[Path]
-        """Scene folder: COLMAP, transforms.json, LLFF, DTU or Middlebury."""
+        """Scene folder: COLMAP, transforms.json, LLFF, DTU or Middlebury; or photographs or a video without cameras."""
         out: Path
         """Run folder to fill; must not exist yet."""
         split: str | None = None

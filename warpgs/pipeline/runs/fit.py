@@ -31,6 +31,7 @@ from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line, write_report
 from warpgs.pipeline.runs.rule_report import rule_report_of
 from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, sampling_report_of
+from warpgs.pipeline.runs.with_poses import with_poses
 from warpgs.pipeline.train.background import choose_background, over_background
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.complexity import complexity_figures, complexity_summary
@@ -162,7 +163,7 @@ def fit(
         where = choose_device(device)
         began = time.perf_counter()
         lpips = None if lpips_weights is None else load_lpips(Path(lpips_weights), where[0])
-        request, read, parts, found = _scene_of(scene, split, progress)
+        request, read, parts, found = _scene_of(scene, split, out, progress)
         notes = (*notes, *held, *found, *([] if out is None else renaming_notes(image_names(v.name for v in read.views))))
         job = _Job(
             read, request, parts, preset_config(config), *where, out, lpips, [*notes], verbose, on_step, began,
@@ -195,7 +196,7 @@ def fit_request(request: FitRequest) -> FitResult:
 
 
 def _scene_of(
-    scene: Scene | SceneRequest | str | Path, spec: str | None, progress: Callable[[str], object]
+    scene: Scene | SceneRequest | str | Path, spec: str | None, out: Path | None, progress: Callable[[str], object]
 ) -> tuple[SceneRequest, Scene, Split, list[str]]:
     """Read and split a scene that is given in one of four ways; its notes come last."""
     if isinstance(scene, Scene):
@@ -204,8 +205,10 @@ def _scene_of(
     request = scene if isinstance(scene, SceneRequest) else SceneRequest(str(scene))
     if spec is not None:
         request = replace(request, split=spec)
+    request, found = with_poses(request, out, progress)
     progress(f"reading {request.path}")
-    return request, *read_scene(request, progress)
+    read, parts, notes = read_scene(request, progress)
+    return request, read, parts, [*found, *notes]
 
 
 def _prepare(job: _Job, resumed: Path | None) -> tuple[Trainer, State | None, dict[str, Any]]:

@@ -7,7 +7,7 @@ import importlib.metadata
 import json
 import platform
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +24,15 @@ from warpgs.pipeline.runs.model_file import FittedModel, checked_gaussians
 from warpgs.pipeline.runs.request import SceneRequest, choose_device
 from warpgs.pipeline.runs.schemas import MODEL_STATE, check_record
 from warpgs.pipeline.train.config import FitConfig
+from warpgs.poses.record import JSON as POSES
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Camera, Gaussians, Normalization, Scene
 
 CONFIG = "config.json"
 IMAGE_FOLDERS = ("renders", "depth", "coverage", "sampling")
 """Folders in a run folder with the images that its fit writes."""
+POSED_SCENE = "scene"
+"""Folder in a run folder with the scene that was made of photographs without cameras."""
 
 
 def versions() -> dict[str, str]:
@@ -64,6 +67,10 @@ def _check_folder(out: Path, resume: bool) -> None:
         if resume and not (out / CONFIG).is_file():
             raise UsageError(f"--resume: {out} holds no {CONFIG}, so there is no run to continue; give a run's folder")
         if not resume and out.exists() and not (out.is_dir() and is_empty(out)):
+            if not (out / CONFIG).exists() and (out / POSED_SCENE / POSES).is_file():
+                raise UsageError(
+                    f"{out} holds found poses and no run; fit them with `warpgs fit {out / POSED_SCENE} --out RUN`"
+                )
             raise UsageError(f"{out} exists already; choose another --out, or continue that run with --resume")
     except OSError as e:
         raise UsageError(f"{out}: cannot be looked into ({e.strerror or e}); choose another --out") from e
@@ -199,6 +206,8 @@ class StoredRun(FittedModel):
                 "there with warpgs.evaluate"
             )
         request = SceneRequest(**self.record["scene"])
+        if not Path(request.path).exists() and (self.folder / POSED_SCENE / POSES).is_file():
+            request = replace(request, path=str(self.folder / POSED_SCENE))  # the run folder was moved, and its scene with it
         if request.reader is not None and ":" in request.reader and reader != request.reader:
             raise UsageError(
                 f"{self.folder}: its scene was read with {request.reader}, code from outside warpgs. A run folder never "

@@ -1,0 +1,53 @@
+"""A fit of photographs without cameras: poses are found once, kept in the run folder, and found there again."""
+
+import shutil
+from types import SimpleNamespace
+
+import pytest
+
+from warpgs.errors import UsageError
+from warpgs.pipeline.runs import with_poses as module
+from warpgs.pipeline.runs.folder import StoredRun, run_folder
+from warpgs.pipeline.runs.request import SceneRequest
+from warpgs.pipeline.runs.with_poses import with_poses
+
+
+def test_poses_are_kept_in_the_run_folder(tmp_path, photographs, found, monkeypatch):
+    """Found at first; a continued run takes them from there, and refuses other photographs."""
+    calls, said, run = [], [], tmp_path / "run"
+    run.mkdir()
+
+    def copied(source, out, **options):
+        calls.append(source)
+        shutil.copytree(found[0], out)
+        return found[1]
+
+    monkeypatch.setattr(module, "find_poses", copied)
+    shutil.copytree(photographs, tmp_path / "in")
+    request = SceneRequest(str(tmp_path / "in"))
+    for _ in range(2):
+        posed, notes = with_poses(request, run, said.append)
+        assert posed.path == str(run / "scene") and any(n.startswith("poses found for 6 of 6") for n in notes)
+    assert calls == [tmp_path / "in"] and "holds no cameras: finding poses" in said[0]
+    (tmp_path / "in" / "0.png").write_bytes((tmp_path / "in" / "1.png").read_bytes())
+    with pytest.raises(UsageError, match="no longer holds the photographs"):
+        with_poses(request, run, said.append)
+    with pytest.raises(UsageError, match="found poses and no run"), run_folder(run, False):
+        pass
+
+
+def test_other_requests_stay_as_they_are(tmp_path, photographs, found):
+    for request in (SceneRequest(str(found[0])), SceneRequest(str(photographs), reader="llff"), SceneRequest("")):
+        assert with_poses(request, tmp_path, print) == (request, [])
+    with pytest.raises(UsageError, match="kept in a run folder; give out"):
+        with_poses(SceneRequest(str(photographs)), None, print)
+
+
+def test_a_run_that_was_moved_finds_its_scene(tmp_path, found):
+    """The record holds where the scene lay; where nothing is there any more, the run's own scene is read."""
+    options = {"path": str(tmp_path / "gone" / "scene"), "downscale": 2}
+    run = SimpleNamespace(folder=tmp_path, record={"scene": options})
+    assert StoredRun.scene_request(run).path == options["path"]
+    (tmp_path / "scene").mkdir()
+    shutil.copy(found[0] / "poses.json", tmp_path / "scene")
+    assert StoredRun.scene_request(run) == SceneRequest(str(tmp_path / "scene"), downscale=2)

@@ -1,0 +1,42 @@
+"""`warpgs poses`: find the poses of photographs or of a video. Parses, calls, prints; no logic."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from warpgs.app.flags import MAX_THREADS, check_range, parse_flags
+from warpgs.io.decoding import MAX_PIXELS
+from warpgs.runtime.terminal import say
+
+
+def run(arguments: list[str], about: str) -> int:
+    """Run the command; ``about`` heads its help."""
+    import tyro
+
+    from warpgs.poses.find import FRAMES, find_poses
+
+    @dataclass(frozen=True)
+    class Poses:
+        photographs: tyro.conf.Positional[Path]
+        """Folder of photographs, or a video file."""
+        out: Path
+        """Scene folder to make; must not exist yet."""
+        frames: int = FRAMES
+        """Frames that are taken of a video, evenly spaced and sharp."""
+        threads: int = 0
+        """CPU threads; 0 for as many as there are cores."""
+        max_pixels: int = MAX_PIXELS
+        """Largest number of pixels that an image may have."""
+
+    a = parse_flags(Poses, arguments, "warpgs poses", about)
+    check_range("--frames", a.frames, 3, 1000)
+    check_range("--threads", a.threads, 0, MAX_THREADS)
+    check_range("--max-pixels", a.max_pixels, 1, 2**40)
+    from warpgs.poses.record import TEXT, report_lines
+    from warpgs.report.progress import Stages
+
+    record = find_poses(a.photographs, a.out, frames=a.frames, threads=a.threads, max_pixels=a.max_pixels, progress=Stages())
+    for line in report_lines(record):
+        say(line)
+    say(f"{a.out}: a COLMAP scene; what is above also stands in {a.out / TEXT}")
+    say(f"next: warpgs fit {a.out} --out run")
+    return 0

@@ -1,0 +1,58 @@
+"""Fits of photographs without cameras: their poses are found first, and kept as a scene in the run folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from warpgs.errors import UsageError
+from warpgs.pipeline.runs.folder import POSED_SCENE
+from warpgs.pipeline.runs.request import SceneRequest
+from warpgs.poses.find import find_poses, needs_poses, source_digest
+from warpgs.poses.record import JSON, TEXT, read_record
+
+
+def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str], object]) -> tuple[SceneRequest, list[str]]:
+    """Find the poses of photographs where a request names some without cameras; other requests are returned as they are.
+
+    Args:
+        request: The request; its path may be a folder of images or a video.
+        out: Run folder, whose folder `scene` keeps the poses; a continued run finds them there.
+        progress: Called with lines for the user.
+
+    Returns:
+        The request for the scene with poses, and notes for the user.
+
+    Raises:
+        DataError: The photographs do not fit together, or are too few.
+        UsageError: There is no run folder to keep the poses in, pycolmap is not installed, or a continued run has other
+            photographs.
+    """
+    source = Path(request.path)
+    if request.reader is not None or not request.path or not needs_poses(source):
+        return request, []
+    if out is None:
+        raise UsageError(f"{source}: has no cameras, and those found are kept in a run folder; give out")
+    scene = out / POSED_SCENE
+    if (scene / JSON).is_file():
+        record = read_record(scene)
+        if record["source_sha256"] != source_digest(source):
+            raise UsageError(
+                f"--resume: {source} no longer holds the photographs of {scene}; restore them, or give a new --out"
+            )
+    else:
+        progress(f"{source} holds no cameras: finding poses, which {scene} keeps")
+        threads = torch.get_num_threads()
+        record = find_poses(source, scene, threads=threads, max_pixels=request.max_pixels, progress=progress)
+    return replace(request, path=str(scene)), _notes(record)
+
+
+def _notes(record: dict[str, Any]) -> list[str]:
+    """Return what the report says of found poses: how they were found, and who has none."""
+    lost = [f"no pose: {p['name']} {p['reason']}" for p in record["photographs"] if not p["registered"]]
+    where = [f"what to photograph next stands in {POSED_SCENE}/{TEXT} of the run"] if record["advice"] else []
+    return [*record["notes"], *lost[:5], *([f"and {len(lost) - 5} more without a pose"] if len(lost) > 5 else []), *where]

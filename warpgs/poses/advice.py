@@ -1,0 +1,89 @@
+"""Words on photographs and their poses: why one has none, and what to photograph next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from warpgs.poses.mapping import Mapping
+
+MIN_KEYPOINTS = 100
+"""Keypoints below which a photograph shows too little to find again: a blank wall, darkness, blur."""
+MIN_MATCHES = 15
+"""Matches that agree with one motion of the camera which a pair needs."""
+WEAK_MATCHES = 60
+"""Matches below which the link between two photographs is called weak: a few wrong ones bend the poses."""
+WIDE_ANGLE = 30.0
+"""Angle between the optical axes of neighbours [degrees] beyond which SIFT finds few places again."""
+MAX_ADVICE = 8
+"""Number of pieces of advice that are given, the most urgent first."""
+
+
+def partners(found: Mapping, i: int) -> list[tuple[int, int]]:
+    """Return the photographs that one matches, each with the number of matches, the most first."""
+    mine = [(n, a + b - i) for (a, b), n in found.matches.items() if i in (a, b) and n > 0]
+    return [(j, n) for n, j in sorted(mine, key=lambda m: (-m[0], m[1]))]
+
+
+def reason(found: Mapping, i: int, names: Sequence[str]) -> str:
+    """Return why a photograph has no pose, in words that follow its name."""
+    keypoints = found.keypoints[i]
+    if keypoints < MIN_KEYPOINTS:
+        return f"has {keypoints} keypoints, too few to find again: a blank wall, darkness or blur"
+    best = partners(found, i)
+    if not best:
+        return f"has {keypoints:,} keypoints and matches no other photograph: nothing that it shows is in another one"
+    j, n = best[0]
+    matched = f"has {keypoints:,} keypoints and {n} matches with {names[j]}"
+    if j in found.views:
+        return f"{matched}, too few of them at places whose depth is known"
+    group = next((g for g in found.groups[1:] if i in g), ())
+    together = f", in a group of {len(group)} by itself" if group else ""
+    return f"{matched}, which has no pose either{together}"
+
+
+def axis_angle(found: Mapping, i: int, j: int) -> float:
+    """Return the angle between the optical axes of two views [degrees]."""
+    cosine = float((found.views[i].rotation[2] * found.views[j].rotation[2]).sum())
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def neighbours(found: Mapping) -> list[tuple[int, int, float]]:
+    """Return the pairs of views that join all by the smallest angles (a minimum spanning tree), with the angle of each."""
+    left = list(found.views)
+    if not left:
+        return []
+    joined, tree = [left.pop(0)], []
+    while left:
+        angle, i, j = min((axis_angle(found, i, j), i, j) for i in joined for j in left)
+        tree.append((min(i, j), max(i, j), angle))
+        joined.append(j)
+        left.remove(j)
+    return sorted(tree)
+
+
+def advice(found: Mapping, names: Sequence[str]) -> list[str]:
+    """Return what to photograph next, a sentence each, the most urgent first; nothing where nothing is missing."""
+    said = []
+    for i in range(len(names)):
+        if i not in found.views:
+            best = partners(found, i)
+            if found.keypoints[i] < MIN_KEYPOINTS:
+                said.append(f"take {names[i]} again, sharp, in light, and with something patterned in view")
+            elif best:
+                said.append(f"take two or three photographs between {names[i]} and {names[best[0][0]]}, in small steps")
+            else:
+                said.append(
+                    f"take photographs that lead from {names[i]} to the others, each overlapping the last by two thirds"
+                )
+    tree = neighbours(found)
+    for i, j, angle in sorted(tree, key=lambda t: -t[2]):
+        if angle > WIDE_ANGLE:
+            said.append(f"take one or two photographs between {names[i]} and {names[j]}, which look {angle:.0f} degrees apart")
+    for i in found.views:
+        best = [(n, j) for j, n in partners(found, i) if j in found.views]
+        if best and best[0][0] < WEAK_MATCHES:
+            said.append(f"take a photograph between {names[i]} and {names[best[0][1]]}: they share {best[0][0]} matches only")
+    more = len(said) - MAX_ADVICE
+    return said[:MAX_ADVICE] + ([f"and {more} more places like these, once these are done"] if more > 0 else [])

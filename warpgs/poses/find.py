@@ -1,0 +1,187 @@
+"""Poses of photographs or of a video: from files without cameras to a scene folder that a fit reads."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from warpgs.errors import DataError, UsageError
+from warpgs.files import filling, is_empty, make_folder, write_bytes
+from warpgs.io.decoding import MAX_PIXELS, read_image_file
+from warpgs.io.readers import all_readers
+from warpgs.poses.advice import MIN_KEYPOINTS
+from warpgs.poses.mapping import Mapping, camera_groups, check_installed, find_model
+from warpgs.poses.photographs import Photograph, find_photographs, image_root, prepare, write_copy
+from warpgs.poses.record import record_of, write_record
+from warpgs.poses.video import is_video, write_frames
+
+MIN_PHOTOGRAPHS = 3
+"""Fewest photographs: of two, nothing checks the focal length and the depths that they give each other."""
+FRAMES = 60
+"""Frames taken of a video where nobody says how many."""
+MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
+"""Files of a COLMAP model; the first three make a scene."""
+
+
+def needs_poses(path: Path) -> bool:
+    """Return whether a path is a video, or a folder of images that holds no scene format."""
+    try:
+        if is_video(path):
+            return True
+        return path.is_dir() and all(r.probe(path) is None for r in all_readers()) and bool(find_photographs(path))
+    except OSError:  # who reads it as a scene says what is wrong
+        return False
+
+
+def source_digest(source: Path) -> str:
+    """Return the SHA-256 over the names and contents of a source's photographs, or of a video.
+
+    Raises:
+        DataError: A file cannot be read.
+    """
+    total = hashlib.sha256()
+    if is_video(source):
+        with source.open("rb") as f:
+            return hashlib.file_digest(f, "sha256").hexdigest()
+    root = image_root(source)
+    for path in find_photographs(source):
+        name = path.relative_to(root).as_posix().encode("utf-8", "surrogateescape")
+        total.update(name + b"\0" + hashlib.sha256(read_image_file(path)).digest())
+    return total.hexdigest()
+
+
+def find_poses(
+    source: str | Path,
+    out: str | Path,
+    *,
+    frames: int = FRAMES,
+    threads: int = 0,
+    max_pixels: int = MAX_PIXELS,
+    progress: Callable[[str], object] = lambda line: None,
+) -> dict[str, Any]:
+    """Find the poses of photographs or of a video's sharpest frames, and write a scene folder that holds those registered.
+
+    The folder appears whole or not at all: ``images`` upright and without metadata, ``sparse/0`` as COLMAP has it, and the
+    record of who has a pose and why (poses.json, poses.txt).
+
+    Args:
+        source: Folder of images, or a video file.
+        out: Scene folder to make; must not exist yet, or be empty.
+        frames: Frames that are taken of a video.
+        threads: CPU threads; 0 for as many as there are cores.
+        max_pixels: Largest number of pixels that an image may have.
+        progress: Called with lines for the user.
+
+    Returns:
+        The record, as poses.json holds it.
+
+    Raises:
+        DataError: There are no photographs or too few, one cannot be decoded, or fewer than three fit together.
+        ResourceError: pycolmap failed, or the folder cannot be written.
+        UsageError: pycolmap is not installed, or ``out`` holds something already.
+    """
+    source, out = Path(source), Path(out)
+    check_installed()
+    _check(source, out)
+    with filling(out) as scene:
+        work = scene / "work"
+        make_folder(work / "small")
+        photographs, names, notes = _prepared(source, work, frames, max_pixels, progress)
+        found = find_model(photographs, names, "video" if is_video(source) else "photographs", work, progress, threads)
+        _check_found(source, found, photographs)
+        record = record_of(found, photographs, source_digest(source), notes)
+        for done, i in enumerate(found.views):
+            progress(f"writing images: {done + 1} of {len(found.views)}")
+            write_copy(photographs[i], scene / "images", max_pixels)
+        make_folder(scene / "sparse" / "0")
+        for name in MODEL_FILES:
+            if (work / "model" / name).is_file():
+                write_bytes(scene / "sparse" / "0" / name, (work / "model" / name).read_bytes())
+        write_record(scene, record)
+        shutil.rmtree(work)
+    return record
+
+
+def _check(source: Path, out: Path) -> None:
+    """Raise an error for a source or a target that cannot be, before any work."""
+    try:
+        if not is_video(source) and not source.is_dir():
+            what = "is no video that is read (mp4, mov, m4v, avi, mkv, webm)" if source.is_file() else "does not exist"
+            raise DataError(f"{source}: {what}; give a folder of photographs, or a video")
+        if not is_video(source) and not find_photographs(source):
+            raise DataError(
+                f"{source}: holds no image file that is read (JPEG, PNG, TIFF, BMP, WebP); give the folder of photographs"
+            )
+        if out.exists() and not (out.is_dir() and is_empty(out)):
+            raise UsageError(f"{out} exists already; choose another --out, or remove it")
+    except OSError as e:
+        raise UsageError(f"{e.filename or out}: cannot be looked into ({e.strerror or e}); choose another folder") from e
+
+
+def _prepared(
+    source: Path, work: Path, frames: int, max_pixels: int, progress: Callable[[str], object]
+) -> tuple[list[Photograph], list[str], list[str]]:
+    """Return the photographs of a source, the names of their copies in ``work``/small, and notes for the user."""
+    notes, root = [], source
+    if is_video(source):
+        root = work / "frames"
+        make_folder(root)
+        total = write_frames(source, root, frames, progress)
+        notes.append(f"{min(frames, total)} of {total} frames are taken: the sharpest of as many equal stretches of the video")
+    root = image_root(root)
+    paths = find_photographs(root)
+    if len(paths) < MIN_PHOTOGRAPHS:
+        what = "frame" if is_video(source) else "photograph"
+        raise DataError(
+            f"{source}: has {len(paths)} {what}{'s' if len(paths) != 1 else ''}; poses need at least {MIN_PHOTOGRAPHS}, "
+            "better 8 to 20 that overlap by two thirds"
+        )
+    photographs, names = [], []
+    for i, path in enumerate(paths):
+        progress(f"reading photographs: {i + 1} of {len(paths)}")
+        names.append(f"{i:06d}.png")
+        photographs.append(prepare(path, root, work / "small" / names[-1], max_pixels))
+    doubled = sorted({p.name for p in photographs if sum(q.name == p.name for q in photographs) > 1})
+    if doubled:
+        raise DataError(f"{source}: two files would both be called {doubled[0]!r} in the scene; rename one of them")
+    return photographs, names, [*notes, *_notes(photographs)]
+
+
+def _notes(photographs: list[Photograph]) -> list[str]:
+    """Return what was assumed of the photographs, a sentence each."""
+    of = camera_groups(photographs)
+    cameras = [photographs[of.index(n)] for n in range(max(of) + 1)]
+    known = sum(c.focal is not None for c in cameras)
+    source = "from EXIF" if known == len(cameras) else "unknown to EXIF" if not known else f"from EXIF for {known} of them"
+    many = "one camera is" if len(cameras) == 1 else f"{len(cameras)} cameras, one for each device, lens and image size, are"
+    notes = [f"{many} assumed, focal length {source}"]
+    turned = sum(p.orientation != 1 for p in photographs)
+    if turned:
+        notes.append(f"{turned} photograph{'s' if turned != 1 else ''} turned upright by EXIF")
+    return notes
+
+
+def _check_found(source: Path, found: Mapping, photographs: list[Photograph]) -> None:
+    """Raise a DataError where too few photographs fit together, with the reason that most of them have."""
+    if len(found.views) >= MIN_PHOTOGRAPHS:
+        return
+    count, blank = len(photographs), sum(k < MIN_KEYPOINTS for k in found.keypoints)
+    largest = max(found.matches.values(), default=0)
+    if 2 * blank >= count:
+        most = max(found.keypoints)
+        why = (
+            f"{blank} of {count} show next to nothing that can be found again (at most {most:,} keypoints): a blank wall, "
+            "darkness or blur. Photograph something patterned, sharp and in light"
+        )
+    elif not largest:
+        why = f"no two of {count} show the same place. Take photographs that overlap by two thirds, in small steps"
+    else:
+        why = (
+            f"at most {len(found.views)} of {count} fit together (no pair has more than {largest} matches, from at most "
+            f"{max(found.keypoints):,} keypoints). Take photographs that overlap by two thirds, moving the camera, not only "
+            "turning it"
+        )
+    raise DataError(f"{source}: no poses: {why}")

@@ -1,0 +1,193 @@
+"""Structure from motion of prepared photographs: runs the worker process and holds what it found."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import warpgs
+from warpgs.errors import ResourceError, UsageError
+from warpgs.files import write_json
+from warpgs.poses.photographs import MATCHING_SIDE, Photograph
+
+EXHAUSTIVE = 60
+"""Most photographs of which all pairs are matched; of more, pairs are chosen."""
+LAST_WORDS = 500
+"""Letters of pycolmap's last message that are shown where it fails."""
+
+
+@dataclass(frozen=True)
+class FoundView:
+    """A photograph whose pose was found."""
+
+    rotation: np.ndarray
+    """Rotation of camera_from_world, shape [3, 3]."""
+    center: np.ndarray
+    """Camera centre [file units], shape [3]."""
+    points: int
+    """Number of points that it sees."""
+
+
+@dataclass(frozen=True)
+class FoundCamera:
+    """Intrinsics that were found, of one or more photographs."""
+
+    focal: float
+    """Focal length [px of the photograph]."""
+    distortion: float
+    """Coefficient of the radius squared, on the plane at distance 1."""
+    width: int
+    """Image width [px]."""
+    height: int
+    """Image height [px]."""
+
+
+@dataclass(frozen=True)
+class Mapping:
+    """Result of structure from motion; photographs are known by their number in the order of their names."""
+
+    keypoints: tuple[int, ...]
+    """Number of SIFT keypoints of each photograph."""
+    matches: dict[tuple[int, int], int]
+    """Number of matches that agree with one motion of the camera, by pair, the smaller number first."""
+    tried: int
+    """Number of pairs that were matched."""
+    views: dict[int, FoundView]
+    """Views of the largest model."""
+    cameras: tuple[FoundCamera, ...]
+    """Cameras of its views."""
+    groups: tuple[tuple[int, ...], ...]
+    """Photographs of each model, the largest first: photographs of different models share too little."""
+    points: int
+    """Number of points of the largest model."""
+    error: float
+    """Mean reprojection error of its points [px of the photograph]; 0 without a model."""
+    method: str
+    """Mapper that the model is of, incremental or global."""
+    version: str
+    """Version of pycolmap."""
+
+
+def check_installed() -> None:
+    """Check that pycolmap is installed.
+
+    Raises:
+        UsageError: It is not.
+    """
+    if importlib.util.find_spec("pycolmap") is None:
+        raise UsageError("poses are found with pycolmap, which is not installed; `pip install 'warpgs[poses]'`")
+
+
+def camera_groups(photographs: list[Photograph]) -> list[int]:
+    """Return the number of the camera of each photograph: one for each device, focal length and image size."""
+    numbers: dict[tuple[str, float | None, int, int], int] = {}
+    return [numbers.setdefault((p.device, p.focal, p.width, p.height), len(numbers)) for p in photographs]
+
+
+def _job(photographs: list[Photograph], names: list[str], kind: str, folder: Path, threads: int) -> dict[str, Any]:
+    """Return what the worker is told."""
+    of = camera_groups(photographs)
+    cameras = []
+    for number in range(max(of) + 1):
+        p = photographs[of.index(number)]
+        scale = min(1.0, MATCHING_SIDE / max(p.width, p.height))
+        width, height = round(scale * p.width), round(scale * p.height)
+        focal = None if p.focal is None else p.focal * max(width, height)
+        cameras.append({"focal": focal, "width": width, "height": height})
+    (folder / "models").mkdir()
+    return {
+        "names": names, "camera_of": of, "cameras": cameras, "kind": kind, "threads": threads, "exhaustive": EXHAUSTIVE,
+        "sizes": [(p.width, p.height) for p in photographs], "scene_names": [p.name for p in photographs],
+        "images": str(folder / "small"), "database": str(folder / "matches.db"), "pairs": str(folder / "pairs.txt"),
+        "models": str(folder / "models"), "model": str(folder / "model"),
+    }  # fmt: skip
+
+
+def _lines(job: dict[str, Any], folder: Path) -> Iterator[dict[str, Any]]:
+    """Yield what the worker says, and end it where nobody listens any more."""
+    path = folder / "job.json"
+    write_json(path, job)
+    home = str(Path(warpgs.__file__).parent.parent)
+    search = os.pathsep.join(p for p in (home, os.environ.get("PYTHONPATH", "")) if p)
+    environment = os.environ | {
+        "PYTHONPATH": search,
+        "PYTHONSAFEPATH": "1",
+        "PYTHONIOENCODING": "utf-8",
+        "GLOG_logtostderr": "1",
+    }
+    command = [sys.executable, "-P", "-m", "warpgs.poses.worker", str(path)]
+    with tempfile.TemporaryFile() as errors:
+        process = subprocess.Popen(
+            command, env=environment, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors,
+            text=True, encoding="utf-8", errors="replace",
+        )  # fmt: skip
+        try:
+            assert process.stdout is not None
+            for line in process.stdout:
+                if line.startswith("{"):
+                    yield json.loads(line)
+            if process.wait():
+                errors.seek(0)
+                last = errors.read().decode("utf-8", "replace").strip()[-LAST_WORDS:].replace("\n", " ")
+                raise ResourceError(
+                    f"pycolmap ended with code {process.returncode}; it may have had too little memory. Its last words: {last}"
+                )
+        finally:
+            process.kill()
+            process.wait()
+
+
+def find_model(
+    photographs: list[Photograph],
+    names: list[str],
+    kind: str,
+    folder: Path,
+    progress: Callable[[str], object],
+    threads: int = 0,
+) -> Mapping:
+    """Find poses of photographs and write the model of those that fit together into ``folder``/model, in COLMAP's files.
+
+    The same photographs give the same bits on the same machine, whatever the number of threads, but for the global mapper.
+
+    Args:
+        photographs: The photographs, sorted by name.
+        names: Names of their copies in ``folder``/small.
+        kind: photographs or video.
+        folder: Folder to work in.
+        progress: Called with lines for the user.
+        threads: CPU threads; 0 for as many as there are cores.
+
+    Raises:
+        ResourceError: pycolmap failed.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    result: dict[str, Any] | None = None
+    for said in _lines(_job(photographs, names, kind, folder, threads or cores), folder):
+        if "progress" in said:
+            progress(said["progress"])
+        result = said.get("result", result)
+    if result is None:
+        raise ResourceError("pycolmap ended without a result; try again, with fewer photographs if memory is short")
+    index, model = (
+        {n: i for i, n in enumerate(names)},
+        result["model"] or {"views": {}, "cameras": {}, "points": 0, "error": 0.0},
+    )
+    views = {int(i): FoundView(np.array(v["rotation"]), np.array(v["center"]), v["points"]) for i, v in model["views"].items()}
+    p = photographs[min(views, default=0)]
+    scale = max(1.0, max(p.width, p.height) / MATCHING_SIDE)
+    return Mapping(
+        tuple(result["keypoints"]), {(i, j): n for i, j, n in result["pairs"]}, result["tried"], dict(sorted(views.items())),
+        tuple(FoundCamera(**c) for c in model["cameras"].values()),
+        tuple(tuple(sorted(index[n] for n in group)) for group in result["groups"]),
+        model["points"], scale * model["error"], result["method"], result["version"],
+    )  # fmt: skip

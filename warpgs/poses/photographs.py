@@ -1,0 +1,166 @@
+"""Photographs without cameras: which files they are, what EXIF says of them, and copies without anything personal."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import math
+import struct
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from warpgs.errors import DataError
+from warpgs.files import make_folder, write_bytes
+from warpgs.io.decoding import MAX_PIXELS, decode, format_of, read_image_file
+from warpgs.io.images import exif_orientation, list_images
+from warpgs.poses.metadata import without_jpeg_metadata, without_png_metadata
+
+MASK_FOLDERS = ("mask", "masks", "idrmasks")
+"""Folders beside or below photographs that hold masks."""
+MATCHING_SIDE = 2000
+"""Longer side of the copies that are matched [px]; larger ones cost time and find the same points."""
+DIAGONAL_35MM = math.hypot(36, 24)
+"""Diagonal of 35 mm film [mm], by which the equivalent focal length in EXIF is defined (CIPA DCG-001)."""
+MAKE, MODEL, EXIF, FOCAL_35MM = 0x010F, 0x0110, 0x8769, 0xA405
+"""EXIF tags: maker and model of the device, the block of exposure data, and in it the equivalent focal length [mm]."""
+JPEG_QUALITY = 98
+"""Quality of a photograph that must be coded again since it is turned upright."""
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A photograph without a camera."""
+
+    name: str
+    """Path below the folder of photographs, POSIX style."""
+    path: Path
+    """The image file."""
+    width: int
+    """Width once upright [px]."""
+    height: int
+    """Height once upright [px]."""
+    orientation: int
+    """EXIF orientation, 1 to 8."""
+    device: str
+    """Maker, model and equivalent focal length of the device; empty where EXIF does not say."""
+    focal: float | None
+    """Focal length by EXIF, in longer sides of the image; None where it does not say."""
+    digest: str
+    """SHA-256 of the file."""
+
+
+def image_root(folder: Path) -> Path:
+    """Return the folder with the photographs: ``images`` in it where that holds some, else the folder itself."""
+    inner = folder / "images"
+    return inner if inner.is_dir() and list_images(inner) else folder
+
+
+def find_photographs(folder: Path) -> list[Path]:
+    """Return the image files of a folder of photographs, sorted by name; masks are left out."""
+    root = image_root(folder)
+    return [p for p in list_images(root) if not set(p.relative_to(root).parts[:-1]) & set(MASK_FOLDERS)]
+
+
+def scene_name(name: str, data: bytes) -> str:
+    """Return the name of a photograph in the scene: its own, with .png added where the file becomes a PNG.
+
+    Raises:
+        DataError: The name is no UTF-8, which COLMAP's files need.
+    """
+    try:
+        name.encode("utf-8")
+    except UnicodeEncodeError as e:
+        raise DataError(f"{name.encode('utf-8', 'backslashreplace').decode()}: the name is no UTF-8; rename the file") from e
+    return name if _format(data) in ("JPEG", "PNG") else f"{name}.png"
+
+
+def _format(data: bytes) -> str:
+    try:
+        return format_of(data)[0]
+    except ValueError:
+        return ""
+
+
+def _exif(data: bytes) -> tuple[str, float | None]:
+    """Return maker and model of the device, and the equivalent focal length [mm] or None."""
+    from PIL import Image, UnidentifiedImageError
+
+    Image.init()
+    try:
+        # not Image.open, which has a limit of its own on the number of pixels
+        with Image.OPEN[_format(data)][0](io.BytesIO(data), "photograph") as image:
+            exif = image.getexif()
+            words = [str(exif.get(tag, "")).strip("\0 ") for tag in (MAKE, MODEL)]
+            focal = exif.get_ifd(EXIF).get(FOCAL_35MM)
+    except (OSError, UnidentifiedImageError, SyntaxError, ValueError, KeyError, TypeError, struct.error):
+        return "", None
+    known = isinstance(focal, (int, float)) and 1 <= focal <= 10_000
+    return " ".join(w for w in words if w)[:100], float(focal) if known else None
+
+
+def prepare(path: Path, root: Path, small: Path, max_pixels: int = MAX_PIXELS) -> Photograph:
+    """Read a photograph and write the upright copy that is matched, at most `MATCHING_SIDE` pixels wide and high.
+
+    Args:
+        path: The image file.
+        root: The folder of photographs.
+        small: File to write, a PNG.
+        max_pixels: Largest number of pixels that the file may have.
+
+    Raises:
+        DataError: The file cannot be decoded, or its name is no UTF-8.
+    """
+    import cv2
+
+    data = read_image_file(path)
+    name, orientation = path.relative_to(root).as_posix(), exif_orientation(path)
+    image = _upright(decode(path, max_pixels)[0], orientation)
+    height, width = image.shape[:2]
+    scale = min(1.0, MATCHING_SIDE / max(width, height))
+    if scale < 1:
+        size = max(1, round(scale * width)), max(1, round(scale * height))
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    _, png = cv2.imencode(".png", np.round(255 * image[..., ::-1]).astype(np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    write_bytes(small, png.tobytes())
+    device, film = _exif(data)
+    focal = None if film is None else film / DIAGONAL_35MM * math.hypot(width, height) / max(width, height)
+    device = device if film is None else f"{device} {film:g} mm"
+    return Photograph(scene_name(name, data), path, width, height, orientation, device, focal, hashlib.sha256(data).hexdigest())
+
+
+def _upright(image: np.ndarray, orientation: int) -> np.ndarray:
+    """Rotate or mirror an image [H, W, ...] as its EXIF orientation asks."""
+    if orientation in (5, 6, 7, 8):
+        image = np.swapaxes(image, 0, 1)
+    flips = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}.get(orientation, ())
+    return np.ascontiguousarray(np.flip(image, flips) if flips else image)
+
+
+def write_copy(photograph: Photograph, folder: Path, max_pixels: int = MAX_PIXELS) -> None:
+    """Write a photograph into the image folder of a scene: upright, at full size, and without its metadata.
+
+    JPEG and PNG files that are upright keep their coded pixels; others are coded again, JPEG at quality `JPEG_QUALITY`, all
+    else as PNG of 8 bits.
+
+    Raises:
+        DataError: The file is no longer the one that was matched.
+        ResourceError: The disk is full.
+    """
+    import cv2
+
+    data = read_image_file(photograph.path)
+    if hashlib.sha256(data).hexdigest() != photograph.digest:
+        raise DataError(f"{photograph.path}: the file changed while its pose was sought; start again")
+    kind, target = _format(data), folder / PurePosixPath(photograph.name)
+    make_folder(target.parent)
+    if photograph.orientation == 1 and kind in ("JPEG", "PNG"):
+        write_bytes(target, without_jpeg_metadata(data) if kind == "JPEG" else without_png_metadata(data))
+        return
+    colors, alpha = (None if a is None else _upright(a, photograph.orientation) for a in decode(photograph.path, max_pixels))
+    assert colors is not None
+    pixels = colors[..., ::-1] if alpha is None else np.concatenate([colors[..., ::-1], alpha[..., None]], -1)
+    suffix, options = (".jpg", [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]) if kind == "JPEG" else (".png", [])
+    _, coded = cv2.imencode(suffix, np.round(255 * pixels).astype(np.uint8), options)
+    write_bytes(target, coded.tobytes())

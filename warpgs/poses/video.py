@@ -1,0 +1,100 @@
+"""Frames of a video that show most: evenly spaced in time, the sharpest of each stretch."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from warpgs.errors import DataError
+from warpgs.files import write_bytes
+from warpgs.io.decoding import MAX_PIXELS
+
+SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+"""Endings of video files."""
+SHARPNESS_SIDE = 640
+"""Longer side at which frames are compared for sharpness [px]: what noise and compression add is averaged away."""
+MAX_FRAMES = 100_000
+"""Longest video that is read [frames]: an hour at 25 a second."""
+
+
+def is_video(path: Path) -> bool:
+    """Return whether a path is a file that ends like a video."""
+    return path.suffix.lower() in SUFFIXES and path.is_file()
+
+
+def _frames(path: Path) -> Iterator[np.ndarray]:
+    """Yield the frames of a video, uint8 BGR [H, W, 3], upright."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # it writes about broken files past everything
+    import cv2
+
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    try:
+        if not capture.isOpened():
+            raise DataError(
+                f"{path}: OpenCV cannot read it as a video; convert it to an mp4 file with H.264, or give its frames"
+            )
+        size = capture.get(cv2.CAP_PROP_FRAME_WIDTH) * capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
+        if not 0 < size <= MAX_PIXELS:
+            raise DataError(f"{path}: its frames have {size:,.0f} pixels, not 1 to {MAX_PIXELS:,}; convert the video")
+        for _ in range(MAX_FRAMES):
+            there, frame = capture.read()
+            if not there:
+                return
+            yield frame
+    finally:
+        capture.release()
+    raise DataError(f"{path}: has more than {MAX_FRAMES:,} frames; cut it shorter")
+
+
+def sharpness(frame: np.ndarray) -> float:
+    """Return the variance of the Laplacian of a frame, uint8 BGR [H, W, 3], at a size that noise is averaged away at."""
+    import cv2
+
+    gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+    scale = SHARPNESS_SIDE / max(gray.shape)
+    if scale < 1:
+        gray = cv2.resize(gray, (0, 0), fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return float(cv2.Laplacian(gray.astype(np.float64), cv2.CV_64F).var())
+
+
+def sharpest(values: list[float], count: int) -> list[int]:
+    """Return the indices of at most ``count`` frames: of so many equal stretches the sharpest each, the earliest of equals."""
+    bounds = np.linspace(0, len(values), min(count, len(values)) + 1).round().astype(int)
+    return [a + int(np.argmax(values[a:b])) for a, b in itertools.pairwise(bounds)]
+
+
+def write_frames(path: Path, folder: Path, count: int, progress: Callable[[str], object]) -> int:
+    """Write the sharpest evenly spaced frames of a video as PNG files, named by their number.
+
+    Args:
+        path: The video file.
+        folder: Folder to write into.
+        count: Number of frames wanted; all where the video has fewer.
+        progress: Called with a line for the user now and then.
+
+    Returns:
+        The number of frames that the video has.
+
+    Raises:
+        DataError: The video cannot be read, or is too long.
+        ResourceError: The disk is full.
+    """
+    import cv2
+
+    values = []
+    for i, frame in enumerate(_frames(path)):
+        progress(f"looking for sharp frames: {i + 1} read")
+        values.append(sharpness(frame))
+    if not values:
+        raise DataError(f"{path}: holds no frame that OpenCV can read; record it again, or give its frames as images")
+    wanted = set(sharpest(values, count))
+    for i, frame in enumerate(_frames(path)):
+        if i in wanted:
+            progress(f"writing frames: frame {i}")
+            _, png = cv2.imencode(".png", frame, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            write_bytes(folder / f"frame_{i:06d}.png", png.tobytes())
+    return len(values)

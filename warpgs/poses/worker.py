@@ -1,0 +1,166 @@
+"""The process that calls pycolmap: features, matches, poses. It reads one job and prints lines of JSON.
+
+It is a process of its own for three reasons: pycolmap ends the process it runs in where something is wrong inside of it, cannot
+be interrupted, and its wheels hold code under the GPL (docs/poses.md). Nothing else in warpgs imports it.
+
+A line holds ``progress``, a text for the user, or ``result``, the last one.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from warpgs.files import write_text
+from warpgs.poses.pairs import choose_pairs
+
+SEED = 0
+"""Seed of everything that is sampled."""
+MIN_INLIERS = 15
+"""Matches that agree with one motion of the camera which a pair needs, and points that a new photograph must see."""
+PEAK = 0.003
+"""Contrast that a SIFT keypoint needs, half of pycolmap's: few photographs need more points. Chosen on temple and fern."""
+CAMERA_MODEL = "SIMPLE_RADIAL"
+"""One focal length and one coefficient of distortion: what a handful of photographs can tell."""
+
+
+def _say(**values: Any) -> None:
+    print(json.dumps(values), flush=True)
+
+
+def extract(pycolmap: Any, job: dict[str, Any]) -> None:
+    """Write cameras, photographs and their SIFT features into the database; numbers follow the order of the job."""
+    pycolmap.Database.open(job["database"]).close()
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads, options.use_gpu, options.sift.peak_threshold = job["threads"], False, PEAK
+    arguments = (job["database"], job["images"])
+    for number, camera in enumerate(job["cameras"]):
+        names = [n for n, c in zip(job["names"], job["camera_of"], strict=True) if c == number]
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = CAMERA_MODEL
+        if camera["focal"] is not None:
+            reader.camera_params = ",".join(map(repr, (camera["focal"], camera["width"] / 2, camera["height"] / 2, 0.0)))
+        pycolmap.import_images(*arguments, pycolmap.CameraMode.SINGLE, names, reader)
+    step = max(job["threads"], len(job["names"]) // 20)  # each thread takes one photograph
+    for begin in range(0, len(job["names"]), step):
+        _say(progress=f"finding features: photograph {begin + 1} of {len(job['names'])}")
+        mode, reader = pycolmap.CameraMode.AUTO, pycolmap.ImageReaderOptions()
+        names = job["names"][begin : begin + step]
+        pycolmap.extract_features(*arguments, names, mode, reader, options, pycolmap.Device.cpu)
+
+
+def match(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
+    """Match pairs of photographs; return keypoints by photograph, and pairs with their matches that agree with one motion."""
+    with pycolmap.Database.open(job["database"]) as database:
+        numbers = {image.name: image.image_id for image in database.read_all_images()}
+        order = [numbers[name] for name in job["names"]]
+        keypoints = [database.num_keypoints_for_image(i) for i in order]
+        few = len(order) <= job["exhaustive"]
+        found = [] if few else [database.read_descriptors(i).data for i in order]
+    pairs = choose_pairs(found, job["kind"], SEED) if found else [(i, j) for j in range(len(order)) for i in range(j)]
+    matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    matching.num_threads, matching.use_gpu = job["threads"], False
+    verification.ransac.random_seed, verification.min_num_inliers = SEED, MIN_INLIERS
+    listed, chosen = Path(job["pairs"]), pycolmap.ImportedPairingOptions()
+    chosen.match_list_path = str(listed)
+    step = max(1, len(pairs) // 20)
+    for begin in range(0, len(pairs), step):
+        _say(progress=f"matching: pair {begin + 1} of {len(pairs)}")
+        write_text(listed, "".join(f"{job['names'][i]} {job['names'][j]}\n" for i, j in pairs[begin : begin + step]))
+        pycolmap.match_image_pairs(job["database"], matching, chosen, verification, pycolmap.Device.cpu)
+    index = {number: i for i, number in enumerate(order)}
+    with pycolmap.Database.open(job["database"]) as database:
+        ids, geometries = database.read_two_view_geometries()
+    agreed = []
+    for pair, geometry in zip(ids, geometries, strict=True):
+        i, j = sorted(index[k] for k in pycolmap.pair_id_to_image_pair(pair))
+        agreed.append([i, j, len(geometry.inlier_matches)])
+    return {"keypoints": keypoints, "pairs": sorted(agreed), "tried": len(pairs)}
+
+
+def map_incrementally(pycolmap: Any, job: dict[str, Any]) -> list[Any]:
+    """Return the models that grow photograph by photograph from a good pair."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1  # else the last digits depend on which thread is done first
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
+    options.min_model_size, options.min_num_matches = 2, MIN_INLIERS
+    options.mapper.abs_pose_min_num_inliers = MIN_INLIERS
+    options.triangulation.ignore_two_view_tracks = False  # most points of a few photographs are seen by two of them
+    registered = [2]
+
+    def on_next() -> None:
+        registered[0] += 1
+        _say(progress=f"finding poses: photograph {min(registered[0], len(job['names']))} of {len(job['names'])}")
+
+    folder = Path(job["models"]) / "incremental"
+    folder.mkdir()
+    arguments = job["database"], job["images"], str(folder)
+    return list(pycolmap.incremental_mapping(*arguments, options, next_image_callback=on_next).values())
+
+
+def map_globally(pycolmap: Any, job: dict[str, Any]) -> list[Any]:
+    """Return the models in which all poses are found at once."""
+    _say(progress="finding poses: all at once")
+    if not pycolmap.calibrate_view_graph(job["database"]):
+        return []
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = options.mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
+    mapper = options.mapper
+    for part in (options, mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
+        part.random_seed = SEED
+    folder = Path(job["models"]) / "global"
+    folder.mkdir()
+    return list(pycolmap.global_mapping(job["database"], job["images"], str(folder), options).values())
+
+
+def finish(model: Any, job: dict[str, Any]) -> dict[str, Any]:
+    """Give a model the names and sizes of the scene's images and write it; return what is known of it."""
+    error, index = model.compute_mean_reprojection_error(), {name: i for i, name in enumerate(job["names"])}
+    views = {}
+    for number in model.reg_image_ids():
+        image = model.image(number)
+        i = index[image.name]
+        pose = image.cam_from_world()
+        views[i] = {"rotation": pose.rotation.matrix().tolist(), "center": image.projection_center().tolist(),
+                    "points": image.num_points3D, "camera": image.camera_id}  # fmt: skip
+        small, (width, height) = image.camera, job["sizes"][i]
+        scale = [width / small.width, height / small.height]
+        for point in image.points2D:
+            point.xy = point.xy * scale
+        image.name = job["scene_names"][i]
+    for camera in model.cameras.values():
+        used = [i for i, v in views.items() if v["camera"] == camera.camera_id]
+        if used:
+            camera.rescale(*job["sizes"][used[0]])
+    Path(job["model"]).mkdir(parents=True)
+    model.write_binary(job["model"])
+    cameras = {c.camera_id: {"focal": c.mean_focal_length(), "distortion": c.params[-1], "width": c.width, "height": c.height}
+               for c in model.cameras.values() if any(v["camera"] == c.camera_id for v in views.values())}  # fmt: skip
+    return {"views": views, "cameras": cameras, "points": model.num_points3D(), "error": error}
+
+
+def main(path: str) -> None:
+    """Run the job in a file."""
+    import pycolmap
+
+    pycolmap.logging.minloglevel = 2  # errors
+    job = json.loads(Path(path).read_text("utf-8"))
+    pycolmap.set_random_seed(SEED)
+    extract(pycolmap, job)
+    result = match(pycolmap, job) | {"version": pycolmap.__version__}
+    models: list[Any] = map_incrementally(pycolmap, job) if result["pairs"] else []
+    largest = max((m.num_reg_images() for m in models), default=0)
+    method = "incremental"
+    if result["pairs"] and largest < len(job["names"]):
+        others = map_globally(pycolmap, job)
+        if max((m.num_reg_images() for m in others), default=0) > largest:
+            models, method = others, "global"
+    models.sort(key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
+    groups = [sorted(m.image(i).name for i in m.reg_image_ids()) for m in models]
+    _say(result=result | {"method": method, "groups": groups, "model": finish(models[0], job) if models else None})
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
