@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     import viser
 
 POLL = 1.0
-"""Time between looks at a run folder [s]."""
+"""Time between looks at a run folder, and between states of a fit in this process [s]."""
 
 
 def address(server: viser.ViserServer) -> str:
@@ -79,7 +80,12 @@ def _follow(server: viser.ViserServer, path: Path, device: str, reader: str | No
                 say(f"  {content.title}: {len(content.model.gaussians()):,} Gaussians")
             else:
                 _update(window, path, device)
-        time.sleep(POLL)
+        _pause()
+
+
+def _pause() -> None:
+    """Wait until it is time for another look."""
+    time.sleep(POLL)
 
 
 def _update(window: Window, path: Path, device: str) -> None:
@@ -99,15 +105,24 @@ class LiveView:
         """Begin without a state."""
         self.server, self.title, self.folder = server, title, folder
         self._latest: FittedModel | None = None
-        self._wake, self._open, self._window = threading.Event(), True, None
+        self._next = -math.inf
+        self._wake, self._drawn, self._open = threading.Event(), threading.Event(), True
+        self._window: Window | None = None
         self._thread = threading.Thread(target=self._draw, name="live view", daemon=True)
         self._thread.start()
 
     def look(self, model: FittedModel) -> None:
-        """Take a copy of a state, which the fit's next step may overwrite; a state that was not drawn yet is dropped."""
+        """Copy a state, which the fit's next step overwrites, at most once in `POLL`; one that was not drawn yet is dropped."""
+        if time.monotonic() < self._next:
+            return
         copy = {n: t.detach().to("cpu", copy=True) for n, t in model.gaussians().tensors().items()}
         self._latest = replace(model, scene_gaussians=Gaussians(**copy))
+        self._next = time.monotonic() + POLL
         self._wake.set()
+
+    def wait_drawn(self, seconds: float) -> bool:
+        """Wait until a state was drawn; returns whether one was, within a time [s]."""
+        return self._drawn.wait(seconds)
 
     def close(self) -> None:
         """Draw no more."""
@@ -131,6 +146,7 @@ class LiveView:
                 self._window = Window(self.server, content, maps=False)
             else:
                 self._window.show(content)
+            self._drawn.set()
 
 
 @contextlib.contextmanager

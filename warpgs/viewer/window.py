@@ -104,8 +104,7 @@ class Window:
                 )
             else:
                 self.server.scene.remove_by_name("/gaussians")
-            for frustum in self._frusta.values():
-                frustum.visible = self.panel.shows_cameras()
+            self._hide_near()
             self._drawn.clear()
         self._wake.set()
 

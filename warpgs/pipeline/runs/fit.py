@@ -82,6 +82,7 @@ class _Job:
     on_step: Callable[[StepReport], object] | None
     began: float
     progress: Callable[[str], object]
+    on_model: Callable[[FittedModel], object] | None
     photographs: list[PhotoCheck] = field(default_factory=list)
 
     @property
@@ -127,6 +128,7 @@ def fit(
     time_budget: float | None = None,
     notes: tuple[str, ...] = (),
     verbose: bool = True,
+    on_model: Callable[[FittedModel], object] | None = None,
 ) -> FitResult:
     """Fit Gaussians to a scene: the same code as `warpgs fit`.
 
@@ -144,6 +146,7 @@ def fit(
         time_budget: Time that the fit may take [s], by which its steps are chosen; None for those of ``config``.
         notes: Choices made before, to be printed and recorded with the fit's own.
         verbose: Whether to print.
+        on_model: Called after every step with the model as it is, for those who look on: the next step overwrites its tensors.
 
     Raises:
         UsageError: Settings, a preset or a split cannot be, ``out`` holds something already, or ``resume`` comes without it.
@@ -166,7 +169,7 @@ def fit(
         notes = (*notes, *held, *found, *([] if out is None else renaming_notes(image_names(v.name for v in read.views))))
         job = _Job(
             read, request, parts, preset_config(config), *where, out, lpips, [*notes], verbose, on_step, began,
-            progress,
+            progress, on_model,
         )  # fmt: skip
         if time_budget is not None:
             job.config, note = within_budget(job.config, time_budget, job.train, job.device)
@@ -185,12 +188,12 @@ def _set_background(job: _Job) -> None:
     job.notes += [note] if note else []
 
 
-def fit_request(request: FitRequest) -> FitResult:
+def fit_request(request: FitRequest, on_model: Callable[[FittedModel], object] | None = None) -> FitResult:
     """Run `fit` as the command line or a study asks for it."""
     r = request
     return fit(
         r.scene, r.config, out=r.out, device=r.device, resume=r.resume, lpips_weights=r.lpips_weights,
-        time_budget=r.time_budget, notes=r.notes,
+        time_budget=r.time_budget, notes=r.notes, on_model=on_model,
     )  # fmt: skip
 
 
@@ -254,12 +257,17 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
         if note:
             job.say(f"  {note}")
     _print_result(job, metrics)
-    cameras = {v.name: v.camera for v in job.scene.views}
     return FitResult(
-        trainer.gaussians, job.scene.normalization, cameras, job.split.train, job.split.test, job.config.rule,
-        job.scene.background, trainer.step, job.config, metrics, tuple(job.notes), job.out,
+        *_model_fields(job, trainer), job.config, metrics, tuple(job.notes), job.out,
         transparent=job.scene.transparent,
     )  # fmt: skip
+
+
+def _model_fields(job: _Job, trainer: Trainer) -> tuple[Any, ...]:
+    """Return the fields of the `FittedModel` that a fit has by now."""
+    cameras = {v.name: v.camera for v in job.scene.views}
+    names, rule = (job.split.train, job.split.test), job.config.rule
+    return trainer.gaussians, job.scene.normalization, cameras, *names, rule, job.scene.background, trainer.step
 
 
 def _announce(job: _Job, trainer: Trainer) -> None:
@@ -342,6 +350,8 @@ def _train(job: _Job, trainer: Trainer, images_written: Callable[[], None]) -> N
             _tell(job, trainer)
             if job.on_step is not None:
                 job.on_step(r)
+            if job.on_model is not None:
+                job.on_model(FittedModel(*_model_fields(job, trainer), transparent=job.scene.transparent))
 
         try:
             with noted_signals() as stopped:
