@@ -16,7 +16,7 @@ from warpgs.pipeline.model.init import InitConfig
 from warpgs.synthetic.demo import split_spec, write_demo
 from warpgs.viewer import watch
 from warpgs.viewer.content import content_of_ply, content_of_run, views_of
-from warpgs.viewer.maps import COVERAGE, DEPTH, ERROR, MAPS, RENDER, SPLATS, placed
+from warpgs.viewer.maps import COVERAGE, DEPTH, ERROR, GAUSSIANS, MAPS, RENDER, placed
 from warpgs.viewer.panel import COARSE, FINE
 from warpgs.viewer.server import open_server, stop_server
 from warpgs.viewer.window import Window
@@ -34,7 +34,7 @@ def folder(tmp_path_factory):
     write_demo(folder / "scene", views=8, width=SIZE[0], height=SIZE[1])
     with watch.live_view(folder / "run", port=0) as live:
         fit(folder, "run", live.look)
-        assert live.wait_drawn(60)
+        assert live.wait_shown(60)
     return folder
 
 
@@ -112,7 +112,7 @@ def test_layers_and_the_crop_box_choose_what_is_shown(window):
 
 
 def test_a_browser_gets_the_image_that_it_asks_for(window):
-    """Once for each camera and wish; splats again where they are asked for."""
+    """Once for each camera and wish; Gaussians again where they are asked for."""
     camera = window.content.model.scene_cameras[window.content.model.train[0]]
     sent = []
     state = SimpleNamespace(
@@ -125,7 +125,7 @@ def test_a_browser_gets_the_image_that_it_asks_for(window):
     window._render_for(client)
     window._render_for(client)
     assert [i.shape for i in sent] == [(48, 64, 3)] and MAPS[DEPTH].split(",")[0] in window.panel._note.content
-    window.panel._kind.value = SPLATS
+    window.panel._kind.value = GAUSSIANS
     window._render_for(client)
     assert sent[-1].shape == (2, 2, 3) and not window.panel._note.visible
 

@@ -1,4 +1,4 @@
-"""What the viewer shows: a model, with the cameras, photographs and layers that are known of it."""
+"""Contents of the viewer: a model, with the cameras, photographs and layers that are known of it."""
 
 from __future__ import annotations
 

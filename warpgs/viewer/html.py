@@ -17,9 +17,9 @@ from warpgs.pipeline.runs.folder import open_run
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Camera, Gaussians
+from warpgs.viewer.packing import packed
 from warpgs.viewer.poses import camera_before, distance_ahead, fov_y, up_of
 from warpgs.viewer.server import open_server, require_viser, stop_server
-from warpgs.viewer.splats import splats_of
 
 if TYPE_CHECKING:
     import viser
@@ -34,7 +34,7 @@ SORT_FROM_DISK = (
     "b=>b instanceof Blob&&b.type.startsWith('text/javascript')?'':make.call(URL,b)}</script>"
 )
 """Script for a page opened from disk, whose blobs browsers refuse as module workers: without the worker that sorts them, the
-Gaussians are drawn in the order of the file. Refused here, viser's page starts it from a data: address, which works."""
+Gaussians are blended in the order of the file. Refused here, viser's page starts it from a data: address, which works."""
 
 
 def place_first_camera(server: viser.ViserServer, camera: Camera, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
@@ -61,7 +61,7 @@ def page_of(
 ) -> tuple[str, list[str]]:
     """Return the page as text, and notes for the user on what it shows otherwise than a render would.
 
-    The page holds the Gaussians in units of their own (`splats_of`), without directions: colours are those of degree 0. No name
+    The page holds the Gaussians in units of their own (`packed`), without directions: colours are those of degree 0. No name
     of a file, a view or a machine is in it, but for ``title``.
 
     Args:
@@ -76,14 +76,14 @@ def page_of(
     """
     if not len(gaussians):
         raise DataError("a page needs at least one Gaussian; fit the scene for longer")
-    splats = splats_of(gaussians)
+    stored = packed(gaussians)
     cameras = cameras or [camera_before(gaussians)]
     server = open_server(port=0)
     try:
         place_first_camera(server, cameras[0], gaussians, cameras)
         server.scene.set_background_image(plain_background(background), format="png")
         server.scene.add_gaussian_splats(
-            "/gaussians", splats.centers, splats.covariances, splats.colors, splats.opacities, scale=splats.scale
+            "/gaussians", stored.centers, stored.covariances, stored.colors, stored.opacities, scale=stored.scale
         )
         text = server.get_scene_serializer().as_html(dark_mode=True)
     finally:
@@ -93,8 +93,8 @@ def page_of(
     notes = ["the page shows colours of degree 0: those that change with the direction stay in the run and in its PLY"]
     if gaussians.sh_degree == 0:
         notes.clear()
-    if splats.shortened:
-        notes.append(f"{splats.shortened:,} Gaussians are longer than the page can hold, and are drawn shorter")
+    if stored.shortened:
+        notes.append(f"{stored.shortened:,} Gaussians are longer than the page can hold, and are shown shorter")
     return text.replace("<head>", head, 1), notes
 
 

@@ -18,7 +18,7 @@ from warpgs.scene import Camera, Gaussians
 from warpgs.viewer.content import Content
 from warpgs.viewer.poses import stands_at
 
-SPLATS, RENDER, DEPTH, COVERAGE, ERROR = "splats (browser)", "render", "depth", "coverage", "error"
+GAUSSIANS, RENDER, DEPTH, COVERAGE, ERROR = "Gaussians (browser)", "render", "depth", "coverage", "error"
 MAPS = {
     RENDER: "colours of all directions, by the rasterizer of the fit",
     DEPTH: "near warm, far cold; gray where little is there",

@@ -13,7 +13,7 @@ from warpgs.geometry import rotation_matrices
 from warpgs.runtime.terminal import say
 from warpgs.scene import Camera
 from warpgs.viewer.content import Content
-from warpgs.viewer.maps import MAPS, SPLATS
+from warpgs.viewer.maps import GAUSSIANS, MAPS
 from warpgs.viewer.saved import CROP, PATH, CropBox, keyframe
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ BOX, GIZMO = "/crop/box", "/crop"
 
 
 class Shown(Protocol):
-    """What the panel asks of the window."""
+    """The window, as the panel uses it."""
 
     def redraw(self) -> None:
         """Send what is to be seen now."""
@@ -48,11 +48,11 @@ class Panel:
         self._lock = threading.Lock()
         gui = server.gui
         self._status = gui.add_markdown("")
-        self._kind = gui.add_dropdown("show", (SPLATS, *MAPS) if maps else (SPLATS,), initial_value=SPLATS)
+        self._kind = gui.add_dropdown("show", (GAUSSIANS, *MAPS) if maps else (GAUSSIANS,), initial_value=GAUSSIANS)
         degree = content.model.gaussians().sh_degree
         self._degree = gui.add_slider(
             "SH degree", 0, max(degree, 1), 1, degree, disabled=degree == 0, visible=maps,
-            hint="degree of the colours of a render; splats in the browser have degree 0",
+            hint="degree of the colours of a render; those that the browser renders have degree 0",
         )  # fmt: skip
         self._layer = gui.add_dropdown("layer", (ALL, COARSE, FINE), initial_value=ALL, visible=content.fine is not None)
         self._cameras = gui.add_checkbox("cameras", True, visible=bool(content.model.scene_cameras))
@@ -66,7 +66,7 @@ class Panel:
         self.tell(content)
 
     def kind(self) -> str:
-        """Return what is to be shown: `SPLATS` or one of `MAPS`."""
+        """Return what is to be shown: `GAUSSIANS` or one of `MAPS`."""
         return str(self._kind.value)
 
     def sh_degree(self) -> int:
@@ -89,7 +89,7 @@ class Panel:
         return CropBox(np.asarray(self._gizmo.position, np.float64), size, rotation_matrices(np.asarray(self._gizmo.wxyz)))
 
     def tell(self, content: Content) -> None:
-        """Say what is shown now."""
+        """Write what is shown now."""
         self.content = content
         model = content.model
         parts = [f"{len(model.gaussians()):,} Gaussians"]
@@ -98,7 +98,7 @@ class Panel:
         self._status.content = f"**{_plain(content.title)}**\n\n{', '.join(parts)}"
 
     def explain(self, note: str) -> None:
-        """Say what an image shows."""
+        """Write what an image shows."""
         self._note.content, self._note.visible = _plain(note), bool(note)
 
     def _add_stepping(self) -> None:

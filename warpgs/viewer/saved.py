@@ -1,4 +1,4 @@
-"""What the viewer saves: a crop box and the keyframes of a path, both in the units of the scene's files."""
+"""Files that the viewer saves: a crop box and the keyframes of a path, both in the units of the scene's files."""
 
 from __future__ import annotations
 

@@ -47,12 +47,12 @@ def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None 
         ResourceError: viser or the device is not there.
         UsageError: The port is taken.
     """
-    require_viser()
     choose_device(device)
     if path.is_dir():
         read_record(path)
     elif path.suffix.lower() != ".ply" or not path.is_file():
         raise DataError(f"{path}: is neither a run folder ({CONFIG} in it) nor a PLY file; give one of the two")
+    require_viser()
     with contextlib.suppress(KeyboardInterrupt):
         server = open_server(port)
         try:
@@ -106,13 +106,13 @@ class LiveView:
         self.server, self.title, self.folder = server, title, folder
         self._latest: FittedModel | None = None
         self._next = -math.inf
-        self._wake, self._drawn, self._open = threading.Event(), threading.Event(), True
+        self._wake, self._shown, self._open = threading.Event(), threading.Event(), True
         self._window: Window | None = None
         self._thread = threading.Thread(target=self._draw, name="live view", daemon=True)
         self._thread.start()
 
     def look(self, model: FittedModel) -> None:
-        """Copy a state, which the fit's next step overwrites, at most once in `POLL`; one that was not drawn yet is dropped."""
+        """Copy a state, which the fit's next step overwrites, at most once in `POLL`; one that was not shown yet is dropped."""
         if time.monotonic() < self._next:
             return
         copy = {n: t.detach().to("cpu", copy=True) for n, t in model.gaussians().tensors().items()}
@@ -120,9 +120,9 @@ class LiveView:
         self._next = time.monotonic() + POLL
         self._wake.set()
 
-    def wait_drawn(self, seconds: float) -> bool:
-        """Wait until a state was drawn; returns whether one was, within a time [s]."""
-        return self._drawn.wait(seconds)
+    def wait_shown(self, seconds: float) -> bool:
+        """Wait until a state was shown; returns whether one was, within a time [s]."""
+        return self._shown.wait(seconds)
 
     def close(self) -> None:
         """Draw no more."""
@@ -133,6 +133,13 @@ class LiveView:
             self._window.close()
 
     def _draw(self) -> None:
+        try:
+            self._draw_states()
+        except Exception as e:  # of viser, too: the fit goes on
+            say(f"the viewer stopped ({type(e).__name__}: {e}); the fit goes on", error=True)
+
+    def _draw_states(self) -> None:
+        """Show each state that comes, until `close`."""
         while True:
             self._wake.wait()
             self._wake.clear()
@@ -146,7 +153,7 @@ class LiveView:
                 self._window = Window(self.server, content, maps=False)
             else:
                 self._window.show(content)
-            self._drawn.set()
+            self._shown.set()
 
 
 @contextlib.contextmanager

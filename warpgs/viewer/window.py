@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import threading
 import time
 from typing import TYPE_CHECKING, Any
@@ -10,15 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from warpgs.errors import WarpgsError
 from warpgs.geometry import camera_extent
 from warpgs.report.images import resized
 from warpgs.scene import Camera, Gaussians
 from warpgs.viewer.content import Content
 from warpgs.viewer.html import place_first_camera, plain_background
-from warpgs.viewer.maps import SPLATS, Maps
+from warpgs.viewer.maps import GAUSSIANS, Maps
+from warpgs.viewer.packing import packed
 from warpgs.viewer.panel import ALL, FINE, Panel
 from warpgs.viewer.poses import camera_at, camera_before, distance_ahead, fov_y, wxyz_of
-from warpgs.viewer.splats import splats_of
 
 if TYPE_CHECKING:
     import viser
@@ -97,8 +97,8 @@ class Window:
     def redraw(self) -> None:
         """Send what is to be seen now to the browsers: the Gaussians, or images at each browser's camera."""
         with self._lock, self.server.atomic():
-            if self.panel.kind() == SPLATS:
-                s = splats_of(self.shown())
+            if self.panel.kind() == GAUSSIANS:
+                s = packed(self.shown())
                 self.server.scene.add_gaussian_splats(
                     "/gaussians", s.centers, s.covariances, s.colors, s.opacities, scale=s.scale
                 )
@@ -167,20 +167,24 @@ class Window:
             if self._wake.is_set() or not self._open:
                 continue  # still moving
             for client in list(self.server.get_clients().values()):
-                with contextlib.suppress(AssertionError):  # a browser that has not told its camera yet; it will wake us
+                try:
                     self._render_for(client)
+                except AssertionError:  # a browser that has not told its camera yet; it will wake us
+                    continue
+                except (WarpgsError, RuntimeError) as e:  # of torch: no memory for this image; the next one may be smaller
+                    self.panel.explain(f"no image: {e}")
 
     def _render_for(self, client: viser.ClientHandle) -> None:
         """Put the image that the panel asks for behind a browser's scene, where the one it has is another."""
         kind, degree = self.panel.kind(), self.panel.sh_degree()
         state = client.camera
         asked = (kind, degree, tuple(state.position), tuple(state.wxyz), state.fov, state.image_width, state.image_height)
-        asked = (kind,) if kind == SPLATS else asked
+        asked = (kind,) if kind == GAUSSIANS else asked
         if self._drawn.get(client.client_id) == asked:
             return
         with self._lock:
             self._drawn[client.client_id] = asked
-            if kind == SPLATS:
+            if kind == GAUSSIANS:
                 client.scene.set_background_image(plain_background(self.content.model.background), format="png")
                 self.panel.explain("")
                 return

@@ -11,9 +11,9 @@ from tests.scenes import ring, three_gaussians
 from warpgs.coordinates import convert_camera, convert_gaussians
 from warpgs.geometry import rotation_matrices
 from warpgs.scene import Normalization
+from warpgs.viewer.packing import LARGEST_HALF, packed
 from warpgs.viewer.poses import camera_at, camera_before, distance_ahead, fov_y, stands_at, up_of, wxyz_of
 from warpgs.viewer.saved import CropBox, keyframe
-from warpgs.viewer.splats import LARGEST_HALF, splats_of
 
 
 def test_half_precision_keeps_gaussians_of_any_scene():
@@ -21,7 +21,7 @@ def test_half_precision_keeps_gaussians_of_any_scene():
     g = cloud(200)
     for factor in (1e-4, 1.0, 1e4):
         scaled = dataclasses.replace(g, means=factor * g.means, log_scales=g.log_scales + math.log(factor))
-        s = splats_of(scaled)
+        s = packed(scaled)
         half = s.covariances.astype(np.float16).astype(np.float64)
         exact = s.covariances.astype(np.float64)
         assert np.abs(half - exact).max(axis=(1, 2)).max() <= 1e-3 * np.abs(exact).max()
@@ -29,21 +29,21 @@ def test_half_precision_keeps_gaussians_of_any_scene():
         wanted = np.exp(2 * scaled.log_scales.double().numpy()).sum(1)
         np.testing.assert_allclose(traces, wanted, rtol=2e-3)
         np.testing.assert_allclose(s.scale * s.centers, scaled.means.numpy(), rtol=1e-5, atol=1e-6 * factor)
-    assert (np.trace((splats_of(g).covariances * 1e-8).astype(np.float16), axis1=1, axis2=2) < 1e-6).all()
+    assert (np.trace((packed(g).covariances * 1e-8).astype(np.float16), axis1=1, axis2=2) < 1e-6).all()
 
 
 def test_what_is_too_long_is_counted_and_finite():
     """One axis of a million medians."""
     g = cloud(50)
     g.log_scales[7, 1] += math.log(1e6)
-    s = splats_of(g)
+    s = packed(g)
     assert s.shortened == 1 and np.abs(s.covariances).max() <= LARGEST_HALF
     assert np.isfinite(s.covariances.astype(np.float16)).all()
 
 
 def test_colors_and_opacities_are_those_of_degree_0():
     """The three colours of the scene, rounded to bytes."""
-    s = splats_of(three_gaussians())
+    s = packed(three_gaussians())
     np.testing.assert_allclose(s.colors, 255 * np.array([[0.9, 0.2, 0.1], [0.15, 0.8, 0.2], [0.2, 0.3, 0.95]]), atol=0.51)
     np.testing.assert_allclose(s.opacities[:, 0], 255 * np.array([0.9, 0.85, 0.95]), atol=0.51)
 

@@ -1,4 +1,4 @@
-"""Gaussians as browsers draw them: covariances in half precision, and one colour each."""
+"""Gaussians as browsers render them: covariances in half precision, and one colour each."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from 6.1e-5 on, the least normal number: so for axes from 1/128 of the median to
 
 
 @dataclass(frozen=True)
-class Splats:
+class Packed:
     """N Gaussians of one colour each, in units of their own, of which one is ``scale`` scene units long."""
 
     centers: np.ndarray
-    """Means in stored units, float32, shape [N, 3]."""
+    """Positions in stored units, float32, shape [N, 3]."""
     covariances: np.ndarray
     """Covariances in squared stored units, float32 within half precision, shape [N, 3, 3]."""
     colors: np.ndarray
@@ -34,10 +34,10 @@ class Splats:
     scale: float
     """Scene units [u] per stored unit."""
     shortened: int
-    """Number of Gaussians that are longer than half precision holds, and are drawn as long as it does."""
+    """Number of Gaussians that are longer than half precision holds, and are shown as long as it does."""
 
 
-def splats_of(gaussians: Gaussians) -> Splats:
+def packed(gaussians: Gaussians) -> Packed:
     """Return Gaussians for the browser.
 
     A covariance in scene units can lie below what half precision resolves: axes of 0.001 u have squares of 1e-6, of which it
@@ -57,7 +57,7 @@ def splats_of(gaussians: Gaussians) -> Splats:
     covariances = np.einsum("nij,nj,nkj->nik", rotations, axes**2, rotations)
     colors = np.clip(0.5 + C0 * sh[:, 0], 0, 1)
     opacities = torch.sigmoid(torch.from_numpy(logits)).numpy()[:, None]
-    return Splats(
+    return Packed(
         (means / scale).astype(np.float32), covariances.astype(np.float32), _bytes(colors), _bytes(opacities), scale,
         int((relative > longest).any(1).sum()),
     )  # fmt: skip
