@@ -50,6 +50,7 @@ def test_the_lock_is_of_this_project():
 def test_every_package_stands_in_the_table_with_its_use():
     wanted = {n: "indirect" for n in locked() if not n.startswith(NVIDIA)}
     wanted |= {plain(r): "export" for r in PROJECT["optional-dependencies"]["export"]}
+    wanted |= {plain(r): "view" for r in PROJECT["optional-dependencies"]["view"]}
     wanted |= {plain(r): "tests and documents" for r in PROJECT["optional-dependencies"]["dev"]}
     wanted |= {plain(r): "fit" for r in PROJECT["dependencies"]}
     assert {n: use for n, (_, use) in table().items()} == wanted
