@@ -121,7 +121,7 @@ class Panel:
             image = cv2.imread(str(sheet))
             if image is None:
                 return self.explain("the image of importance cannot be read")
-            with event.client.gui.add_modal("Where importance placed Gaussians", size="xl") as modal:
+            with event.client.gui.add_modal("Where importance placed Gaussians") as modal:
                 event.client.gui.add_image(image[..., ::-1], format="jpeg")
                 event.client.gui.add_button("close").on_click(lambda _: modal.close())
 
