@@ -45,8 +45,9 @@ from warpgs.report.progress import Progress, Stages
 from warpgs.runtime.load_module import told_of_compiling
 from warpgs.runtime.stop_signals import noted_signals
 from warpgs.runtime.terminal import say
-from warpgs.scene import Scene, View
+from warpgs.scene import Camera, Gaussians, Normalization, Scene, View
 
+Names = tuple[str, ...]
 State = tuple[dict[str, torch.Tensor], dict[str, Any]]
 """Tensors and plain values of a checkpoint."""
 
@@ -263,7 +264,9 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
     )  # fmt: skip
 
 
-def _model_fields(job: _Job, trainer: Trainer) -> tuple[Any, ...]:
+def _model_fields(
+    job: _Job, trainer: Trainer
+) -> tuple[Gaussians, Normalization, dict[str, Camera], Names, Names, str, tuple[float, float, float], int]:
     """Return the fields of the `FittedModel` that a fit has by now."""
     cameras = {v.name: v.camera for v in job.scene.views}
     names, rule = (job.split.train, job.split.test), job.config.rule
