@@ -16,11 +16,13 @@ def run(arguments: list[str], about: str) -> int:
         run: tyro.conf.Positional[Path]
         """Run folder of `warpgs fit`."""
         to: Path
-        """File to write; its suffix says the format: .ply."""
+        """File to write; its suffix says the format: .ply, or .html for a page that shows the model in any browser."""
 
     a = parse_flags(Export, arguments, "warpgs export", about)
-    from warpgs.pipeline.runs.commands import export
-
+    if a.to.suffix.lower() == ".html":
+        from warpgs.viewer.html import export_html as export
+    else:
+        from warpgs.pipeline.runs.commands import export
     for line in export(a.run, a.to):
         say(line)
     return 0

@@ -70,6 +70,10 @@ def _request_type() -> type:
         """Choose the fastest rule whose images are off exact by at most this on average, in [0, 1]; not with --rule."""
         time_budget: float | None = None
         """Choose the number of steps so that the fit is done in this time [s]; not with --steps or --max-error."""
+        view: bool = False
+        """Show the model in a browser while it trains, at http://127.0.0.1:PORT; the result is the same to the byte."""
+        view_port: int = 8080
+        """PORT of --view; 0 for any free one."""
 
     return Request
 
@@ -215,6 +219,7 @@ def request_of(arguments: list[str], about: str) -> FitRequest:
     if a.reader is not None:
         _load(READERS, a.reader)
     check_range("--threads", a.threads, 0, MAX_THREADS)
+    check_range("--view-port", a.view_port, 0, 65535)
     if a.threads:
         set_threads(a.threads)
     config, notes = _chosen(a, arguments, _config(a, base, terms))
@@ -225,7 +230,8 @@ def request_of(arguments: list[str], about: str) -> FitRequest:
         str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.masks, a.mask_keeps, a.black_is_empty, masks, a.reader,
         a.max_pixels,
     )  # fmt: skip
-    return FitRequest(scene, a.out, config, a.device, a.resume, a.lpips_weights, a.time_budget, notes)
+    view_port = a.view_port if a.view else None
+    return FitRequest(scene, a.out, config, a.device, a.resume, a.lpips_weights, a.time_budget, notes, view_port)
 
 
 def run(arguments: list[str], about: str) -> int:
@@ -233,5 +239,11 @@ def run(arguments: list[str], about: str) -> int:
     request = request_of(arguments, about)
     with fast_imports():
         from warpgs.pipeline.runs.fit import fit_request
-    fit_request(request)
+    if request.view_port is None:
+        fit_request(request)
+        return 0
+    from warpgs.viewer.watch import live_view
+
+    with live_view(request.out, request.view_port) as live:
+        fit_request(request, live.look)
     return 0

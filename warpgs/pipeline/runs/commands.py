@@ -160,7 +160,7 @@ def export(folder: Path, target: Path) -> list[str]:
         UsageError: The suffix is not supported.
     """
     if target.suffix.lower() != ".ply":
-        raise UsageError(f"{target}: format {target.suffix or '(none)'} is not supported; use .ply")
+        raise UsageError(f"{target}: format {target.suffix or '(none)'} is not supported; use .ply or .html")
     stored = open_run(folder, torch.device("cpu"))
     with hold_folder(target.parent) as notes:
         write_ply(target, drop_unused_sh(stored.gaussians()), stored.normalization)

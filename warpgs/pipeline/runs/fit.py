@@ -46,8 +46,9 @@ from warpgs.report.progress import Progress, Stages
 from warpgs.runtime.load_module import told_of_compiling
 from warpgs.runtime.stop_signals import noted_signals
 from warpgs.runtime.terminal import say
-from warpgs.scene import Scene, View
+from warpgs.scene import Camera, Gaussians, Normalization, Scene, View
 
+Names = tuple[str, ...]
 State = tuple[dict[str, torch.Tensor], dict[str, Any]]
 """Tensors and plain values of a checkpoint."""
 
@@ -83,6 +84,7 @@ class _Job:
     on_step: Callable[[StepReport], object] | None
     began: float
     progress: Callable[[str], object]
+    on_model: Callable[[FittedModel], object] | None
     photographs: list[PhotoCheck] = field(default_factory=list)
 
     @property
@@ -128,6 +130,7 @@ def fit(
     time_budget: float | None = None,
     notes: tuple[str, ...] = (),
     verbose: bool = True,
+    on_model: Callable[[FittedModel], object] | None = None,
 ) -> FitResult:
     """Fit Gaussians to a scene: the same code as `warpgs fit`.
 
@@ -145,6 +148,7 @@ def fit(
         time_budget: Time that the fit may take [s], by which its steps are chosen; None for those of ``config``.
         notes: Choices made before, to be printed and recorded with the fit's own.
         verbose: Whether to print.
+        on_model: Called after every step with the model as it is, for those who look on: the next step overwrites its tensors.
 
     Raises:
         UsageError: Settings, a preset or a split cannot be, ``out`` holds something already, or ``resume`` comes without it.
@@ -167,7 +171,7 @@ def fit(
         notes = (*notes, *held, *found, *([] if out is None else renaming_notes(image_names(v.name for v in read.views))))
         job = _Job(
             read, request, parts, preset_config(config), *where, out, lpips, [*notes], verbose, on_step, began,
-            progress,
+            progress, on_model,
         )  # fmt: skip
         if time_budget is not None:
             job.config, note = within_budget(job.config, time_budget, job.train, job.device)
@@ -186,12 +190,12 @@ def _set_background(job: _Job) -> None:
     job.notes += [note] if note else []
 
 
-def fit_request(request: FitRequest) -> FitResult:
+def fit_request(request: FitRequest, on_model: Callable[[FittedModel], object] | None = None) -> FitResult:
     """Run `fit` as the command line or a study asks for it."""
     r = request
     return fit(
         r.scene, r.config, out=r.out, device=r.device, resume=r.resume, lpips_weights=r.lpips_weights,
-        time_budget=r.time_budget, notes=r.notes,
+        time_budget=r.time_budget, notes=r.notes, on_model=on_model,
     )  # fmt: skip
 
 
@@ -257,12 +261,19 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
         if note:
             job.say(f"  {note}")
     _print_result(job, metrics)
-    cameras = {v.name: v.camera for v in job.scene.views}
     return FitResult(
-        trainer.gaussians, job.scene.normalization, cameras, job.split.train, job.split.test, job.config.rule,
-        job.scene.background, trainer.step, job.config, metrics, tuple(job.notes), job.out,
+        *_model_fields(job, trainer), job.config, metrics, tuple(job.notes), job.out,
         transparent=job.scene.transparent,
     )  # fmt: skip
+
+
+def _model_fields(
+    job: _Job, trainer: Trainer
+) -> tuple[Gaussians, Normalization, dict[str, Camera], Names, Names, str, tuple[float, float, float], int]:
+    """Return the fields of the `FittedModel` that a fit has by now."""
+    cameras = {v.name: v.camera for v in job.scene.views}
+    names, rule = (job.split.train, job.split.test), job.config.rule
+    return trainer.gaussians, job.scene.normalization, cameras, *names, rule, job.scene.background, trainer.step
 
 
 def _announce(job: _Job, trainer: Trainer) -> None:
@@ -345,6 +356,8 @@ def _train(job: _Job, trainer: Trainer, images_written: Callable[[], None]) -> N
             _tell(job, trainer)
             if job.on_step is not None:
                 job.on_step(r)
+            if job.on_model is not None:
+                job.on_model(FittedModel(*_model_fields(job, trainer), transparent=job.scene.transparent))
 
         try:
             with noted_signals() as stopped:

@@ -63,6 +63,8 @@ class FitRequest:
     """Time that the fit may take [s], by which its steps are chosen; None for those of ``config``. Not with ``resume``."""
     notes: tuple[str, ...] = ()
     """Choices made for the user while the request was read."""
+    view_port: int | None = None
+    """Port at which the command line shows the model while it trains; None for no viewer."""
 
 
 def choose_device(name: str | torch.device) -> tuple[torch.device, str]:

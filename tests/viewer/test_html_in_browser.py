@@ -1,0 +1,71 @@
+"""The page of a model in a real browser, opened as a file: it shows what our rasterizer does, and asks nobody for anything."""
+
+import dataclasses
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.report.test_page_in_browser import BROWSERS
+from tests.scenes import ring, three_gaussians
+from warpgs.render.rasterize import rasterize
+from warpgs.viewer.html import SORT_FROM_DISK, write_html
+
+pytest.importorskip("viser")
+WIDTH, HEIGHT = 700, 600
+SHOWN = np.s_[200:, :]
+"""Rows without the browser's remark on software rendering and the page's own button."""
+MILLISECONDS = 30_000
+"""The browser's own time until the picture is taken: Gaussians fade in."""
+
+
+def shot(page, folder) -> tuple[np.ndarray, str]:
+    """A picture of a page in [0, 1], [H, W, 3], and what the browser wrote."""
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        pytest.skip(f"none of {', '.join(BROWSERS)} is there")
+    done = subprocess.run(
+        [
+            browser, "--headless=new", "--no-sandbox", "--disable-gpu-sandbox", "--use-gl=angle", "--use-angle=swiftshader",
+            "--enable-unsafe-swiftshader", "--no-first-run", "--disable-background-networking", "--disable-component-update",
+            "--disable-sync", f"--user-data-dir={folder / 'profile'}", f"--window-size={WIDTH},{HEIGHT}", "--hide-scrollbars",
+            "--enable-logging=stderr", f"--virtual-time-budget={MILLISECONDS}", f"--screenshot={folder / 'shot.png'}",
+            page.as_uri(),
+        ],
+        capture_output=True, text=True, encoding="utf-8", check=True, timeout=240,
+    )  # fmt: skip
+    return np.asarray(Image.open(folder / "shot.png").convert("RGB"), np.float32) / 255, done.stderr
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(-10 * np.log10(np.mean((a[SHOWN] - b[SHOWN]) ** 2)))
+
+
+def crowd():
+    """The three Gaussians, large and opaque, the far ones last in the file: only sorting shows them rightly."""
+    g = three_gaussians()
+    order = g.means[:, 2].argsort()
+    means = g.means * g.means.new_tensor([0.3, 0.3, 1.0])
+    g = dataclasses.replace(g, means=means, log_scales=g.log_scales + 0.4)
+    return type(g)(**{n: t[order] for n, t in g.tensors().items()})
+
+
+@pytest.mark.browser
+def test_a_page_from_disk_shows_the_render(tmp_path):
+    """At least 22 dB at a training camera; without the script for pages from disk the Gaussians come in the wrong order."""
+    g, camera = crowd(), ring(3)[1]
+    factor = HEIGHT / camera.height
+    K = np.diag([factor, factor, 1.0]) @ camera.K
+    K[:2, 2] = WIDTH / 2, HEIGHT / 2
+    wanted = rasterize(g, dataclasses.replace(camera, K=K, width=WIDTH, height=HEIGHT)).rgb.clamp(0, 1).numpy()
+    path = tmp_path / "scene.html"
+    assert write_html(path, g, [camera]) == []
+    image, console = shot(path, tmp_path)
+    assert image.shape == wanted.shape and wanted[SHOWN].std() > 0.1
+    assert psnr(image, wanted) > 22, psnr(image, wanted)
+    assert "Content Security Policy" not in console and "Refused" not in console, console
+    path.write_text(path.read_text("utf-8").replace(SORT_FROM_DISK, ""), "utf-8")
+    unsorted, console = shot(path, tmp_path)
+    assert "Refused" in console and psnr(unsorted, wanted) < psnr(image, wanted) - 3

@@ -1,0 +1,87 @@
+"""What the browser is given: covariances that half precision holds, boxes and keyframes in file units."""
+
+import dataclasses
+import math
+
+import numpy as np
+import torch
+
+from tests.gaussians import cloud
+from tests.scenes import ring, three_gaussians
+from warpgs.coordinates import convert_camera, convert_gaussians
+from warpgs.geometry import rotation_matrices
+from warpgs.scene import Normalization
+from warpgs.viewer.packing import LARGEST_HALF, packed
+from warpgs.viewer.poses import camera_at, camera_before, distance_ahead, fov_y, stands_at, up_of, wxyz_of
+from warpgs.viewer.saved import CropBox, keyframe
+
+
+def test_half_precision_keeps_gaussians_of_any_scene():
+    """Covariances keep ten bits at any size of the scene; in scene units those of a small one would vanish."""
+    g = cloud(200)
+    for factor in (1e-4, 1.0, 1e4):
+        scaled = dataclasses.replace(g, means=factor * g.means, log_scales=g.log_scales + math.log(factor))
+        s = packed(scaled)
+        half = s.covariances.astype(np.float16).astype(np.float64)
+        exact = s.covariances.astype(np.float64)
+        assert np.abs(half - exact).max(axis=(1, 2)).max() <= 1e-3 * np.abs(exact).max()
+        traces = np.trace(half, axis1=1, axis2=2) * s.scale**2
+        wanted = np.exp(2 * scaled.log_scales.double().numpy()).sum(1)
+        np.testing.assert_allclose(traces, wanted, rtol=2e-3)
+        np.testing.assert_allclose(s.scale * s.centers, scaled.means.numpy(), rtol=1e-5, atol=1e-6 * factor)
+    assert (np.trace((packed(g).covariances * 1e-8).astype(np.float16), axis1=1, axis2=2) < 1e-6).all()
+
+
+def test_what_is_too_long_is_counted_and_finite():
+    """One axis of a million medians."""
+    g = cloud(50)
+    g.log_scales[7, 1] += math.log(1e6)
+    s = packed(g)
+    assert s.shortened == 1 and np.abs(s.covariances).max() <= LARGEST_HALF
+    assert np.isfinite(s.covariances.astype(np.float16)).all()
+
+
+def test_colors_and_opacities_are_those_of_degree_0():
+    """The three colours of the scene, rounded to bytes."""
+    s = packed(three_gaussians())
+    np.testing.assert_allclose(s.colors, 255 * np.array([[0.9, 0.2, 0.1], [0.15, 0.8, 0.2], [0.2, 0.3, 0.95]]), atol=0.51)
+    np.testing.assert_allclose(s.opacities[:, 0], 255 * np.array([0.9, 0.85, 0.95]), atol=0.51)
+
+
+def test_poses_there_and_back():
+    """A camera told to the browser comes back; the made one sees the model; up is up."""
+    for c in ring(5):
+        back = camera_at(wxyz_of(c), c.center, fov_y(c), c.width, c.height)
+        np.testing.assert_allclose(back.viewmat, c.viewmat, atol=1e-12)
+        assert abs(back.K[1, 1] - c.K[1, 1]) < 1e-9 and stands_at(back, c, 1e-9)
+    first, second = ring(2)
+    assert not stands_at(first, second, 1.0) and up_of(ring(5)) @ [0, -1, 0] > 0.99
+    assert abs(distance_ahead(first, three_gaussians()) - 2.2) < 0.4
+    assert distance_ahead(camera_before(three_gaussians()), three_gaussians()) > 0.3
+
+
+def test_a_box_in_file_units_holds_the_same_points():
+    """A turned box, the Gaussians moved to a georeferenced place."""
+    turn = rotation_matrices(np.array([0.8, 0.0, 0.6, 0.0]))
+    g, box = cloud(300), CropBox(np.array([0.2, 0.1, 4.0]), np.array([2.0, 1.0, 1.5]), turn)
+    inside = box.contains(g.means)
+    assert 0 < int(inside.sum()) < len(inside)
+    n = Normalization(np.array([400.0, -20.0, 7.0]), 0.25)
+    stored = box.to_json(n)
+    means = convert_gaussians(g, n, "scene", "file").means.double().numpy()
+    local = (means - stored["center"]) @ np.array(stored["rotation"])
+    again = (np.abs(local) <= np.array(stored["size"]) / 2 + 1e-4).all(1)
+    assert (again == inside.numpy()).mean() > 0.99
+    assert torch.equal(
+        CropBox(np.zeros(3), np.full(3, 2.0), np.eye(3)).contains(torch.eye(3) * 1.1), torch.zeros(3, dtype=bool)
+    )
+
+
+def test_a_keyframe_is_camera_to_world_in_file_units():
+    """Its last column is the camera's centre in the files."""
+    n, c = Normalization(np.array([4.0, -2.0, 7.0]), 0.25), ring(3)[0]
+    k = keyframe(c, 1.5, n)
+    c2w = np.array(k["c2w"])
+    np.testing.assert_allclose(c2w @ convert_camera(c, n, "scene", "file").viewmat, np.eye(4), atol=1e-9)
+    np.testing.assert_allclose(c2w[:3, 3], c.center / 0.25 + n.offset, atol=1e-9)
+    assert k["seconds"] == 1.5 and abs(k["fov_y"] - fov_y(c)) < 1e-12

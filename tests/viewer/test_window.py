@@ -1,0 +1,172 @@
+"""The viewer on a run: what it sends, renders and saves, without a browser; and beside a fit."""
+
+import base64
+import dataclasses
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+import warpgs
+from warpgs.app.cli import main
+from warpgs.errors import DataError
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.synthetic.demo import split_spec, write_demo
+from warpgs.viewer import watch
+from warpgs.viewer.content import content_of_ply, content_of_run, views_of
+from warpgs.viewer.maps import COVERAGE, DEPTH, ERROR, GAUSSIANS, MAPS, RENDER, placed
+from warpgs.viewer.panel import COARSE, FINE
+from warpgs.viewer.server import open_server, stop_server
+from warpgs.viewer.window import Window
+
+pytest.importorskip("viser")
+zstandard = pytest.importorskip("zstandard")
+CONFIG = warpgs.FitConfig(steps=12, init=InitConfig(source="random", random_count=80))
+SIZE = (40, 32)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A scene, and a run on it that somebody looked at."""
+    folder = tmp_path_factory.mktemp("view")
+    write_demo(folder / "scene", views=8, width=SIZE[0], height=SIZE[1])
+    with watch.live_view(folder / "run", port=0) as live:
+        fit(folder, "run", live.look)
+        assert live.wait_shown(60)
+    return folder
+
+
+def fit(folder, name, on_model=None):
+    """Fit a few steps."""
+    warpgs.fit(
+        str(folder / "scene"), CONFIG, split=split_spec(8), out=folder / name, device="cpu", verbose=False, on_model=on_model
+    )
+
+
+@pytest.fixture(scope="module")
+def window(folder):
+    """A window on the run with its photographs and made-up layers, at a server that nobody asks."""
+    content = content_of_run(folder / "run")
+    views, notes = views_of(content)
+    assert not notes and len(views) == 8
+    fine = torch.arange(len(content.model.gaussians())) % 3 == 0
+    server = open_server(0)
+    opened = Window(server, dataclasses.replace(content, views=views, fine=fine))
+    yield opened
+    opened.close()
+    stop_server(server)
+
+
+def test_looking_on_changes_nothing(folder):
+    """The PLY of a fit that was looked at has the bytes of one that was not."""
+    fit(folder, "alone")
+    assert (folder / "run" / "point_cloud.ply").read_bytes() == (folder / "alone" / "point_cloud.ply").read_bytes()
+
+
+def test_images_at_a_camera_are_those_of_the_rasterizer(window):
+    """At a training camera: its render, depth, coverage and the error against its photograph; elsewhere no error."""
+    content = window.content
+    name = content.model.train[0]
+    camera = content.model.scene_cameras[name]
+    assert window.maps.view_at(camera) == name
+    rgb = warpgs.rasterize(content.model.gaussians(), camera, content.model.options()).rgb.detach().clamp(0, 1).numpy()
+    image, _ = window.maps.image(RENDER, camera, content.model.gaussians(), 3)
+    assert image.dtype == np.uint8 and np.abs(image / 255 - rgb).max() < 0.003
+    images = {k: window.maps.image(k, camera, content.model.gaussians(), 3) for k in (DEPTH, COVERAGE, ERROR)}
+    assert all(i.shape == (SIZE[1], SIZE[0], 3) for i, _ in images.values())
+    assert name in images[ERROR][1]
+    moved = camera.viewmat.copy()
+    moved[0, 3] += 0.5
+    assert "step into a camera" in window.maps.image(ERROR, dataclasses.replace(camera, viewmat=moved), window.shown(), 3)[1]
+
+
+def test_an_image_is_placed_where_another_camera_sees_it(window):
+    """Twice as large and shifted: pixel centres lie at +0.5."""
+    camera = next(iter(window.content.model.scene_cameras.values()))
+    K = camera.K * np.array([[2.0], [2.0], [1.0]])
+    K[0, 2] += 6
+    ramp = np.mgrid[:32, :40][1].astype(np.float32)[..., None].repeat(3, 2)
+    out = placed(ramp, camera, dataclasses.replace(camera, K=K, width=92, height=64))
+    np.testing.assert_allclose(out[20, 16:70, 0], (np.arange(16, 70) + 0.5 - 6) / 2 - 0.5, atol=0.02)
+
+
+def test_layers_and_the_crop_box_choose_what_is_shown(window):
+    """Fine and coarse make the whole; the box that is saved is the one that is seen, in file units."""
+    panel, count = window.panel, len(window.content.model.gaussians())
+    shown = {}
+    for layer in (FINE, COARSE):
+        panel._layer.value = layer
+        shown[layer] = len(window.shown())
+    panel._layer.value = "all"
+    assert shown[FINE] == (count + 2) // 3 and sum(shown.values()) == len(window.shown()) == count
+    panel._crop.value = True
+    assert 0 < len(window.shown()) < count
+    n = window.content.model.normalization
+    panel._save("crop.json", panel.crop_box().to_json(n))
+    stored = json.loads((window.content.stem / "crop.json").read_text())
+    means = (window.shown().means.double().numpy() / n.scale + n.offset) - stored["center"]
+    assert (np.abs(means @ np.array(stored["rotation"])) <= np.array(stored["size"]) / 2 + 1e-4).all()
+    panel._crop.value = False
+
+
+def test_a_browser_gets_the_image_that_it_asks_for(window):
+    """Once for each camera and wish; Gaussians again where they are asked for."""
+    camera = window.content.model.scene_cameras[window.content.model.train[0]]
+    sent = []
+    state = SimpleNamespace(
+        position=camera.center, wxyz=np.array([1.0, 0, 0, 0]), fov=0.8, image_width=64, image_height=48, update_timestamp=1.0
+    )
+    client = SimpleNamespace(
+        client_id=7, camera=state, scene=SimpleNamespace(set_background_image=lambda i, **_: sent.append(i))
+    )
+    window.panel._kind.value = DEPTH
+    window._render_for(client)
+    window._render_for(client)
+    assert [i.shape for i in sent] == [(48, 64, 3)] and MAPS[DEPTH].split(",")[0] in window.panel._note.content
+    window.panel._kind.value = GAUSSIANS
+    window._render_for(client)
+    assert sent[-1].shape == (2, 2, 3) and not window.panel._note.visible
+
+
+def test_a_ply_and_what_is_neither(folder, tmp_path):
+    """A PLY file is shown without cameras, about its middle; saved files lie beside it; others are one sentence."""
+    content = content_of_ply(folder / "run" / "point_cloud.ply")
+    assert not content.model.scene_cameras and content.saved("crop.json") == folder / "run" / "point_cloud-crop.json"
+    middle = content.model.gaussians().means.double().quantile(0.5, dim=0)
+    assert middle.abs().max() < 1
+    (tmp_path / "a.txt").write_text("x")
+    for wrong in (tmp_path / "a.txt", tmp_path / "none", tmp_path):
+        with pytest.raises(DataError):
+            watch.view(wrong, 0)
+
+
+def test_a_run_is_followed_until_it_is_interrupted(folder, monkeypatch, capsys):
+    """A checkpoint that replaces another is shown; Ctrl-C ends with code 0."""
+    shown: list = []
+    polls, times = iter(range(3)), iter((None, None, 1.0, 2.0))
+
+    def pause():
+        if next(polls) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(watch, "_pause", pause)
+    monkeypatch.setattr(watch, "modified", lambda _: next(times))
+    monkeypatch.setattr(watch, "Window", lambda _, content: SimpleNamespace(content=content, show=shown.append))
+    monkeypatch.setattr(watch, "open_server", lambda port: SimpleNamespace(get_port=lambda: 1, stop=lambda: None))
+    assert main(["view", str(folder / "run"), "--device", "cpu"]) == 0
+    told = capsys.readouterr().out
+    assert "waiting for the first checkpoint" in told and "step 12" in told and len(shown) == 1 and "127.0.0.1:1" in told
+
+
+def test_a_page_names_nobody(folder, tmp_path, capsys):
+    """One file without a path, an image's name or an address in the network; and it starts at a training camera."""
+    assert main(["export", str(folder / "run"), "--to", str(tmp_path / "scene.html")]) == 0
+    text = (tmp_path / "scene.html").read_text("utf-8")
+    assert "default-src 'none'" in text and "<title>warpgs</title>" in text
+    head, _, data = text.partition('__VISER_EMBED_DATA__="')
+    assert str(folder) not in text and "warpgs/" not in head
+    scene = zstandard.ZstdDecompressor().decompressobj().decompress(base64.b64decode(data.partition('"')[0])[8:])
+    assert b"/gaussians" in scene and not [w for w in (b".png", b"run", str(folder).encode()) if w in scene]
+    assert "without a network" in capsys.readouterr().out

@@ -1,0 +1,29 @@
+"""`warpgs view`: look at a model in a browser. Parses, calls, prints; no logic."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from warpgs.app.flags import check_range, parse_flags
+
+
+def run(arguments: list[str], about: str) -> int:
+    """Run the command; ``about`` heads its help."""
+    import tyro
+
+    @dataclass(frozen=True)
+    class View:
+        what: tyro.conf.Positional[Path]
+        """Run folder of `warpgs fit`, also while it goes on; or a PLY file."""
+        port: int = 8080
+        """Port that this machine's browser finds the viewer at; 0 for any free one."""
+        device: str = "auto"
+        """auto, cpu or cuda: what renders depth, coverage and error."""
+        reader: str | None = None
+        """Reader from outside warpgs, as `warpgs fit --reader` was given it."""
+
+    a = parse_flags(View, arguments, "warpgs view", about)
+    check_range("--port", a.port, 0, 65535)
+    from warpgs.viewer.watch import view
+
+    view(a.what, a.port, a.device, a.reader)
+    return 0

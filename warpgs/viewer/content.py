@@ -1,0 +1,102 @@
+"""Contents of the viewer: a model, with the cameras, photographs and layers that are known of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from warpgs.coordinates import convert_gaussians
+from warpgs.errors import DataError, WarpgsError
+from warpgs.export.ply import read_ply
+from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
+from warpgs.pipeline.runs.commands import scene_of
+from warpgs.pipeline.runs.folder import StoredRun, open_run
+from warpgs.pipeline.runs.model_file import FittedModel
+from warpgs.pipeline.train.strategies.importance_sampling import FINE
+from warpgs.scene import Normalization, View
+
+
+@dataclass(frozen=True)
+class Content:
+    """A model and what is known of it."""
+
+    title: str
+    """Name for people: that of the folder or the file."""
+    model: FittedModel
+    """Gaussians, cameras by name, background and rule; without cameras where a file has none."""
+    stem: Path
+    """Beginning of the paths of files that are saved from the viewer: RUN/ or x. of x.ply."""
+    fine: torch.Tensor | None = None
+    """True for Gaussians of the fine layer, bool, shape [N]; None where no layers are known."""
+    views: Mapping[str, View] = field(default_factory=dict)
+    """Views by name, with their photographs; none where the scene cannot be read."""
+    sheet: Path | None = None
+    """PNG that shows where importance placed Gaussians; None where there is none."""
+
+    def saved(self, name: str) -> Path:
+        """Return the path of a file that is saved from the viewer."""
+        return self.stem / name if self.stem.is_dir() else self.stem.with_name(f"{self.stem.name}-{name}")
+
+
+def content_of_run(folder: Path, device: str = "cpu", views: Mapping[str, View] | None = None) -> Content:
+    """Read a run, finished or still going.
+
+    Args:
+        folder: The run folder.
+        device: auto, cpu or cuda.
+        views: Views that were read before, by name.
+
+    Raises:
+        DataError: The folder is no run, or it holds no checkpoint yet.
+    """
+    run = open_run(folder, device)
+    level = load_checkpoint(folder)[0].get("columns.level")
+    # a fit that goes on may have written another checkpoint in between
+    fine = level == FINE if level is not None and level.shape == (len(run.gaussians()),) else None
+    sheets = sorted((folder / "sampling").glob("*.png"))
+    return Content(
+        folder.resolve().name, run, folder, None if fine is None else fine.to(run.gaussians().means.device), views or {},
+        sheets[-1] if sheets else None,
+    )  # fmt: skip
+
+
+def views_of(content: Content, reader: str | None = None) -> tuple[dict[str, View], list[str]]:
+    """Return the views of a run's scene by name, and notes for the user where they cannot be read."""
+    if not isinstance(content.model, StoredRun):
+        return {}, []
+    try:
+        _, train, test = scene_of(content.model, reader)
+    except WarpgsError as e:
+        return {}, [f"cameras come without photographs, since the scene cannot be read: {e}"]
+    return {v.name: v for v in [*train, *test]}, []
+
+
+def content_of_ply(path: Path, device: str = "cpu") -> Content:
+    """Read a PLY file; it is shown about its own middle, at a size that suits float32 and the viewer's near plane.
+
+    Raises:
+        DataError: The file holds no Gaussians.
+    """
+    stored = read_ply(path)
+    if not len(stored):
+        raise DataError(f"{path}: holds no Gaussian; export the model again")
+    means = stored.means.double().numpy()
+    low, high = np.percentile(means, [5, 95], axis=0)
+    normalization = Normalization((low + high) / 2, 1 / max(0.5 * float(np.linalg.norm(high - low)), 1e-12))
+    gaussians = convert_gaussians(stored, normalization, "file", "scene")
+    gaussians = dataclasses.replace(gaussians, **{n: t.to(device) for n, t in gaussians.tensors().items()})
+    model = FittedModel(gaussians, normalization, {}, (), (), "exact", (0.0, 0.0, 0.0), 0)
+    return Content(path.name, model, path.with_suffix(""))
+
+
+def modified(folder: Path) -> float | None:
+    """Return when the last checkpoint of a run was written [s]; None where there is none yet."""
+    try:
+        return (folder / TENSORS).stat().st_mtime
+    except OSError:
+        return None

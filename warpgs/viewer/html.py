@@ -1,0 +1,139 @@
+"""A model as one HTML file: viser's own page with the Gaussians in it, which opens from disk without a network."""
+
+from __future__ import annotations
+
+import html
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from warpgs.errors import DataError
+from warpgs.files import write_text
+from warpgs.pipeline.runs.folder import open_run
+from warpgs.runtime.byte_units import format_bytes
+from warpgs.runtime.folder_lock import hold_folder
+from warpgs.scene import Camera, Gaussians
+from warpgs.viewer.packing import packed
+from warpgs.viewer.poses import camera_before, distance_ahead, fov_y, up_of
+from warpgs.viewer.server import open_server, require_viser, stop_server
+
+if TYPE_CHECKING:
+    import viser
+
+POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; style-src 'unsafe-inline'; "
+    "img-src data: blob:; font-src data:; worker-src blob: data:; connect-src data: blob:"
+)
+"""Content security policy of the page: it may use what is in it, and ask nobody for anything."""
+SORT_FROM_DISK = (
+    "<script>{const make=URL.createObjectURL;URL.createObjectURL="
+    "b=>b instanceof Blob&&b.type.startsWith('text/javascript')?'':make.call(URL,b)}</script>"
+)
+"""Script for a page opened from disk, whose blobs browsers refuse as module workers: without the worker that sorts them, the
+Gaussians are blended in the order of the file. Refused here, viser's page starts it from a data: address, which works."""
+
+
+def place_first_camera(server: viser.ViserServer, camera: Camera, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
+    """Have pages start at a camera, with the cameras' upward direction up."""
+    forward = np.asarray(camera.viewmat[2, :3])
+    server.scene.set_up_direction(up_of(cameras))
+    server.initial_camera.position = camera.center
+    server.initial_camera.look_at = camera.center + distance_ahead(camera, gaussians) * forward
+    server.initial_camera.up = -np.asarray(camera.viewmat[1, :3])
+    server.initial_camera.fov = fov_y(camera)
+    server.initial_camera.far = 1e5  # else what lies beyond 1000 u is cut off
+
+
+def plain_background(color: Sequence[float]) -> np.ndarray:
+    """Return an image of one colour in [0, 1], uint8, shape [2, 2, 3], to stand behind the scene."""
+    return np.full((2, 2, 3), np.round(255 * np.clip(color, 0, 1)), np.uint8)
+
+
+def page_of(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera] = (),
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    title: str = "warpgs",
+) -> tuple[str, list[str]]:
+    """Return the page as text, and notes for the user on what it shows otherwise than a render would.
+
+    The page holds the Gaussians in units of their own (`packed`), without directions: colours are those of degree 0. No name
+    of a file, a view or a machine is in it, but for ``title``.
+
+    Args:
+        gaussians: N Gaussians in the units of the cameras.
+        cameras: Cameras, of which the first is where the page starts; none to start before the model.
+        background: Colour behind the scene, in [0, 1].
+        title: Title of the page.
+
+    Raises:
+        DataError: There is no Gaussian.
+        ResourceError: viser is not installed.
+    """
+    if not len(gaussians):
+        raise DataError("a page needs at least one Gaussian; fit the scene for longer")
+    stored = packed(gaussians)
+    cameras = cameras or [camera_before(gaussians)]
+    server = open_server(port=0)
+    try:
+        place_first_camera(server, cameras[0], gaussians, cameras)
+        server.scene.set_background_image(plain_background(background), format="png")
+        server.scene.add_gaussian_splats(
+            "/gaussians", stored.centers, stored.covariances, stored.colors, stored.opacities, scale=stored.scale
+        )
+        text = server.get_scene_serializer().as_html(dark_mode=True)
+    finally:
+        stop_server(server)
+    head = f'<head><meta http-equiv="Content-Security-Policy" content="{POLICY}" />{SORT_FROM_DISK}'
+    text = re.sub(r"<title>[^<]*</title>", lambda _: f"<title>{html.escape(title)}</title>", text, count=1)
+    notes = ["the page shows colours of degree 0: those that change with the direction stay in the run and in its PLY"]
+    if gaussians.sh_degree == 0:
+        notes.clear()
+    if stored.shortened:
+        notes.append(f"{stored.shortened:,} Gaussians are longer than the page can hold, and are shown shorter")
+    return text.replace("<head>", head, 1), notes
+
+
+def write_html(
+    path: str | os.PathLike[str],
+    gaussians: Gaussians,
+    cameras: Sequence[Camera] = (),
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    title: str = "warpgs",
+) -> list[str]:
+    """Write a model as one HTML file, which appears whole or not at all; returns notes for the user (`page_of`).
+
+    Args:
+        path: The file; an existing one is replaced.
+        gaussians: N Gaussians in the units of the cameras.
+        cameras: Cameras, of which the first is where the page starts; none to start before the model.
+        background: Colour behind the scene, in [0, 1].
+        title: Title of the page.
+
+    Raises:
+        DataError: There is no Gaussian.
+        ResourceError: viser is not installed, or the file cannot be written.
+    """
+    text, notes = page_of(gaussians, cameras, background, title)
+    write_text(Path(path), text)
+    return notes
+
+
+def export_html(folder: Path, target: Path) -> list[str]:
+    """Write a run as one HTML file that starts at its first training camera; returns lines for the user.
+
+    Raises:
+        DataError: The folder is no run.
+        ResourceError: viser is not installed, another process writes into the file's folder, or it cannot be written.
+    """
+    require_viser()
+    run = open_run(folder, "cpu")
+    cameras = run.cameras()
+    with hold_folder(target.parent) as held:
+        notes = write_html(target, run.gaussians(), [cameras[n] for n in run.train], run.background)
+    size = format_bytes(target.stat().st_size)
+    return [*held, *notes, f"{len(run.gaussians()):,} Gaussians in {target}, {size}; open it in any browser, without a network"]

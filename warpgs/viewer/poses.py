@@ -1,0 +1,70 @@
+"""Cameras between our conventions and the viewer's: poses as camera-to-world, fields of view, an upward direction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from warpgs.geometry import look_at, matmul, quaternions, rotation_matrices
+from warpgs.scene import Camera, Gaussians
+
+FIELD_OF_VIEW = math.radians(50)
+"""Vertical field of view of the camera that is made where a model has none [rad]."""
+
+
+def wxyz_of(camera: Camera) -> np.ndarray:
+    """Return the rotation from camera to world axes as a unit quaternion wxyz, float64, shape [4]."""
+    return quaternions(torch.from_numpy(np.asarray(camera.viewmat)[None, :3, :3].transpose(0, 2, 1).copy()))[0].numpy()
+
+
+def fov_y(camera: Camera) -> float:
+    """Return the vertical field of view [rad], as of a principal point in the middle."""
+    return 2 * math.atan(0.5 * camera.height / float(camera.K[1, 1]))
+
+
+def up_of(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the mean upward direction of cameras, of length 1, shape [3]; up in the first camera where they cancel."""
+    up = -np.mean([c.viewmat[1, :3] for c in cameras], axis=0)
+    up = up if np.linalg.norm(up) > 1e-3 else -np.asarray(cameras[0].viewmat[1, :3])
+    return up / np.linalg.norm(up)
+
+
+def distance_ahead(camera: Camera, gaussians: Gaussians) -> float:
+    """Return the median depth of the means that a camera sees [u], which a view turns about; 1 where it sees none."""
+    means = gaussians.means.detach().cpu().double().numpy()
+    points = matmul(means, camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]
+    z = points[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = (np.abs(points[:, i] / z * camera.K[i, i]) / size for i, size in ((0, camera.width), (1, camera.height)))
+    seen = (z > 0) & (x < 0.5) & (y < 0.5)
+    return float(np.median(z[seen])) if seen.any() else 1.0
+
+
+def camera_at(wxyz: Any, position: Any, fov: float, width: int, height: int) -> Camera:
+    """Return a pinhole camera from what a browser says of its own: camera-to-world rotation, position [u], vertical angle."""
+    rotation = rotation_matrices(np.asarray(wxyz, np.float64)).T
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -matmul(rotation, np.asarray(position, np.float64))
+    focal = 0.5 * height / math.tan(0.5 * fov)
+    return Camera(viewmat, np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]]), width, height)
+
+
+def camera_before(gaussians: Gaussians, width: int = 960, height: int = 720) -> Camera:
+    """Return a camera that sees nine tenths of the means from the front, -z, for a model without cameras."""
+    means = gaussians.means.detach().cpu().double().numpy()
+    low, high = np.percentile(means, [5, 95], axis=0)
+    middle, radius = (low + high) / 2, max(0.5 * float(np.linalg.norm(high - low)), 1e-6)
+    center = middle - np.array([0, 0, radius / math.sin(0.5 * FIELD_OF_VIEW)])
+    focal = 0.5 * height / math.tan(0.5 * FIELD_OF_VIEW)
+    K = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]])
+    return Camera(look_at(center, middle, np.array([0.0, -1, 0])), K, width, height)
+
+
+def stands_at(camera: Camera, other: Camera, near: float) -> bool:
+    """Return whether two cameras are within ``near`` [u] of each other and look the same way to a thousandth."""
+    turned = float(np.trace(matmul(camera.viewmat[:3, :3], other.viewmat[:3, :3].T)))
+    return bool(np.linalg.norm(camera.center - other.center) <= near) and turned > 3 - 1e-3

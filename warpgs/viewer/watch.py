@@ -1,0 +1,176 @@
+"""Viewing a run, a file, or a fit that is still going, until Ctrl-C."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from warpgs.errors import DataError, WarpgsError
+from warpgs.pipeline.runs.folder import CONFIG, read_record
+from warpgs.pipeline.runs.model_file import FittedModel
+from warpgs.pipeline.runs.request import choose_device
+from warpgs.runtime.terminal import say
+from warpgs.scene import Gaussians
+from warpgs.viewer.content import Content, content_of_ply, content_of_run, modified, views_of
+from warpgs.viewer.server import HOST, PORT, open_server, require_viser, stop_server
+from warpgs.viewer.window import Window
+
+if TYPE_CHECKING:
+    import viser
+
+POLL = 1.0
+"""Time between looks at a run folder, and between states of a fit in this process [s]."""
+
+
+def address(server: viser.ViserServer) -> str:
+    """Return the address to open in a browser."""
+    return f"http://{HOST}:{server.get_port()}"
+
+
+def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None = None) -> None:
+    """Show a run folder or a PLY file until Ctrl-C; checkpoints of a fit that goes on are shown as they come.
+
+    Args:
+        path: Run folder, of a fit that goes on, too; or a PLY file.
+        port: Port to listen at; 0 for any free one.
+        device: Device that renders images: auto, cpu or cuda.
+        reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
+
+    Raises:
+        DataError: It is neither.
+        ResourceError: viser or the device is not there.
+        UsageError: The port is taken.
+    """
+    choose_device(device)
+    if path.is_dir():
+        read_record(path)
+    elif path.suffix.lower() != ".ply" or not path.is_file():
+        raise DataError(f"{path}: is neither a run folder ({CONFIG} in it) nor a PLY file; give one of the two")
+    require_viser()
+    with contextlib.suppress(KeyboardInterrupt):
+        server = open_server(port)
+        try:
+            say(f"open {address(server)} in a browser on this machine; Ctrl-C ends")
+            _follow(server, path, device, reader)
+        finally:
+            stop_server(server)
+
+
+def _follow(server: viser.ViserServer, path: Path, device: str, reader: str | None) -> None:
+    """Show what there is, and every checkpoint that replaces it."""
+    window, seen = None, None
+    if path.is_dir() and modified(path) is None:
+        say("waiting for the first checkpoint of the fit")
+    while True:
+        found = modified(path) if path.is_dir() else 0.0
+        if found is not None and found != seen:
+            seen = found
+            if window is None:
+                content = content_of_run(path, device) if path.is_dir() else content_of_ply(path, choose_device(device)[0].type)
+                views, notes = views_of(content, reader)
+                for note in notes:
+                    say(f"  {note}")
+                window = Window(server, replace(content, views=views))
+                say(f"  {content.title}: {len(content.model.gaussians()):,} Gaussians")
+            else:
+                _update(window, path, device)
+        _pause()
+
+
+def _pause() -> None:
+    """Wait until it is time for another look."""
+    time.sleep(POLL)
+
+
+def _update(window: Window, path: Path, device: str) -> None:
+    """Show the newest checkpoint; one that cannot be read is said, and the one before stays."""
+    try:
+        window.show(content_of_run(path, device, window.content.views))
+    except WarpgsError as e:
+        say(f"  {e}", error=True)
+    else:
+        say(f"  step {window.content.model.step}: {len(window.content.model.gaussians()):,} Gaussians")
+
+
+class LiveView:
+    """A viewer of a fit in this process: it draws the latest state in a thread of its own, and the fit never waits for it."""
+
+    def __init__(self, server: viser.ViserServer, title: str, folder: Path):
+        """Begin without a state."""
+        self.server, self.title, self.folder = server, title, folder
+        self._latest: FittedModel | None = None
+        self._next = -math.inf
+        self._wake, self._shown, self._open = threading.Event(), threading.Event(), True
+        self._window: Window | None = None
+        self._thread = threading.Thread(target=self._draw, name="live view", daemon=True)
+        self._thread.start()
+
+    def look(self, model: FittedModel) -> None:
+        """Copy a state, which the fit's next step overwrites, at most once in `POLL`; one that was not shown yet is dropped."""
+        if time.monotonic() < self._next:
+            return
+        copy = {n: t.detach().to("cpu", copy=True) for n, t in model.gaussians().tensors().items()}
+        self._latest = replace(model, scene_gaussians=Gaussians(**copy))
+        self._next = time.monotonic() + POLL
+        self._wake.set()
+
+    def wait_shown(self, seconds: float) -> bool:
+        """Wait until a state was shown; returns whether one was, within a time [s]."""
+        return self._shown.wait(seconds)
+
+    def close(self) -> None:
+        """Draw no more."""
+        self._open = False
+        self._wake.set()
+        self._thread.join(timeout=10)
+        if self._window is not None:
+            self._window.close()
+
+    def _draw(self) -> None:
+        try:
+            self._draw_states()
+        except Exception as e:  # of viser, too: the fit goes on
+            say(f"the viewer stopped ({type(e).__name__}: {e}); the fit goes on", error=True)
+
+    def _draw_states(self) -> None:
+        """Show each state that comes, until `close`."""
+        while True:
+            self._wake.wait()
+            self._wake.clear()
+            if not self._open:
+                return
+            model, self._latest = self._latest, None
+            if model is None or not len(model.gaussians()):
+                continue
+            content = Content(self.title, model, self.folder)
+            if self._window is None:
+                self._window = Window(self.server, content, maps=False)
+            else:
+                self._window.show(content)
+            self._shown.set()
+
+
+@contextlib.contextmanager
+def live_view(folder: Path, port: int = PORT) -> Iterator[LiveView]:
+    """Give a viewer of a fit that runs in the body; it closes when the fit ends, and `warpgs view` shows the run from then on.
+
+    Raises:
+        ResourceError: viser is not installed.
+        UsageError: The port is taken.
+    """
+    server = open_server(port)
+    try:
+        say(f"the fit can be seen at {address(server)} while it goes on; `warpgs view {folder}` shows it afterwards")
+        live = LiveView(server, folder.resolve().name, folder)
+        try:
+            yield live
+        finally:
+            live.close()
+    finally:
+        stop_server(server)
