@@ -78,7 +78,8 @@ def record_of(
 ) -> dict[str, Any]:
     """Return the contents of config.json: format, scene, views, settings, device, versions and cameras."""
     return {
-        "format": FORMAT, "scene": {**asdict(request), "path": str(Path(request.path).resolve()) if request.path else None},
+        "format": FORMAT,
+        "scene": {**asdict(request.with_scale()), "path": str(Path(request.path).resolve()) if request.path else None},
         "scene_format": scene.format, "fingerprint": scene.fingerprint,
         "train": split.train, "test": split.test, "notes": notes,
         "normalization": {"offset": scene.normalization.offset.tolist(), "scale": scene.normalization.scale},
