@@ -136,7 +136,7 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
             if isinstance(now, dict) and isinstance(then, dict):
                 changed = [k for k in now if now[k] != then.get(k)]
                 key = f"{key} ({', '.join(changed)})"
-            words = {"fingerprint": "the scene (images, cameras or points, as --downscale and --reader give them)"}
+            words = {"fingerprint": "the scene (images, cameras or points, as --downscale, --max-side and --reader give them)"}
             raise UsageError(
                 f"--resume: {words.get(key, key)} differs from the run in {out}; give all flags that it was started "
                 "with, or a new --out"
