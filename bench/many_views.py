@@ -38,7 +38,7 @@ def fit_in_new_process(task: tuple[str, str, str, int, str]) -> dict:
     folder, split, preset, seed, device = task
     config = dataclasses.replace(config_of(preset, torch.device(device)), seed=seed)
     began = time.perf_counter()
-    metrics = warpgs.fit(SceneRequest(folder, split), config, device=device, verbose=False).metrics
+    metrics = warpgs.fit(SceneRequest(folder, split, 1), config, device=device, verbose=False).metrics
     wall = time.perf_counter() - began
     views = metrics["protocol"]["training_views"]
     return {"seed": seed, "training_views": views, "wall": wall, "peak_rss_bytes": peak_resident()} | figures_of(metrics)

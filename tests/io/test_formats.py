@@ -43,6 +43,20 @@ def test_pixels_arrive_as_rgb(kind, tmp_path):
 
 
 @pytest.mark.parametrize("kind", scenes.WRITERS)
+def test_images_over_the_longest_side_are_reduced_and_that_is_said(kind, tmp_path, monkeypatch):
+    """Without a factor the default bound holds, with one or with 0 none does."""
+    monkeypatch.setattr("warpgs.io.readers.DEFAULT_MAX_SIDE", 8)
+    scenes.WRITERS[kind](tmp_path)
+    reduced, whole = load_scene(tmp_path), load_scene(tmp_path, max_side=0)
+    assert {(v.camera.width, v.camera.height) for v in reduced.views} == {(8, 6)} and "at most 8 px a side" in reduced.pixels
+    assert any("reduced to 8 px on the longer side" in n for n in reduced.notes)
+    for a, b in zip(reduced.views, whole.views, strict=True):
+        np.testing.assert_allclose(a.camera.K[:2] * (b.camera.width / 8), b.camera.K[:2])
+    assert whole.views[0].camera.width == load_scene(tmp_path, downscale=1).views[0].camera.width == 16
+    assert not any("reduced" in n for n in whole.notes)
+
+
+@pytest.mark.parametrize("kind", scenes.WRITERS)
 @pytest.mark.parametrize("downscale", [2, 3])
 def test_downscaling_keeps_the_point_at_the_same_part_of_the_image(kind, downscale, tmp_path):
     scene = load_scene(scenes.WRITERS[kind](tmp_path), downscale=downscale)

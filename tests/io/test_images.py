@@ -122,6 +122,24 @@ def test_uneven_resampling_scales_each_axis_by_itself(tmp_path):
     np.testing.assert_allclose(loaded.K[[0, 1], [0, 1]], [20 * 12 / 35, 20 * 9 / 26])
 
 
+@pytest.mark.parametrize("downscale,side,size", [(1, 17, (17, 13)), (2, 17, (17, 13)), (2, 18, (18, 13)), (1, 0, (35, 26))])
+def test_a_longest_side_bounds_an_image_and_scales_each_axis_of_its_camera(downscale, side, size, tmp_path):
+    """It holds after the factor; an image within it is untouched by it, and nothing is said."""
+    scenes.save(tmp_path / "a.png", scenes.image(0, 35, 26))
+    loaded = load_image(tmp_path / "a.png", lens(35, 26), downscale=downscale, max_side=side)
+    assert loaded.image.shape == (*size[::-1], 3)
+    np.testing.assert_allclose(
+        loaded.K[[0, 1, 0, 1], [0, 1, 2, 2]], [20 * size[0] / 35, 20 * size[1] / 26, *np.array(size) / 2]
+    )
+    assert any("17 px on the longer side (--max-side 17" in d for d in loaded.done) == (side == 17)
+
+
+def test_a_longest_side_that_leaves_nothing_is_refused(tmp_path):
+    scenes.save(tmp_path / "a.png", scenes.image(0, 35, 26))
+    with pytest.raises(UsageError, match=r"--max-side 4 leaves 4 x 3 px of .*a\.png"):
+        load_image(tmp_path / "a.png", lens(35, 26), max_side=4)
+
+
 def distort(x, y, k1, k2, p1, p2, k3=0.0):
     """Apply OpenCV's model, written anew, from image plane to image plane."""
     r2 = x * x + y * y

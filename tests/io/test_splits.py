@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tests.io import scenes
 from warpgs.errors import DataError, UsageError
 from warpgs.io.load import load_scene
-from warpgs.io.splits import Split, coincident_views, default_split, split_views
+from warpgs.io.splits import Split, coincident_views, held_out_split, split_views
 from warpgs.scene import Camera
 
 
@@ -177,14 +177,13 @@ def test_splits_that_make_no_sense(spec):
         split_views(scene_of(NAMES), spec)
 
 
-def test_default_split():
-    split, note = default_split(numbered(9))
-    assert ids(split.test) == [0, 8] and "every 8th" in note
-    split, note = default_split(numbered(8))
-    assert ids(split.test) == [4] and len(split.train) == 7 and "004.png" in note
-    assert ids(default_split(numbered(3))[0].test) == [1]
-    split, note = default_split(numbered(2))
-    assert len(split.train) == 2 and split.test == () and "none is held out" in note
+@pytest.mark.parametrize(
+    "views,held_out,words", [(9, [0, 8], "every 8th"), (8, [4], "004.png"), (3, [1], "001.png"), (2, [], "none is held out")]
+)
+def test_a_study_without_a_split_holds_views_out(views, held_out, words):
+    spec, note = held_out_split(numbered(views))
+    split = split_views(numbered(views), spec)
+    assert ids(split.test) == held_out and len(split.train) == views - len(held_out) and words in note
 
 
 def test_a_split_of_a_real_folder(tmp_path):

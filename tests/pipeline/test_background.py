@@ -75,7 +75,17 @@ def test_a_run_keeps_its_background(tmp_path, capsys):
     """config.json holds the colour; scoring and continuing put the scene over it, and no colour makes another scene of it."""
     scenes.write_blender(tmp_path / "scene")
     flags = ["--init.source", "random", "--init.random-count", "20", "--preset", "3dgs", "--steps", "2", "--device", "cpu"]
-    fit = ["fit", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), "--background", "0.5,0.25,0", *flags]
+    fit = [
+        "fit",
+        str(tmp_path / "scene"),
+        "--out",
+        str(tmp_path / "run"),
+        "--split",
+        "every:8",
+        "--background",
+        "0.5,0.25,0",
+        *flags,
+    ]
     assert main(fit) == 0
     assert "background: 0.5,0.25,0, #804000" in capsys.readouterr().out
     record = json.loads((tmp_path / "run" / "config.json").read_text())

@@ -20,7 +20,7 @@ from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.checkpoint import TENSORS
 from warpgs.pipeline.runs.fit import fit_request
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest, read_scene
-from warpgs.pipeline.study.compare import ABLATION_ROWS, ablation_variants, preset_variants, run_study
+from warpgs.pipeline.study.compare import ABLATION_ROWS, _places, ablation_variants, preset_variants, run_study
 from warpgs.pipeline.study.ensure_run import ensure_run
 from warpgs.pipeline.study.statistics import paired_difference
 from warpgs.pipeline.study.study import FILES, SWITCHES, StudyRequest, run_folder
@@ -46,6 +46,15 @@ def finished(scene, tmp_path_factory):
     """Two settings, two seeds, one scene."""
     request = StudyRequest((scene,), {"a": A, "b b": B}, 2, tmp_path_factory.mktemp("study") / "out", "cpu")
     return request, run_study(request)
+
+
+def test_a_study_without_a_split_holds_a_view_out_and_its_fits_do_the_same(scene, tmp_path, capsys):
+    """A fit of its own would train on every view."""
+    wanted = dataclasses.replace(scene, split=None)
+    request = StudyRequest((wanted,), {"a": A, "b": B}, 1, tmp_path / "out", "cpu")
+    (place,) = _places(request)
+    assert place.split.test == ("004.png",) and "no --split given: 004.png is held out" in capsys.readouterr().out
+    assert read_scene(place.request)[1] == place.split
 
 
 def metrics_of(request, variant, seed):

@@ -13,6 +13,7 @@ from warpgs.app.cli import main
 from warpgs.coordinates import convert_camera
 from warpgs.errors import DataError, UsageError
 from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.runs.request import NO_SCORES
 from warpgs.synthetic.demo import split_spec, write_demo
 
 STEPS, SPLIT = 12, split_spec(8)
@@ -54,6 +55,24 @@ def test_command_and_function_are_one_fit(folder, fitted):
     assert (result.train, result.test) == (run.train, run.test) and len(result.test) > 0
     views = [warpgs.load_scene(folder / "scene").view(n) for n in result.test]
     assert warpgs.evaluate(result.gaussians(), views, result.options())[0].psnr == stored["views"][0]["psnr"]
+
+
+def test_every_photograph_trains_by_default_and_a_run_remembers_its_scale(folder, tmp_path, capsys, monkeypatch):
+    """No score is made up, which the report says; a later default leaves the run as it is."""
+    few, out = dataclasses.replace(CONFIG, steps=2), tmp_path / "run"
+    monkeypatch.setattr("warpgs.io.readers.DEFAULT_MAX_SIDE", 20)
+    result = warpgs.fit(folder / "scene", few, out=out, device="cpu")
+    assert len(result.train) == 8 and result.test == () and not result.metrics["test"]
+    assert capsys.readouterr().out.splitlines().count(NO_SCORES) == 1
+    assert NO_SCORES in result.notes and NO_SCORES in (out / "report.html").read_text()
+    protocol = result.metrics["protocol"]
+    assert (protocol["split"], protocol["resolution"]) == ("all (no --split given)", ["20 x 16"])
+    monkeypatch.setattr("warpgs.io.readers.DEFAULT_MAX_SIDE", 30)
+    record = json.loads((out / "config.json").read_text())["scene"]
+    assert (record["downscale"], record["max_side"]) == (1, 20)
+    assert main(["eval", str(out), "--device", "cpu"]) == 0 and "no view is held out" in capsys.readouterr().out
+    with pytest.raises(UsageError, match="--downscale, --max-side and --reader"):
+        warpgs.fit(folder / "scene", few, out=out, device="cpu", resume=True, verbose=False)
 
 
 def test_nothing_is_written_or_printed_unless_asked_for(folder, tmp_path, monkeypatch, capsys):

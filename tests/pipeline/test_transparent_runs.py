@@ -74,6 +74,7 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cut_out")
     scenes.write_blender(folder / "scene")
     flags = ["--init.source", "random", "--init.random-count", "60", "--preset", "3dgs", "--steps", "3", "--device", "cpu"]
+    flags += ["--split", "every:8"]
     assert main(["fit", str(folder / "scene"), "--out", str(folder / "run"), *flags]) == 0
     return folder / "run"
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from warpgs.errors import DataError, ResourceError
 from warpgs.io.image_formats import bmp, jpeg, png, tiff, webp
+from warpgs.io.unread_formats import unread_format
 
 MAX_PIXELS = 100_000_000
 """Largest number of pixels of an image where the user names none; decoded, it takes 1.2 GB."""
@@ -59,6 +60,9 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
     import cv2
 
     pixels = 0
+    unread = unread_format(path, data[:32])
+    if unread is not None:
+        raise DataError(f"{path}: is {unread}")
     try:
         _, module = format_of(data)
         width, height = module.size(data)

@@ -13,8 +13,9 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.io.decoding import MAX_PIXELS, decode
-from warpgs.io.images import BLACK, Lens, LoadedImage, list_images, load_image
+from warpgs.io.images import BLACK, REDUCED, Lens, LoadedImage, list_images, load_image
 from warpgs.io.readers import ReadOptions
+from warpgs.io.unread_formats import unread_note
 from warpgs.scene import Camera, View
 
 MAX_NAME_LENGTH = 4096
@@ -78,6 +79,7 @@ class SceneFolder:
 
     def __init__(self, root: Path, options: ReadOptions):
         self.root, self.options = root, options
+        self._reduced = False
 
     def inside(self, path: Path) -> Path:
         """Return a path after a check that no link on it leads out of the scene folder, unless that is allowed.
@@ -121,10 +123,12 @@ class SceneFolder:
         """
         if self.options.on_image is not None:
             self.options.on_image(path)
-        return load_image(
+        loaded = load_image(
             self.inside(path), lens, downscale=downscale or self.options.downscale, mask=mask, background=background,
-            max_pixels=self.options.max_pixels, cutout=self.options.masks == "cutout",
+            max_pixels=self.options.max_pixels, cutout=self.options.masks == "cutout", max_side=self.options.max_side,
         )  # fmt: skip
+        self._reduced = self._reduced or any(words.startswith(REDUCED) for words in loaded.done)
+        return loaded
 
     def mask(self, path: Path) -> np.ndarray:
         """Return a mask file of the scene, how far it keeps each pixel: float32 [H, W], 0 not at all, 1 wholly."""
@@ -157,7 +161,9 @@ class SceneFolder:
         return self.inside(folder), factor, note
 
     def pixel_source(self, by_folder: bool) -> str:
-        """Return the source of a scene's pixels, for result files: the folder, and "as stored" or the factor of resampling.
+        """Return the source of a scene's pixels, for result files: the folder, and "as stored" or what resampled them.
+
+        To be called after all images are read: only then is it known whether one was longer than ``max_side``.
 
         Args:
             by_folder: The format takes a ready-made `images_N` (`images`); others always read what the scene names.
@@ -166,7 +172,8 @@ class SceneFolder:
         if by_folder:
             folder, factor, _ = self.images()
             name = folder.name
-        return f"{name} area-resampled by {factor}" if factor > 1 else f"{name} as stored"
+        how = f"area-resampled by {factor}" if factor > 1 else "as stored"
+        return f"{name} {how}, {REDUCED}at most {self.options.max_side} px a side" if self._reduced else f"{name} {how}"
 
 
 def read_mask(path: Path, keeps: str = "white", max_pixels: int = MAX_PIXELS) -> np.ndarray:
@@ -193,7 +200,10 @@ def _image_folder(root: Path, downscale: int, base: str) -> tuple[Path, int, str
         return full, downscale, f"images area-resampled by {downscale}" if downscale > 1 else ""
     others = {int(n): p for p in root.glob(f"{base}_*") if (n := p.name[len(base) + 1 :]).isdecimal() and list_images(p)}
     if not others:
-        raise DataError(f"{root}: there is no folder '{base}' with images; put the images there")
+        unread = unread_note(full)
+        raise DataError(
+            f"{full}: {unread}" if unread else f"{root}: there is no folder '{base}' with images; put the images there"
+        )
     largest = others[min(others)]
     how = f", area-resampled by {downscale}" if downscale > 1 else ""
     return largest, downscale, f"there is no full-size folder '{base}': images taken from {largest.name}{how}"

@@ -14,6 +14,8 @@ from warpgs.errors import DataError, UsageError
 from warpgs.io.decoding import MAX_PIXELS, decode, format_of, read_image_file
 
 BLACK = (0.0, 0.0, 0.0)
+REDUCED = "reduced to "
+"""First words of what is noted of an image that `load_image` brought to its longest side."""
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 EXIF_ORIENTATION = 0x0112
 MIN_SIDE = 4
@@ -158,18 +160,25 @@ def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     return LoadedImage(image, None if inside.all() else inside, loaded.K, done, alpha, loaded.kept)
 
 
-def _shrink(path: Path, loaded: LoadedImage, downscale: int) -> LoadedImage:
+def _shrink(path: Path, loaded: LoadedImage, downscale: int, max_side: int) -> LoadedImage:
+    """Resample by the factor, then to the longest side where it is longer; the intrinsics follow the sizes exactly."""
     height, width = loaded.image.shape[:2]
-    small_w, small_h = round(width / downscale), round(height / downscale)
+    factor, flags, done = float(downscale), f"--downscale {downscale}", loaded.done
+    if max_side and round(max(width, height) / downscale) > max_side:
+        factor, flags = max(width, height) / max_side, f"--max-side {max_side}"
+        done = (*done, f"{REDUCED}{max_side} px on the longer side ({flags}; 0 keeps the size)")
+    if factor == 1:
+        return loaded
+    small_w, small_h = round(width / factor), round(height / factor)
     if min(small_w, small_h) < MIN_SIDE:
         raise UsageError(
-            f"--downscale {downscale} leaves {small_w} x {small_h} px of {path} ({width} x {height} px); "
-            f"both sides must keep at least {MIN_SIDE} px. Choose a smaller factor"
+            f"{flags} leaves {small_w} x {small_h} px of {path} ({width} x {height} px); "
+            f"both sides must keep at least {MIN_SIDE} px. Choose a smaller factor or a longer side"
         )
     K = np.diag([small_w / width, small_h / height, 1.0]) @ loaded.K
     mask = None if loaded.mask is None else _resize(loaded.mask.astype(np.float32), small_w, small_h) > 0.5
     alpha = None if loaded.alpha is None else _resize(loaded.alpha, small_w, small_h)
-    return LoadedImage(_resize(loaded.image, small_w, small_h), mask, K, loaded.done, alpha, loaded.kept)
+    return LoadedImage(_resize(loaded.image, small_w, small_h), mask, K, done, alpha, loaded.kept)
 
 
 def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tuple[int, int], orientation: int) -> np.ndarray:
@@ -214,6 +223,7 @@ def load_image(
     background: tuple[float, float, float] = BLACK,
     max_pixels: int = MAX_PIXELS,
     cutout: bool = False,
+    max_side: int = 0,
 ) -> LoadedImage:
     """Decode an image, set it upright if its camera says so, undo distortion, and resample.
 
@@ -228,13 +238,14 @@ def load_image(
         background: Colour in [0, 1] behind transparent pixels.
         max_pixels: Largest number of pixels that the file may have.
         cutout: What the mask does not keep is transparent, gray in part; else pixels kept by half or less do not count.
+        max_side: Longest side that the image keeps [px] after ``downscale``; 0 for no limit.
 
     Returns:
         The image with intrinsics for its final size.
 
     Raises:
         DataError: The file cannot be decoded, its size does not fit its camera or its mask, or no pixel counts.
-        UsageError: ``downscale`` leaves next to nothing.
+        UsageError: ``downscale`` or ``max_side`` leaves next to nothing.
     """
     image, alpha = decode(path, max_pixels)
     stored, done = image.shape[:2], []
@@ -267,8 +278,7 @@ def load_image(
     loaded = LoadedImage(image, mask, K, tuple(done), alpha, kept)
     if any(lens.distortion):
         loaded = _undistort(loaded, lens)
-    if downscale > 1:
-        loaded = _shrink(path, loaded, downscale)
+    loaded = _shrink(path, loaded, downscale, max_side)
     if loaded.mask is not None and not loaded.mask.any():
         raise DataError(f"{path}: no pixel is left after its mask, its lens distortion and --downscale; look at all three")
     image, alpha = np.ascontiguousarray(loaded.image, np.float32), loaded.alpha

@@ -16,7 +16,7 @@ from warpgs.io.folders import SceneFolder
 from warpgs.io.images import list_images
 from warpgs.io.normalize import fingerprint, normalization_of, normalize_points, normalize_view
 from warpgs.io.poses import rigid
-from warpgs.io.readers import Reader, ReadOptions, all_readers, find_reader
+from warpgs.io.readers import Reader, ReadOptions, all_readers, find_reader, image_scale
 from warpgs.io.score_masks import FOLDER, add_score_masks
 from warpgs.scene import Normalization, Scene, View
 
@@ -25,7 +25,8 @@ def load_scene(
     path: str | Path,
     *,
     reader: str | type[Reader] | Reader | None = None,
-    downscale: int = 1,
+    downscale: int | None = None,
+    max_side: int | None = None,
     strict: bool = False,
     allow_outside: bool = False,
     masks: str = "ignore",
@@ -44,7 +45,10 @@ def load_scene(
         path: The scene folder.
         reader: Name of a format (colmap, transforms, llff, dtu, middlebury), or a `Reader` of your own: an object, a class,
             ``module:Class`` or ``path/to/file.py:Class``. None asks every built-in reader whether the folder has its format.
-        downscale: Factor by which both image sides shrink; a ready-made folder `images_N` is used where there is one.
+        downscale: Factor by which both image sides shrink; a ready-made folder `images_N` is used where there is one. None for
+            1.
+        max_side: Longest side that an image keeps [px], 0 for no limit; larger ones are reduced to it, and the intrinsics with
+            them. None for 1600 where ``downscale`` is None too, else for no limit.
         strict: A frame without an image file is an error instead of a note.
         allow_outside: Let names and links of the scene lead to images and masks outside its folder.
         masks: Fate of pixels that a mask file does not keep: ignore (they do not count, in fit and score) or cutout
@@ -63,8 +67,8 @@ def load_scene(
     Raises:
         DataError: Anything in the folder is missing or malformed; the message names file, reason and remedy.
         ResourceError: There is not enough memory to decode an image.
-        UsageError: ``downscale`` or ``max_pixels`` is below 1, ``masks`` or ``mask_keeps`` is another word, or there is no such
-            reader.
+        UsageError: ``downscale`` or ``max_pixels`` is below 1, ``max_side`` is below 0, ``masks`` or ``mask_keeps`` is another
+            word, or there is no such reader.
     """
     root, numbers = Path(path), itertools.count(1)
 
@@ -72,8 +76,9 @@ def load_scene(
         if progress is not None:
             progress(f"reading {root}: image {next(numbers)}")
 
+    factor, side = image_scale(downscale, max_side)
     options = ReadOptions(
-        downscale, strict, allow_outside, masks, mask_keeps, black_is_empty, max_pixels=max_pixels, on_image=on_image
+        factor, strict, allow_outside, masks, mask_keeps, black_is_empty, max_pixels, max_side=side, on_image=on_image
     )
     try:
         _check_folder(root)

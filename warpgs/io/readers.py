@@ -17,6 +17,16 @@ from warpgs.io.decoding import MAX_PIXELS
 from warpgs.plugins import Registry
 from warpgs.scene import Scene, View
 
+DEFAULT_MAX_SIDE = 1600
+"""Longest side of an image [px] where the user names neither a factor nor a side: a phone's 12 MP would take hours on a CPU."""
+
+
+def image_scale(downscale: int | None, max_side: int | None) -> tuple[int, int]:
+    """Return the factor and the longest side [px] (0 for no limit) that a user's two wishes come to; None for not given."""
+    if max_side is None:
+        max_side = DEFAULT_MAX_SIDE if downscale is None else 0
+    return 1 if downscale is None else downscale, max_side
+
 
 @dataclass(frozen=True)
 class ReadOptions:
@@ -36,12 +46,16 @@ class ReadOptions:
     """Dark pixels around an object are transparent, where every image shows one on black."""
     max_pixels: int = MAX_PIXELS
     """Largest number of pixels that an image or a mask may have."""
+    max_side: int = 0
+    """Longest side that an image keeps [px], after ``downscale``; 0 for no limit."""
     on_image: Callable[[Path], object] | None = None
     """Called with the file of each image before it is decoded; None for nothing."""
 
     def __post_init__(self) -> None:
         if isinstance(self.downscale, bool) or not isinstance(self.downscale, int) or self.downscale < 1:
             raise UsageError(f"--downscale must be a whole number of at least 1, not {self.downscale!r}")
+        if isinstance(self.max_side, bool) or not isinstance(self.max_side, int) or not 0 <= self.max_side:
+            raise UsageError(f"--max-side must be a whole number of pixels, 0 for no limit, not {self.max_side!r}")
         if isinstance(self.max_pixels, bool) or not isinstance(self.max_pixels, int) or self.max_pixels < 1:
             raise UsageError(f"--max-pixels must be a whole number of at least 1, not {self.max_pixels!r}")
         if self.masks not in ("ignore", "cutout"):

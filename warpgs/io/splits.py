@@ -144,18 +144,18 @@ def split_views(scene: Scene, spec: str) -> Split:
     return {"llff": _every_8th, "mip360": _every_8th, "dtu": _dtu, "blender": _blender}[kind](names, count, spec)
 
 
-def default_split(scene: Scene) -> tuple[Split, str]:
-    """Return the split for a user who names none, and a sentence that says so.
+def held_out_split(scene: Scene) -> tuple[str, str]:
+    """Return the split for a study that needs held-out views and whose user names none, and a sentence that says so.
 
     Every 8th view is held out where there are at least 9, else the middle one; of two views none.
     """
     names = sorted(v.name for v in scene.views)
     if len(names) >= 9:
-        return split_views(scene, "every:8"), "no --split given: every 8th view is held out"
-    if len(names) == 2:
-        return Split(tuple(names), ()), "no --split given: both views train, none is held out"
+        return "every:8", "no --split given: every 8th view is held out (--split every:8)"
     middle = names[len(names) // 2]
-    return Split(tuple(n for n in names if n != middle), (middle,)), f"no --split given: {middle} is held out"
+    if len(names) == 2 or set(middle) & set(",;=") or middle != middle.strip():
+        return "all", "no --split given: every view trains, none is held out (--split all)"
+    return f"test={middle}", f"no --split given: {middle} is held out"
 
 
 def coincident_views(scene: Scene, split: Split) -> list[tuple[str, str]]:

@@ -39,9 +39,12 @@ def _request_type() -> type:
         out: Path
         """Run folder to fill; must not exist yet."""
         split: str | None = None
-        """llff:K, mip360:K, dtu:3|6|9, blender:8, every:N, all, or train=NAMES;test=NAMES."""
-        downscale: int = 1
-        """Factor by which both image sides shrink."""
+        """Views to hold out for scores: llff:K, mip360:K, dtu:3|6|9, blender:8, every:N, all (trains on all, as without this
+        flag), or train=NAMES;test=NAMES."""
+        downscale: int | None = None
+        """Factor by which both image sides shrink; with it, images keep what it leaves of them."""
+        max_side: int | None = None
+        """Longest side that an image keeps [px], 0 for no limit; 1600 where neither this nor --downscale is given."""
         reader: str | None = None
         """Name of the scene's format, or a reader of your own: module:Class or path/to/file.py:Class."""
         device: str = "auto"
@@ -228,7 +231,7 @@ def request_of(arguments: list[str], about: str) -> FitRequest:
     masks = None if a.score_masks is None else str(a.score_masks.resolve())
     scene = SceneRequest(
         str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.masks, a.mask_keeps, a.black_is_empty, masks, a.reader,
-        a.max_pixels,
+        a.max_pixels, a.max_side,
     )  # fmt: skip
     view_port = a.view_port if a.view else None
     return FitRequest(scene, a.out, config, a.device, a.resume, a.lpips_weights, a.time_budget, notes, view_port)

@@ -38,8 +38,10 @@ def _show(arguments: list[str], about: str) -> int:
         """Folder for a PNG sheet per training view."""
         split: str | None = None
         """As for `warpgs fit`."""
-        downscale: int = 1
-        """Factor by which both image sides shrink."""
+        downscale: int | None = None
+        """Factor by which both image sides shrink; with it, images keep what it leaves of them."""
+        max_side: int | None = None
+        """Longest side that an image keeps [px], 0 for no limit; 1600 where neither this nor --downscale is given."""
         allow_outside: bool = False
         """Let names and links of the scene lead to images and masks outside its folder."""
         max_pixels: int = MAX_PIXELS
@@ -55,7 +57,9 @@ def _show(arguments: list[str], about: str) -> int:
     from warpgs.pipeline.runs.request import SceneRequest
 
     check_range("--threads", a.threads, 0, MAX_THREADS)
-    scene = SceneRequest(str(a.scene), a.split, a.downscale, allow_outside=a.allow_outside, max_pixels=a.max_pixels)
+    scene = SceneRequest(
+        str(a.scene), a.split, a.downscale, allow_outside=a.allow_outside, max_pixels=a.max_pixels, max_side=a.max_side
+    )
     for line in show_priors(scene, a.priors, a.source, a.out, a.threads):
         say(line)
     return 0

@@ -21,9 +21,11 @@ def study_flags() -> type:
         seeds: int = 5
         """Runs of each setting on each scene, seeds 0, 1, ..."""
         split: str | None = None
-        """As in `warpgs fit`, for all scenes."""
-        downscale: int = 1
-        """Factor by which both image sides shrink."""
+        """As in `warpgs fit`, for all scenes; where not given, every 8th view or the middle one is held out."""
+        downscale: int | None = None
+        """Factor by which both image sides shrink; with it, images keep what it leaves of them."""
+        max_side: int | None = None
+        """Longest side that an image keeps [px], 0 for no limit; 1600 where neither this nor --downscale is given."""
         allow_outside: bool = False
         """Let names and links of the scenes lead to images and masks outside their folders."""
         max_pixels: int = MAX_PIXELS
@@ -44,7 +46,7 @@ def run_study_of(a, variants: dict, marks: dict) -> int:
     from warpgs.pipeline.study.compare import run_study
     from warpgs.pipeline.study.study import StudyRequest
 
-    options = {"allow_outside": a.allow_outside, "max_pixels": a.max_pixels}
+    options = {"allow_outside": a.allow_outside, "max_pixels": a.max_pixels, "max_side": a.max_side}
     scenes = tuple(SceneRequest(str(s), a.split, a.downscale, **options) for s in a.scenes)
     for line in run_study(StudyRequest(scenes, variants, a.seeds, a.out, a.device, a.lpips_weights, marks)):
         say(line)

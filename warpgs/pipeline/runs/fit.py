@@ -27,7 +27,7 @@ from warpgs.pipeline.runs.failed_step import failed_step, save_failed_step
 from warpgs.pipeline.runs.folder import CONFIG, check_checkpoint, check_same, read_record, record_of, run_folder
 from warpgs.pipeline.runs.image_names import image_names, renaming_notes
 from warpgs.pipeline.runs.model_file import FittedModel
-from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device, choose_split, read_scene
+from warpgs.pipeline.runs.request import NO_SCORES, FitRequest, SceneRequest, choose_device, choose_split, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line, write_report
 from warpgs.pipeline.runs.rule_report import rule_report_of
 from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, sampling_report_of
@@ -139,7 +139,7 @@ def fit(
     Args:
         scene: A scene, its folder, or a folder with the options it is read with.
         config: Settings, the name of a preset, or None for the default one.
-        split: Views to fit and to hold out, as in `warpgs fit --split`; None for the default of the scene's format.
+        split: Views to fit and to hold out, as in `warpgs fit --split`; None for all to fit.
         out: Run folder to fill with configuration, log, checkpoints, PLY, images, scores and report; None to write nothing.
         device: auto, cpu, cuda, or one of torch's.
         on_step: Called after every step with its number, loss, PSNR, number of Gaussians and time.
@@ -205,8 +205,8 @@ def _scene_of(
     """Read and split a scene that is given in one of four ways; its notes come last."""
     if isinstance(scene, Scene):
         split, notes = choose_split(scene, spec)
-        return SceneRequest("", spec), scene, split, [*scene.notes, *notes]
-    request = scene if isinstance(scene, SceneRequest) else SceneRequest(str(scene))
+        return SceneRequest("", spec, 1).with_scale(), scene, split, [*scene.notes, *notes]
+    request = (scene if isinstance(scene, SceneRequest) else SceneRequest(str(scene))).with_scale()
     if spec is not None:
         request = replace(request, split=spec)
     request, found = with_poses(request, out, progress)
@@ -393,6 +393,8 @@ def _print_result(job: _Job, metrics: dict[str, Any]) -> None:
         job.say(f"  {metrics['coverage']['summary']}")
         for name, value in metrics["baselines"].items():
             job.say(f"  without a fit, the {name.replace('_', ' ')} scores {value:.2f} dB")
+    else:
+        job.say(NO_SCORES)
     job.say(complexity_summary(metrics))
     if job.out is None:
         job.say(f"{metrics['gaussians']:,} Gaussians; no folder was asked for, so nothing is written")

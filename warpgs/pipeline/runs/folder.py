@@ -85,7 +85,8 @@ def record_of(
 ) -> dict[str, Any]:
     """Return the contents of config.json: format, scene, views, settings, device, versions and cameras."""
     return {
-        "format": FORMAT, "scene": {**asdict(request), "path": str(Path(request.path).resolve()) if request.path else None},
+        "format": FORMAT,
+        "scene": {**asdict(request.with_scale()), "path": str(Path(request.path).resolve()) if request.path else None},
         "scene_format": scene.format, "fingerprint": scene.fingerprint,
         "train": split.train, "test": split.test, "notes": notes,
         "normalization": {"offset": scene.normalization.offset.tolist(), "scale": scene.normalization.scale},
@@ -142,7 +143,7 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
             if isinstance(now, dict) and isinstance(then, dict):
                 changed = [k for k in now if now[k] != then.get(k)]
                 key = f"{key} ({', '.join(changed)})"
-            words = {"fingerprint": "the scene (images, cameras or points, as --downscale and --reader give them)"}
+            words = {"fingerprint": "the scene (images, cameras or points, as --downscale, --max-side and --reader give them)"}
             raise UsageError(
                 f"--resume: {words.get(key, key)} differs from the run in {out}; give all flags that it was started "
                 "with, or a new --out"

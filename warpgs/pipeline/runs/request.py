@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -12,9 +12,13 @@ import torch
 from warpgs.errors import ResourceError, UsageError
 from warpgs.io.decoding import MAX_PIXELS
 from warpgs.io.load import load_scene
-from warpgs.io.splits import Split, coincident_views, default_split, split_views
+from warpgs.io.readers import image_scale
+from warpgs.io.splits import Split, coincident_views, split_views
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.scene import Scene
+
+NO_SCORES = "scores: none, every photograph was trained on; --split every:8 holds some out"
+"""Sentence on a fit without held-out views, with the way to scores."""
 
 
 @dataclass(frozen=True)
@@ -24,9 +28,9 @@ class SceneRequest:
     path: str
     """Folder of the scene; empty where it was passed from Python."""
     split: str | None = None
-    """Views to fit and to hold out, as in `warpgs fit --split`; None for the format's default."""
-    downscale: int = 1
-    """Factor by which both image sides shrink."""
+    """Views to fit and to hold out, as in `warpgs fit --split`; None for all to fit."""
+    downscale: int | None = None
+    """Factor by which both image sides shrink; None for 1."""
     strict: bool = False
     """A frame without an image file is an error."""
     allow_outside: bool = False
@@ -43,6 +47,13 @@ class SceneRequest:
     """Name of the reader, ``module:Class`` or ``path/to/file.py:Class``; None to ask every built-in reader."""
     max_pixels: int = MAX_PIXELS
     """Largest number of pixels that an image or a mask may have as stored."""
+    max_side: int | None = None
+    """Longest side that an image keeps [px], 0 for no limit; None for 1600 where ``downscale`` is None too, else for 0."""
+
+    def with_scale(self) -> SceneRequest:
+        """Return this request with its size of images in numbers, as a run remembers it."""
+        downscale, max_side = image_scale(self.downscale, self.max_side)
+        return replace(self, downscale=downscale, max_side=max_side)
 
 
 @dataclass(frozen=True)
@@ -96,7 +107,7 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
 
     Args:
         scene: The scene.
-        spec: As in `warpgs fit --split`; None for the default of the scene's format.
+        spec: As in `warpgs fit --split`; None for all to fit.
 
     Returns:
         The split, and notes for the user: the choice made, masks and held-out views that make scores mean less.
@@ -105,12 +116,8 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
         DataError: A view that is named is not there.
         UsageError: The split is not understood.
     """
-    notes = []
-    if spec is None:
-        split, note = default_split(scene)
-        notes.append(note)
-    else:
-        split = split_views(scene, spec)
+    split = split_views(scene, "all" if spec is None else spec)
+    notes = [] if split.test else [NO_SCORES]
     if (spec or "").startswith("dtu:") and any(v.mask is not None for v in scene.views):
         notes.append(
             "masks hide pixels from the fit, which the published DTU protocol does not do: object masks that only scores "
@@ -124,7 +131,7 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
 def read_scene(request: SceneRequest, progress: Callable[[str], object] | None = None) -> tuple[Scene, Split, list[str]]:
     """Load a scene and split its views; returns both with the notes for the user. ``progress`` is as in `load_scene`."""
     scene = load_scene(
-        request.path, reader=request.reader, downscale=request.downscale, strict=request.strict,
+        request.path, reader=request.reader, downscale=request.downscale, max_side=request.max_side, strict=request.strict,
         allow_outside=request.allow_outside, masks=request.masks, mask_keeps=request.mask_keeps,
         black_is_empty=request.black_is_empty, score_masks=request.score_masks, max_pixels=request.max_pixels,
         progress=progress,

@@ -69,7 +69,7 @@ def protocol_of(scene: Scene, spec: str | None, downscale: int, train: list[View
     """Return the conditions in which scores must agree before they may be compared, for result files and the page."""
     sizes = sorted({(v.camera.width, v.camera.height) for v in test or train})
     return {
-        "split": spec or "default (no --split given)", "training_views": len(train), "held_out_views": len(test),
+        "split": spec or "all (no --split given)", "training_views": len(train), "held_out_views": len(test),
         "ground_truth": scene.pixels, "downscale": downscale, "resolution": [f"{w} x {h}" for w, h in sizes],
         "score_masks": sum(v.score_mask is not None for v in test),
     }  # fmt: skip

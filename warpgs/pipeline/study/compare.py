@@ -8,6 +8,7 @@ import gc
 import torch
 
 from warpgs.errors import DataError, UsageError
+from warpgs.io.splits import held_out_split, split_views
 from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.runs.request import FitRequest, choose_device, read_scene
 from warpgs.pipeline.study.ensure_run import ensure_run
@@ -61,6 +62,10 @@ def _places(request: StudyRequest) -> list[Place]:
     places = []
     for wanted in request.scenes:
         scene, split, _ = read_scene(wanted)
+        if wanted.split is None:
+            spec, note = held_out_split(scene)
+            say(f"{wanted.path}: {note}")
+            wanted, split = dataclasses.replace(wanted, split=spec), split_views(scene, spec)
         if not split.test:
             raise DataError(f"{wanted.path}: no view is held out, so there is nothing to compare; choose another --split")
         places.append(Place(scene_name(wanted), wanted, scene.fingerprint, split, train_views(scene, split.test)))

@@ -1,0 +1,35 @@
+"""Photographs in formats that are known and not read: one sentence with the format and the remedy."""
+
+import pytest
+
+from tests.io import scenes
+from warpgs.errors import DataError
+from warpgs.io.decoding import decode
+from warpgs.io.load import load_scene
+
+FTYP = b"\0\0\0\x1cftyp"
+
+
+@pytest.mark.parametrize(
+    "name,data,words",
+    [
+        ("a.heic", FTYP + b"heic\0\0\0\0mif1heic" + bytes(40), "a HEIC photograph.*convert all of them to JPEG"),
+        ("a.jpg", FTYP + b"mif1", "a HEIC photograph"),  # truncated, under another name
+        ("a.jpg", FTYP + b"mif1\0\0\0\0mif1avif", "an AVIF photograph.*PNG"),
+        ("a.avif", FTYP + b"avif", "an AVIF photograph"),
+        ("a.DNG", b"II*\0" + bytes(60), "a camera's RAW file.*develop"),
+        ("a.cr3", FTYP + b"crx ", "a camera's RAW file"),
+    ],
+)
+def test_the_format_and_its_remedy_are_named(name, data, words, tmp_path):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(DataError, match=rf"{name}: is {words}"):
+        decode(tmp_path / name)
+
+
+def test_a_folder_of_them_is_told_from_an_empty_one(tmp_path):
+    scenes.WRITERS["llff"](tmp_path)
+    for file in (tmp_path / "images").iterdir():
+        file.rename(file.with_suffix(".HEIC"))
+    with pytest.raises(DataError, match=r"images: .*\.HEIC is a HEIC photograph, which is not read: convert"):
+        load_scene(tmp_path)
