@@ -20,10 +20,9 @@ from bench.rows import folds, scene_at
 from bench.training import compile_kernels, full_bytes, make_trainer
 from warpgs.errors import UsageError
 from warpgs.io.splits import split_views
-from warpgs.pipeline.runs.fit import preset_config
 from warpgs.pipeline.runs.prune import prune
 from warpgs.pipeline.runs.request import SceneRequest
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.config import FitConfig, preset_config
 from warpgs.scene import Scene, View
 
 PEER, PEER_POINTS = "gsplat", "gsplat-points"

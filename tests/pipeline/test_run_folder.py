@@ -70,7 +70,7 @@ def test_whatever_writes_into_a_run_waits_for_nobody(folder, tmp_path, capsys):
             fit(folder, run, resume=True)
         for words in (
             ["eval", str(run), *cpu],
-            ["render", str(run), *cpu],
+            ["render", str(run), "--path", "views", *cpu],
             ["export", str(run), "--to", str(run / "a.ply")],
             ["prune", str(run), "--keep-psnr", "3", "--out", str(run / "pruned"), *cpu],
             ["compare", scene, "--out", str(run), "--presets", "3dgs,mcmc", "--steps", "1", "--split", "every:4", *cpu],

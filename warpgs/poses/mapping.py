@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
-import subprocess
-import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-import warpgs
 from warpgs.errors import ResourceError, UsageError
 from warpgs.files import write_json
 from warpgs.poses.photographs import MATCHING_SIDE, Photograph
+from warpgs.runtime.processor import usable_cores
+from warpgs.runtime.subprocesses import ProcessFailed, python_lines
 
 EXHAUSTIVE = 60
 """Most photographs of which all pairs are matched; of more, pairs are chosen."""
@@ -117,34 +114,15 @@ def _lines(job: dict[str, Any], folder: Path) -> Iterator[dict[str, Any]]:
     """Yield what the worker says, and end it where nobody listens any more."""
     path = folder / "job.json"
     write_json(path, job)
-    home = str(Path(warpgs.__file__).parent.parent)
-    search = os.pathsep.join(p for p in (home, os.environ.get("PYTHONPATH", "")) if p)
-    environment = os.environ | {
-        "PYTHONPATH": search,
-        "PYTHONSAFEPATH": "1",
-        "PYTHONIOENCODING": "utf-8",
-        "GLOG_logtostderr": "1",
-    }
-    command = [sys.executable, "-P", "-m", "warpgs.poses.worker", str(path)]
-    with tempfile.TemporaryFile() as errors:
-        process = subprocess.Popen(
-            command, env=environment, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors,
-            text=True, encoding="utf-8", errors="replace",
-        )  # fmt: skip
-        try:
-            assert process.stdout is not None
-            for line in process.stdout:
-                if line.startswith("{"):
-                    yield json.loads(line)
-            if process.wait():
-                errors.seek(0)
-                last = errors.read().decode("utf-8", "replace").strip()[-LAST_WORDS:].replace("\n", " ")
-                raise ResourceError(
-                    f"pycolmap ended with code {process.returncode}; it may have had too little memory. Its last words: {last}"
-                )
-        finally:
-            process.kill()
-            process.wait()
+    try:
+        for line in python_lines("warpgs.poses.worker", str(path), folder=folder, environment={"GLOG_logtostderr": "1"}):
+            if line.startswith("{"):
+                yield json.loads(line)
+    except ProcessFailed as e:
+        last = e.errors[-LAST_WORDS:].replace("\n", " ")
+        raise ResourceError(
+            f"pycolmap ended with code {e.code}; it may have had too little memory. Its last words: {last}"
+        ) from e
 
 
 def find_model(
@@ -170,9 +148,8 @@ def find_model(
     Raises:
         ResourceError: pycolmap failed.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     result: dict[str, Any] | None = None
-    for said in _lines(_job(photographs, names, kind, folder, threads or cores), folder):
+    for said in _lines(_job(photographs, names, kind, folder, threads or usable_cores()), folder):
         if "progress" in said:
             progress(said["progress"])
         result = said.get("result", result)

@@ -15,6 +15,7 @@ from typing import Any
 
 from warpgs.files import write_text
 from warpgs.poses.pairs import choose_pairs
+from warpgs.runtime.terminal import say
 
 SEED = 0
 """Seed of everything that is sampled."""
@@ -27,7 +28,7 @@ CAMERA_MODEL = "SIMPLE_RADIAL"
 
 
 def _say(**values: Any) -> None:
-    print(json.dumps(values), flush=True)
+    say(json.dumps(values))
 
 
 def extract(pycolmap: Any, job: dict[str, Any]) -> None:

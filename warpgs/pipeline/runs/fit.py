@@ -35,7 +35,7 @@ from warpgs.pipeline.runs.with_poses import with_poses
 from warpgs.pipeline.train.background import choose_background, over_background
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.complexity import complexity_figures, complexity_summary
-from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESETS, FitConfig
+from warpgs.pipeline.train.config import FitConfig, preset_config
 from warpgs.pipeline.train.loop import run, train_views
 from warpgs.pipeline.train.time_budget import within_budget
 from warpgs.pipeline.train.trainer import StepReport, Trainer
@@ -101,20 +101,6 @@ class _Job:
         """Print a line for the user, unless the fit is to be silent."""
         if self.verbose:
             say(line)
-
-
-def preset_config(config: FitConfig | str | None) -> FitConfig:
-    """Return the settings for a preset's name, for settings themselves, or for None: the default preset.
-
-    Raises:
-        UsageError: There is no such preset.
-    """
-    if isinstance(config, FitConfig):
-        return config
-    name = DEFAULT_PRESET if config is None else config
-    if name not in PRESETS:
-        raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
-    return PRESETS[name]
 
 
 def fit(
@@ -316,7 +302,7 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
         job.notes.append(note)
         job.say(f"  {note}")
     return metrics | {
-        "protocol": protocol_of(scene, job.request.split, job.request.downscale, train, test),
+        "protocol": protocol_of(scene, job.request.split, job.request.downscale or 1, train, test),
         "steps": trainer.step, "gaussians": len(gaussians), "preset": c.preset, "seed": c.seed,
         "config_hash": c.fingerprint(), "fingerprint": scene.fingerprint, "device": job.where.removeprefix("on "),
         "seconds": {**seconds, "total": time.perf_counter() - job.began}, **peak,

@@ -193,3 +193,17 @@ PRESET_NOTES: dict[str, str] = {
     "paper-literal": "the paper to the letter, with first proposals for what it leaves open; slow",
 }
 """One description of each preset."""
+
+
+def preset_config(config: FitConfig | str | None) -> FitConfig:
+    """Return the settings for a preset's name, for settings themselves, or for None: the default preset.
+
+    Raises:
+        UsageError: There is no such preset.
+    """
+    if isinstance(config, FitConfig):
+        return config
+    name = DEFAULT_PRESET if config is None else config
+    if name not in PRESETS:
+        raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
+    return PRESETS[name]
