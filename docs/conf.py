@@ -8,8 +8,8 @@ import warpgs
 sys.path.insert(0, str(Path(__file__).parent))  # mathml.py
 
 EXPECTED = (
-    "install", "quickstart", "your-photos", "poses", "presets", "troubleshooting", "viewer", "films", "mesh", "formats", "python",
-    "measured",
+    "install", "quickstart", "your-photos", "poses", "presets", "troubleshooting", "viewer", "films", "mesh", "formats",
+    "python", "measured",
 )  # fmt: skip
 """Pages in the navigation that are still being written."""
 HIDDEN_COLON = "\N{OBJECT REPLACEMENT CHARACTER}"
