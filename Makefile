@@ -13,7 +13,7 @@ export PYTHONUTF8 := 1
 export PYTHONDONTWRITEBYTECODE :=
 OUT ?= runs/demo
 
-.PHONY: demo install lint types docs test test-slow test-fault test-browser test-audit test-cuda clean
+.PHONY: demo install lint types docs docs-links test test-slow test-fault test-browser test-audit test-cuda clean
 
 # LOCKED=1: only files whose hashes stand in requirements.lock; else, from wherever pip is told, the versions of constraints.txt
 $(VENV)/installed: pyproject.toml constraints.txt requirements.lock
@@ -56,9 +56,12 @@ types: install
 	$(BIN)/mypy
 	$(if $(wildcard examples),$(BIN)/mypy examples)
 
-# The documents as a site in site/; a broken link or an unknown formula fails. (With --quiet mkdocs counts no warnings.)
+# The documents as a site in site/; a broken link, an unknown formula or any other warning fails. docs-links asks the network, too.
 docs: install
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --builder html docs site
+
+docs-links: install
+	$(BIN)/python -m sphinx --quiet --builder linkcheck docs site/links
 
 # Run these before a change is called done: CONTRIBUTING.md says which one when. Properties get more examples here;
 # `make test-fault FUZZ=100000` gives the readers so many damaged files (2000 where nothing is said).
