@@ -21,6 +21,7 @@ from warpgs.pipeline.runs.film_plan import FilmSettings, plan_film
 from warpgs.pipeline.runs.folder import IMAGE_FOLDERS, StoredRun, open_run
 from warpgs.pipeline.runs.image_names import image_names, renaming_notes
 from warpgs.pipeline.runs.paths import COVERAGE, FILM, render_film, sheet_path
+from warpgs.pipeline.runs.refined_poses import with_cameras
 from warpgs.pipeline.runs.request import choose_device, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line
 from warpgs.pipeline.train.background import color_of, over_background
@@ -47,6 +48,8 @@ def scene_of(stored: StoredRun, reader: str | None = None) -> tuple[Scene, list[
     scene, _, _ = read_scene(stored.scene_request(reader))
     if scene.fingerprint != stored.record["fingerprint"]:
         raise DataError(f"{scene.path}: its images or cameras are not those that {stored.folder} was fitted to; restore them")
+    if stored.record["config"].get("refine_poses"):
+        scene = with_cameras(scene, stored.cameras)
     scene, split = over_background(scene, stored.background), Split(stored.train, stored.test)
     return scene, train_views(scene, split.train), train_views(scene, split.test)
 
