@@ -99,18 +99,20 @@ def fitted(views, steps=240):
     return trainer
 
 
-def test_a_fit_finds_poses_back():
-    """Of a scene with poses that are off, most of the error goes, with steps at half size in between; the first pose stays."""
-    truth = scenes.photos(6)
-    given = noisy(truth)
-    trainer = fitted(given)
-    names = [v.name for v in given]
+def test_a_fit_finds_poses_back(tmp_path):
+    """Of a ray-cast scene with poses that are off, a good part of the error goes, at the rates of the default."""
+    write_demo(tmp_path, views=8, width=64, height=48)
+    scene = warpgs.load_scene(tmp_path)
+    truth = list(scene.views)
+    given, names = noisy(truth), [v.name for v in truth]
+    trainer = Trainer(given, scene.points, FitConfig(steps=400, half_resolution=0.25, refine_poses=True), CPU)
+    while trainer.step < 400:
+        trainer.advance()
     cameras = refined_cameras({v.name: v.camera for v in given}, names, (), trainer.view_table.params)
     assert np.array_equal(cameras[names[0]].viewmat, given[0].camera.viewmat)
     found = [dataclasses.replace(v, camera=cameras[v.name]) for v in given]
     before, after = errors(given, truth), errors(found, truth)
-    print(before, after)
-    assert (after < 0.5 * before).all()
+    assert (after < 0.8 * before).all(), (before, after)
     for name in (ROTATION, TRANSLATION):
         assert not trainer.view_table.params[name][0].any()
 
@@ -182,13 +184,13 @@ def test_runs_keep_refined_poses(tmp_path):
     assert summary in (tmp_path / "run" / "report.html").read_text()
     run, scene = warpgs.open_run(tmp_path / "run", "cpu"), warpgs.load_scene(tmp_path / "scene")
     given = {v.name: v.camera for v in scene.views}
-    again = pose_figures(given, run.cameras, run.train, run.test, run.normalization.scale)
+    again = pose_figures(given, run.scene_cameras, run.train, run.test, run.normalization.scale)
     assert again["views"] == rows
     assert main(["eval", str(tmp_path / "run"), "--device", "cpu"]) == 0
     scores = json.loads((tmp_path / "run" / "eval.json").read_text())
     assert scores["test"] == metrics["test"] and scores["train"] == metrics["train"]
     assert main(["prune", str(tmp_path / "run"), "--out", str(tmp_path / "pruned"), "--device", "cpu"]) == 0
-    pruned = warpgs.open_run(tmp_path / "pruned", "cpu").cameras
-    assert all(np.array_equal(pruned[n].viewmat, c.viewmat) for n, c in run.cameras.items())
+    pruned = warpgs.open_run(tmp_path / "pruned", "cpu").scene_cameras
+    assert all(np.array_equal(pruned[n].viewmat, c.viewmat) for n, c in run.scene_cameras.items())
     assert main([*words, "--resume"]) == 0
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["poses"]["views"] == rows

@@ -49,7 +49,7 @@ def scene_of(stored: StoredRun, reader: str | None = None) -> tuple[Scene, list[
     if scene.fingerprint != stored.record["fingerprint"]:
         raise DataError(f"{scene.path}: its images or cameras are not those that {stored.folder} was fitted to; restore them")
     if stored.record["config"].get("refine_poses"):
-        scene = with_cameras(scene, stored.cameras)
+        scene = with_cameras(scene, stored.scene_cameras)
     scene, split = over_background(scene, stored.background), Split(stored.train, stored.test)
     return scene, train_views(scene, split.train), train_views(scene, split.test)
 

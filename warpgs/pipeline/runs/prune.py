@@ -113,7 +113,7 @@ def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str, re
         "train_psnr": scores[0], "test_psnr": scores[1] if test else None,
     }  # fmt: skip
     # the new checkpoint has no increments of poses: its record holds the cameras after them
-    record = stored.record | {"pruned": figures, "cameras": {n: camera_values(c) for n, c in stored.cameras.items()}}
+    record = stored.record | {"pruned": figures, "cameras": {n: camera_values(c) for n, c in stored.scene_cameras.items()}}
     notes = _write(out, record, made, stored.step, stored.normalization)
     lines = [
         *notes,
