@@ -19,7 +19,7 @@ RULE = (
     "held-out views are moved by the one similarity that takes the given training cameras to the refined ones best; their "
     "own images are not looked at"
 )
-"""What is done to the poses of held-out views, for people."""
+"""Rule for the poses of held-out views, for people."""
 
 
 def _motions(tensors: Mapping[str, torch.Tensor], views: int) -> np.ndarray:
@@ -73,7 +73,7 @@ def refined_cameras(
 
 def with_cameras(scene: Scene, cameras: Mapping[str, Camera]) -> Scene:
     """Return a scene whose views have the poses of cameras by name."""
-    views = tuple(replace(v, camera=replace(v.camera, viewmat=cameras[v.name].viewmat)) for v in scene.views)
+    views = tuple(replace(v, camera=replace(v.camera, viewmat=cameras.get(v.name, v.camera).viewmat)) for v in scene.views)
     return replace(scene, views=views)
 
 
