@@ -49,7 +49,7 @@ def _help() -> str:
         for purpose, names in GROUPS.items()
     )
     return (
-        f"warpgs {__version__}: from a handful of posed photographs to a 3D Gaussian scene\n\n"
+        f"warpgs {__version__}: from a handful of photographs to a 3D Gaussian scene\n\n"
         "usage: warpgs COMMAND [flags]\n\n" + "\n\n".join(groups) + "\n\n"
         "`warpgs COMMAND --help` lists a command's flags.\n"
         "First steps: warpgs demo scene && warpgs fit scene --out run\n"
