@@ -69,8 +69,8 @@ def help_lines(about: str) -> list[str]:
         stated = f" [{default}]" if default not in ("", "False") else ""
         flags.append((f"{name} {word}".strip(), text + stated))
     return [
-        f"warpgs fit: {about}", "", "usage: warpgs fit SCENE --out RUN [flags]", "", "flags most fits need, and their [defaults]:",
-        *rows(flags), "",
+        f"warpgs fit: {about}", "", "usage: warpgs fit SCENE --out RUN [flags]", "",
+        "flags most fits need, and their [defaults]:", *rows(flags), "",
         "presets (--preset):", *rows(list(PRESETS.items())), "", "splits (--split):", *rows(list(SPLITS.items())), "",
         "examples:", *(f"  {line}" for line in EXAMPLES), "", "`warpgs fit --help-all` lists every flag by topic.",
     ]  # fmt: skip
