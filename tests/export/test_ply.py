@@ -68,8 +68,9 @@ def test_layout_on_disk(tmp_path):
     lines, body = split(tmp_path / "a.ply")
     names = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2".split() + [f"f_rest_{i}" for i in range(9)]
     names += "opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
-    assert lines[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 1"]
-    assert lines[3:] == [f"property float {n}" for n in names]
+    comments = ["comment SplatRenderMode: default", "comment antialiased 0"]
+    assert lines[:5] == ["ply", "format binary_little_endian 1.0", *comments, "element vertex 1"]
+    assert lines[5:] == [f"property float {n}" for n in names]
     rest = [3, 6, 9, 4, 7, 10, 5, 8, 11]
     want = [1, 2, 3, 0, 0, 0, 0, 1, 2, *rest, 2.5, -1, -2, -3, 0.5, 0.1, 0.2, 0.3]
     assert body == struct.pack(f"<{len(want)}f", *want)

@@ -8,58 +8,25 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from warpgs.coordinates import checked_normalization, convert_gaussians
 from warpgs.errors import DataError
+from warpgs.export.arrays import arrays_of, check_finite
+from warpgs.export.ply_header import COMMENTS, MAX_HEADER_BYTES, Element, parse_header, ply_error
 from warpgs.files import replacing
 from warpgs.scene import Gaussians, Normalization
 
-MAX_HEADER_BYTES = 65536
-"""Largest accepted header [bytes]: a real one has some two thousand."""
 CHUNK_ROWS = 65536
 """Number of Gaussians written at a time, so that the interleaved copy of a large model never exists as a whole."""
 
-REMEDY = "Export the model again with warpgs, or with any tool that writes the binary layout of the INRIA 3DGS code."
-
-_TYPES = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "<i2",
-    "int16": "<i2",
-    "ushort": "<u2",
-    "uint16": "<u2",
-    "int": "<i4",
-    "int32": "<i4",
-    "uint": "<u4",
-    "uint32": "<u4",
-    "float": "<f4",
-    "float32": "<f4",
-    "double": "<f8",
-    "float64": "<f8",
-}
 _POSITION = ("x", "y", "z")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALE = ("scale_0", "scale_1", "scale_2")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 _REST_COUNTS = (0, 9, 24, 45)
-
-
-@dataclass
-class _Element:
-    """One element of a PLY header."""
-
-    name: str
-    count: int
-    properties: list[tuple[str, str]] = field(default_factory=list)
-    """Pairs (name, numpy type) in file order."""
-    has_list: bool = False
-    """True where a property is a list, so that rows differ in length."""
 
 
 def write_ply(
@@ -89,8 +56,8 @@ def write_ply(
     normalization = checked_normalization(normalization, units, f"{path}: not written")
     in_file = convert_gaussians(gaussians, normalization, units, "file")
     for g in (gaussians, in_file):  # finite numbers may leave float32 on the way
-        arrays = {name: t.detach().cpu().numpy() for name, t in g.tensors().items()}
-        _refuse_non_finite(path, arrays)
+        arrays = arrays_of(g)
+        check_finite(path, arrays)
 
     n, k = arrays["sh"].shape[:2]
     header = _header(n, 3 * (k - 1))
@@ -125,13 +92,13 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
     try:
         with open(path, "rb") as file:
             size = os.fstat(file.fileno()).st_size
-            elements, start = _parse_header(path, file.read(MAX_HEADER_BYTES))
+            elements, start = parse_header(path, file.read(MAX_HEADER_BYTES))
             vertex, start = _locate_vertices(path, elements, start)
             rest = _check_properties(path, vertex)
             dtype = np.dtype(vertex.properties)
             end = start + vertex.count * dtype.itemsize
             if end > size:
-                raise _error(
+                raise ply_error(
                     path,
                     f"cut short: {vertex.count} Gaussians of {dtype.itemsize} bytes need {end} bytes, it has {size}",
                 )
@@ -140,19 +107,8 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({e.strerror or e}). Check the path and its permissions.") from e
     if len(rows) != vertex.count:
-        raise _error(path, f"cut short: {vertex.count} Gaussians announced, {len(rows)} read")
+        raise ply_error(path, f"cut short: {vertex.count} Gaussians announced, {len(rows)} read")
     return convert_gaussians(_assemble(path, rows, rest), normalization, "file", units)
-
-
-def _refuse_non_finite(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Raise a DataError that names the first tensor with a NaN or an infinity."""
-    for name, array in arrays.items():
-        bad = array.size - int(np.isfinite(array).sum())
-        if bad:
-            raise DataError(
-                f"{path}: not written, {name} holds {bad} non-finite of {array.size} values, which no viewer can show. "
-                "Export an earlier checkpoint, or fit again with a lower learning rate."
-            )
 
 
 def _names(rest: int) -> list[str]:
@@ -162,7 +118,7 @@ def _names(rest: int) -> list[str]:
 
 def _header(n: int, rest: int) -> bytes:
     """Return the header of a file with ``n`` Gaussians and ``rest`` coefficients above degree 0."""
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
+    lines = ["ply", "format binary_little_endian 1.0", *COMMENTS, f"element vertex {n}"]
     lines += [f"property float {name}" for name in _names(rest)]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
@@ -178,70 +134,32 @@ def _rows(arrays: dict[str, np.ndarray]) -> np.ndarray:
     return np.concatenate(columns, axis=1, dtype="<f4", casting="same_kind")
 
 
-def _error(path: Path, what: str) -> DataError:
-    """Return a DataError about a malformed file, with the remedy."""
-    return DataError(f"{path}: not a usable Gaussian PLY file: {what}. {REMEDY}")
-
-
-def _parse_header(path: Path, head: bytes) -> tuple[list[_Element], int]:
-    """Return the elements of the header in the first bytes of a file, and the offset [bytes] of the data behind it."""
-    if not re.match(rb"ply\r?\n", head):
-        raise _error(path, "it does not start with 'ply'")
-    end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
-    if end is None:
-        raise _error(path, f"no 'end_header' line within the first {MAX_HEADER_BYTES} bytes")
-    try:
-        lines = head[: end.start()].decode("ascii").splitlines()[1:]
-    except UnicodeDecodeError as e:
-        raise _error(path, f"byte {e.start} of the header is not ASCII") from e
-
-    elements: list[_Element] = []
-    formats = []
-    for line in lines:
-        match line.split():
-            case [] | ["comment" | "obj_info", *_]:
-                pass
-            case ["format", *words]:
-                formats.append(" ".join(words))
-            case ["element", name, count] if re.fullmatch(r"[0-9]{1,18}", count):
-                elements.append(_Element(name, int(count)))
-            case ["property", "list", count, item, _] if elements and count in _TYPES and item in _TYPES:
-                elements[-1].has_list = True
-            case ["property", kind, name] if elements and kind in _TYPES:
-                elements[-1].properties.append((name, _TYPES[kind]))
-            case _:
-                raise _error(path, f"header line {line[:80]!r} makes no sense")
-    if formats != ["binary_little_endian 1.0"]:
-        raise _error(path, f"its format is {' and '.join(formats)[:80] or 'not given'}, not binary_little_endian 1.0")
-    return elements, end.end()
-
-
-def _locate_vertices(path: Path, elements: list[_Element], start: int) -> tuple[_Element, int]:
+def _locate_vertices(path: Path, elements: list[Element], start: int) -> tuple[Element, int]:
     """Return the vertex element and the offset [bytes] of its rows, behind the rows of any elements before it."""
     if [e.name for e in elements].count("vertex") != 1:
-        raise _error(path, "the header must have one 'element vertex'")
+        raise ply_error(path, "the header must have one 'element vertex'")
     for element in elements:
         if element.has_list and (element.count or element.name == "vertex"):
-            raise _error(path, f"the lists in element {element.name[:40]!r} leave the place of the Gaussians unknown")
+            raise ply_error(path, f"the lists in element {element.name[:40]!r} leave the place of the Gaussians unknown")
         if element.name == "vertex":
             break
         start += element.count * sum(np.dtype(kind).itemsize for _, kind in element.properties)
     return element, start
 
 
-def _check_properties(path: Path, vertex: _Element) -> int:
+def _check_properties(path: Path, vertex: Element) -> int:
     """Return the number of coefficients above degree 0; DataError where the layout is incomplete."""
     names = [name for name, _ in vertex.properties]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise _error(path, f"property {twice[:40]!r} appears twice")
+        raise ply_error(path, f"property {twice[:40]!r} appears twice")
     rest = sum(bool(re.fullmatch(r"f_rest_[0-9]+", name)) for name in names)
     if rest not in _REST_COUNTS:
-        raise _error(path, f"it has {rest} f_rest properties, but degrees 0 to 3 have 0, 9, 24 or 45")
+        raise ply_error(path, f"it has {rest} f_rest properties, but degrees 0 to 3 have 0, 9, 24 or 45")
     # Normals carry nothing, and some tools leave them out.
     missing = sorted(set(_names(rest)) - set(names) - {"nx", "ny", "nz"})
     if missing:
-        raise _error(path, f"properties missing: {', '.join(missing[:8])}{' ...' if len(missing) > 8 else ''}")
+        raise ply_error(path, f"properties missing: {', '.join(missing[:8])}{' ...' if len(missing) > 8 else ''}")
     return rest
 
 
@@ -258,7 +176,7 @@ def _assemble(path: Path, rows: np.ndarray, rest: int) -> Gaussians:
         bad = ~np.isfinite(out)
         if bad.any():
             row, column = np.argwhere(bad)[0]
-            raise _error(path, f"{names[column]} of Gaussian {row} is not finite in float32")
+            raise ply_error(path, f"{names[column]} of Gaussian {row} is not finite in float32")
         return out
 
     sh = np.empty((len(rows), 1 + rest // 3, 3), np.float32)
@@ -268,7 +186,7 @@ def _assemble(path: Path, rows: np.ndarray, rest: int) -> Gaussians:
     quats = columns(_ROTATION)
     zero = ~quats.any(axis=1)
     if zero.any():
-        raise _error(path, f"the rotation of Gaussian {int(np.argmax(zero))} has zero length")
+        raise ply_error(path, f"the rotation of Gaussian {int(np.argmax(zero))} has zero length")
 
     return Gaussians(
         means=torch.from_numpy(columns(_POSITION)),

@@ -1,0 +1,332 @@
+"""Every format reads back what it wrote within its quantum, and a stranger's file ends in one sentence."""
+
+import base64
+import gzip
+import io
+import json
+import struct
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.gaussians import cloud
+from warpgs.errors import DataError, UsageError
+from warpgs.export import compressed_ply, gltf, sog, splat, spz
+from warpgs.export.arrays import arrays_of, half_turn
+from warpgs.export.formats import FORMATS, format_of, read_gaussians, write_gaussians
+from warpgs.kernels.sh import basis
+from warpgs.scene import Normalization
+
+GOLDEN = Path(__file__).parent / "golden"
+
+
+def model(n=300, degree=3, seed=0):
+    return cloud(n, seed=seed, degree=degree)
+
+
+def same_rotation(a, b):
+    """Return the largest difference of unit quaternions, either sign."""
+    a, b = (torch.nn.functional.normalize(q.double(), dim=1) for q in (a, b))
+    return float(torch.minimum((a - b).abs().amax(1), (a + b).abs().amax(1)).max())
+
+
+def differences(a, b):
+    out = {n: float((getattr(a, n).double() - getattr(b, n).double()).abs().max()) for n in ("means", "log_scales")}
+    out["opacity"] = float((a.logit_opacities.sigmoid() - b.logit_opacities.sigmoid()).abs().max())
+    out["rotation"] = same_rotation(a.quats, b.quats)
+    count = min(a.sh.shape[1], b.sh.shape[1])
+    out["dc"] = float((a.sh[:, 0] - b.sh[:, 0]).abs().max())
+    out["rest"] = float((a.sh[:, 1:count] - b.sh[:, 1:count]).abs().max()) if count > 1 else 0.0
+    return out
+
+
+EXTENT = 4.0  # largest side of the box of `cloud`
+LOG_SPAN = 3.0  # range of its log scales
+QUANTA = {  # half a step of each attribute, with a little room for rounding in float32
+    ".ply": (0, 0, 0, 0, 0, 0),
+    ".gltf": (0, 2e-6, 2e-7, 2e-7, 0, 0),
+    ".glb": (0, 2e-6, 2e-7, 2e-7, 0, 0),
+    ".splat": (0, 2e-6, 0.51 / 255, 0.02, 0.51 / 255 / 0.282, 0),
+    ".spz": (1e-6, 0.51 / 16, 0.51 / 255, 0.003, 0.51 / 38.25, 0.51 / 128),
+    ".compressed.ply": (0.51 * EXTENT / 1023, 0.51 * LOG_SPAN / 1023, 0.51 / 255, 0.004, 0.01, 8 / 256),
+    ".sog": (1e-3, 2 * LOG_SPAN / 255, 0.51 / 255, 0.009, 0.02, 0.02),
+}
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_round_trip_is_within_the_quantum(suffix, degree, tmp_path):
+    made = model(degree=degree)
+    write_gaussians(tmp_path / f"a{suffix}", made, units="file")
+    back = read_gaussians(tmp_path / f"a{suffix}")
+    assert back.sh.shape[1] == (1 if suffix == ".splat" else made.sh.shape[1])
+    limits = QUANTA[suffix]
+    for (name, difference), limit in zip(differences(made, back).items(), limits):
+        assert difference <= limit, (name, difference)
+
+
+@pytest.mark.parametrize("version", spz.VERSIONS)
+def test_versions_of_spz(version, tmp_path):
+    if version == 4:
+        pytest.importorskip("zstandard")
+    made = model(degree=2)
+    (tmp_path / "a.spz").write_bytes(b"".join(spz.encode(arrays_of(made), version)))
+    found = differences(made, read_gaussians(tmp_path / "a.spz"))
+    assert found["rotation"] < (0.1 if version == 2 else 0.003) and found["rest"] <= 0.51 / 128 and found["means"] < 1e-6
+    with pytest.raises(UsageError, match="SPZ version 5"):
+        spz.encode(arrays_of(made), 5)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_units_of_the_scene_lead_to_the_files(suffix, tmp_path):
+    made, n = model(degree=1), Normalization(np.array([1.0, -2.0, 3.0]), 2.0)
+    write_gaussians(tmp_path / f"a{suffix}", made, n, units="scene")
+    stored, back = read_gaussians(tmp_path / f"a{suffix}"), read_gaussians(tmp_path / f"a{suffix}", n, units="scene")
+    assert torch.allclose(stored.means.double(), made.means.double() / 2 + torch.tensor([1.0, -2.0, 3.0]), atol=5e-3)
+    assert torch.allclose(back.log_scales, made.log_scales, atol=0.05)
+
+
+@pytest.mark.parametrize("axis", ["x", "z"])
+def test_a_half_turn_turns_colours_and_shapes(axis):
+    made = arrays_of(model(degree=3))
+    turned = half_turn(made, axis)
+    signs = torch.tensor([1.0 if a == axis else -1.0 for a in "xyz"])
+    directions = torch.nn.functional.normalize(torch.randn(7, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+    for d in directions:
+        before = torch.einsum("k,nkc->nc", basis(d[None])[0], torch.from_numpy(made["sh"]))
+        after = torch.einsum("k,nkc->nc", basis((d * signs)[None])[0], torch.from_numpy(turned["sh"]))
+        assert torch.allclose(before, after, atol=1e-5)
+    for name, array in half_turn(turned, axis).items():
+        assert np.array_equal(array, made[name])
+
+
+def test_axes_on_disk(tmp_path):
+    made = model(n=1, degree=0)
+    x, y, z = made.means[0].tolist()
+    document, body = gltf._split(Path("a.glb"), b"".join(gltf.encode_glb(arrays_of(made))))
+    assert np.allclose(np.frombuffer(body, "<f4", 3), [-x, -y, z])  # y up
+    plain = gzip.decompress(spz.encode(arrays_of(made))[0])
+    fixed = [int.from_bytes(plain[16 + 3 * i : 19 + 3 * i], "little", signed=True) / 2.0 ** plain[13] for i in range(3)]
+    assert np.allclose(fixed, [x, -y, -z], atol=1e-5)  # x right, y up, z back
+    primitive = document["meshes"][0]["primitives"][0]
+    assert primitive["extensions"]["KHR_gaussian_splatting"]["colorSpace"] == "srgb_rec709_display"
+    assert {"POSITION", "KHR_gaussian_splatting:SH_DEGREE_0_COEF_0"} <= primitive["attributes"].keys()
+
+
+def test_more_rows_of_harmonics_than_a_palette(monkeypatch, tmp_path):
+    monkeypatch.setattr(sog, "PALETTE", 64)
+    made = model(n=200, degree=1)
+    write_gaussians(tmp_path / "a.sog", made, units="file")
+    back = read_gaussians(tmp_path / "a.sog")
+    assert 0.02 < differences(made, back)["rest"] < float(made.sh[:, 1:].max() - made.sh[:, 1:].min())
+    assert len(torch.unique(back.sh[:, 1:], dim=0)) <= 64
+
+
+def test_a_compressed_ply_may_have_a_plain_name(tmp_path):
+    made = model()
+    (tmp_path / "a.ply").write_bytes(b"".join(compressed_ply.encode(arrays_of(made))))
+    assert differences(made, read_gaussians(tmp_path / "a.ply"))["means"] < 0.01
+
+
+def test_names_say_the_format(tmp_path):
+    assert format_of("A.Compressed.PLY").name == "compressed PLY" and format_of("a.b.ply").name == "PLY"
+    with pytest.raises(UsageError, match=r"format \.obj is not supported; use one of"):
+        format_of("a.obj")
+    with pytest.raises(DataError, match="holds no Gaussian"):
+        write_gaussians(tmp_path / "a.sog", model(n=0), units="file")
+    with pytest.raises(DataError, match="cannot be read"):
+        read_gaussians(tmp_path / "none.spz")
+
+
+def test_numbers_that_are_none_are_not_written(tmp_path):
+    made = model()
+    made.means[3, 1] = torch.nan
+    for suffix in FORMATS:
+        with pytest.raises(DataError, match="means holds 1 non-finite"):
+            write_gaussians(tmp_path / f"a{suffix}", made, units="file")
+    assert not list(tmp_path.iterdir())
+    made.means[3, 1] = 1e8
+    with pytest.raises(DataError, match="SPZ holds coordinates up to"):
+        write_gaussians(tmp_path / "a.spz", made, units="file")
+
+
+@pytest.mark.parametrize("suffix", [s for s in FORMATS if s != ".ply"])
+def test_golden_files(suffix):
+    """The bytes of today are read tomorrow; `make(seed=5)` wrote them."""
+    made = model(n=20, degree=3, seed=5)
+    for (name, difference), limit in zip(differences(made, read_gaussians(GOLDEN / f"twenty{suffix}")).items(), QUANTA[suffix]):
+        assert difference <= limit, (name, difference)
+
+
+# ---- strangers' files ------------------------------------------------------------------------------------------------
+
+
+def encoded(suffix, n=5, degree=1):
+    return b"".join(format_of(f"a{suffix}").encode(arrays_of(model(n, degree))))
+
+
+def refused(path, data, match="not a usable"):
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=match) as e:
+        read_gaussians(path)
+    assert "\n" not in str(e.value) and len(str(e.value)) < 400 + len(str(path))
+
+
+CUT = [s for s in FORMATS if s != ".ply"]
+
+
+@pytest.mark.parametrize("suffix", CUT)
+def test_every_truncation_is_noticed(suffix, tmp_path):
+    data = encoded(suffix)
+    step = max(1, len(data) // 150)
+    for length in [*range(0, min(64, len(data))), *range(64, len(data) - 1, step)]:
+        if suffix == ".splat" and length % 32 == 0:
+            continue  # fewer Gaussians, as far as the format can tell
+        refused(tmp_path / f"a{suffix}", data[:length])
+
+
+@pytest.mark.parametrize("suffix", CUT)
+def test_changed_bytes_end_in_a_sentence_or_in_gaussians(suffix, tmp_path):
+    data, random = encoded(suffix), np.random.default_rng(0)
+    path = tmp_path / f"a{suffix}"
+    for _ in range(150):
+        changed = bytearray(data)
+        for at in random.integers(0, len(data), random.integers(1, 6)):
+            changed[at] = random.integers(0, 256)
+        path.write_bytes(changed)
+        try:
+            assert len(read_gaussians(path)) >= 0
+        except DataError as e:
+            assert "\n" not in str(e)
+
+
+def test_counts_beyond_the_size_are_refused(tmp_path):
+    head = spz.HEADER.pack(spz.MAGIC, 3, 2**31, 3, 12, 0, 0)
+    refused(tmp_path / "a.spz", gzip.compress(head + bytes(1000)), "2147483648 Gaussians in")
+    refused(tmp_path / "a.spz", gzip.compress(spz.HEADER.pack(spz.MAGIC, 3, 5, 0, 12, 0, 0) + bytes(10**6)), "it has more")
+    refused(tmp_path / "a.spz", gzip.compress(spz.HEADER.pack(spz.MAGIC, 3, 0, 0, 12, 1, 0)), "antialiasing")
+    lines = ["ply", "format binary_little_endian 1.0", "element chunk 99999999999", "property float min_x"]
+    lines += ["element vertex 1", "property uint packed_position", "end_header\n"]
+    refused(tmp_path / "a.compressed.ply", "\n".join(lines).encode(), "cut short")
+
+
+def test_bombs_of_zstd(tmp_path):
+    zstandard = pytest.importorskip("zstandard")
+    bomb = zstandard.ZstdCompressor().compress(bytes(10**7))
+    sizes = [9 * 5, 5, 15, 15, 20]
+    toc = b"".join(struct.pack("<QQ", len(bomb), s) for s in sizes)
+    head = spz.HEADER_4.pack(spz.MAGIC, 4, 5, 0, 12, 0, 5, spz.HEADER_4.size)
+    refused(tmp_path / "a.spz", head + toc + 5 * bomb, "stream 0 does not hold its 45 bytes")
+
+
+def repacked(change, *, deflate=False):
+    """Return a .sog whose members were changed."""
+    source = zipfile.ZipFile(io.BytesIO(encoded(".sog")))
+    members = {n: source.read(n) for n in source.namelist()}
+    meta = json.loads(members["meta.json"])
+    change(meta, members)
+    members["meta.json"] = json.dumps(meta).encode()
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED if deflate else zipfile.ZIP_STORED) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return out.getvalue()
+
+
+def set_to(*keys, value):
+    def change(meta, members):
+        for key in keys[:-1]:
+            meta = meta[key]
+        meta[keys[-1]] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "change,match",
+    [
+        (set_to("count", value=10**12), "Gaussians in"),
+        (set_to("count", value=1000), "pixels for 1000"),
+        (set_to("version", value=1), "version 2"),
+        (set_to("means", "files", 0, value="../../etc/passwd"), "not in the archive"),
+        (set_to("means", "mins", 0, value=1e300), "not finite"),
+        (set_to("scales", "codebook", value=[1.0]), "codebook"),
+        (set_to("scales", value=None), "makes no sense"),
+        (set_to("shN", "count", value=3), "beyond its 3 rows"),
+        (set_to("shN", "bands", value=7), "7 degrees"),
+        (lambda meta, members: members.update({"quats.webp": bytes(10**7)}), "would take"),
+    ],
+)
+def test_archives_that_lie(change, match, tmp_path):
+    refused(tmp_path / "a.sog", repacked(change, deflate=True), match)
+
+
+def with_document(change):
+    """Return a .glb whose document was changed."""
+    document, body = gltf._split(Path("a.glb"), encoded(".glb"))
+    change(document)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<IIIII", gltf.GLB, 2, 28 + len(text) + len(body), len(text), gltf.JSON_CHUNK)
+    return head + text + struct.pack("<II", len(body), gltf.BINARY_CHUNK) + body
+
+
+def at(*keys, value):
+    def change(document):
+        set_to(*keys, value=value)(document, {})
+
+    return change
+
+
+EXTENSION = ("meshes", 0, "primitives", 0, "extensions", "KHR_gaussian_splatting")
+
+
+@pytest.mark.parametrize(
+    "change,match",
+    [
+        (at("accessors", 0, "count", value=10**15), "does not fit"),
+        (at("accessors", 0, "count", value=6), "reaches beyond"),
+        (at("accessors", 1, "byteOffset", value=-4), "does not fit"),
+        (at("accessors", 1, "componentType", value=5125), "of a kind"),
+        (at("bufferViews", 0, "byteStride", value=1), "reaches beyond"),
+        (at("accessors", 0, "bufferView", value=99), "does not exist"),
+        (at("buffers", 0, "uri", value="../../secret.bin"), "another file"),
+        (at("buffers", 0, "uri", value="http://example.org/a.bin"), "another file"),
+        (at(*EXTENSION, "kernel", value="box"), "kernel 'box'"),
+        (at(*EXTENSION, "colorSpace", value="lin_rec709_display"), "lin_rec709"),
+        (at("nodes", 0, value={"mesh": 0, "scale": [2, 2, 2]}), "moves its mesh"),
+        (lambda d: d["meshes"].append(d["meshes"][0]), "2 primitives"),
+        (lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("POSITION"), "POSITION is missing"),
+    ],
+)
+def test_documents_that_lie(change, match, tmp_path):
+    refused(tmp_path / "a.glb", with_document(change), match)
+
+
+def test_numbers_of_a_gltf_that_are_none(tmp_path):
+    document = json.loads(encoded(".gltf"))
+    head, _, text = document["buffers"][0]["uri"].partition(",")
+    body = bytearray(base64.b64decode(text))
+    body[0:4] = struct.pack("<f", float("nan"))
+    document["buffers"][0]["uri"] = head + "," + base64.b64encode(body).decode()
+    refused(tmp_path / "a.gltf", json.dumps(document).encode(), "means of Gaussian 0 is not finite")
+
+
+@pytest.mark.parametrize("comment,match", [("SplatRenderMode: mip", "'mip'"), ("antialiased 1", "antialiasing")])
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply"])
+def test_other_ways_of_rendering_are_refused(suffix, comment, match, tmp_path):
+    path = tmp_path / f"a{suffix}"
+    write_gaussians(path, model(), units="file")
+    data = path.read_bytes()
+    assert b"comment SplatRenderMode: default\ncomment antialiased 0\n" in data
+    line = b"comment " + comment.encode()
+    refused(path, data.replace(b"comment antialiased 0", line), match)
+
+
+def test_rows_of_splat_that_make_no_sense(tmp_path):
+    row = np.frombuffer(encoded(".splat", degree=0), splat._ROW).copy()
+    row["scale"][2, 1] = -1
+    refused(tmp_path / "a.splat", row.tobytes(), "axis of Gaussian 2 has a negative length")

@@ -1,0 +1,161 @@
+"""The compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian, and one more per harmonic and channel.
+
+Chunks of 256 Gaussians share the bounds between which positions (11, 10, 11 bits), log scales (11, 10, 11) and colours (8 each)
+are fractions; rotations have 2 bits for the largest component and 10 for each other. Gaussians near each other in the file are
+stored best when they are near each other in space: `warpgs.export.formats` says so of this format.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from warpgs.export.arrays import (
+    C0,
+    SH_SIZES,
+    SQRT2,
+    Arrays,
+    from_smallest_three,
+    logits,
+    malformed,
+    rounded,
+    sigmoid,
+    smallest_three,
+)
+from warpgs.export.ply_header import COMMENTS, MAX_HEADER_BYTES, Element, parse_header
+
+CHUNK = 256
+"""Gaussians that share bounds."""
+SH_RANGE = 8
+"""Width of the range about 0 that harmonics above degree 0 are stored in."""
+_GROUPS = (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
+_CHUNK_NAMES = [f"{end}_{name}" for group in _GROUPS for end in ("min", "max") for name in group]
+_VERTEX_NAMES = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
+_BITS = (11, 10, 11)
+
+
+def encode(arrays: Arrays) -> list[bytes]:
+    """Return the bytes of a file; harmonics beyond 4 are clamped."""
+    n, k = arrays["sh"].shape[:2]
+    chunks = np.arange(n) // CHUNK
+    colors = 0.5 + C0 * arrays["sh"][:, 0].astype(np.float64)
+    bounds, fractions = [], []
+    for values in (arrays["means"], arrays["log_scales"], colors):
+        starts = np.arange(0, n, CHUNK)
+        low = np.minimum.reduceat(values, starts).astype("<f4")
+        high = np.maximum.reduceat(values, starts).astype("<f4")
+        bounds += [low, high]
+        span = high.astype(np.float64) - low
+        fractions.append((values - low[chunks].astype(np.float64)) / np.where(span > 0, span, 1)[chunks])
+    largest, others = smallest_three(arrays["quats"])
+    position, scale = (_pack(fractions[i], _BITS) for i in (0, 1))
+    rgba = np.concatenate([fractions[2], sigmoid(arrays["logit_opacities"])[:, None]], 1)
+    rotation = (largest << 30) | _pack(others / SQRT2 + 0.5, (10, 10, 10))
+    rows = np.stack([position, rotation, scale, _pack(rgba, (8, 8, 8, 8))], 1).astype("<u4")
+    rest = arrays["sh"][:, 1:].astype(np.float64).transpose(0, 2, 1).reshape(n, -1)
+    harmonics = np.clip(np.floor((rest / SH_RANGE + 0.5) * 256), 0, 255).astype("u1")
+    lines = ["ply", "format binary_little_endian 1.0", *COMMENTS, f"element chunk {len(bounds[0])}"]
+    lines += [f"property float {name}" for name in _CHUNK_NAMES]
+    lines += [f"element vertex {n}", *(f"property uint {name}" for name in _VERTEX_NAMES)]
+    if k > 1:
+        lines += [f"element sh {n}", *(f"property uchar f_rest_{i}" for i in range(3 * (k - 1)))]
+    header = ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
+    return [header, np.concatenate(bounds, 1).tobytes(), rows.tobytes(), harmonics.tobytes()]
+
+
+def is_compressed(path: Path, data: bytes) -> bool:
+    """Return whether the bytes of a .ply file are of this format, by its header; DataError where it has none."""
+    elements, _ = parse_header(path, data[:MAX_HEADER_BYTES])
+    return any(e.name == "vertex" and "packed_position" in dict(e.properties) for e in elements)
+
+
+def decode(path: Path, data: bytes) -> Arrays:
+    """Return the Gaussians of a file's bytes.
+
+    Raises:
+        DataError: The file is malformed, cut short, or for another way of rendering.
+    """
+    elements, start = parse_header(path, data[:MAX_HEADER_BYTES])
+    tables = {}
+    for element in elements:
+        if element.name in tables or element.has_list or not element.properties:
+            raise malformed(path, f"its element {element.name[:40]!r} makes no sense")
+        tables[element.name], start = _table(path, data, element, start)
+    chunk, vertex, sh = tables.get("chunk"), tables.get("vertex"), tables.get("sh")
+    if chunk is None or vertex is None:
+        raise malformed(path, "it lacks the element chunk or vertex")
+    n = len(vertex)
+    if len(chunk) != -(-n // CHUNK):
+        raise malformed(path, f"{len(chunk)} chunks for {n} Gaussians")
+    position, rotation, scale, color = (_column(path, vertex, name, "<u4").astype(np.int64) for name in _VERTEX_NAMES)
+    rgba = _unpack(color, (8, 8, 8, 8))
+    rows = np.arange(n) // CHUNK
+    values = [_unpack(position, _BITS), _unpack(scale, _BITS), rgba[:, :3]]
+    for i, group in enumerate(_GROUPS):
+        if i == 2 and "min_r" not in (chunk.dtype.names or ()):
+            break  # older files: colours between 0 and 1
+        low, high = (
+            np.stack([_column(path, chunk, f"{end}_{name}", "<f4") for name in group], 1).astype(np.float64)[rows]
+            for end in ("min", "max")
+        )
+        values[i] = low * (1 - values[i]) + high * values[i]
+    others = (_unpack(rotation & (2**30 - 1), (10, 10, 10)) - 0.5) * SQRT2
+    harmonics = [((values[2] - 0.5) / C0)[:, None]]
+    if sh is not None:
+        harmonics.append(_harmonics(path, sh, n))
+    return {
+        "means": values[0],
+        "quats": from_smallest_three(rotation >> 30, others),
+        "log_scales": values[1],
+        "logit_opacities": logits(rgba[:, 3], 1 / 255),
+        "sh": np.concatenate(harmonics, 1),
+    }
+
+
+def _harmonics(path: Path, sh: np.ndarray, n: int) -> np.ndarray:
+    """Return the coefficients above degree 0 [N, K - 1, 3]."""
+    count = len(sh.dtype.names or ())
+    if len(sh) != n or count // 3 + 1 not in SH_SIZES or count % 3:
+        raise malformed(path, f"{len(sh)} rows of {count} harmonics for {n} Gaussians")
+    levels = np.stack([_column(path, sh, f"f_rest_{i}", "u1") for i in range(count)], 1).astype(np.float64)
+    fraction = np.where(levels == 0, 0, np.where(levels == 255, 1, (levels + 0.5) / 256))
+    return ((fraction - 0.5) * SH_RANGE).reshape(n, 3, count // 3).transpose(0, 2, 1)
+
+
+def _table(path: Path, data: bytes, element: Element, start: int) -> tuple[np.ndarray, int]:
+    """Return the rows of an element at a byte of the file, and the byte behind them."""
+    names = [name for name, _ in element.properties]
+    if len(set(names)) < len(names):
+        raise malformed(path, f"a property of {element.name[:40]!r} appears twice")
+    dtype = np.dtype(element.properties)
+    end = start + element.count * dtype.itemsize
+    if end > len(data):
+        raise malformed(path, f"cut short: {element.count} rows of {element.name[:40]!r} end at byte {end}, it has {len(data)}")
+    return np.frombuffer(data, dtype, element.count, start), end
+
+
+def _column(path: Path, table: np.ndarray, name: str, kind: str) -> np.ndarray:
+    """Return a column of a table; DataError where it is missing or of another type."""
+    if name not in (table.dtype.names or ()) or table.dtype[name] != np.dtype(kind):
+        raise malformed(path, f"the property {name} is missing, or not of its type")
+    return table[name]
+
+
+def _pack(fractions: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+    """Return fractions [N, B] in [0, 1] as one integer each row, the first in the upper bits, int64 [N]."""
+    packed = np.zeros(len(fractions), np.int64)
+    for column, width in zip(fractions.T, bits):
+        most = 2**width - 1
+        packed = (packed << width) | rounded(column * most, most)
+    return packed
+
+
+def _unpack(packed: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+    """Return the fractions [N, B] that `_pack` packed, float64."""
+    columns = []
+    for width in reversed(bits):
+        most = 2**width - 1
+        columns.append((packed & most) / most)
+        packed = packed >> width
+    return np.stack(columns[::-1], 1)

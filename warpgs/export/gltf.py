@@ -1,0 +1,232 @@
+"""The format glTF with the extension KHR_gaussian_splatting, in float32: .glb, or .gltf with its numbers inside.
+
+Axes lengths are linear, opacities after the sigmoid, rotations xyzw. Axes have y up, a half turn about z from those of PLY.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import math
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpgs.export.arrays import SH_SIZES, Arrays, half_turn, logits, malformed, sigmoid, unit_quats
+
+EXTENSION = "KHR_gaussian_splatting"
+COLOR_SPACE = "srgb_rec709_display"
+GLB, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
+_KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_TINY = 1e-37
+
+
+def encode_glb(arrays: Arrays) -> list[bytes]:
+    """Return the bytes of a .glb file."""
+    document, body = _document(arrays)
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    total = 12 + 8 + len(text) + 8 + len(body)
+    return [
+        struct.pack("<IIIII", GLB, 2, total, len(text), JSON_CHUNK),
+        text,
+        struct.pack("<II", len(body), BINARY_CHUNK),
+        body,
+    ]
+
+
+def encode_gltf(arrays: Arrays) -> list[bytes]:
+    """Return the bytes of a .gltf file, whose numbers are base64 inside it."""
+    document, body = _document(arrays)
+    document["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(body).decode()
+    return [json.dumps(document, separators=(",", ":")).encode()]
+
+
+def _attributes(arrays: Arrays) -> dict[str, tuple[str, np.ndarray]]:
+    """Return the attributes of the primitive by name, each with its type, float32."""
+    a = half_turn({k: np.asarray(v) for k, v in arrays.items()}, "z")
+    scales = np.clip(np.exp(a["log_scales"].astype(np.float64)), _TINY, 3e38)
+    out = {
+        "POSITION": ("VEC3", a["means"]),
+        f"{EXTENSION}:ROTATION": ("VEC4", unit_quats(a["quats"])[:, [1, 2, 3, 0]]),
+        f"{EXTENSION}:SCALE": ("VEC3", scales),
+        f"{EXTENSION}:OPACITY": ("SCALAR", sigmoid(a["logit_opacities"])),
+    }
+    for k in range(a["sh"].shape[1]):
+        degree = math.isqrt(k)
+        out[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - degree * degree}"] = ("VEC3", a["sh"][:, k])
+    return {name: (kind, np.ascontiguousarray(values, "<f4")) for name, (kind, values) in out.items()}
+
+
+def _document(arrays: Arrays) -> tuple[dict[str, Any], bytes]:
+    """Return the glTF document and its binary buffer."""
+    attributes = _attributes(arrays)
+    views: list[dict] = []
+    accessors: list[dict] = []
+    start = 0
+    for name, (kind, values) in attributes.items():
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": values.nbytes, "target": 34962})
+        accessor = {"bufferView": len(accessors), "componentType": 5126, "count": len(values), "type": kind}
+        if name == "POSITION":  # glTF wants the bounds of positions
+            accessor |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
+        accessors.append(accessor)
+        start += values.nbytes
+    extension = {"kernel": "ellipse", "colorSpace": COLOR_SPACE, "sortingMethod": "cameraDistance", "projection": "perspective"}
+    names = {name: i for i, name in enumerate(attributes)}
+    document = {
+        "asset": {"version": "2.0", "generator": "warpgs"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": names, "mode": 0, "extensions": {EXTENSION: extension}}]}],
+        "buffers": [{"byteLength": start}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+    return document, b"".join(values.tobytes() for _, values in attributes.values())
+
+
+def decode(path: Path, data: bytes) -> Arrays:
+    """Return the Gaussians of a .glb or .gltf file's bytes, in the axes of PLY.
+
+    Raises:
+        DataError: The file is malformed or cut short, needs another file, or has a kernel, colour space, transformation or
+            number of Gaussian primitives that this program does not read.
+    """
+    document, body = _split(path, data)
+    buffers = document.get("buffers")
+    if not isinstance(buffers, list) or len(buffers) != 1 or not isinstance(buffers[0], dict):
+        raise malformed(path, "it does not have exactly one buffer")
+    if (uri := buffers[0].get("uri")) is not None:
+        body = _inside(path, uri)
+    primitive = _primitive(path, document)
+    names = primitive["attributes"]
+
+    def values(name: str) -> np.ndarray:
+        if name not in names:
+            raise malformed(path, f"the attribute {name} is missing")
+        return _accessor(path, document, body, names[name])
+
+    degrees = [d for d in range(4) if f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in names]
+    if degrees != list(range(len(degrees))) or not degrees:
+        raise malformed(path, f"it has harmonics of degrees {degrees}")
+    orders = [(math.isqrt(k), k - math.isqrt(k) ** 2) for k in range(SH_SIZES[degrees[-1]])]
+    scales = values(f"{EXTENSION}:SCALE")
+    if (scales < 0).any():
+        raise malformed(path, "an axis has a negative length")
+    arrays = {
+        "means": values("POSITION"),
+        "quats": values(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]],
+        "log_scales": np.log(np.maximum(scales, _TINY)),
+        "logit_opacities": logits(values(f"{EXTENSION}:OPACITY")[:, 0], 2.0**-22),
+    }
+    harmonics = [values(f"{EXTENSION}:SH_DEGREE_{d}_COEF_{c}") for d, c in orders]
+    if len({len(v) for v in [*arrays.values(), *harmonics]}) != 1:
+        raise malformed(path, "its attributes differ in length")
+    shapes = [arrays["means"].shape[1], arrays["log_scales"].shape[1], *(h.shape[1] for h in harmonics)]
+    if set(shapes) != {3}:
+        raise malformed(path, "a position, scale or harmonic does not have three components")
+    return half_turn(arrays | {"sh": np.stack(harmonics, 1)}, "z")
+
+
+def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
+    """Return the document and the binary chunk (empty where there is none) of a file."""
+    body = b""
+    if data[:4] == b"glTF":
+        if len(data) < 20:
+            raise malformed(path, "its header is cut short")
+        _, version, total, size, kind = struct.unpack_from("<IIIII", data)
+        if version != 2 or kind != JSON_CHUNK or not 20 + size <= total <= len(data):
+            raise malformed(path, f"its header announces {total} bytes, it has {len(data)}")
+        text, rest = data[20 : 20 + size], data[20 + size : total]
+        if len(rest) >= 8:
+            size, kind = struct.unpack_from("<II", rest)
+            if kind != BINARY_CHUNK or size > len(rest) - 8:
+                raise malformed(path, f"its binary part of {size} bytes is cut short")
+            body = rest[8 : 8 + size]
+    else:
+        text = data
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError) as e:
+        raise malformed(path, "its JSON cannot be read") from e
+    if not isinstance(document, dict):
+        raise malformed(path, "its JSON is no object")
+    return document, body
+
+
+def _inside(path: Path, uri: object) -> bytes:
+    """Return the bytes of a data URI; every other one is refused, since a file must not say which others are opened."""
+    head, comma, text = uri.partition(",") if isinstance(uri, str) else ("", "", "")
+    if not (head.startswith("data:") and head.endswith(";base64") and comma):
+        raise malformed(path, "its numbers are in another file, which is not opened; make one .glb of both")
+    try:
+        return base64.b64decode(text, validate=True)
+    except (binascii.Error, ValueError) as e:
+        raise malformed(path, "its base64 numbers cannot be read") from e
+
+
+def _primitive(path: Path, document: dict[str, Any]) -> dict[str, Any]:
+    """Return the one primitive of Gaussians, checked for what this program does not read."""
+    meshes, nodes = document.get("meshes"), document.get("nodes", [])
+    found = []
+    for mesh in meshes if isinstance(meshes, list) else []:
+        primitives = mesh.get("primitives") if isinstance(mesh, dict) else None
+        for p in primitives if isinstance(primitives, list) else []:
+            if isinstance(p, dict) and isinstance(p.get("extensions"), dict) and EXTENSION in p["extensions"]:
+                found.append(p)
+    if len(found) != 1:
+        raise malformed(path, f"it has {len(found)} primitives with {EXTENSION}, and this reads exactly one")
+    extension = found[0]["extensions"][EXTENSION]
+    kernel, space = (extension.get(k) if isinstance(extension, dict) else None for k in ("kernel", "colorSpace"))
+    if (kernel, space) != ("ellipse", COLOR_SPACE):
+        raise malformed(path, f"kernel {str(kernel)[:40]!r} in {str(space)[:40]!r}; this reads 'ellipse' in {COLOR_SPACE!r}")
+    if isinstance(extension, dict) and extension.get("extensions"):
+        raise malformed(path, "its Gaussians are compressed by a further extension; export them uncompressed")
+    if not isinstance(found[0].get("attributes"), dict):
+        raise malformed(path, "its primitive has no attributes")
+    moved = {"matrix", "translation", "rotation", "scale"}
+    if any(not isinstance(n, dict) or moved & n.keys() for n in (nodes if isinstance(nodes, list) else [None])):
+        raise malformed(path, "a node moves its mesh; apply the transformations, and export again")
+    return found[0]
+
+
+def _accessor(path: Path, document: dict[str, Any], body: bytes, index: object) -> np.ndarray:
+    """Return the numbers of an accessor [count, width]: float32, or normalized integers as fractions in float64."""
+
+    def item(table: str, at: object) -> dict[str, Any]:
+        rows = document.get(table)
+        if not isinstance(rows, list) or type(at) is not int or not 0 <= at < len(rows) or not isinstance(rows[at], dict):
+            raise malformed(path, f"{table} {str(at)[:20]} does not exist")
+        return rows[at]
+
+    def count(row: dict[str, Any], key: str, default: int | None = None) -> int:
+        value = row.get(key, default)
+        if type(value) is not int or not 0 <= value <= len(body):
+            raise malformed(path, f"{key} {str(value)[:20]!r} does not fit its {len(body)} bytes of numbers")
+        return value
+
+    accessor = item("accessors", index)
+    view = item("bufferViews", accessor.get("bufferView"))
+    kind, width = _KINDS.get(accessor.get("componentType")), _WIDTHS.get(accessor.get("type"))
+    if kind is None or width is None or "sparse" in accessor or view.get("buffer") != 0:
+        raise malformed(path, f"accessor {index} is of a kind that this does not read")
+    if kind != "<f4" and accessor.get("normalized") is not True:
+        raise malformed(path, f"accessor {index} holds integers that are no fractions")
+    dtype = np.dtype(kind)
+    size, rows = dtype.itemsize * width, count(accessor, "count")
+    stride = count(view, "byteStride", size) or size
+    start, offset, length = count(view, "byteOffset", 0), count(accessor, "byteOffset", 0), count(view, "byteLength")
+    if stride < size or start + length > len(body) or (rows and offset + (rows - 1) * stride + size > length):
+        raise malformed(path, f"accessor {index} reaches beyond its {length} bytes")
+    if not rows:
+        return np.empty((0, width), np.float32)
+    block = np.ndarray((rows, width), dtype, body, start + offset, (stride, dtype.itemsize))
+    if kind == "<f4":
+        return block.astype(np.float32)
+    return np.maximum(block / float(np.iinfo(dtype).max), -1.0)

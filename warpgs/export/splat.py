@@ -1,0 +1,49 @@
+"""The .splat format of antimatter15's viewer: 32 bytes a Gaussian, without spherical harmonics above degree 0.
+
+Position and axis lengths as float32, colour and opacity as bytes, rotation wxyz as bytes (128 is 0). Axes are those of PLY.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from warpgs.export.arrays import C0, Arrays, logits, malformed, rounded, sigmoid, unit_quats
+
+_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+_TINY = 1e-37
+"""Least axis length that is written and read: the logarithm of 0 is no number."""
+
+
+def encode(arrays: Arrays) -> list[bytes]:
+    """Return the bytes of a file; harmonics above degree 0 are lost, and colours outside of [0, 1] clamped."""
+    rows = np.empty(len(arrays["means"]), _ROW)
+    rows["mean"] = arrays["means"]
+    rows["scale"] = np.clip(np.exp(arrays["log_scales"].astype(np.float64)), _TINY, 3e38)
+    rows["rgba"][:, :3] = rounded(255 * (0.5 + C0 * arrays["sh"][:, 0].astype(np.float64)), 255)
+    rows["rgba"][:, 3] = rounded(255 * sigmoid(arrays["logit_opacities"]), 255)
+    rows["quat"] = rounded(128 * unit_quats(arrays["quats"]) + 128, 255)
+    return [rows.tobytes()]
+
+
+def decode(path: Path, data: bytes) -> Arrays:
+    """Return the Gaussians of a file's bytes.
+
+    Raises:
+        DataError: The size is no multiple of 32 bytes, or an axis length is negative.
+    """
+    if len(data) % _ROW.itemsize:
+        raise malformed(path, f"its {len(data)} bytes are no multiple of {_ROW.itemsize}")
+    rows = np.frombuffer(data, _ROW)
+    scales = rows["scale"].astype(np.float64)
+    if (scales < 0).any():
+        raise malformed(path, f"an axis of Gaussian {int(np.argwhere(scales < 0)[0][0])} has a negative length")
+    colors = rows["rgba"][:, :3].astype(np.float64) / 255
+    return {
+        "means": rows["mean"],
+        "quats": (rows["quat"].astype(np.float64) - 128) / 128,
+        "log_scales": np.log(np.maximum(scales, _TINY)),
+        "logit_opacities": logits(rows["rgba"][:, 3] / 255, 1 / 255),
+        "sh": ((colors - 0.5) / C0)[:, None, :],
+    }
