@@ -21,7 +21,8 @@ COMMANDS = {
     "render": "render a run as a film: along a path, its views, or keyframes",
     "plot": "show a run's cameras and Gaussians in one image",
     "priors": "look at what is known before a fit, or write networks as ONNX",
-    "export": "write a run's Gaussians to a PLY file or an HTML page",
+    "export": "write a run's Gaussians to a file: .ply, .spz, .sog, .glb, .html, ...",
+    "convert": "write a file of Gaussians in another format",
     "mesh": "make a mesh of the surfaces that a run's views see: .ply, .glb",
     "prune": "shrink a finished model as far as its training views allow",
     "eval": "score a run again on its held-out views",
@@ -35,7 +36,7 @@ COMMANDS = {
 GROUPS = {
     "start": ("demo", "poses", "fit"),
     "look": ("view", "render", "plot", "priors"),
-    "share": ("export", "mesh", "prune"),
+    "share": ("export", "convert", "mesh", "prune"),
     "measure": ("eval", "compare", "ablate", "convert-lpips"),
     "this machine": ("doctor",),
 }

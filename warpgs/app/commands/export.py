@@ -16,7 +16,8 @@ def run(arguments: list[str], about: str) -> int:
         run: tyro.conf.Positional[Path]
         """Run folder of `warpgs fit`."""
         to: Path
-        """File to write; its suffix says the format: .ply, or .html for a page that shows the model in any browser."""
+        """File to write; its suffix says the format: .ply, .compressed.ply, .splat, .spz, .sog, .glb, .gltf, or .html for a
+        page that shows the model in any browser."""
 
     a = parse_flags(Export, arguments, "warpgs export", about)
     if a.to.suffix.lower() == ".html":
