@@ -37,8 +37,9 @@ def test_the_help_of_fit_imports_nothing_heavy():
 
 def test_all_flags_are_one_word_further(capsys):
     """--help-all is the help of the parser, with every flag of the short one and those of the groups."""
+    help_all = "--help-all"
     with pytest.raises(SystemExit) as end:
-        main(["fit", "--help-all"])
+        main(["fit", help_all])
     text = capsys.readouterr().out
     assert end.value.code == 0 and all(name in text for name, *_ in fit_help.FLAGS)
     assert "--holdout.levels" in text and len(text.splitlines()) > 200
