@@ -7,14 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from warpgs.errors import DataError, UsageError, WarpgsError
-from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.splits import Split
 from warpgs.pipeline.metrics.lpips import load_lpips
-from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.runs.coverage_report import coverage_lines, coverage_of_run
 from warpgs.pipeline.runs.failed_step import findings, read_failed_step
 from warpgs.pipeline.runs.film_plan import FilmSettings, plan_film
@@ -23,6 +19,8 @@ from warpgs.pipeline.runs.image_names import image_names, renaming_notes
 from warpgs.pipeline.runs.paths import COVERAGE, FILM, render_film, sheet_path
 from warpgs.pipeline.runs.request import choose_device, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line
+from warpgs.pipeline.runs.share import convert as convert  # noqa: PLC0414
+from warpgs.pipeline.runs.share import export as export  # noqa: PLC0414
 from warpgs.pipeline.train.background import color_of, over_background
 from warpgs.pipeline.train.loop import train_views
 from warpgs.report.coverage_image import LEGEND
@@ -149,22 +147,6 @@ def render(
     if last.name == FILM:
         return [*notes, f"{len(files)} images and {FILM} in {out}"]
     return [*notes, f"{len(files) + 1} images in {out}; no film, since the views differ in size"]
-
-
-def export(folder: Path, target: Path) -> list[str]:
-    """Write a run's Gaussians to a file, in the units of the scene's files; returns lines for the user.
-
-    Raises:
-        DataError: The folder is no run.
-        ResourceError: Another process writes into the file's folder, or it cannot be written.
-        UsageError: The suffix is not supported.
-    """
-    if target.suffix.lower() != ".ply":
-        raise UsageError(f"{target}: format {target.suffix or '(none)'} is not supported; use .ply or .html")
-    stored = open_run(folder, torch.device("cpu"))
-    with hold_folder(target.parent) as notes:
-        write_ply(target, drop_unused_sh(stored.gaussians()), stored.normalization)
-    return [*notes, f"{len(stored.gaussians()):,} Gaussians in {target}"]
 
 
 def repeat_failed_step(path: Path, device_name: str) -> list[str]:
