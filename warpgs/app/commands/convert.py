@@ -1,4 +1,4 @@
-"""`warpgs convert`: a file of Gaussians in another format. Parses, calls, prints; no logic."""
+"""`warpgs convert`: write a file of Gaussians in another format. Parses, calls, prints; no logic."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,11 +16,20 @@ def run(arguments: list[str], about: str) -> int:
         source: tyro.conf.Positional[Path]
         """File to read: .ply, .compressed.ply, .splat, .spz, .sog, .glb or .gltf."""
         target: tyro.conf.Positional[Path]
-        """File to write; its suffix says the format, one of the same."""
+        """File to write, of the same formats."""
+        crop: str | None = None
+        """Box to keep, in units of the scene's files: six numbers (least x,y,z and largest), or JSON with center, size and
+        perhaps rotation."""
+        clean: bool | None = None
+        """Remove what only disturbs: Gaussians larger than the scene, and long needles. On where not given, but for .ply."""
+        sh_degree: int | None = None
+        """Highest degree of harmonics; 0 for colours that are the same from all sides. All where not given."""
+        rotate: str | None = None
+        """Turn the model about the origin: x,y,z,degrees."""
 
     a = parse_flags(Convert, arguments, "warpgs convert", about)
-    from warpgs.pipeline.runs.commands import convert
+    from warpgs.pipeline.runs.share import Filters, convert
 
-    for line in convert(a.source, a.target):
+    for line in convert(a.source, a.target, Filters(a.crop, a.clean, a.sh_degree, a.rotate)):
         say(line)
     return 0

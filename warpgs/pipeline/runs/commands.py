@@ -7,14 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from warpgs.errors import DataError, UsageError, WarpgsError
-from warpgs.export.formats import Format, format_of, read_gaussians, write_gaussians
 from warpgs.files import write_json
 from warpgs.io.splits import Split
 from warpgs.pipeline.metrics.lpips import load_lpips
-from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.runs.coverage_report import coverage_lines, coverage_of_run
 from warpgs.pipeline.runs.failed_step import findings, read_failed_step
 from warpgs.pipeline.runs.film_plan import FilmSettings, plan_film
@@ -28,9 +24,8 @@ from warpgs.pipeline.train.background import color_of, over_background
 from warpgs.pipeline.train.loop import train_views
 from warpgs.report.coverage_image import LEGEND
 from warpgs.report.progress import Stages
-from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.folder_lock import hold_folder
-from warpgs.scene import Gaussians, Scene, View
+from warpgs.scene import Scene, View
 
 ALPHAS = {"alpha_empty": "where empty", "alpha_object": "in the object"}
 """Scores of the rendered alpha, with the words for each view's line."""
@@ -153,50 +148,6 @@ def render(
     if last.name == FILM:
         return [*notes, f"{len(files)} images and {FILM} in {out}"]
     return [*notes, f"{len(files) + 1} images in {out}; no film, since the views differ in size"]
-
-
-def export(folder: Path, target: Path) -> list[str]:
-    """Write a run's Gaussians to a file, in the units of the scene's files; returns lines for the user.
-
-    Raises:
-        DataError: The folder is no run.
-        ResourceError: Another process writes into the file's folder, or it cannot be written.
-        UsageError: The suffix is none of a format.
-    """
-    kind = format_of(target)
-    stored = open_run(folder, torch.device("cpu"))
-    model = drop_unused_sh(stored.gaussians())
-    with hold_folder(target.parent) as notes:
-        write_gaussians(target, model, stored.normalization)
-    return [*notes, *_lost(model, kind), _written(model, target)]
-
-
-def convert(source: Path, target: Path) -> list[str]:
-    """Write the Gaussians of a file to another, in the same units; returns lines for the user.
-
-    Raises:
-        DataError: The file is none of its format.
-        ResourceError: Another process writes into the file's folder, or it cannot be written.
-        UsageError: A suffix is none of a format, or both name one file.
-    """
-    kind = format_of(target)
-    if source.resolve() == target.resolve():
-        raise UsageError(f"{target}: source and target are one file; name another target")
-    model = read_gaussians(source)
-    with hold_folder(target.parent) as notes:
-        write_gaussians(target, model, units="file")
-    return [*notes, *_lost(model, kind), _written(model, target)]
-
-
-def _lost(model: Gaussians, kind: Format) -> list[str]:
-    """Return a line on what the format does not hold of a model."""
-    if model.sh_degree <= kind.max_degree:
-        return []
-    return [f"{kind.name} holds colours of degree {kind.max_degree}: those of degree {model.sh_degree} are left out"]
-
-
-def _written(model: Gaussians, target: Path) -> str:
-    return f"{len(model):,} Gaussians in {target}, {format_bytes(target.stat().st_size)}"
 
 
 def repeat_failed_step(path: Path, device_name: str) -> list[str]:

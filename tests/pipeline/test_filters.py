@@ -1,0 +1,131 @@
+"""Filters of models on their way into files: rotations turn colours, boxes cut, cleaning says what it takes."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tests.gaussians import cloud
+from warpgs.errors import DataError, UsageError
+from warpgs.export.formats import read_gaussians, write_gaussians
+from warpgs.geometry import rotation_matrices
+from warpgs.kernels.sh import basis
+from warpgs.pipeline.model.filters import (
+    box_of,
+    disturbing,
+    harmonics_rotation,
+    inside,
+    levelling,
+    limit_degree,
+    rotate,
+    rotation_about,
+)
+from warpgs.pipeline.runs.share import Filters, convert
+
+TURN = rotation_about(np.array([1.0, -2.0, 0.5]), 1.1)
+
+
+def covariances(g):
+    axes = torch.as_tensor(rotation_matrices(torch.nn.functional.normalize(g.quats.double(), dim=1)))
+    return axes @ torch.diag_embed((2 * g.log_scales.double()).exp()) @ axes.mT
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_colours_and_shapes_turn_with_the_scene(degree):
+    made = cloud(40, degree=degree)
+    turned, turn = rotate(made, TURN), torch.from_numpy(TURN)
+    d = torch.nn.functional.normalize(torch.randn(9, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)), dim=1)
+    k = made.sh.shape[1]
+    before = torch.einsum("dk,nkc->dnc", basis(d)[:, :k], made.sh.double())
+    after = torch.einsum("dk,nkc->dnc", basis(d @ turn.T)[:, :k], turned.sh.double())
+    assert torch.allclose(before, after, atol=1e-6)
+    assert torch.allclose(covariances(turned), turn @ covariances(made) @ turn.T, rtol=1e-4, atol=1e-9)
+    assert torch.allclose(turned.means.double(), made.means.double() @ turn.T, atol=1e-6)
+
+
+def test_rotations_of_harmonics_are_orthogonal_and_compose():
+    first, second = harmonics_rotation(TURN), harmonics_rotation(TURN @ TURN)
+    assert torch.allclose(first @ first.T, torch.eye(16, dtype=torch.float64), atol=1e-13)
+    assert torch.allclose(first @ first, second, atol=1e-13)
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (0, 1, 0), (1, 2, 3), (0, -5, 1e-9)])
+def test_up_becomes_minus_y(up):
+    rotation = levelling(np.array(up, float))
+    assert np.allclose(rotation @ (np.array(up) / np.linalg.norm(up)), [0, -1, 0], atol=1e-8)
+    assert np.allclose(rotation @ rotation.T, np.eye(3)) and np.linalg.det(rotation) > 0
+
+
+def test_boxes():
+    made = cloud(200)
+    plain = inside(made, box_of("-1,-1,3,1,1,5"))
+    assert torch.equal(plain, (made.means - torch.tensor([0.0, 0, 4])).abs().amax(1) <= 1)
+    assert torch.equal(plain, inside(made, box_of('{"center": [0, 0, 4], "size": [2, 2, 2]}')))
+    turned = json.dumps(
+        {"center": [0, 0, 4], "size": [2, 1, 4], "rotation": rotation_about(np.array([0, 0, 1.0]), 0.5).tolist()}
+    )
+    local = (made.means.double() - torch.tensor([0.0, 0, 4])) @ torch.from_numpy(rotation_about(np.array([0, 0, 1.0]), 0.5))
+    assert torch.equal(inside(made, box_of(turned)), (local.abs() <= torch.tensor([1.0, 0.5, 2])).all(1))
+
+
+@pytest.mark.parametrize(
+    "text,match",
+    [
+        ("1,2,3", "takes 6 finite"), ("a", "six numbers"), ("[" * 9000, "six numbers"),
+        ('{"size": [1, 1, 1]}', "center takes 3"),
+        ("0,0,0,1,1,0", "longer than 0"), ("0,0,0,1,1,NaN", "finite"),
+        ('{"center": [0,0,0], "size": [1,1,1], "rotation": [[2,0,0],[0,1,0],[0,0,1]]}', "no rotation"),
+    ],
+)  # fmt: skip
+def test_boxes_that_are_none(text, match):
+    with pytest.raises(UsageError, match=match):
+        box_of(text)
+
+
+def test_what_disturbs_is_counted_once():
+    made = cloud(100)
+    made.log_scales[:] = -5
+    made.log_scales[0] = 4  # larger than the scene, and seen by nobody
+    made.log_scales[1] = 4
+    made.log_scales[2] = torch.tensor([0.5, -4.0, -5.0])  # a long needle
+    made.log_scales[3] = torch.tensor([-4.0, -9.0, -9.0])  # a short one, which stays
+    maxima = torch.ones(100)
+    maxima[0] = 0
+    found = {reason: where.nonzero()[:, 0].tolist() for reason, where in disturbing(made, maxima).items()}
+    assert list(found.values()) == [[0], [1], [2]]
+    assert list(disturbing(made)) == ["larger than the scene", "needles beyond 30 to 1"]
+
+
+def test_degrees():
+    assert limit_degree(cloud(5, degree=3), 1).sh.shape[1] == 4
+    with pytest.raises(UsageError, match="degrees 0 to 3"):
+        limit_degree(cloud(5), 4)
+
+
+def test_convert_says_what_it_did(tmp_path):
+    made = cloud(100, degree=2)
+    made.log_scales[7] = 4
+    write_gaussians(tmp_path / "a.ply", made, units="file")
+    lines = convert(tmp_path / "a.ply", tmp_path / "b.spz", Filters(sh_degree=1))
+    assert any("removed: 1 larger than the scene, 0 needles" in line for line in lines)
+    assert any("above degree 1 are left out, as asked" in line for line in lines)
+    assert "99 Gaussians in" in lines[-1] and read_gaussians(tmp_path / "b.spz").sh.shape == (99, 4, 3)
+    lines = convert(tmp_path / "b.spz", tmp_path / "c.ply", Filters(crop="-1,-1,3,1,1,5", rotate="0,0,1,180"))
+    assert not any("removed" in line for line in lines) and any("turned by 180.0 degrees" in line for line in lines)
+    assert float(read_gaussians(tmp_path / "c.ply").means[:, :2].abs().max()) <= 1
+    convert(tmp_path / "a.ply", tmp_path / "d.ply")
+    assert (tmp_path / "d.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
+    assert any("splat holds none" in line for line in convert(tmp_path / "a.ply", tmp_path / "e.splat"))
+    with pytest.raises(DataError, match="no Gaussian is left"):
+        convert(tmp_path / "a.ply", tmp_path / "f.glb", Filters(crop="90,90,90,91,91,91"))
+    assert not (tmp_path / "f.glb").exists()
+
+
+@pytest.mark.parametrize("wish,match", [("level", "cameras of a run"), ("0,0,0,9", "no length"), ("1,2", "x,y,z,degrees")])
+def test_rotations_that_are_none(wish, match, tmp_path):
+    write_gaussians(tmp_path / "a.ply", cloud(5), units="file")
+    with pytest.raises(UsageError, match=match):
+        convert(tmp_path / "a.ply", tmp_path / "b.ply", Filters(rotate=wish))
+    assert math.isclose(float(np.trace(rotation_about(np.array([0, 0, 2.0]), math.pi))), -1)

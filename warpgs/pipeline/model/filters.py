@@ -1,0 +1,196 @@
+"""Filters of a finished model: a box cut out, what only disturbs taken away, harmonics dropped, everything turned."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from warpgs.errors import UsageError
+from warpgs.geometry import matmul, quaternions, rotation_matrices
+from warpgs.kernels.sh import basis
+from warpgs.pipeline.model.coverage import SEEN
+from warpgs.scene import Gaussians
+
+INNER = 0.02
+"""Fraction of the means left out at either end of each axis where the size of the scene is measured."""
+NEEDLE, NEEDLE_LENGTH = 30.0, 0.1
+"""Ratio of the longest to the middle axis beyond which a Gaussian is a needle, and the fraction of the scene's size that it
+must be long, too: short needles are hairs and edges of a good model."""
+_NODES = ((-0.8611363115940526, 0.34785484513745385), (-0.33998104358485626, 0.6521451548625461))
+"""Nodes and weights of Gauss and Legendre's rule with four points, the other two mirrored: exact to degree 7."""
+_AZIMUTHS = 8
+"""Points of the rule around the axis, exact to order 7; products of harmonics of degree 3 have degree 6."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box, whose axes may be turned."""
+
+    center: tuple[float, float, float]
+    """Middle [file units]."""
+    size: tuple[float, float, float]
+    """Whole lengths of the sides [file units]."""
+    rotation: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    """Columns: the directions of the sides in the world, shape [3, 3]."""
+
+
+def _numbers(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """Return finite numbers of a shape; UsageError where ``value`` is none."""
+    try:
+        array = np.array(value, np.float64)
+    except (ValueError, TypeError, OverflowError):
+        array = np.empty(0)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise UsageError(f"--crop: {what} takes {' x '.join(map(str, shape))} finite numbers, not {str(value)[:60]}")
+    return array
+
+
+def box_of(text: str) -> Box:
+    """Return the box that a user asks for.
+
+    Args:
+        text: JSON with center, size and perhaps rotation, or six numbers with commas: the least x, y, z and the largest.
+
+    Raises:
+        UsageError: The text is neither, or a side is not longer than 0.
+    """
+    try:
+        value = json.loads(text if text.lstrip().startswith("{") else f"[{text}]")
+    except (ValueError, RecursionError) as e:
+        raise UsageError(f"--crop {text[:60]}: give six numbers, or JSON with center and size") from e
+    if isinstance(value, list):
+        low, high = _numbers(value, (6,), "a box").reshape(2, 3)
+        center, size, rotation = (low + high) / 2, high - low, np.eye(3)
+    else:
+        center, size = (_numbers(value.get(key), (3,), key) for key in ("center", "size"))
+        rotation = _numbers(value.get("rotation", np.eye(3).tolist()), (3, 3), "rotation")
+        if np.abs(matmul(rotation, rotation.T) - np.eye(3)).max() > 1e-3:
+            raise UsageError("--crop: rotation is no rotation: its columns are not perpendicular, or not of length 1")
+    if not (size > 0).all():
+        raise UsageError(f"--crop: the box has sides of {', '.join(f'{s:g}' for s in size)}; each must be longer than 0")
+    a, b, c = (tuple(map(float, v)) for v in (center, size, rotation[0]))
+    return Box(a, b, (c, tuple(map(float, rotation[1])), tuple(map(float, rotation[2]))))  # type: ignore[arg-type]
+
+
+def select(gaussians: Gaussians, keep: torch.Tensor) -> Gaussians:
+    """Return the Gaussians at which ``keep``, bool or rows [N], says so."""
+    return Gaussians(**{name: t[keep] for name, t in gaussians.tensors().items()})
+
+
+def inside(gaussians: Gaussians, box: Box) -> torch.Tensor:
+    """Return where the means lie in a box, bool [N]; both in the same units."""
+    offsets = gaussians.means.double() - torch.tensor(box.center, dtype=torch.float64, device=gaussians.means.device)
+    directions = np.array(box.rotation).T
+    out = torch.ones(len(gaussians), dtype=torch.bool, device=offsets.device)
+    for direction, side in zip(directions, box.size):
+        along = sum(float(d) * offsets[:, i] for i, d in enumerate(direction))
+        out &= along.abs() <= side / 2
+    return out
+
+
+def disturbing(gaussians: Gaussians, maxima: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+    """Return which Gaussians only disturb, each for the first reason that holds, bool [N] by reason.
+
+    Args:
+        gaussians: N Gaussians.
+        maxima: Largest blending weight of each over all training views, shape [N]; None where no view is known.
+    """
+    out = {}
+    free = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+    if not len(gaussians):
+        return out
+    means = gaussians.means.double().cpu().numpy()
+    low, high = np.quantile(means, [INNER, 1 - INNER], axis=0)
+    size = max(math.sqrt(float(((high - low) ** 2).sum())), 1e-30)
+    axes = gaussians.log_scales.double().sort(dim=1).values
+    longest, middle = axes[:, 2], axes[:, 1]
+    found = {
+        "larger than the scene": longest > math.log(size),
+        f"needles beyond {NEEDLE:g} to 1": (longest - middle > math.log(NEEDLE)) & (longest > math.log(NEEDLE_LENGTH * size)),
+    }
+    if maxima is not None:
+        found = {"seen by no training view": maxima < SEEN} | found
+    for reason, where in found.items():
+        out[reason] = where & free
+        free &= ~where
+    return out
+
+
+def limit_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+    """Return the same Gaussians without the harmonics above a degree.
+
+    Raises:
+        UsageError: The degree is not 0 to 3.
+    """
+    if not 0 <= degree <= 3:
+        raise UsageError(f"--sh-degree {degree}: harmonics have degrees 0 to 3")
+    return replace(gaussians, sh=gaussians.sh[:, : (degree + 1) ** 2].contiguous())
+
+
+def harmonics_rotation(rotation: np.ndarray) -> torch.Tensor:
+    """Return the matrix that turns coefficients with the scene, float64 [16, 16] (Wigner's D for degrees 0 to 3, real).
+
+    Entry (j, k) is the integral over the sphere of Y_j(d) Y_k(R^T d), which a product rule of 32 points takes exactly.
+
+    Args:
+        rotation: The rotation, shape [3, 3].
+    """
+    nodes = [*_NODES, *((-z, w) for z, w in _NODES)]
+    points, weights = [], []
+    for z, weight in nodes:
+        for i in range(_AZIMUTHS):
+            angle, radius = 2 * math.pi * i / _AZIMUTHS, math.sqrt(1 - z * z)
+            points.append([radius * math.cos(angle), radius * math.sin(angle), z])
+            weights.append(weight * 2 * math.pi / _AZIMUTHS)
+    d = np.array(points)
+    here, there = (basis(torch.from_numpy(p)).numpy() for p in (d, matmul(d, np.asarray(rotation, np.float64))))
+    return torch.from_numpy(np.einsum("i,ij,ik->jk", np.array(weights), here, there))
+
+
+def rotate(gaussians: Gaussians, rotation: np.ndarray) -> Gaussians:
+    """Return Gaussians turned about the origin: means, shapes and the directions that colours depend on.
+
+    Args:
+        gaussians: N Gaussians.
+        rotation: New axes from old ones, shape [3, 3], determinant 1.
+    """
+    like = {"dtype": torch.float64, "device": gaussians.means.device}
+    turn = torch.tensor(np.asarray(rotation), **like)
+    k = gaussians.sh.shape[1]
+    harmonics = harmonics_rotation(rotation).to(like["device"])[:k, :k]
+    quats = torch.nn.functional.normalize(gaussians.quats.double(), dim=1)
+    turned = torch.einsum("ij,njk->nik", turn, torch.as_tensor(rotation_matrices(quats)))
+    return Gaussians(
+        means=torch.einsum("ij,nj->ni", turn, gaussians.means.double()).to(gaussians.means.dtype),
+        quats=quaternions(turned).to(gaussians.quats.dtype),
+        log_scales=gaussians.log_scales,
+        logit_opacities=gaussians.logit_opacities,
+        sh=torch.einsum("jk,nkc->njc", harmonics, gaussians.sh.double()).to(gaussians.sh.dtype),
+    )
+
+
+def rotation_about(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Return the rotation [3, 3] by an angle [rad] about an axis [3] of any length (Rodrigues).
+
+    Raises:
+        UsageError: The axis has no length.
+    """
+    length = math.sqrt(float((np.asarray(axis) ** 2).sum()))
+    if not (math.isfinite(length) and length > 0 and math.isfinite(angle)):
+        raise UsageError("--rotate: the axis has no length, or a number is not finite")
+    x, y, z = np.asarray(axis, np.float64) / length
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * matmul(cross, cross)
+
+
+def levelling(up: np.ndarray) -> np.ndarray:
+    """Return the rotation [3, 3] that turns an upward direction [3] to -y, which is up in PLY files, by the shortest way."""
+    u = np.asarray(up, np.float64) / math.sqrt(float((np.asarray(up) ** 2).sum()))
+    axis = np.cross(u, [0.0, -1.0, 0.0])
+    angle = math.atan2(math.sqrt(float((axis**2).sum())), -float(u[1]))
+    return rotation_about(axis if angle % math.pi > 1e-12 else np.array([1.0, 0.0, 0.0]), angle)
