@@ -4,7 +4,7 @@ usage: python -m bench.formats RUN ... [--splat-transform CLI] [--out bench/resu
 
 A run is written in each format, read back and rendered at its held-out views; the difference to the PSNR of the model in memory
 is what the format costs. CLI is the command of npm's @playcanvas/splat-transform (such as "node cli.mjs"): with it, each file
-is read by that program, too, written as PLY, and compared with what this program reads.
+is read by that program, too, written as .glb, and compared with what this program reads.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def _scores(run: StoredRun, gaussians: Gaussians, views: tuple) -> float:
 
 def _foreign(command: str, file: Path, folder: Path) -> dict:
     """Return how another program's reading of a file differs from ours; both keep the order of the file."""
-    target = folder / "foreign.ply"
+    target = folder / "foreign.glb"  # as PLY it would hold infinite logits for opacities of 0 and 255
     subprocess.run([*shlex.split(command), "-w", "-q", str(file), str(target)], check=True, capture_output=True)
     ours, theirs = read_gaussians(file), read_gaussians(target)
     out: dict = {"count": len(theirs), "same_count": len(ours) == len(theirs)}

@@ -25,8 +25,6 @@ def open_file(
     cameras: Path | None,
     rule: str | None = None,
     device: str = "auto",
-    *,
-    background: tuple[float, ...] | None = None,
 ) -> tuple[FittedModel, list[str]]:
     """Read a file of Gaussians and the cameras that it is seen through; returns the model and notes for the user.
 
