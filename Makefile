@@ -13,7 +13,7 @@ export PYTHONUTF8 := 1
 export PYTHONDONTWRITEBYTECODE :=
 OUT ?= runs/demo
 
-.PHONY: demo install lint types docs docs-links test test-slow test-fault test-browser test-audit test-cuda clean
+.PHONY: demo install lint types docs docs-links docs-run test test-slow test-fault test-browser test-audit test-cuda clean
 
 # LOCKED=1: only files whose hashes stand in requirements.lock; else, from wherever pip is told, the versions of constraints.txt
 $(VENV)/installed: pyproject.toml constraints.txt requirements.lock
@@ -62,6 +62,10 @@ docs: install
 
 docs-links: install
 	$(BIN)/python -m sphinx --quiet --builder linkcheck docs site/links
+
+# The shell commands of the README and of the pages for users, in temporary folders with a small scene.
+docs-run: install
+	$(BIN)/python -m tools.run_docs
 
 # Run these before a change is called done: CONTRIBUTING.md says which one when. Properties get more examples here;
 # `make test-fault FUZZ=100000` gives the readers so many damaged files (2000 where nothing is said).

@@ -161,7 +161,7 @@ def test_settings_of_plug_ins_reach_the_run(plugged, capsys):
     (term,) = config["loss_terms"]
     assert term["name"].endswith("mine.py:Opaque") and term["weight"] == 0.25
     with pytest.raises(SystemExit):
-        main([*command, *named, "--help"])
+        main([*command, *named, "--help-all"])
     text = capsys.readouterr().out
     assert "slow-growth options" in text and "Rate of nothing, on two lines." in text and "--opaque.weight" in text
 
@@ -194,7 +194,7 @@ def test_a_run_folder_never_decides_what_code_is_loaded(plugged):
 def test_the_current_folder_is_not_searched(plugged, found):
     """`python -m warpgs` finds module:Class on PYTHONPATH, where its user put it, and not by standing beside it."""
     folder, _, _ = plugged
-    command = [sys.executable, "-m", "warpgs", "fit", *BASE, "--strategy", "mine:SlowGrowth", "--help"]
+    command = [sys.executable, "-m", "warpgs", "fit", *BASE, "--strategy", "mine:SlowGrowth", "--help-all"]
     root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
     environment = {**os.environ, "PYTHONPATH": f"{root}{os.pathsep}{folder}" if found else root}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)

@@ -1,8 +1,10 @@
 """The report on the machine: never raises, names a remedy for what is missing, reads well in 80 columns."""
 
-import importlib
+import importlib.util
 import io
+import os
 import sys
+import threading
 import types
 
 import pytest
@@ -205,3 +207,37 @@ def test_colours_only_on_a_terminal():
     findings = [Finding("Python", OK, "3.12")]
     assert "\x1b[" in text_of(findings, terminal=True)[0]
     assert "\x1b" not in text_of(findings)[0]
+
+
+def test_a_package_that_is_only_found(monkeypatch):
+    """VTK and pyvista are not imported here: another check tries them in a process of its own."""
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    found = by_topic(doctor._packages())
+    assert {found[n].status for n in ("pyvista", "vtk")} == {NOTE} and found["vtk"].remedy == "pip install vtk"
+    assert found["numpy"].status == OK
+
+
+def test_checks_run_side_by_side(monkeypatch):
+    """The one that waits for a process waits beside the others, and keeps its place in the report."""
+    met = threading.Barrier(2, timeout=60)
+
+    def one():
+        met.wait()
+        yield Finding("one", OK, "x")
+
+    def two():
+        met.wait()
+        yield Finding("two", OK, "x")
+
+    monkeypatch.setattr(doctor, "CHECKS", (one, two))
+    monkeypatch.setattr(doctor, "APART", frozenset({one}))
+    assert [(f.topic, f.status) for f in doctor.diagnose()] == [("one", OK), ("two", OK)]
+
+
+def test_what_native_code_says_of_a_driver_is_hidden(monkeypatch, capfd):
+    fake = types.SimpleNamespace(
+        config=types.SimpleNamespace(log_level=1), LOG_ERROR=4, init=lambda: os.write(2, b"no driver\n")
+    )
+    monkeypatch.setitem(sys.modules, "warp", fake)
+    monkeypatch.setattr(doctor, "prepare_kernel_cache", lambda: None)
+    assert doctor._quiet_warp() is fake and fake.config.log_level == 1 and capfd.readouterr().err == ""

@@ -15,6 +15,7 @@ from tests.faults.targets import Target, not_finite, register
 from tests.io import scenes
 from tests.priors import networks as nw
 from warpgs.export import ply
+from warpgs.export.ply_header import parse_header, ply_error
 from warpgs.files import write_json
 from warpgs.io.load import load_scene
 from warpgs.io.splits import Split
@@ -71,7 +72,7 @@ def ply_files(root: Path) -> list[Path]:
     return [root / "a.ply", root / "b.ply"]
 
 
-PLY = (ply.read_ply, ply._parse_header, ply._locate_vertices, ply._check_properties, ply._assemble, ply._error)
+PLY = (ply.read_ply, parse_header, ply._locate_vertices, ply._check_properties, ply._assemble, ply_error)
 PLY_CHANGES = (ply_header(text_number), ply_header(text_line), ply_body, ply_body)
 register(Target("ply", ply_files, lambda root, path: ply.read_ply(path), PLY, PLY_CHANGES, nonsense=nonsense))
 

@@ -4,6 +4,7 @@ import ast
 import os
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -100,7 +101,9 @@ def test_no_command_runs_what_lies_beside_a_scene(trap, tmp_path, program):
         "ablate": (0, ["ablate", ".", "--preset", "quick", *STUDY, "--out", str(tmp_path / "ablate")]),
         "convert-lpips": (3, ["convert-lpips", "--backbone", "a.pth", "--heads", "b.pth", "--out", "c.safetensors"]),
         "demo": (0, ["demo", "new", "--views", "8", "--width", "32", "--height", "32"]), "doctor": (0, ["doctor"]),
-        "view": (3, ["view", "."]),
+        "view": (3, ["view", "."]), "convert": (3, ["convert", "a.ply", str(tmp_path / "b.spz")]),
+        "poses": (0 if find_spec("pycolmap") else 4, ["poses", "images", "--out", str(tmp_path / "found")]),
+        "mesh": (3, ["mesh", out, "--out", str(tmp_path / "a.glb"), "--device", "cpu"]),
     }  # fmt: skip
     assert {c.split()[0] for c in commands} == {"help", *COMMANDS}
     for name, (code, words) in commands.items():

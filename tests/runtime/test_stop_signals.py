@@ -127,7 +127,7 @@ def test_more_signals_while_the_program_ends(monkeypatch, capsys):
 
     from warpgs.app import cli
 
-    monkeypatch.setattr("warpgs.pipeline.runs.commands.export", tidy)
+    monkeypatch.setattr("warpgs.pipeline.runs.share.export", tidy)
     say = cli.say
     monkeypatch.setattr(cli, "say", lambda *a, **k: (signal.raise_signal(signal.SIGINT), say(*a, **k)))
     try:
@@ -135,4 +135,4 @@ def test_more_signals_while_the_program_ends(monkeypatch, capsys):
     except KeyboardInterrupt:  # which would end pytest
         pytest.fail("the command does not end in good order")
     assert code == 130
-    assert capsys.readouterr().err == SENTENCE
+    assert capsys.readouterr().err == "warpgs: interrupted\n"

@@ -6,6 +6,7 @@ import sys
 
 from warpgs import __version__
 from warpgs.app.failures import report_defect, report_no_memory
+from warpgs.app.fit_help import help_lines, wants_help
 from warpgs.errors import UsageError, WarpgsError
 from warpgs.runtime.device_memory import is_out_of_memory
 from warpgs.runtime.imports import fast_imports
@@ -13,32 +14,46 @@ from warpgs.runtime.stop_signals import ignored_signals, interrupting_signals
 from warpgs.runtime.terminal import accept_all_letters, say
 
 COMMANDS = {
-    "fit": "fit Gaussians to a scene folder and fill a run folder",
-    "eval": "score a run again on its held-out views",
-    "render": "render a run as a film: along a path that suits it, through its views, or along keyframes",
-    "plot": "show a run's cameras and Gaussians in one image",
-    "mesh": "make a mesh of the surfaces that a run's training views see, as .ply or .glb",
-    "view": "look at a run, a PLY file or a fit that goes on, in a browser",
-    "export": "write a run's Gaussians to a file of any format that viewers read, or to an HTML page that shows them",
-    "convert": "write a file of Gaussians in another format: .ply, .spz, .sog, .glb, .splat and others",
-    "prune": "shrink a finished model as far as its training views allow, into a new run folder",
-    "poses": "find camera poses of photographs or a video, and write them as a scene folder",
-    "priors": "look at what is known before a fit (priors show), or write networks as ONNX (priors export)",
-    "compare": "fit presets to scenes with several seeds; tables, plot and figure of the differences",
-    "ablate": "fit a preset with its parts off one at a time; the same tables, plot and figure",
-    "convert-lpips": "join published LPIPS weights into the file that --lpips-weights takes",
     "demo": "write a synthetic scene to try things with",
+    "poses": "find the poses of photographs or a video; gives a scene folder",
+    "fit": "fit Gaussians to a scene folder and fill a run folder",
+    "view": "look at a run, a PLY file or a fit that goes on, in a browser",
+    "render": "render a run as a film: along a path, its views, or keyframes",
+    "plot": "show a run's cameras and Gaussians in one image",
+    "priors": "look at what is known before a fit, or write networks as ONNX",
+    "export": "write a run's Gaussians to a file: .ply, .spz, .glb, .html",
+    "convert": "write a file of Gaussians in another format",
+    "mesh": "make a mesh of the surfaces that a run's views see: .ply, .glb",
+    "prune": "shrink a finished model as far as its training views allow",
+    "eval": "score a run again on its held-out views",
+    "compare": "fit presets to scenes with several seeds; tables and plots",
+    "ablate": "fit a preset with its parts off one at a time; the same tables",
+    "convert-lpips": "join LPIPS weights into the file that --lpips-weights takes",
     "doctor": "say what this machine has, what is missing, and how to get it",
 }
+"""Commands by name, in the order of the help, each with a line about it."""
+
+GROUPS = {
+    "start": ("demo", "poses", "fit"),
+    "look": ("view", "render", "plot", "priors"),
+    "share": ("export", "convert", "mesh", "prune"),
+    "measure": ("eval", "compare", "ablate", "convert-lpips"),
+    "this machine": ("doctor",),
+}
+"""Names of the commands by purpose."""
 
 
 def _help() -> str:
     width = max(map(len, COMMANDS))
-    rows = "\n".join(f"  {name:<{width}}  {text}" for name, text in COMMANDS.items())
+    groups = (
+        "\n".join([f"{purpose}:", *(f"  {name:<{width}}  {COMMANDS[name]}" for name in names)])
+        for purpose, names in GROUPS.items()
+    )
     return (
-        f"warpgs {__version__}: from a handful of posed photographs to a 3D Gaussian scene\n\n"
-        f"usage: warpgs COMMAND [flags]\n\n{rows}\n\n"
-        "`warpgs COMMAND --help` lists a command's flags. First steps: warpgs demo scene && warpgs fit scene --out run\n"
+        f"warpgs {__version__}: from a handful of photographs to a 3D Gaussian scene\n\n"
+        "usage: warpgs COMMAND [flags]\n\n" + "\n\n".join(groups) + "\n\n"
+        "`warpgs COMMAND --help` lists a command's flags.\n"
+        "First steps: warpgs demo scene && warpgs fit scene --out run\n"
     )
 
 
@@ -62,6 +77,10 @@ def _run(arguments: list[str]) -> int:
     try:
         if name not in COMMANDS:
             raise UsageError(f"there is no command {name!r}; choose one of {', '.join(COMMANDS)}")
+        if name == "fit" and wants_help(arguments[1:]):  # before the import, which costs seconds
+            for line in help_lines(COMMANDS[name]):
+                say(line)
+            return 0
         with fast_imports():
             command = importlib.import_module(f"warpgs.app.commands.{name.replace('-', '_')}")
         code: int = command.run(arguments[1:], COMMANDS[name])
@@ -71,7 +90,8 @@ def _run(arguments: list[str]) -> int:
         return e.exit_code
     except KeyboardInterrupt:
         with ignored_signals():
-            say("warpgs: interrupted; --resume continues from the last checkpoint", error=True)
+            hint = "; --resume continues from the last checkpoint" if name == "fit" else ""
+            say(f"warpgs: interrupted{hint}", error=True)
         return 130
     except BrokenPipeError:  # the reader, `head` for one, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import importlib.util
 import os
 import platform
 import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -18,6 +20,7 @@ from warpgs.errors import ResourceError
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.device_memory import ASSUMED_BYTES, machine_memory
 from warpgs.runtime.kernel_cache import prepare_kernel_cache
+from warpgs.runtime.native_output import hidden_stderr
 from warpgs.runtime.processor import processor_name, usable_cores
 from warpgs.runtime.terminal import printable
 
@@ -55,6 +58,8 @@ class Package:
     """True where a fit needs it."""
     use: str
     """Part that is lost without it."""
+    imported: bool = True
+    """False where another check uses it for real, in a process of its own; here it is only found."""
 
 
 PACKAGES = (
@@ -67,8 +72,8 @@ PACKAGES = (
     Package("psutil", "psutil", False, "free memory"),
     Package("safetensors", "safetensors", True, "checkpoints"),
     Package("onnxruntime", "onnxruntime", False, "depth and feature networks"),
-    Package("pyvista", "pyvista", False, "3D overviews in reports"),
-    Package("vtk", "vtk", False, "3D overviews in reports"),
+    Package("pyvista", "pyvista", False, "3D overviews in reports", imported=False),
+    Package("vtk", "vtk", False, "3D overviews in reports", imported=False),
 )
 
 
@@ -90,10 +95,18 @@ def _python() -> Iterable[Finding]:
     yield Finding("System", OK, f"{platform.system()} {platform.release()} on {platform.machine()}")
 
 
+def _find(name: str) -> object:
+    """Look for a module without importing it, which for VTK takes long; ModuleNotFoundError where it is not there."""
+    spec = importlib.util.find_spec(name)
+    if spec is None:
+        raise ModuleNotFoundError(f"No module named {name!r}")
+    return spec
+
+
 def _package(package: Package) -> Finding:
     """Import a package: an installed one may still lack a system library."""
     try:
-        module = importlib.import_module(package.module)
+        module = importlib.import_module(package.module) if package.imported else _find(package.module)
     except Exception as e:
         status = MISSING if package.required else NOTE
         wanted = package.distribution
@@ -170,7 +183,8 @@ def _quiet_warp():
     before = warp.config.log_level
     warp.config.log_level = warp.LOG_ERROR
     try:
-        warp.init()
+        with hidden_stderr():  # native code says where there is no driver, whatever the level
+            warp.init()
     finally:
         warp.config.log_level = before
     return warp
@@ -284,20 +298,29 @@ CHECKS: tuple[Callable[[], Iterable[Finding]], ...] = (
 )  # fmt: skip
 
 
+APART = frozenset({_rendering})
+"""Checks that wait for a process of their own, and so run beside the others."""
+
+
+def _findings(check: Callable[[], Iterable[Finding]]) -> list[Finding]:
+    """Return what a check finds; its own failure is a finding, too."""
+    try:
+        return list(check())
+    except Exception as e:
+        topic = check.__name__.strip("_").replace("_", " ").capitalize()
+        return [Finding(topic, NOTE, f"the check itself failed: {_reason(e)}", "report this as a bug")]
+
+
 def diagnose() -> list[Finding]:
     """Look at everything a fit and its report need.
 
     Returns:
         The findings in the order of the report. Nothing is raised: a check that fails is itself a finding.
     """
-    findings: list[Finding] = []
-    for check in CHECKS:
-        try:
-            findings.extend(check())
-        except Exception as e:
-            topic = check.__name__.strip("_").replace("_", " ").capitalize()
-            findings.append(Finding(topic, NOTE, f"the check itself failed: {_reason(e)}", "report this as a bug"))
-    return findings
+    with ThreadPoolExecutor(len(APART)) as pool:
+        apart = {check: pool.submit(_findings, check) for check in CHECKS if check in APART}
+        here = {check: _findings(check) for check in CHECKS if check not in APART}
+        return [f for check in CHECKS for f in (here[check] if check in here else apart[check].result())]
 
 
 def print_report(findings: list[Finding], console=None) -> int:

@@ -282,7 +282,10 @@ def project_gradients(
     threads = -(-count // BLOCK) * BLOCK if native else count
     kernel = make_backward(real, native, settings.camera_model)
     interop.launch(kernel, threads, inputs, device, cost=10 * cameras, block_dim=BLOCK)
-    return [*found, *((v_viewmats.sum(1), v_Ks.sum(1)) if wants_camera else (None, None))]
+    if not wants_camera:
+        return [*found, None, None]
+    # in float64, whose rounding no number of threads shows in float32
+    return [*found, *(v.sum(1, dtype=torch.float64).to(v.dtype) for v in (v_viewmats, v_Ks))]
 
 
 def project(

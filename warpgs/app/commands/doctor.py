@@ -34,4 +34,7 @@ def run(arguments: list[str], about: str) -> int:
         return 0
     from warpgs.app.doctor import diagnose, print_report
 
-    return print_report(diagnose())
+    say("looking at this machine ...")
+    with fast_imports():
+        findings = diagnose()
+    return print_report(findings)

@@ -42,8 +42,7 @@ def run(arguments: list[str], about: str) -> int:
             raise UsageError("--crop, --clean, --sh-degree and --rotate are not for .html; export a .ply, and view that")
         lines = export_html(a.run, a.to)
     else:
-        from warpgs.pipeline.runs.commands import export
-        from warpgs.pipeline.runs.share import Filters
+        from warpgs.pipeline.runs.share import Filters, export
 
         lines = export(a.run, a.to, Filters(a.crop, a.clean, a.sh_degree, a.rotate))
     for line in lines:

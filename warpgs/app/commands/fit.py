@@ -216,6 +216,7 @@ def request_of(arguments: list[str], about: str) -> FitRequest:
     Raises:
         UsageError: A flag is wrong, or a plug-in cannot be loaded.
     """
+    arguments = ["--help" if word == "--help-all" else word for word in arguments]  # tyro has one help, that of all flags
     base = _preset(arguments)
     terms = _terms(arguments, base)
     a: Any = parse_flags(_flags(base, terms), arguments, "warpgs fit", f"{about}\n\n{_presets()}")

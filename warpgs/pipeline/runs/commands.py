@@ -19,10 +19,9 @@ from warpgs.pipeline.runs.image_names import image_names, renaming_notes
 from warpgs.pipeline.runs.model_and_cameras import open_file
 from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.pipeline.runs.paths import COVERAGE, FILM, render_film, sheet_path
+from warpgs.pipeline.runs.refined_poses import with_cameras
 from warpgs.pipeline.runs.request import choose_device, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line
-from warpgs.pipeline.runs.share import convert as convert  # noqa: PLC0414
-from warpgs.pipeline.runs.share import export as export  # noqa: PLC0414
 from warpgs.pipeline.train.background import color_of, over_background
 from warpgs.pipeline.train.loop import train_views
 from warpgs.report.coverage_image import LEGEND
@@ -47,6 +46,8 @@ def scene_of(stored: StoredRun, reader: str | None = None) -> tuple[Scene, list[
     scene, _, _ = read_scene(stored.scene_request(reader))
     if scene.fingerprint != stored.record["fingerprint"]:
         raise DataError(f"{scene.path}: its images or cameras are not those that {stored.folder} was fitted to; restore them")
+    if stored.record["config"].get("refine_poses"):
+        scene = with_cameras(scene, stored.scene_cameras)
     scene, split = over_background(scene, stored.background), Split(stored.train, stored.test)
     return scene, train_views(scene, split.train), train_views(scene, split.test)
 

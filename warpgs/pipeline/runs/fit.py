@@ -27,6 +27,7 @@ from warpgs.pipeline.runs.failed_step import failed_step, save_failed_step
 from warpgs.pipeline.runs.folder import CONFIG, check_checkpoint, check_same, read_record, record_of, run_folder
 from warpgs.pipeline.runs.image_names import image_names, renaming_notes
 from warpgs.pipeline.runs.model_file import FittedModel
+from warpgs.pipeline.runs.refined_poses import refined_scene
 from warpgs.pipeline.runs.request import NO_SCORES, FitRequest, SceneRequest, choose_device, choose_split, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line, write_report
 from warpgs.pipeline.runs.rule_report import rule_report_of
@@ -236,9 +237,10 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
         _train(job, trainer, images_written)
     _tell(job, trainer)  # of images that were written last
     training = time.perf_counter() - job.began - setup
+    poses = _refined(job, trainer)
     if job.out is not None:
         write_ply(job.out / "point_cloud.ply", drop_unused_sh(trainer.gaussians), job.scene.normalization)
-    metrics = _score(job, trainer, {"setup": setup, "training": training})
+    metrics = _score(job, trainer, {"setup": setup, "training": training}) | poses
     if job.out is not None:
         write_json(job.out / "metrics.json", metrics)
         record["notes"] = job.notes
@@ -260,6 +262,16 @@ def _model_fields(
     cameras = {v.name: v.camera for v in job.scene.views}
     names, rule = (job.split.train, job.split.test), job.config.rule
     return trainer.gaussians, job.scene.normalization, cameras, *names, rule, job.scene.background, trainer.step
+
+
+def _refined(job: _Job, trainer: Trainer) -> dict[str, Any]:
+    """Give the scene its refined poses, and tell of them; returns their entry of metrics.json, if any."""
+    if not job.config.refine_poses:
+        return {}
+    job.scene, figures = refined_scene(job.scene, job.split, trainer.view_table.params)
+    job.notes.append(figures["summary"])
+    job.say(f"  {figures['summary']}")
+    return {"poses": figures}
 
 
 def _announce(job: _Job, trainer: Trainer) -> None:

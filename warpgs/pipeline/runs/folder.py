@@ -21,9 +21,11 @@ from warpgs.io.splits import Split
 from warpgs.pipeline.model.parameter_bounds import unpack
 from warpgs.pipeline.runs.checkpoint import FORMAT, TENSORS, load_checkpoint
 from warpgs.pipeline.runs.model_file import FittedModel, checked_gaussians
+from warpgs.pipeline.runs.refined_poses import refined_cameras
 from warpgs.pipeline.runs.request import SceneRequest, choose_device
 from warpgs.pipeline.runs.schemas import MODEL_STATE, check_record
 from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.refine_poses import ROTATION
 from warpgs.poses.record import JSON as POSES
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Camera, Gaussians, Normalization, Scene
@@ -76,7 +78,8 @@ def _check_folder(out: Path, resume: bool) -> None:
         raise UsageError(f"{out}: cannot be looked into ({e.strerror or e}); choose another --out") from e
 
 
-def _camera_values(camera: Camera) -> dict[str, Any]:
+def camera_values(camera: Camera) -> dict[str, Any]:
+    """Return the values of a camera as config.json holds them."""
     return {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in vars(camera).items()}
 
 
@@ -93,7 +96,7 @@ def record_of(
         "background": scene.background, "transparent": scene.transparent,
         "config": config.to_json(), "config_hash": config.fingerprint(),
         "device": device.type, "versions": versions(),
-        "cameras": {v.name: _camera_values(v.camera) for v in scene.views},
+        "cameras": {v.name: camera_values(v.camera) for v in scene.views},
     }  # fmt: skip
 
 
@@ -238,6 +241,12 @@ def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredR
     tensors, state = load_checkpoint(folder)
     gaussians, step = _model_of(tensors, state, folder / TENSORS)
     train, test, rule = tuple(record["train"]), tuple(record["test"]), record["config"]["rule"]
+    own = {n.removeprefix("views.params."): t for n, t in tensors.items() if n.startswith("views.params.")}
+    if ROTATION in own:
+        try:
+            cameras = refined_cameras(cameras, train, test, own)
+        except DataError as e:
+            raise DataError(f"{folder / TENSORS}: {e}") from e
     return StoredRun(
         Gaussians(**{n: t.to(where) for n, t in gaussians.tensors().items()}),
         Normalization(np.array(offset, np.float64), float(scale)),

@@ -23,7 +23,7 @@ from warpgs.pipeline.model import compress
 from warpgs.pipeline.model.parameter_bounds import model_bytes, pack
 from warpgs.pipeline.runs.checkpoint import save_checkpoint
 from warpgs.pipeline.runs.commands import scene_of
-from warpgs.pipeline.runs.folder import CONFIG, StoredRun, open_run
+from warpgs.pipeline.runs.folder import CONFIG, StoredRun, camera_values, open_run
 from warpgs.pipeline.runs.request import choose_device
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.render.rasterize import RasterizeOptions
@@ -112,7 +112,9 @@ def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str, re
         "mean_degree": [float(d.double().mean()) for d in (degrees, made.degrees)],
         "train_psnr": scores[0], "test_psnr": scores[1] if test else None,
     }  # fmt: skip
-    notes = _write(out, stored.record | {"pruned": figures}, made, stored.step, stored.normalization)
+    # the new checkpoint has no increments of poses: its record holds the cameras after them
+    record = stored.record | {"pruned": figures, "cameras": {n: camera_values(c) for n, c in stored.scene_cameras.items()}}
+    notes = _write(out, record, made, stored.step, stored.normalization)
     lines = [
         *notes,
         f"{len(before):,} -> {len(made.degrees):,} Gaussians, mean SH degree {figures['mean_degree'][0]:.2f} -> "

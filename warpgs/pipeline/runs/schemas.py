@@ -112,6 +112,9 @@ METRICS = fields(
     {
         "gaussians": whole(0), "seconds": fields({"total": number(0)}), "shape": _SHAPE,
         "photographs": items(_PHOTOGRAPH),
+        "poses": fields({
+            "views": items(fields({"name": _view_name, "degrees": number(0), "units": number(0)})), "summary": text,
+        }),
         "coverage": fields({
             "classes": _COVERED, "views": items(fields({"name": text, "classes": _COVERED})), "tolerance": number(0),
             "depth_differences": items(number(0)), "photo_psnr": or_null(items(or_null(real))), "summary": text,

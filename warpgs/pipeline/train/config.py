@@ -57,6 +57,9 @@ class FitConfig:
     before a step would exceed it, and images are rendered in chunks where a whole one would."""
     cuda_graph: bool = True
     """CUDA graphs: a step is captured once and replayed; the same kernels and the same bytes as without, in less time."""
+    refine_poses: bool = False
+    """Learn an increment of each training camera but the first with the Gaussians, for poses that are a little off
+    (docs/your-photos.md)."""
     max_gaussians: int = 1_000_000
     """Largest number of Gaussians, from the start on."""
     background: str = "scene"

@@ -45,6 +45,12 @@ class OptimizerConfig:
     """Learning rate of the constant colour coefficient."""
     sh_rest_factor: float = 0.05
     """Fraction of that for the other coefficients."""
+    pose_rotation_lr: float = 5e-4
+    """Learning rate of the training cameras' rotations [rad] at the start, where poses are refined."""
+    pose_translation_lr: float = 5e-4
+    """The same of their translations, times the scene's extent."""
+    pose_decay: float = 0.01
+    """Fraction of both that is left at the last step; log-linear between."""
 
     def __post_init__(self):
         for name, value in vars(self).items():
@@ -68,6 +74,11 @@ class OptimizerConfig:
             "logit_opacities": self.opacities_lr,
             "sh": self.sh_lr * self.sh_rest_factor,
         }
+
+    def pose_lrs(self, progress: float, extent: float) -> tuple[float, float]:
+        """Return the learning rates of rotations [rad] and translations [u] of cameras; arguments are those of `lrs`."""
+        left = log_linear(1.0, self.pose_decay, progress)
+        return self.pose_rotation_lr * left, self.pose_translation_lr * extent * left
 
     @property
     def head_lrs(self) -> dict[str, float]:

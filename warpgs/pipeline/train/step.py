@@ -24,6 +24,7 @@ from warpgs.pipeline.metrics.psnr import masked_mse
 from warpgs.pipeline.model.scale_limits import NO_LIMITS, Limits
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.loss import LossTerm, Target, over
+from warpgs.pipeline.train.refine_poses import ROTATION, TRANSLATION, moved
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.views import Kind, Rows, ViewStack
 from warpgs.render.rasterize import RasterizeOptions, rasterize
@@ -182,6 +183,8 @@ def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPla
     mask = None if views.masks is None else buffers.of_view(views.masks)
     number = buffers.of_view(views.numbers).view(1)
     own = {n: t.index_select(0, number)[0] for n, t in learned.views.params.items()}  # not t[number], which reads it back
+    if ROTATION in own:
+        viewmat = moved(viewmat, number, own[ROTATION][None], own[TRANSLATION][None])
     alpha = shift = None
     if views.alphas is not None:
         alpha, shift = buffers.of_view(views.alphas), settings[3:]

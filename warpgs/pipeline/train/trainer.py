@@ -21,6 +21,7 @@ from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import built_in_terms, collect, random_shift
 from warpgs.pipeline.train.memory_plan import Layout, layout_of, most_instances, plan
+from warpgs.pipeline.train.refine_poses import ROTATION, TRANSLATION, GivenPoses, first_increments
 from warpgs.pipeline.train.schedule import plan_phases
 from warpgs.pipeline.train.setup import prepare, prepared_views
 from warpgs.pipeline.train.step import (
@@ -122,6 +123,10 @@ class Trainer:
         self.table = Table.of_gaussians(initial_gaussians(cloud, config.init, self.extent, device), self.strategy.columns())
         own = collect(self.terms, lambda t: t.view_parameters(), "view parameter")
         first = {n: torch.tensor(p.initial, dtype=torch.float32, device=device).repeat(len(train), 1) for n, p in own.items()}
+        self.poses: GivenPoses | None = None
+        """Training poses as given, where they are refined."""
+        if config.refine_poses:
+            first |= first_increments(len(train), device)
         self.view_table = Table(first, {}, device, len(train))
         self.view_lrs = {n: p.lr for n, p in own.items()}
         self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(first)))
@@ -131,6 +136,8 @@ class Trainer:
         self.layout: Layout
         self.max_instances: int | None = None
         views, self.disparities = prepared_views(train, made, config, self.terms, device)
+        if config.refine_poses:
+            views, self.poses = GivenPoses.owned(views), GivenPoses(views)
         self.set_views(views)
         self.strategy.setup()
 
@@ -285,7 +292,11 @@ class Trainer:
 
     def _lr_row(self, step: int) -> list[float]:
         row = self.table.lr_row(self.lrs(step), step, self.config.optimizer.head_lrs)
-        return row + self.view_table.lr_row(self.view_lrs, step, {})
+        lrs = dict(self.view_lrs)
+        if self.poses is not None:
+            rates = self.config.optimizer.pose_lrs(self.progress(step), self.extent)
+            lrs |= {ROTATION: rates[0], TRANSLATION: rates[1]}
+        return row + self.view_table.lr_row(lrs, step, {})
 
     def lrs(self, step: int) -> dict[str, float]:
         """Return the learning rate of each parameter of the Gaussians at a step."""
@@ -304,10 +315,16 @@ class Trainer:
         if not self.strategy.due(self.step):
             return
         self._forget_graphs()
+        self._show_poses()
         for change in self.strategy.update(self.step):
             self.table.apply(change)
             self.count_changed()
         self.plan_of(self.step).limits.hold(self.table.params, self.learned.centers)
+
+    def _show_poses(self) -> None:
+        """Let the views show their poses as they are now, where these are refined."""
+        if self.poses is not None:
+            self.poses.show(self.views, self.view_table.params)
 
     def _forget_graphs(self) -> None:
         if self.graphs is not None:
@@ -320,6 +337,8 @@ class Trainer:
         shown = [*views, *(half_size(v) for v in views if self.half_resolution > 0)]
         shown, self.stacks, self.places = stack_views(shown, len(views))
         self.views = shown[: len(views)]
+        if self.poses is not None:
+            self.poses.restore(self.stacks.values())
         layout = layout_of(
             self.table, shown, kept=self.strategy.kept_views(), scored=self.strategy.samples(c), captured=self.captured,
             depth_supervised=c.loss.depth_weight > 0, trimmed=self.strategy.shrinks(c),

@@ -1,0 +1,101 @@
+"""Help on one screen: what it says is what the code does, and it imports nothing that takes time."""
+
+import dataclasses
+import re
+import subprocess
+import sys
+
+import pytest
+
+from warpgs.app import cli, fit_help
+from warpgs.app.cli import COMMANDS, GROUPS, main
+from warpgs.app.commands.fit import request_of
+from warpgs.io.splits import SPECS
+from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESET_NOTES, PRESETS
+
+BASE = ["SCENE", "--out", "RUN"]
+SCENE_FIELDS = {"split", "downscale", "max_side", "masks"}
+
+
+def printed(capsys, *words):
+    assert main(list(words)) == 0
+    return capsys.readouterr().out.splitlines()
+
+
+@pytest.mark.parametrize(("words", "most"), [(["fit", "--help"], 45), (["fit", "scene", "-h"], 45), (["--help"], 45)])
+def test_help_fits_one_screen(capsys, words, most):
+    lines = printed(capsys, *words)
+    assert 20 < len(lines) <= most and max(map(len, lines)) <= 80
+
+
+def test_the_help_of_fit_imports_nothing_heavy():
+    heavy = "{'torch', 'warp', 'numpy', 'tyro'}"
+    code = f"import sys; from warpgs.app.cli import main; main(['fit', '--help']); print({heavy} & {{*sys.modules}})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "set()"
+
+
+def test_all_flags_are_one_word_further(capsys):
+    """--help-all is the help of the parser, with every flag of the short one and those of the groups."""
+    help_all = "--help-all"
+    with pytest.raises(SystemExit) as end:
+        main(["fit", help_all])
+    text = capsys.readouterr().out
+    assert end.value.code == 0 and all(name in text for name, *_ in fit_help.FLAGS)
+    assert "--holdout.levels" in text and len(text.splitlines()) > 200
+
+
+def test_every_command_has_one_purpose(capsys):
+    assert sorted(name for names in GROUPS.values() for name in names) == sorted(COMMANDS)
+    text = "\n".join(printed(capsys, "--help"))
+    assert all(f"\n{purpose}:\n" in text for purpose in GROUPS) and all(about in text for about in COMMANDS.values())
+
+
+@pytest.mark.parametrize(("flag", "word", "default"), [f[:3] for f in fit_help.FLAGS if f[0] != "--out"])
+def test_flags_and_their_defaults_are_those_of_the_parser(flag, word, default):
+    """A flag is a switch where it has no value, and what it does not say of itself is None."""
+    request = request_of(BASE, "")
+    name = flag.removeprefix("--").replace("-", "_")
+    owner = request.scene if name in SCENE_FIELDS else request if name in ("device", "resume") else request.config
+    value = request.view_port is not None if name == "view" else getattr(owner, name)
+    assert default == ("" if value is None else str(value)) and (word == "") == isinstance(value, bool)
+    if not word:
+        assert request_of([*BASE, flag], "") != request
+
+
+def test_presets_are_those_of_the_code():
+    assert list(fit_help.PRESETS) == list(PRESETS) == list(PRESET_NOTES)
+    assert {f[0]: f[2] for f in fit_help.FLAGS}["--preset"] == DEFAULT_PRESET
+    for name, line in fit_help.PRESETS.items():
+        stated = re.search(r"([0-9]+) steps", line)
+        assert (stated and int(stated[1])) == PRESETS[name].steps
+
+
+def test_splits_are_those_of_the_code():
+    kinds = ", ".join(fit_help.SPLITS).split(", ")
+    assert sorted(kinds) == sorted(re.split(r", (?:or )?", SPECS))
+
+
+def test_choices_are_those_of_the_code():
+    text = {f[0]: f[3] for f in fit_help.FLAGS}
+    fields = request_of(BASE, "").config
+    for color in re.findall(r"auto|mean|scene|black|white", text["--background"]):
+        dataclasses.replace(fields, background=color)
+    for how in ("ignore", "cutout"):
+        assert how in text["--masks"] and request_of([*BASE, "--masks", how], "").scene.masks == how
+
+
+@pytest.mark.parametrize("line", fit_help.EXAMPLES)
+def test_examples_parse(line):
+    program, command, *words = line.split()
+    assert (program, command) == ("warpgs", "fit") and request_of(words, "").out.name == "run"
+
+
+@pytest.mark.parametrize(("name", "resumes"), [("fit", True), ("export", False), ("doctor", False)])
+def test_only_a_fit_is_told_to_resume(capsys, monkeypatch, name, resumes):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli.importlib, "import_module", interrupted)
+    assert main([name]) == 130
+    assert ("--resume" in capsys.readouterr().err) == resumes

@@ -1,0 +1,76 @@
+"""`warpgs fit --help` on one screen. Importing it costs nothing: no settings, no torch; tests hold it against the code."""
+
+FLAGS = (
+    ("--out", "RUN", "", "run folder to fill; must not exist yet"),
+    ("--split", "SPEC", "", "views to hold out for scores; without it all train"),
+    ("--preset", "NAME", "default", "settings to start from: presets, below"),
+    ("--steps", "N", "", "steps, one view each; without it the preset decides"),
+    ("--device", "NAME", "auto", "auto, cpu or cuda"),
+    ("--downscale", "F", "", "divide both sides of the images by F"),
+    ("--max-side", "N", "", "longest side [px]; 1600 without --downscale, 0 no limit"),
+    ("--seed", "N", "0", "seed of every random choice"),
+    ("--background", "COLOR", "auto", "auto, mean, scene, black, white, #rrggbb or r,g,b"),
+    ("--masks", "HOW", "ignore", "masked out: ignore it, or cutout: transparent"),
+    ("--resume", "", "False", "continue the run in --out from its last checkpoint"),
+    ("--view", "", "False", "watch in a browser while it trains"),
+)
+"""Flags that most fits need: name, word for the value, default (empty for none; False for a switch), and words about it."""
+
+PRESETS = {
+    "default": "any capture; steps follow from the number of views",
+    "quick": "a first look: the same in 600 steps",
+    "3dgs": "a baseline: Kerbl et al. 2023, 7000 steps",
+    "mcmc": "a baseline: Kheradmand et al. 2024, 7000 steps",
+    "paper-literal": "the paper to the letter, 30000 steps; slow",
+}
+"""Presets, each in a line."""
+
+SPLITS = {
+    "every:N": "hold out every Nth view",
+    "llff:K, mip360:K": "hold out every 8th, train on K of the rest",
+    "dtu:3|6|9, blender:8": "the published ids of these data sets",
+    "train=NAMES;test=NAMES": "by name, with commas; one half is enough",
+    "all": "hold out none: no scores",
+}
+"""Kinds of splits, each in a line."""
+
+EXAMPLES = (
+    "warpgs fit scene --out run --preset quick",
+    "warpgs fit scene --out run --split every:8 --max-side 800",
+    "warpgs fit scene --out run --resume",
+)
+"""Commands to begin with."""
+
+SCENE = (
+    "folder: COLMAP, transforms.json, LLFF, DTU, Middlebury;",
+    "or photographs or a video, whose poses are then found",
+)
+"""Words about the positional argument."""
+
+
+def wants_help(arguments: list[str]) -> bool:
+    """Return whether the words after `fit` ask for the help of one screen."""
+    return any(word in ("-h", "--help") for word in arguments)
+
+
+def help_lines(about: str) -> list[str]:
+    """Return the help of `warpgs fit` in at most 45 lines of 80 columns.
+
+    Args:
+        about: Words about the command.
+    """
+
+    def rows(pairs: list[tuple[str, str]]) -> list[str]:
+        width = max(len(left) for left, _ in pairs)
+        return [f"  {left:<{width}}  {right}".rstrip() for left, right in pairs]
+
+    flags = [("SCENE", SCENE[0]), ("", SCENE[1])]
+    for name, word, default, text in FLAGS:
+        stated = f" [{default}]" if default not in ("", "False") else ""
+        flags.append((f"{name} {word}".strip(), text + stated))
+    return [
+        f"warpgs fit: {about}", "", "usage: warpgs fit SCENE --out RUN [flags]", "",
+        "flags most fits need, and their [defaults]:", *rows(flags), "",
+        "presets (--preset):", *rows(list(PRESETS.items())), "", "splits (--split):", *rows(list(SPLITS.items())), "",
+        "examples:", *(f"  {line}" for line in EXAMPLES), "", "`warpgs fit --help-all` lists every flag by topic.",
+    ]  # fmt: skip
