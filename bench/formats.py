@@ -27,7 +27,8 @@ from warpgs.geometry import rotation_matrices
 from warpgs.pipeline.runs.commands import scene_of
 from warpgs.pipeline.runs.folder import StoredRun, open_run
 from warpgs.pipeline.runs.results import evaluate_run
-from warpgs.pipeline.runs.share import Filters, export
+from warpgs.pipeline.runs.share import export
+from warpgs.pipeline.runs.share_filters import Filters
 from warpgs.scene import Gaussians
 
 WHAT = "file size, differences from the model and loss of PSNR on held-out views of each file format"

@@ -4,17 +4,21 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
 from tests.gaussians import cloud
 from tests.io import scenes
 from warpgs.errors import DataError, UsageError
-from warpgs.export.cameras import write_cameras
+from warpgs.export.cameras import NAMES, write_cameras
 from warpgs.export.formats import write_gaussians
+from warpgs.files import make_folder
 from warpgs.geometry import look_at
 from warpgs.io.camera_files import read_cameras
 from warpgs.pipeline.runs.commands import render
 from warpgs.pipeline.runs.film_plan import FilmSettings
 from warpgs.pipeline.runs.model_and_cameras import open_file
+from warpgs.pipeline.runs.share import convert
+from warpgs.pipeline.runs.share_filters import Filters
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera
 
@@ -25,16 +29,61 @@ def make_cameras(count=3):
     return [Camera(look_at(np.array([0.5 * i - 0.5, 0.2 * i, 0.0]), target, up), K, 64, 48) for i in range(count)]
 
 
-@pytest.mark.parametrize("name", ["cameras.json", "transforms.json"])
+def torch_camera(camera):
+    return Camera(*(torch.from_numpy(np.asarray(m)).float() for m in (camera.viewmat, camera.K)), camera.width, camera.height)
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_cameras_read_back(name, tmp_path):
     made = make_cameras()
-    write_cameras(tmp_path / name, made)
-    found, notes = read_cameras(tmp_path / name)
-    assert len(found) == 3 and not notes and str(tmp_path) not in (tmp_path / name).read_text()
+    assert write_cameras(tmp_path / name, made) == []
+    found, notes = read_cameras(tmp_path / name if name != "sparse" else tmp_path)
+    text = "".join(p.read_text() for p in tmp_path.rglob("*") if p.is_file())
+    assert len(found) == 3 and not notes and str(tmp_path) not in text
     for a, b in zip(made, found.values()):
         assert np.allclose(a.viewmat, b.viewmat) and np.allclose(a.K, b.K) and (a.width, a.height) == (b.width, b.height)
     with pytest.raises(UsageError, match=r"cameras\.json or transforms\.json"):
         write_cameras(tmp_path / "poses.json", made)
+    made[0].K[0, 2] += 2
+    make_folder(tmp_path / "b")
+    notes = write_cameras(tmp_path / "b" / name, made)
+    assert ("up to 2.0 px" in notes[0]) if name == "cameras.json" else not notes
+
+
+def test_a_reconstruction_is_not_replaced(tmp_path):
+    scenes.write_colmap(tmp_path)
+    with pytest.raises(UsageError, match="is there already"):
+        write_cameras(tmp_path / "sparse", make_cameras())
+
+
+def test_colmap_reads_our_cameras(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    write_cameras(tmp_path / "sparse", made := make_cameras())
+    found = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    assert len(found.images) == 3 and len(found.cameras) == 1
+    for image in found.images.values():
+        pose = np.asarray(image.cam_from_world().matrix())
+        assert np.allclose(pose, made[int(image.name[:4])].viewmat[:3])
+
+
+def test_cameras_turn_with_their_gaussians(tmp_path):
+    """A model and its cameras, both converted with the same rotation, give the same image."""
+    made, cameras = cloud(50, degree=2), make_cameras()
+    write_gaussians(tmp_path / "a.ply", made, units="file")
+    write_cameras(tmp_path / "cameras.json", cameras)
+    turn = Filters(rotate="1,2,3,70")
+    convert(tmp_path / "a.ply", tmp_path / "b.ply", turn)
+    lines = convert(tmp_path / "cameras.json", tmp_path / "b" / "transforms.json", turn)
+    assert "turned by 70.0 degrees" in lines[0] and "3 cameras for images of 64 x 48 px, named by number" in lines[-1]
+    models = [open_file(tmp_path / f"{x}.ply", tmp_path / y, "inria", "cpu")[0] for x, y in (
+        ("a", "cameras.json"), ("b", "b/transforms.json"))]  # fmt: skip
+    images = [rasterize(m.gaussians(), torch_camera(list(m.cameras().values())[1])).rgb for m in models]
+    assert float((images[0] - images[1]).abs().max()) < 1e-3 and float(images[0].max()) > 0.1
+    with pytest.raises(UsageError, match="are for Gaussians"):
+        convert(tmp_path / "cameras.json", tmp_path / "c" / "cameras.json", Filters(clean=True))
+    convert(tmp_path / "cameras.json", tmp_path / "l" / "cameras.json", Filters(rotate="level"))
+    with pytest.raises(UsageError, match="not supported"):
+        convert(tmp_path / "cameras.json", tmp_path / "c.txt")
 
 
 def test_cameras_of_colmap(tmp_path):
@@ -70,10 +119,9 @@ def test_a_file_shows_what_it_held(rule, tmp_path):
     write_cameras(tmp_path / "cameras.json", cameras)
     model, notes = open_file(tmp_path / "a.ply", tmp_path / "cameras.json", rule, "cpu")
     assert "50 Gaussians, 3 cameras" in notes[-1] and model.rule == rule
-    like = made.means.new_tensor
     for there, c in zip(model.cameras().values(), cameras):
-        image = rasterize(model.gaussians(), Camera(like(there.viewmat), like(there.K), 64, 48)).rgb
-        want = rasterize(made, Camera(like(c.viewmat), like(c.K), 64, 48)).rgb
+        image = rasterize(model.gaussians(), torch_camera(there)).rgb
+        want = rasterize(made, torch_camera(c)).rgb
         assert float((image - want).abs().max()) < 1e-3 and float(want.max()) > 0.1
 
 
