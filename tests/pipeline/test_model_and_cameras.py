@@ -90,6 +90,8 @@ def test_cameras_of_colmap(tmp_path):
     scenes.write_colmap(tmp_path)
     found, _ = read_cameras(tmp_path)
     assert len(found) == 5 and list(found) == sorted(found)
+    for below in ("sparse", "sparse/0"):
+        assert list(read_cameras(tmp_path / below)[0]) == list(found)
 
 
 ROW = '"position": [0, 0, %s], "width": 9, "height": 9, "fx": 9, "fy": 9}]'

@@ -86,9 +86,15 @@ def _transforms(path: Path) -> dict[str, tuple[np.ndarray, Lens]]:
     return found
 
 
+def colmap_folder(folder: Path) -> Path | None:
+    """Return where a reconstruction lies in a folder, which may be a scene, sparse, or sparse/0; None where none does."""
+    found = colmap.model_folder(folder)
+    return colmap.model_folder(folder / "0") if found is None else found
+
+
 def _colmap(folder: Path) -> dict[str, tuple[np.ndarray, Lens]]:
     """Return pose and lens of each image of a reconstruction, sorted by name."""
-    model = colmap.model_folder(folder)
+    model = colmap_folder(folder)
     kind = None if model is None else colmap.complete_kind(model)
     if model is None or kind is None:
         raise DataError(f"{folder}: holds no cameras and images file of COLMAP. Give cameras.json, transforms.json or a scene")

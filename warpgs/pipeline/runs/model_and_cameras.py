@@ -10,7 +10,7 @@ from warpgs.constants import RULES
 from warpgs.coordinates import convert_camera
 from warpgs.errors import UsageError
 from warpgs.export.formats import read_gaussians
-from warpgs.io.camera_files import read_cameras
+from warpgs.io.camera_files import colmap_folder, read_cameras
 from warpgs.io.load import load_scene
 from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.pipeline.runs.request import choose_device
@@ -60,9 +60,7 @@ def open_file(
 
 def _cameras_of(path: Path) -> tuple[dict[str, Camera], list[str]]:
     """Return cameras by name in file units, and notes; a folder may hold a scene of any format."""
-    if path.is_dir():
-        if (not (path / "images").is_dir() and (path / "sparse").is_dir()) or (path / "cameras.bin").is_file():
-            return read_cameras(path)
+    if path.is_dir() and ((path / "images").is_dir() or colmap_folder(path) is None):
         scene = load_scene(path)
         return {v.name: convert_camera(v.camera, scene.normalization, "scene", "file") for v in scene.views}, list(scene.notes)
     return read_cameras(path)

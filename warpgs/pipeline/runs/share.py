@@ -26,6 +26,9 @@ from warpgs.pipeline.runs.share_filters import (
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Camera, Gaussians
 
+ROUNDING = 1e-4
+"""Change of a log scale below which nothing is said: a hundredth of a percent."""
+
 
 def convert(source: Path, target: Path, filters: Filters = NO_FILTERS) -> list[str]:
     """Write a file of Gaussians, or of cameras, in another format; returns lines for the user.
@@ -89,15 +92,15 @@ def _written(gaussians: Gaussians, stored: StoredRun | None, target: Path, kind:
 
 
 def _changes(target: Path, gaussians: Gaussians) -> list[str]:
-    """Return a line on what the format changed, from the file itself."""
+    """Return a line on what the format rounded, from the file itself; none for what float32 rounds."""
     back = read_gaussians(target)
     moved = float((back.means.double() - gaussians.means.double()).abs().max())
     scales = (back.log_scales.double() - gaussians.log_scales.double()).abs().amax(1)
-    clamped = int((scales > 0.1).sum())
-    if moved == 0 and not scales.any():
+    if moved == 0 and float(scales.max()) < ROUNDING:
         return []
+    other = int((scales > 0.1).sum())
     text = f"rounded by the format: positions by at most {moved:.2g} of the scene's units"
-    return [text + (f"; {clamped:,} Gaussians are of another size by more than a tenth" if clamped else "")]
+    return [text + (f"; {other:,} Gaussians have an axis that is off by more than a tenth" if other else "")]
 
 
 def _check_for_cameras(filters: Filters) -> None:
