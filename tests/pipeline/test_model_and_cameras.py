@@ -132,7 +132,8 @@ def test_render_of_a_file(tmp_path):
     write_cameras(tmp_path / "cameras.json", make_cameras())
     out, settings = tmp_path / "out", FilmSettings(frames=1)
     lines = render(tmp_path / "a.spz", "views", out, settings, "cpu", file_of=(tmp_path / "cameras.json", None))
-    assert any("cut-offs of inria" in line for line in lines) and len(list(out.glob("*.png"))) == 3
+    assert any("cut-offs of inria" in line for line in lines) and any("black lies behind" in line for line in lines)
+    assert len(list(out.glob("*.png"))) == 3
     with pytest.raises(UsageError, match="has no cameras"):
         render(tmp_path / "a.spz", "views", out, settings, "cpu", file_of=(None, None))
     with pytest.raises(UsageError, match="--rule other"):

@@ -139,6 +139,7 @@ def render(
         stored = open_run(folder, device_name)
     else:
         stored, notes = open_file(folder, *file_of, device_name)
+        notes += ["black lies behind the Gaussians; --background gives another colour"] if color is None else []
     tell = Stages()
     settings = replace(settings, background=color)
     plan = plan_film(stored, path, settings)

@@ -83,6 +83,9 @@ def _written(gaussians: Gaussians, stored: StoredRun | None, target: Path, kind:
     if kind.max_degree < gaussians.sh_degree:
         lines.append(f"harmonics above degree {kind.max_degree} are left out, {kind.name} holds none")
         gaussians = limit_degree(gaussians, kind.max_degree)
+    if stored is not None and any(stored.background):
+        color = "".join(f"{round(255 * v):02x}" for v in stored.background)
+        lines.append(f"the file does not hold the colour behind the scene, which was #{color} in the fit")
     if kind.sorted:
         gaussians = select(gaussians, torch.argsort(morton_codes(gaussians.means), stable=True))
     with hold_folder(target.parent) as notes:
