@@ -40,6 +40,7 @@ from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.views import Kind, TrainingView, half_size, stack_views
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.device_memory import available_bytes, is_out_of_memory, no_memory_message
+from warpgs.runtime.terminal import Detail
 from warpgs.scene import Gaussians, PointCloud, Prior, View
 
 
@@ -376,7 +377,7 @@ class Trainer:
         check_state(tensors, plain, views=len(self.views), steps=self.phases.planned, strategy=self.strategy.STATE)
         self.step, self.order = plain["step"], list(plain["order"])
         self.phases = dataclasses.replace(self.phases, stable_start=plain["stable_start"], steps=plain["steps"])
-        self.extent, self.notes = plain["extent"], plain["notes"]
+        self.extent, self.notes = plain["extent"], [*map(Detail, plain["notes"])]  # they were shown when the fit began
         self.table.load(tensors)
         self.view_table.load({n.removeprefix("views."): t for n, t in tensors.items() if n.startswith("views.")})
         self.strategy.load(tensors, plain["strategy"])
