@@ -18,7 +18,7 @@ STAGE_INTERVAL = 5.0
 SMOOTHING = 0.05
 """Weight of the newest value in the running means shown."""
 COUNTED = re.compile(r"(?P<done>[\d,]+) of (?P<total>[\d,]+)")
-"""What a line on a stage says of how far it is."""
+"""Part of a line that says how far a stage is."""
 
 
 def duration(seconds: float) -> str:

@@ -32,7 +32,7 @@ from warpgs.pipeline.runs.rig import up_of
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.report.curve import curve
 from warpgs.report.events import read_events
-from warpgs.report.images import depth_map, error_map, png, side_by_side
+from warpgs.report.images import depth_map, error_map, png, side_by_side, webp
 from warpgs.report.overview import render_overview
 from warpgs.report.page import SamplingReport, ViewImages, write_page
 from warpgs.report.progress import duration
@@ -41,7 +41,7 @@ from warpgs.runtime.terminal import counted
 from warpgs.scene import Gaussians, Scene, View
 
 Overview = tuple[bytes | None, str]
-"""Image of the 3D overview and an empty text, or None and the reason."""
+"""PNG of the 3D overview and an empty text, or None and the reason."""
 LABELS = {
     "psnr": "PSNR [dB]", "psnr_whole": "PSNR, whole image [dB]", "psnr_foreground": "PSNR, foreground [dB]",
     "alpha_empty": "alpha where empty", "alpha_object": "alpha in the object",
@@ -50,6 +50,8 @@ LABELS = {
     "lpips_alex_legacy": "LPIPS-Alex [0, 1]", "lpips_alex_standard": "LPIPS-Alex [-1, 1]", "lpips": "LPIPS",
 }  # fmt: skip
 """Names of scores for people."""
+BASELINES = {"mean_photo": "the mean photograph", "nearest_photo": "the nearest photograph"}
+"""Images that are scored without a fit, for people."""
 SHOWN_VIEWS = 6
 """Held-out views with images in the report; all have files in the run folder."""
 RENDER_WORKERS = 4
@@ -81,7 +83,7 @@ def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
         out: The run folder, or None.
     """
     if metrics["test"]:
-        best = ", ".join(f"the {name.replace('_', ' ')} {value:.2f} dB" for name, value in metrics["baselines"].items())
+        best = ", ".join(f"{BASELINES.get(name, name)} {value:.2f} dB" for name, value in metrics["baselines"].items())
         lines = [
             f"held-out {score_line(metrics['test'])} over {len(metrics['views'])} views",
             *([f"  for comparison, without a fit: {best}"] if best else []),
@@ -96,11 +98,13 @@ def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
     if out is None:
         return [*lines, "no folder was asked for, so nothing is written"]
     run = shlex.quote(str(out))
-    return [
-        *lines, f"report: {out / 'report.html'}", "next:",
-        f"  warpgs view {run}   looks at it in a browser", f"  warpgs render {run}   makes a film",
-        f"  warpgs export {run} --to scene.html   writes one file to send to a friend",
-    ]  # fmt: skip
+    commands = {
+        f"warpgs view {run}": "to look around in a browser", f"warpgs render {run}": "for a film",
+        f"warpgs export {run} --to scene.html": "for one file that opens anywhere",
+    }  # fmt: skip
+    width = max(map(len, commands))
+    following = [f"  {command:<{width}}  {purpose}" for command, purpose in commands.items()]
+    return [*lines, f"report: {out / 'report.html'}", "next:", *following]
 
 
 def protocol_of(scene: Scene, spec: str | None, downscale: int, train: list[View], test: list[View]) -> dict[str, Any]:
@@ -191,7 +195,7 @@ def _images(
             region = f", over {row['region']}" if row and row["region"] != "all" else ""
             caption = f"PSNR {row['psnr']:.2f} dB{region}, SSIM {row['ssim']:.3f}" if row else "training view"
             parts = (image, view.image, error_map(image, view.image), depth_map(depth, alpha))
-            result.append((view.name, caption, render_workers.map(png, parts)))
+            result.append((view.name, caption, render_workers.map(webp, parts)))
     return [ViewImages(name, caption, *parts) for name, caption, parts in result]
 
 
@@ -219,9 +223,8 @@ def _figures(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     return [
         *held_out,
         ("training PSNR", f"{metrics['train']['psnr']:.2f} dB"), ("Gaussians", f"{metrics['gaussians']:,}"),
-        ("mean SH degree", f"{metrics['complexity']['mean_degree']:.2f}"),
         ("model", format_bytes(metrics["complexity"]["bytes"])),
-        ("steps", f"{metrics['steps']:,}"), ("time", f"{metrics['seconds']['total']:.0f} s"),
+        ("steps", f"{metrics['steps']:,}"), ("time", duration(metrics["seconds"]["total"])),
     ]  # fmt: skip
 
 
@@ -284,6 +287,7 @@ def write_report(
         subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
         f"{camera.width} x {camera.height} px, {metrics['device']}",
         figures=_figures(metrics), notes=notes, table=table, views=images, curves=curves, sampling=sampling,
-        overview=image, details={k: v for k, v in record.items() if k != "cameras"}, protocol=_protocol(metrics),
+        overview=None if image is None else webp(image), held_out=bool(test),
+        details={k: v for k, v in record.items() if k != "cameras"}, protocol=_protocol(metrics),
         coverage=covered,
     )  # fmt: skip
