@@ -155,12 +155,14 @@ class Progress:
     def __enter__(self) -> Progress:
         """Start the display."""
         if self.live:
+            from rich.console import Console
             from rich.live import Live
             from rich.spinner import Spinner
 
             _STATUS.clear()
             self.spinner = Spinner("dots" if (sys.stdout.encoding or "").lower().startswith("utf") else "line")
-            self.display = Live(get_renderable=self._panel, refresh_per_second=8, redirect_stderr=sys.stderr.isatty())
+            own = sys.stderr.isatty()
+            self.display = Live(console=Console(), get_renderable=self._panel, refresh_per_second=8, redirect_stderr=own)
             self.display.__enter__()
             _PANELS.append(self)
         return self
