@@ -3,8 +3,8 @@
 usage: python -m bench.silence [--photos FOLDER] [--scene FOLDER] [--only NAME ...] [--out FILE.json]
 Each command runs in a terminal of its own (a pty of 100 x 30 characters). A silence ends when text is written that is not
 what was last written there, so that a frame drawn again without a change is none. The demo scene is fitted with 12 training
-views, first with an empty kernel cache. `--scene` adds a fit of a scene of one's own with the preset quick, `--photos` finds
-the poses of the photographs in a folder.
+views by the preset quick and an empty kernel cache. `--photos` finds the poses of the photographs in a folder, `--scene`
+adds a fit of a scene of one's own.
 """
 
 from __future__ import annotations
@@ -91,17 +91,16 @@ def watch(command: list[str], folder: Path, environment: dict[str, str]) -> dict
 
 def commands(photos: Path | None, scene: Path | None) -> dict[str, list[str]]:
     """Return the commands by name, in the order in which they need each other's results."""
-    fit = ["fit", "demo", "--split", "every:2", "--out"]
+    fit = ["fit", "demo", "--split", "every:2", "--preset", "quick", "--out", "run"]
     found = {
         "help": ["--help"], "fit help": ["fit", "--help"], "doctor": ["doctor"], "demo": ["demo", "demo"],
-        "fit, empty kernel cache": [*fit, "run-cold", "--preset", "quick"], "fit": [*fit, "run"],
-        "eval": ["eval", "run"], "render": ["render", "run"], "export": ["export", "run", "--to", "scene.html"],
+        "fit, empty kernel cache": fit, "eval": ["eval", "run"], "render": ["render", "run"], "export": ["export", "run", "--to", "scene.html"],
         "mesh": ["mesh", "run", "--out", "mesh.ply"], "plot": ["plot", "run"], "prune": ["prune", "run"],
     }  # fmt: skip
-    if scene is not None:
-        found[f"fit {scene.name}"] = ["fit", str(scene.resolve()), "--preset", "quick", "--out", "run-scene"]
     if photos is not None:
         found["poses"] = ["poses", str(photos.resolve()), "--out", "posed"]
+    if scene is not None:
+        found[f"fit {scene.name}"] = ["fit", str(scene.resolve()), "--preset", "quick", "--out", "run-scene"]
     return found
 
 

@@ -90,7 +90,7 @@ def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
             f"  {metrics['coverage']['summary']}",
         ]
     else:
-        lines = [f"training PSNR {metrics['train']['psnr']:.2f} dB; {NO_SCORES}"]
+        lines = [NO_SCORES, f"training PSNR {metrics['train']['psnr']:.2f} dB"]
     compiling = metrics["seconds"].get("compiling", 0.0)
     once = f", {duration(compiling)} of it for kernels, once on this machine" if compiling >= 1 else ""
     size = format_bytes(metrics["complexity"]["bytes"])
