@@ -94,8 +94,8 @@ def commands(photos: Path | None, scene: Path | None) -> dict[str, list[str]]:
     fit = ["fit", "demo", "--split", "every:2", "--preset", "quick", "--out", "run"]
     found = {
         "help": ["--help"], "fit help": ["fit", "--help"], "doctor": ["doctor"], "demo": ["demo", "demo"],
-        "fit, empty kernel cache": fit, "eval": ["eval", "run"], "render": ["render", "run"], "export": ["export", "run", "--to", "scene.html"],
-        "mesh": ["mesh", "run", "--out", "mesh.ply"], "plot": ["plot", "run"], "prune": ["prune", "run"],
+        "fit, empty kernel cache": fit, "eval": ["eval", "run"], "render": ["render", "run"],
+        "export": ["export", "run", "--to", "scene.html"], "mesh": ["mesh", "run", "--out", "mesh.ply"], "plot": ["plot", "run"], "prune": ["prune", "run"],
     }  # fmt: skip
     if photos is not None:
         found["poses"] = ["poses", str(photos.resolve()), "--out", "posed"]
