@@ -93,10 +93,18 @@ def commands(photos: Path | None, scene: Path | None) -> dict[str, list[str]]:
     """Return the commands by name, in the order in which they need each other's results."""
     fit = ["fit", "demo", "--split", "every:2", "--preset", "quick", "--out", "run"]
     found = {
-        "help": ["--help"], "fit help": ["fit", "--help"], "doctor": ["doctor"], "demo": ["demo", "demo"],
-        "fit, empty kernel cache": fit, "eval": ["eval", "run"], "render": ["render", "run"],
-        "export": ["export", "run", "--to", "scene.html"], "mesh": ["mesh", "run", "--out", "mesh.ply"], "plot": ["plot", "run"], "prune": ["prune", "run"],
-    }  # fmt: skip
+        "help": ["--help"],
+        "fit help": ["fit", "--help"],
+        "doctor": ["doctor"],
+        "demo": ["demo", "demo"],
+        "fit, empty kernel cache": fit,
+        "eval": ["eval", "run"],
+        "render": ["render", "run"],
+        "export": ["export", "run", "--to", "scene.html"],
+        "mesh": ["mesh", "run", "--out", "mesh.ply"],
+        "plot": ["plot", "run"],
+        "prune": ["prune", "run"],
+    }
     if photos is not None:
         found["poses"] = ["poses", str(photos.resolve()), "--out", "posed"]
     if scene is not None:
