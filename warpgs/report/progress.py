@@ -57,6 +57,7 @@ class _StatusLine:
                 if self.task is not None:
                     self.display.remove_task(self.task)
                 self.task, self.stage = self.display.add_task(stage, total=total, completed=done, detail=detail), stage
+                self.display.refresh()  # before work that may hold up the thread which draws
             else:
                 self.display.update(self.task, total=total, completed=done, detail=detail)
 
