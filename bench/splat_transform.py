@@ -97,7 +97,7 @@ class Tool:
 
     def _run(self, *words: str) -> str:
         done = subprocess.run([*self.words, *words], check=True, capture_output=True, text=True)
-        return done.stdout
+        return done.stdout or done.stderr
 
     def statistics(self, file: Path) -> tuple[int, dict[str, list[float]]]:
         """Return the number of Gaussians and the statistics of each column that it reads of a file."""
