@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import pytest
 import torch
 
-from bench import document, harness, inputs, peers, predict, result_file
+from bench import document, harness, inputs, measured, peers, predict, result_file
 from bench.ops import OPS, Bench, run
 from bench.points import Point, growth, points
 from bench.series import exponent
@@ -217,3 +217,9 @@ def test_the_document_is_that_of_the_committed_results():
     for path, text in files.items():
         assert (docs / path).read_text("utf-8") == text, f"{path} is stale: run python -m bench.document"
     assert {f"plots/{p.name}" for p in (docs / "plots").glob("*.svg")} == set(files) - {"performance.md"}
+
+
+def test_the_page_of_measured_figures_is_that_of_the_committed_results():
+    """docs/measured.md is what `python -m bench.measured` writes."""
+    text = (result_file.ROOT / measured.PAGE).read_text("utf-8")
+    assert text == measured.page(), "stale: run python -m bench.measured"
