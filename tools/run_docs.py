@@ -252,10 +252,10 @@ def main(arguments: list[str]) -> int:
         for page in arguments or pages():
             ran, wrong, rest = run_page(page, made, programs)
             if ran or rest:
-                print(f"{page}: {ran} blocks ran, {len(wrong)} failed, {len(rest)} left out", flush=True)
+                print(f"{page}: {ran} blocks ran, {len(wrong)} failed, {len(rest)} left out", *wrong, sep="\n", flush=True)
             failed += wrong
             left += rest
-    print("\n".join(["", "left out:", *left, *(["", "failed:"] if failed else []), *failed]))
+    print("\n".join(["", "left out:", *left, "", f"{len(failed)} blocks failed"]))
     return int(bool(failed))
 
 
