@@ -131,7 +131,8 @@ def main_of_warpgs(words: list[str]) -> int:
     if words[:1] != ["view"] or "--help" in words:
         return subprocess.run(command, check=False).returncode
     with tempfile.TemporaryFile("w+", encoding="utf-8") as output:
-        process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
+        plain = {**os.environ, "PYTHONUNBUFFERED": "1"}  # a file is no terminal: lines would stay in a buffer
+        process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=plain)
         told = False
         try:
             for _ in range(10 * VIEWER_TIME):
