@@ -22,7 +22,8 @@ from warpgs.pipeline.model.filters import (
     rotate,
     rotation_about,
 )
-from warpgs.pipeline.runs.share import Filters, convert
+from warpgs.pipeline.runs.share import convert
+from warpgs.pipeline.runs.share_filters import Filters
 
 TURN = rotation_about(np.array([1.0, -2.0, 0.5]), 1.1)
 
@@ -121,6 +122,23 @@ def test_convert_says_what_it_did(tmp_path):
     with pytest.raises(DataError, match="no Gaussian is left"):
         convert(tmp_path / "a.ply", tmp_path / "f.glb", Filters(crop="90,90,90,91,91,91"))
     assert not (tmp_path / "f.glb").exists()
+
+
+def test_boxes_of_files(tmp_path):
+    """As the viewer saves them; the box is in the units of the source, whatever the rotation."""
+    made, path = cloud(100), tmp_path / "crop.json"
+    path.write_text('{"center": [1, 0, 4], "size": [2, 4, 4]}')
+    assert box_of(str(path)) == box_of('{"center": [1, 0, 4], "size": [2, 4, 4]}')
+    write_gaussians(tmp_path / "a.ply", made, units="file")
+    lines = convert(tmp_path / "a.ply", tmp_path / "b.ply", Filters(crop=str(path), rotate="0,0,1,180"))
+    assert f"{int((made.means[:, 0] < 0).sum())} Gaussians lie outside" in lines[0]
+    assert float(read_gaussians(tmp_path / "b.ply").means[:, 0].max()) <= 0
+    for text, match in (("[1, 2]", "no JSON object"), ('{"center": 1}', "center takes 3"), (" " * 70000, "no JSON object")):
+        path.write_text(text)
+        with pytest.raises(DataError, match=match):
+            box_of(str(path))
+    with pytest.raises(DataError, match="cannot be read as a box"):
+        box_of(str(tmp_path / "none.json"))
 
 
 @pytest.mark.parametrize("wish,match", [("level", "cameras of a run"), ("0,0,0,9", "no length"), ("1,2", "x,y,z,degrees")])
