@@ -204,7 +204,7 @@ def write_program(folder: Path) -> None:
 
 def prepare(folder: Path, code: str, made: Path) -> None:
     """Put into the folder of a page what its blocks use and do not make."""
-    own = {word.strip("'\"").rstrip("/") for word in re.findall(r"(?:warpgs demo|--out)[ =](\S+)", code)}
+    own = {word.strip("'\"),").rstrip("/") for word in re.findall(r"(?:warpgs demo |--out[ =]|out=)(\S+)", code)}
     for name in INPUTS:
         if name not in own and re.search(rf"(?<![\w./-]){re.escape(name)}\b", code):
             source = ROOT / name if name == "examples" else made / name
