@@ -9,7 +9,7 @@ import numpy as np
 from warpgs.constants import RULES
 from warpgs.coordinates import convert_camera
 from warpgs.errors import UsageError
-from warpgs.export.formats import read_gaussians
+from warpgs.export.formats import format_of, read_gaussians
 from warpgs.io.camera_files import colmap_folder, read_cameras
 from warpgs.io.load import load_scene
 from warpgs.pipeline.runs.model_file import FittedModel
@@ -51,6 +51,7 @@ def open_file(
     normalization = Normalization(np.mean([c.center for c in found.values()], axis=0))
     gaussians = read_gaussians(path, normalization, units="scene")
     gaussians = Gaussians(**{name: t.to(where) for name, t in gaussians.tensors().items()})
+    notes += [note] if (note := format_of(path).note) else []
     if rule is None:
         notes.append(f"rendered by the cut-offs of {RULE}; --rule gsplat suits models of gsplat and nerfstudio")
     in_scene = {name: convert_camera(c, normalization, "file", "scene") for name, c in found.items()}
