@@ -91,10 +91,11 @@ def objects() -> str:
         rows = [r for r in result["rows"] if r["format"] == form]
         psnr, alpha, empty = (statistics.mean(r[k] for r in rows) for k in ("psnr_white", "alpha_object", "alpha_empty"))
         text.append(f"{psnr:.2f} dB over white, alpha {alpha:.4f} in the object and {empty:.4f} outside ({form})")
+    count, listed = len({r["object"] for r in result["rows"]}), ";\n".join(text)
     return f"""## Objects cut out
 
-{len({r["object"] for r in result["rows"]})} synthetic objects of `warpgs demo --object`, 8 training views of 400 x
-400 px, one fit each: {"; ".join(text)}. {_where(result)}.
+{count} synthetic objects of `warpgs demo --object`, 8 training views of 400 x 400 px, one fit each ({_where(result)}):
+{listed}.
 """
 
 
