@@ -83,32 +83,36 @@ class LocalEngine:
     name = "local"
 
     def __init__(self, slots: list[Slot]):
-        """Start one process, and compile kernels there once for all.
-
-        Raises:
-            ResourceError: That process dies.
-        """
+        """Prepare the slots; processes start with the first job."""
         self.slots = len(slots)
         self._free = list(reversed(slots))
         self._idle: list[_Process] = []
         self._busy: dict[str, _Process] = {}
         self._news: queue.SimpleQueue[tuple[_Process, str | None]] = queue.SimpleQueue()
-        first = _Process(self._free.pop(), self._news)
-        every = slots[0].device != "cpu" and self.slots > 1
-        compiler = _Process(Slot(slots[0].device, 1), self._news) if every else first
+        self._compiled = False
+
+    def _prepare(self) -> None:
+        """Compile kernels once for all, in a process that sees all devices."""
+        self._compiled = True
+        slot = self._free[-1]
+        alone = self.slots == 1 or slot.device == "cpu"  # that process can serve its slot afterwards
+        process = _Process(self._free.pop() if alone else Slot(slot.device, slot.threads), self._news)
         try:
-            self._compile(compiler, slots[0].device)
+            self._compile(process, slot.device)
         except BaseException:
-            compiler.worker.end(0)
-            first.worker.end(0)
+            process.worker.end(0)
             raise
-        if every:
-            compiler.worker.end(SECONDS_TO_SAVE)
-            self._news.get()  # its end
-        self._idle.append(first)
+        if alone:
+            self._idle.append(process)
+        else:
+            process.worker.end(SECONDS_TO_SAVE)
 
     def _compile(self, process: _Process, device: str) -> None:
-        """Compile kernels of all devices that a process sees."""
+        """Compile kernels of all devices that a process sees.
+
+        Raises:
+            ResourceError: It dies.
+        """
         process.worker.send(json.dumps({"kernels": device}))
         _, line = self._news.get()
         if line is None or json.loads(line).get("state") != "done":
@@ -123,7 +127,13 @@ class LocalEngine:
         return {name: process.worker.number for name, process in self._busy.items()}
 
     def start(self, job: FarmJob) -> None:
-        """Start a job in an idle process, or in a new one."""
+        """Start a job in an idle process, or in a new one; before the first, kernels are compiled.
+
+        Raises:
+            ResourceError: They cannot be.
+        """
+        if not self._compiled:
+            self._prepare()
         process = self._idle.pop() if self._idle else _Process(self._free.pop(), self._news)
         process.job = job.name
         self._busy[job.name] = process
