@@ -1,4 +1,4 @@
-"""Exposures of training views: the map and its gradients, a fit of photographs that differ in brightness, runs that keep them."""
+"""Exposures of training views: the map and its gradients, fits of photographs that differ in brightness, their run folders."""
 
 import dataclasses
 import json
@@ -54,10 +54,10 @@ def test_photographs_of_many_exposures_make_one_model(tmp_path):
         warpgs.fit(scene, dataclasses.replace(config, exposure=e), split=split, device="cpu", verbose=False)
         for e in (False, True)
     )
-    assert found.metrics["test"]["psnr"] > plain.metrics["test"]["psnr"] + 1
+    assert found.metrics["test"]["psnr"] > plain.metrics["test"]["psnr"] + 0.5
     figures = found.metrics["exposure"]
     made = gains[::2, 0, 0].mean(-1) / gains[::2].mean()
-    np.testing.assert_allclose([r["gain"] for r in figures["views"]], made, atol=0.1)
+    np.testing.assert_allclose([r["gain"] for r in figures["views"]], made, atol=0.05)
 
 
 def fitted(views, steps, config):
