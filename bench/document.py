@@ -27,10 +27,10 @@ python -m bench.ops --out bench/results/ops_MACHINE.json   # CUDA where there is
 python -m bench.document
 ```
 
-Times are wall times in ms of one call with its inputs loaded, from an idle device to an idle device: the median, and in
-brackets the quartiles. Programs that are compared run in turn, one repeat each, unless one is over 30 times slower. `both`
-is forward and backward together, `step` a training step: rendering, loss, backward pass, Adam. A star marks figures during
-which other programs kept more than 0.2 cores busy, also on a second try.
+Times are wall times in ms of one call with its inputs loaded, from an idle device to an idle device: the median, whose
+quartiles stand in the results. Programs that are compared run in turn, one repeat each, unless one is over 30 times slower.
+`both` is forward and backward together, `step` a training step: rendering, loss, backward pass, Adam. A star marks figures
+during which other programs kept more than 0.2 cores busy, also on a second try.
 
 The scene is a random cloud whose Gaussians shrink as their number grows, rendered under rule `exact`. One size varies at a time
 around 100,000 Gaussians, 504 x 378 px, degree 3, one camera; a few points let Gaussians and image grow together. The tables
@@ -79,9 +79,7 @@ def _key(row: dict) -> tuple:
 def _timing(row: dict | None) -> str:
     if row is None:
         return ""
-    low, high = row["quartiles_ms"]
-    star = "*" if row.get("others_cores", 0.0) > DISTURBED else ""
-    return f"{figure(row['median_ms'])}{star} ({figure(low)} to {figure(high)})"
+    return figure(row["median_ms"]) + ("*" if row.get("others_cores", 0.0) > DISTURBED else "")
 
 
 def _name(program: str, direction: str) -> str:
@@ -124,28 +122,25 @@ def _device(row: dict | None) -> str:
 
 
 def peer_table(rows: list[dict]) -> str:
-    """A size of the tables and the largest at which another program did the same work."""
+    """The largest size at which another program did the same work."""
     ours = {(r["op"], r["direction"], _key(r)): r for r in rows if r["program"] == OURS}
     peers = [r for r in rows if r["program"] != OURS and (r["op"], r["direction"], _key(r)) in ours]
     columns, body = _columns(peers), []
     for op, program, direction in sorted(tasks(peers), key=lambda t: (t[0], t[2], t[1])):
-        own = sorted((r for r in peers if (r["op"], r["program"], r["direction"]) == (op, program, direction)), key=_key)
-        for r in {_key(r): r for r in [*_shown(own)[:1], own[-1]]}.values():
-            mine = ours[r["op"], r["direction"], _key(r)]
-            ratio = figure(r["median_ms"] / mine["median_ms"])
-            body.append([op, direction, *_sizes(r, columns), program, _timing(r), _timing(mine), ratio])
+        r = max((r for r in peers if (r["op"], r["program"], r["direction"]) == (op, program, direction)), key=_key)
+        mine = ours[r["op"], r["direction"], _key(r)]
+        ratio = figure(r["median_ms"] / mine["median_ms"])
+        body.append([op, direction, *_sizes(r, columns), program, _timing(r), _timing(mine), ratio])
     return table(["op", "direction", *columns, "peer", "peer [ms]", "warpgs [ms]", "peer / warpgs"], body) if body else ""
 
 
 def roof_table(rows: list[dict]) -> str:
-    """Our own tasks against the roof: at the base point, and where each was measured at its heaviest."""
+    """Our own tasks against the roof, where each was measured at its heaviest."""
     body = []
     for op, program, direction in tasks(rows):
         own = [r for r in rows if (r["op"], r["program"], r["direction"]) == (op, program, direction) and "roof_ms" in r]
-        base = {**BASE.sizes(("count", "image", "degree", "cameras"))}
-        chosen = [r for r in own if all(r[s] == base[s] for s in base if s in r)]
-        chosen += sorted(own, key=lambda r: r["roof_ms"])[-1:]
-        for r in {_key(r): r for r in chosen}.values():
+        if own:
+            r = max(own, key=lambda r: r["roof_ms"])
             cells = [op, direction, *_sizes(r, ["N", "image", "degree", "cameras"])]
             cells += [figure(r["bytes"] / 1e6), figure(r["operations"] / 1e6), figure(r["roof_ms"]), r["bound"]]
             body.append([*cells, figure(r.get("gpu_ms", r["median_ms"])), f"{figure(100 * r['fraction'])} %"])

@@ -117,16 +117,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--photos", type=Path)
     parser.add_argument("--scene", type=Path)
-    parser.add_argument("--only", nargs="+")
+    parser.add_argument("--only", nargs="+", help="names of commands; rows of the others stay in --out as they are")
     parser.add_argument("--folder", type=Path, help="work here, and keep what is written; a temporary folder where not given")
     parser.add_argument("--out", type=Path)
     a = parser.parse_args()
-    rows = []
+    again = commands(a.photos, a.scene).keys() & (a.only or commands(a.photos, a.scene))
+    kept = result_file.read(a.out)["rows"] if a.only and a.out is not None and a.out.is_file() else []
+    rows = [r for r in kept if r["name"] not in again]
     with tempfile.TemporaryDirectory() as temporary:
         folder = a.folder or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
         for name, words in commands(a.photos, a.scene).items():
-            if a.only and name not in a.only:
+            if name not in again:
                 continue
             own = {"WARP_CACHE_PATH": f"{temporary}/kernels"} if "empty" in name else {}
             load = os.getloadavg()[0]

@@ -74,7 +74,7 @@ def statistics(gaussians: Gaussians, axes: bool = False) -> dict[str, list[float
 def difference(ours: dict[str, list[float]], theirs: dict[str, list[float]]) -> dict:
     """Return the largest difference of two statistics in parts of the range of its column, and where it is."""
     worst = {"largest_of_range": 0.0, "column": "", "columns": len(ours), "same_columns": set(ours) <= set(theirs)}
-    for name in ours.keys() & theirs.keys():
+    for name in (n for n in ours if n in theirs):
         low, high = ours[name][:2]
         for which, a, b in zip(STATISTICS, ours[name], theirs[name]):
             found = abs(a - b) / (high - low if high > low else max(abs(low), 1e-30))
@@ -97,7 +97,7 @@ class Tool:
 
     def _run(self, *words: str) -> str:
         done = subprocess.run([*self.words, *words], check=True, capture_output=True, text=True)
-        return done.stdout
+        return done.stdout or done.stderr
 
     def statistics(self, file: Path) -> tuple[int, dict[str, list[float]]]:
         """Return the number of Gaussians and the statistics of each column that it reads of a file."""

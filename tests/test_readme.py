@@ -33,7 +33,7 @@ def test_the_example_fits_a_scene(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(PRESETS, "quick", dataclasses.replace(PRESETS["quick"], steps=5))
     exec(compile(snippets("README.md")[0], "README.md", "exec"), {})
-    ours, runs = (read_ply(tmp_path / name) for name in ("model.ply", "run/point_cloud.ply"))
+    ours, runs = (read_ply(tmp_path / name) for name in ("model.ply", "fitted/point_cloud.ply"))
     assert torch.equal(ours.means, runs.means)
 
 

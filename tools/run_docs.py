@@ -131,7 +131,9 @@ def main_of_warpgs(words: list[str]) -> int:
     if words[:1] != ["view"] or "--help" in words:
         return subprocess.run(command, check=False).returncode
     with tempfile.TemporaryFile("w+", encoding="utf-8") as output:
-        process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
+        plain = {**os.environ, "PYTHONUNBUFFERED": "1"}  # a file is no terminal: lines would stay in a buffer
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background would ignore it, and its children
+        process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=plain)
         told = False
         try:
             for _ in range(10 * VIEWER_TIME):
@@ -203,7 +205,7 @@ def write_program(folder: Path) -> None:
 
 def prepare(folder: Path, code: str, made: Path) -> None:
     """Put into the folder of a page what its blocks use and do not make."""
-    own = {word.strip("'\"").rstrip("/") for word in re.findall(r"(?:warpgs demo|--out)[ =](\S+)", code)}
+    own = {word.strip("'\"),").rstrip("/") for word in re.findall(r"(?:warpgs demo |--out[ =]|out=)(\S+)", code)}
     for name in INPUTS:
         if name not in own and re.search(rf"(?<![\w./-]){re.escape(name)}\b", code):
             source = ROOT / name if name == "examples" else made / name
@@ -252,10 +254,10 @@ def main(arguments: list[str]) -> int:
         for page in arguments or pages():
             ran, wrong, rest = run_page(page, made, programs)
             if ran or rest:
-                print(f"{page}: {ran} blocks ran, {len(wrong)} failed, {len(rest)} left out", flush=True)
+                print(f"{page}: {ran} blocks ran, {len(wrong)} failed, {len(rest)} left out", *wrong, sep="\n", flush=True)
             failed += wrong
             left += rest
-    print("\n".join(["", "left out:", *left, *(["", "failed:"] if failed else []), *failed]))
+    print("\n".join(["", "left out:", *left, "", f"{len(failed)} blocks failed"]))
     return int(bool(failed))
 
 

@@ -114,6 +114,7 @@ def test_in_a_terminal_a_stage_has_one_line_with_a_bar(terminal):
         for view in counted(range(3), stages, "scoring", "views"):
             assert view in range(3)
         say("a note")
+        assert Stages().live  # what stands before stdout now is still a terminal
         stages("reading fern: image 12")
     text = out.getvalue()
     assert "scoring" in text and "0 of 3 views" in text and "a note\n" in text and "image 12" in text

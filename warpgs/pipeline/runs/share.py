@@ -47,10 +47,10 @@ def convert(source: Path, target: Path, filters: Filters = NO_FILTERS) -> list[s
         _check_for_cameras(filters)
         found, notes = read_cameras(source)
         return [*notes, *_cameras_written(list(found.values()), list(found.values()), target, filters)]
-    kind = format_of(target)
-    format_of(source)
+    kind, read = format_of(target), format_of(source)
     rotation_of(filters.rotate, None)  # before anything is read
-    return _written(read_gaussians(source), None, target, kind, filters)
+    lines = _written(read_gaussians(source), None, target, kind, filters)
+    return [read.note, *lines] if read.note and not kind.note else lines
 
 
 def export(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> list[str]:
@@ -91,6 +91,7 @@ def _written(gaussians: Gaussians, stored: StoredRun | None, target: Path, kind:
     with hold_folder(target.parent) as notes:
         write_gaussians(target, gaussians, units="file")
     lines += _changes(target, gaussians) if kind.encode is not None else []
+    lines += [kind.note] if kind.note else []
     return [*notes, *lines, f"{len(gaussians):,} Gaussians in {target}, {target.stat().st_size / 2**20:.2f} MiB"]
 
 
