@@ -69,15 +69,7 @@ def _places(request: StudyRequest) -> list[Place]:
             wanted, split = dataclasses.replace(wanted, split=spec), split_views(scene, spec)
         if not split.test:
             raise DataError(f"{wanted.path}: no view is held out, so there is nothing to compare; choose another --split")
-        places.append(
-            Place(
-                scene_name(wanted),
-                wanted,
-                scene.fingerprint,
-                split,
-                *(train_views(scene, n) for n in (split.train, split.test)),
-            )
-        )
+        places.append(Place(scene_name(wanted), wanted, scene.fingerprint, split, *(train_views(scene, n) for n in (split.train, split.test))))
     return places
 
 
@@ -94,12 +86,7 @@ def _run_all(request: StudyRequest, places: list[Place], device: torch.device, l
                     request.device, lpips_weights=request.lpips_weights,
                 )  # fmt: skip
                 outcome = ensure_run(
-                    fit,
-                    place.fingerprint,
-                    place.split,
-                    device.type,
-                    lpips,
-                    settings_by_views(fit.config, place.train, device.type)[0],
+                    fit, place.fingerprint, place.split, device.type, lpips, settings_by_views(fit.config, place.train, device.type)[0]
                 )
                 if outcome.state != "fitted":
                     say(f"  {outcome.state}{': ' if outcome.note else ''}{outcome.note}")
