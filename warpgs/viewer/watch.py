@@ -52,8 +52,9 @@ def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None 
     if path.is_dir():
         read_record(path)
     elif not path.name.lower().endswith(tuple(FORMATS)) or not path.is_file():
+        known = ", ".join(FORMATS)
         raise DataError(
-            f"{path}: is neither a run folder ({CONFIG} in it) nor a file of Gaussians ({', '.join(FORMATS)}); give one of these"
+            f"{path}: is neither a run folder ({CONFIG} in it) nor a file of Gaussians ({known}); give one of these"
         )
     require_viser()
     with contextlib.suppress(KeyboardInterrupt):
