@@ -207,6 +207,8 @@ def test_counts_beyond_the_size_are_refused(tmp_path):
     head = spz.HEADER.pack(spz.MAGIC, 3, 2**31, 3, 12, 0, 0)
     refused(tmp_path / "a.spz", gzip.compress(head + bytes(1000)), "2147483648 Gaussians in")
     refused(tmp_path / "a.spz", gzip.compress(spz.HEADER.pack(spz.MAGIC, 3, 5, 0, 12, 0, 0) + bytes(10**6)), "it has more")
+    bomb = gzip.compress(spz.HEADER.pack(spz.MAGIC, 3, 100_000, 0, 12, 0, 0) + bytes(20 * 100_000))
+    refused(tmp_path / "a.spz", bomb, f"100000 Gaussians in {len(bomb)} bytes")
     refused(tmp_path / "a.spz", gzip.compress(spz.HEADER.pack(spz.MAGIC, 3, 0, 0, 12, 1, 0)), "antialiasing")
     lines = ["ply", "format binary_little_endian 1.0", "element chunk 99999999999", "property float min_x"]
     lines += ["element vertex 1", "property uint packed_position", "end_header\n"]

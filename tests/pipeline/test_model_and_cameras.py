@@ -91,6 +91,9 @@ def test_cameras_of_colmap(tmp_path):
     scenes.write_colmap(tmp_path)
     found, _ = read_cameras(tmp_path)
     assert len(found) == 5 and list(found) == sorted(found)
+    lines = convert(tmp_path, tmp_path / "transforms.json")  # names of files may say who and where
+    assert all("photo" in name for name in found) and "5 cameras" in lines[-1]
+    assert "photo" not in (tmp_path / "transforms.json").read_text()
     for below in ("sparse", "sparse/0"):
         assert list(read_cameras(tmp_path / below)[0]) == list(found)
 
