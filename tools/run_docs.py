@@ -132,6 +132,7 @@ def main_of_warpgs(words: list[str]) -> int:
         return subprocess.run(command, check=False).returncode
     with tempfile.TemporaryFile("w+", encoding="utf-8") as output:
         plain = {**os.environ, "PYTHONUNBUFFERED": "1"}  # a file is no terminal: lines would stay in a buffer
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background would ignore it, and its children
         process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=plain)
         told = False
         try:
