@@ -15,8 +15,9 @@ import torch
 from tests.gaussians import cloud
 from warpgs.errors import DataError, UsageError
 from warpgs.export import compressed_ply, gltf, sog, splat, spz
-from warpgs.export.arrays import arrays_of, half_turn
+from warpgs.export.arrays import arrays_of, gaussians_of, half_turn
 from warpgs.export.formats import FORMATS, format_of, read_gaussians, write_gaussians
+from warpgs.geometry import rotation_matrices
 from warpgs.kernels.sh import basis
 from warpgs.scene import Normalization
 
@@ -159,6 +160,34 @@ def test_golden_files(suffix):
     made = model(n=20, degree=3, seed=5)
     for (name, difference), limit in zip(differences(made, read_gaussians(GOLDEN / f"twenty{suffix}")).items(), QUANTA[suffix]):
         assert difference <= limit, (name, difference)
+
+
+FOREIGN = {  # name of the file: limits on means, log scales, opacity, entries of rotation matrices, degree 0, the rest
+    "splat_transform.glb": (1e-6, 2e-6, 2e-7, 1e-6, 1e-6, 1e-6),
+    "splat_transform.sog": (1e-3, 2 * LOG_SPAN / 255, 1.01 / 255, 0.03, 0.02, 0.02),
+    "splat_transform.compressed.ply": (*QUANTA[".compressed.ply"][:3], 0.01, *QUANTA[".compressed.ply"][4:]),
+    "splat_transform_3.spz": (2e-4, 0.51 / 16, 0.51 / 255, 0.01, 0.51 / 38.25, 0.54 / 8),
+    "splat_transform_4.spz": (2e-4, 0.51 / 16, 0.51 / 255, 0.01, 0.51 / 38.25, 0.54 / 8),
+}
+"""Files that splat-transform 3.7.0 wrote of the same Gaussians. Its SPZ has harmonics of 4 bits above degree 1."""
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_files_of_splat_transform(name):
+    """In any order, with any quaternion of the same shape; its SPZ is in the axes of PLY."""
+    if name.endswith("4.spz"):
+        pytest.importorskip("zstandard")
+    made, back = model(n=20, degree=3, seed=5), read_gaussians(GOLDEN / name)
+    if name.endswith(".spz"):
+        back = gaussians_of(GOLDEN / name, half_turn(arrays_of(back), "x"))
+    order = torch.cdist(made.means, back.means).argmin(1)
+    assert len(back) == 20 and sorted(order.tolist()) == list(range(20))
+    back = type(back)(**{n: t[order] for n, t in back.tensors().items()})
+    found = differences(made, back)
+    axes = [rotation_matrices(torch.nn.functional.normalize(g.quats.double(), dim=1)).abs() for g in (made, back)]
+    found["rotation"] = float((axes[0] - axes[1]).abs().max())
+    for (attribute, difference), limit in zip(found.items(), FOREIGN[name]):
+        assert difference <= limit, (attribute, difference)
 
 
 # ---- strangers' files ------------------------------------------------------------------------------------------------
