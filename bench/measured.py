@@ -202,7 +202,7 @@ The demo from its default fit of {result["views"]} images, against the surfaces 
 per cent of the scene's radius. {_where(result)}.
 
 {table(["voxel", "triangles", "from mesh to surface, mean", "from seen surface to mesh, mean"], body)}
-More: [mesh](mesh.md).
+More: [mesh](mesh.md). What each file format costs: [files to send](formats.md).
 """
 
 
