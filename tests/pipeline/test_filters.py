@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests.gaussians import cloud
+from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
 from warpgs.export.formats import read_gaussians, write_gaussians
 from warpgs.geometry import rotation_matrices
@@ -149,3 +150,19 @@ def test_rotations_that_are_none(wish, match, tmp_path):
     with pytest.raises(UsageError, match=match):
         convert(tmp_path / "a.ply", tmp_path / "b.ply", Filters(rotate=wish))
     assert math.isclose(float(np.trace(rotation_about(np.array([0, 0, 2.0]), math.pi))), -1)
+
+
+@pytest.mark.parametrize(
+    "suffix,flags,count",
+    [
+        ("spz", [], 99), ("ply", [], 100), ("spz", ["--no-clean"], 100), ("ply", ["--clean"], 99),
+        ("glb", ["--crop", "-9,-9,-9,9,9,9"], 99),
+    ],
+)  # fmt: skip
+def test_files_for_strangers_are_cleaned_unless_asked_otherwise(suffix, flags, count, tmp_path):
+    made = cloud(100)
+    made.log_scales[7] = 4
+    write_gaussians(tmp_path / "a.ply", made, units="file")
+    words = ["convert", str(tmp_path / "a.ply"), str(tmp_path / f"b.{suffix}")]
+    assert main([*words, *flags]) == 0 and len(read_gaussians(tmp_path / f"b.{suffix}")) == count
+    assert main([*words, "--clean", "--no-clean"]) == UsageError.exit_code

@@ -1,6 +1,7 @@
 """Gaussians trained elsewhere render through cameras from a file."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -134,6 +135,9 @@ def test_render_of_a_file(tmp_path):
     lines = render(tmp_path / "a.spz", "views", out, settings, "cpu", file_of=(tmp_path / "cameras.json", None))
     assert any("cut-offs of inria" in line for line in lines) and any("black lies behind" in line for line in lines)
     assert len(list(out.glob("*.png"))) == 3
+    write_cameras(tmp_path / "transforms.json", [replace(c, K=1000 * c.K, width=20000, height=20000) for c in make_cameras()])
+    with pytest.raises(DataError, match="20000 x 20000 px has more than 100,000,000 pixels"):
+        render(tmp_path / "a.spz", "views", out, settings, "cpu", file_of=(tmp_path / "transforms.json", None))
     with pytest.raises(UsageError, match="has no cameras"):
         render(tmp_path / "a.spz", "views", out, settings, "cpu", file_of=(None, None))
     with pytest.raises(UsageError, match="--rule other"):

@@ -29,6 +29,7 @@ COMMANDS = {
     "compare": "fit presets to scenes with several seeds; tables and plots",
     "ablate": "fit a preset with its parts off one at a time; the same tables",
     "convert-lpips": "join LPIPS weights into the file that --lpips-weights takes",
+    "farm": "fit many scenes, on all GPUs, with Ray or on Slurm",
     "doctor": "say what this machine has, what is missing, and how to get it",
 }
 """Commands by name, in the order of the help, each with a line about it."""
@@ -38,6 +39,7 @@ GROUPS = {
     "look": ("view", "render", "plot", "priors"),
     "share": ("export", "convert", "mesh", "prune"),
     "measure": ("eval", "compare", "ablate", "convert-lpips"),
+    "many scenes": ("farm",),
     "this machine": ("doctor",),
 }
 """Names of the commands by purpose."""

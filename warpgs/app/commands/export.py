@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from warpgs.app.flags import parse_flags
+from warpgs.app.flags import either, parse_flags
 from warpgs.runtime.terminal import say
 
 
@@ -19,11 +19,12 @@ def run(arguments: list[str], about: str) -> int:
         """File to write; its suffix says the format: .ply, .compressed.ply, .splat, .spz, .sog, .glb, .gltf, or .html for a
         page that shows the model in any browser. Its cameras instead: cameras.json, transforms.json, or sparse (COLMAP)."""
         crop: str | None = None
-        """Box to keep, in units of the scene's files: six numbers (least x,y,z and largest), or JSON with center, size and
-        perhaps rotation, or the name of a .json file that holds it, such as the one that the viewer saves."""
-        clean: bool | None = None
-        """Remove what only disturbs: Gaussians that no training view sees, larger than the scene, and long needles. On where
-        not given, except for .ply."""
+        """Box to keep, in units of the scene's files: x,y,z,X,Y,Z, or a .json file such as the one that the viewer saves."""
+        clean: tyro.conf.FlagCreatePairsOff[bool] = False
+        """Remove what only disturbs: Gaussians that no training view sees, larger than the scene, and long needles. Done
+        unless the file is a .ply."""
+        no_clean: tyro.conf.FlagCreatePairsOff[bool] = False
+        """Keep these, too."""
         sh_degree: int | None = None
         """Highest degree of harmonics; 0 for colours that are the same from all sides. All where not given."""
         rotate: str | None = None
@@ -32,7 +33,7 @@ def run(arguments: list[str], about: str) -> int:
     a = parse_flags(Export, arguments, "warpgs export", about)
     from warpgs.pipeline.runs.share_filters import Filters
 
-    filters = Filters(a.crop, a.clean, a.sh_degree, a.rotate)
+    filters = Filters(a.crop, either(a, "clean"), a.sh_degree, a.rotate)
     if a.to.suffix.lower() == ".html":
         from warpgs.viewer.html import export_html
 

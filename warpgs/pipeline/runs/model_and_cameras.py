@@ -8,9 +8,10 @@ import numpy as np
 
 from warpgs.constants import RULES
 from warpgs.coordinates import convert_camera
-from warpgs.errors import UsageError
+from warpgs.errors import DataError, UsageError
 from warpgs.export.formats import format_of, read_gaussians
 from warpgs.io.camera_files import colmap_folder, read_cameras
+from warpgs.io.decoding import MAX_PIXELS
 from warpgs.io.load import load_scene
 from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.pipeline.runs.request import choose_device
@@ -35,7 +36,7 @@ def open_file(
         device: auto, cpu or cuda.
 
     Raises:
-        DataError: The model or the cameras cannot be read.
+        DataError: The model or the cameras cannot be read, or an image would be larger than any photograph may be.
         ResourceError: The device is not there.
         UsageError: No cameras are given, or the rule is unknown.
     """
@@ -47,6 +48,11 @@ def open_file(
         raise UsageError(f"--rule {rule}: choose one of {', '.join(RULES)}")
     where, _ = choose_device(device)
     found, notes = _cameras_of(cameras)
+    for name, c in found.items():
+        if c.width * c.height > MAX_PIXELS:
+            raise DataError(
+                f"{cameras}, {name}: an image of {c.width} x {c.height} px has more than {MAX_PIXELS:,} pixels; write less"
+            )
     # the unit stays that of the file, in which the near plane of a rule is given
     normalization = Normalization(np.mean([c.center for c in found.values()], axis=0))
     gaussians = read_gaussians(path, normalization, units="scene")
