@@ -74,7 +74,8 @@ def captures() -> str:
 Held-out photographs: PSNR [dB], mean and standard deviation over {min(seeds - {0})} to {max(seeds)} seeds, / SSIM. 504 x 378 px
 (fox 270 x 480, temple 640 x 480 by its foreground). {_where(result)}. Settings were chosen on these scenes by leaving training
 views out, but those of the first points, which were compared on three views with their held-out ones ([decision
-007](decisions/007-coarse-start.md)). `gsplat` is that package's default strategy in 7000 steps from the first points of `default`.
+007](decisions/007-coarse-start.md)). `gsplat` is that package's default strategy in 7000 steps, from the first points
+of `default`.
 
 {words}
 What `default` is and how it was chosen: [decision 013](decisions/013-any-capture.md). Synthetic scenes of smooth surfaces

@@ -37,12 +37,12 @@ LEFT_OUT = (
     (r"(python3 -m venv|source .*activate|pip install (\.|torch)|git clone)", "installing, which --install runs"),
 )
 """Beginnings of lines that are left out, and why."""
-INPUTS = ("scene", "photos", "photographs", "PHOTOGRAPHS", "run", "scenes", "keyframes.json", "examples")
+INPUTS = ("scene", "photographs", "PHOTOGRAPHS", "run", "scenes", "keyframes.json", "examples")
 """What pages may use: the small demo scene; its images alone; a short fit; a folder of scenes; cameras of a film; examples."""
 MAKE_INPUTS = """
 warpgs demo scene --views 8 && mkdir scenes && cp -r scene scenes/demo
 python -c "from warpgs.synthetic.demo import write_demo; write_demo('large', views=8, width=160, height=120)"
-for name in photos photographs PHOTOGRAPHS; do cp -r large/images $name; done
+for name in photographs PHOTOGRAPHS; do cp -r large/images $name; done
 warpgs fit scene --out run --split every:4
 python - <<'END'
 import json, numpy, warpgs
