@@ -59,8 +59,8 @@ LIMITS = {
 """Largest values of flags of a command; each is given where a page gives none or more."""
 TIME = 900
 """Seconds that a block may take."""
-VIEWER_TIME = 120
-"""Seconds within which the viewer says where it is."""
+VIEWER_TIME = 300
+"""Seconds within which the viewer says where it is, and within which it ends; on a busy machine it first ends an image."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,10 @@ def main_of_warpgs(words: list[str]) -> int:
                     if told:
                         break
             process.send_signal(signal.SIGINT)
-            ended = process.wait(60)
+            ended = process.wait(VIEWER_TIME)
+        except subprocess.TimeoutExpired:
+            print("the viewer did not end")
+            return 1
         finally:
             process.kill()
         output.seek(0)
