@@ -343,6 +343,7 @@ class Trainer:
         layout = layout_of(
             self.table, shown, kept=self.strategy.kept_views(), scored=self.strategy.samples(c), captured=self.captured,
             depth_supervised=c.loss.depth_weight > 0, trimmed=self.strategy.shrinks(c),
+            refined=c.refine_poses, exposed=c.exposure,
         )  # fmt: skip
         cameras = [v.camera for v in shown]
         self.memory, self.layout = plan(
