@@ -147,6 +147,8 @@ def test_strategies_see_the_poses_of_now_and_steps_count_from_the_given_ones():
     trainer.set_views(trainer.views)
     for stack in trainer.stacks.values():
         assert torch.equal(stack.viewmats, trainer.poses.viewmats[stack.numbers])
+        now = trainer.learned.posed(stack)  # by which a captured step finds its capacity
+        assert torch.equal(now.viewmats, torch.stack(shown)[stack.numbers])
     trainer.show_poses()
     assert all(torch.equal(v.camera.viewmat, a) for v, a in zip(trainer.views, shown))
 
