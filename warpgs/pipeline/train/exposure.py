@@ -81,7 +81,7 @@ def exposed(rgb: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
     return found
 
 
-@register("exposure")
+@register("exposure_penalty")
 @dataclass(frozen=True)
 class ExposurePenalty(LossTerm):
     """The weighted sum of the squares of a view's exposure, which holds it to the identity."""
@@ -91,7 +91,7 @@ class ExposurePenalty(LossTerm):
 
     def __post_init__(self) -> None:
         if not 0 <= self.weight <= 1000:
-            raise UsageError(f"exposure: weight {self.weight} must lie between 0 and 1000")
+            raise UsageError(f"exposure-penalty: weight {self.weight} must lie between 0 and 1000")
 
     def __call__(self, render: Render, target: Target, gaussians: Gaussians) -> torch.Tensor:
         """Compute ``weight`` times the sum of squares of [A - 1 | b], shape []."""
