@@ -179,12 +179,12 @@ def _set_background(job: _Job) -> None:
     job.notes += [note] if note else []
 
 
-def fit_request(request: FitRequest, on_model: Callable[[FittedModel], object] | None = None) -> FitResult:
-    """Run `fit` as the command line or a study asks for it."""
+def fit_request(request: FitRequest, **watchers: Any) -> FitResult:
+    """Run `fit` as the command line, a study or a farm asks for it; ``watchers`` are its on_model and on_step."""
     r = request
     return fit(
         r.scene, r.config, out=r.out, device=r.device, resume=r.resume, lpips_weights=r.lpips_weights,
-        time_budget=r.time_budget, notes=r.notes, on_model=on_model,
+        time_budget=r.time_budget, notes=r.notes, **watchers,
     )  # fmt: skip
 
 
