@@ -37,7 +37,7 @@ def failed_step(trainer: Trainer, view: int, name: str) -> Bundle:
         view: Number of the step's view.
         name: Its name.
     """
-    trainer.show_poses()
+    trainer.show_learned()
     number, shown = trainer.step + 1, trainer.views[view]
     plan = trainer.plan_of(number)
     if plan.half_size:

@@ -8,7 +8,7 @@ while the Gaussians turn brighter, and no training image would tell.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -16,6 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from warpgs.errors import UsageError
 from warpgs.pipeline.train.loss import LossTerm, Target, register
+from warpgs.pipeline.train.views import TrainingView
 from warpgs.scene import Gaussians, Render, View
 
 EXPOSURE = "exposure_affine"
@@ -79,6 +80,23 @@ def exposed(rgb: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
     """Return colours [H, W, 3] under an exposure [12], rows of [A - 1 | b]; differentiable in both."""
     found: torch.Tensor = _Exposed.apply(rgb, exposure)
     return found
+
+
+def exposed_views(views: list[TrainingView]) -> list[TrainingView]:
+    """Return the views with an exposure each, none at first, which `show_exposures` overwrites."""
+    return [replace(v, exposure=torch.zeros(CHANNELS * (CHANNELS + 1), device=v.image.device)) for v in views]
+
+
+def show_exposures(views: list[TrainingView], rows: torch.Tensor) -> None:
+    """Write the exposures as they are now, from the parameters of all views [V, 12], into views of `exposed_views`."""
+    for view, row in zip(views, exposure_of(rows, rows).detach(), strict=True):
+        assert view.exposure is not None
+        view.exposure.copy_(row)
+
+
+def seen_in(view: TrainingView, rgb: torch.Tensor) -> torch.Tensor:
+    """Return the colours of a render [H, W, 3] as a training view shows them, under its exposure if it has one."""
+    return rgb if view.exposure is None else exposed(rgb, view.exposure)
 
 
 @register("exposure_penalty")
