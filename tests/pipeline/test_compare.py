@@ -15,13 +15,13 @@ from PIL import Image
 from tests.pipeline.test_table_files import cells
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
+from warpgs.pipeline.farm.ensure_run import ensure_run
 from warpgs.pipeline.metrics.lpips_weights import NETS, convert_lpips
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.checkpoint import TENSORS
 from warpgs.pipeline.runs.fit import fit_request
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest, read_scene
 from warpgs.pipeline.study.compare import ABLATION_ROWS, _places, ablation_variants, preset_variants, run_study
-from warpgs.pipeline.farm.ensure_run import ensure_run
 from warpgs.pipeline.study.statistics import paired_difference
 from warpgs.pipeline.study.study import FILES, SWITCHES, StudyRequest, run_folder
 from warpgs.pipeline.train import config

@@ -55,7 +55,8 @@ def _card(card: JobCard) -> str:
         duration(row.seconds) if row.seconds else "", row.message if row.state == "failed" else "",
     ]  # fmt: skip
     words = html.escape(", ".join(filter(None, facts)) or row.state)
-    return f'<div class="card {html.escape(row.state)}">{_link(card.report, image)}<p>{_link(card.report, f"<b>{name}</b>")}{words}</p></div>'
+    image, head = _link(card.report, image), _link(card.report, f"<b>{name}</b>")
+    return f'<div class="card {html.escape(row.state)}">{image}<p>{head}{words}</p></div>'
 
 
 def _failures(cards: list[JobCard]) -> str:
@@ -92,7 +93,8 @@ def farm_page(title: str, cards: list[JobCard], seconds: float) -> str:
     cells = "".join(f"<div><b>{html.escape(v)}</b><span>{html.escape(k)}</span></div>" for k, v in figures)
     body = (
         f'<h1>{html.escape(title)}</h1><p class="sub">{line} <a href="results.csv">results.csv</a></p>'
-        f'<div class="figures">{cells}</div>{_failures(cards)}<h2>Scenes</h2><div class="cards">{"".join(map(_card, cards))}</div>'
+        f'<div class="figures">{cells}</div>{_failures(cards)}<h2>Scenes</h2>'
+        f'<div class="cards">{"".join(map(_card, cards))}</div>'
     )
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,'

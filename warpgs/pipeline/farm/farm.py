@@ -53,8 +53,8 @@ def run_farm(
 ) -> list[JobStatus]:
     """Run jobs until each is done or has failed.
 
-    A job that is finished and valid is skipped. A job whose process dies, or that has no memory left, is started once more after
-    the others, and goes on from its checkpoint. A folder of a job is locked while it is worked on here; one that is locked by
+    A job that is finished and valid is skipped. A job whose process dies, or that has no memory left, is started once more
+    after the others, and goes on from its checkpoint. A folder of a job is locked while it is worked on here; one that is locked by
     another farm is looked at again later, and its result is taken over.
 
     Args:
@@ -120,7 +120,7 @@ class _Farm:
                 self.engine.start(status.job)
 
     def _claim(self, status: JobStatus) -> bool:
-        """Lock the folder of a job; return False where another farm holds it. What another one has finished meanwhile is ended."""
+        """Lock the folder of a job; return False where another farm holds it; end one that has been finished meanwhile."""
         if status.job.name not in self.held:
             with contextlib.ExitStack() as stack:
                 try:

@@ -42,7 +42,12 @@ class RayEngine:
         self.slots = slots or int(room)
         if self.slots < 1:
             raise UsageError(f"Ray's cluster has no room for a job of {threads} threads and {gpus:g} GPUs: it has {found}")
-        options = {"num_cpus": threads, "num_gpus": gpus, "max_retries": 1, "runtime_env": {"env_vars": {"PYTHONSAFEPATH": "1"}}}
+        options = {
+            "num_cpus": threads,
+            "num_gpus": gpus,
+            "max_retries": 1,
+            "runtime_env": {"env_vars": {"PYTHONSAFEPATH": "1"}},
+        }
         self._task = ray.remote(**options)(run_job)
         self._running: dict[Any, str] = {}
 

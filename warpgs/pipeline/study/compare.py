@@ -9,9 +9,9 @@ import torch
 
 from warpgs.errors import DataError, UsageError
 from warpgs.io.splits import held_out_split, split_views
+from warpgs.pipeline.farm.ensure_run import ensure_run
 from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.runs.request import FitRequest, choose_device, read_scene
-from warpgs.pipeline.farm.ensure_run import ensure_run
 from warpgs.pipeline.study.study import FILES, SWITCHES, Place, Runs, StudyRequest, run_folder, scene_name, write_study
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import PRESETS, FitConfig
@@ -69,7 +69,15 @@ def _places(request: StudyRequest) -> list[Place]:
             wanted, split = dataclasses.replace(wanted, split=spec), split_views(scene, spec)
         if not split.test:
             raise DataError(f"{wanted.path}: no view is held out, so there is nothing to compare; choose another --split")
-        places.append(Place(scene_name(wanted), wanted, scene.fingerprint, split, *(train_views(scene, n) for n in (split.train, split.test))))
+        places.append(
+            Place(
+                scene_name(wanted),
+                wanted,
+                scene.fingerprint,
+                split,
+                *(train_views(scene, n) for n in (split.train, split.test)),
+            )
+        )
     return places
 
 
@@ -86,7 +94,12 @@ def _run_all(request: StudyRequest, places: list[Place], device: torch.device, l
                     request.device, lpips_weights=request.lpips_weights,
                 )  # fmt: skip
                 outcome = ensure_run(
-                    fit, place.fingerprint, place.split, device.type, lpips, settings_by_views(fit.config, place.train, device.type)[0]
+                    fit,
+                    place.fingerprint,
+                    place.split,
+                    device.type,
+                    lpips,
+                    settings_by_views(fit.config, place.train, device.type)[0],
                 )
                 if outcome.state != "fitted":
                     say(f"  {outcome.state}{': ' if outcome.note else ''}{outcome.note}")

@@ -14,9 +14,9 @@ import torch
 from warpgs.errors import UsageError
 from warpgs.files import write_bytes, write_json, write_text
 from warpgs.io.splits import Split
+from warpgs.pipeline.farm.ensure_run import Outcome
 from warpgs.pipeline.runs.request import SceneRequest
 from warpgs.pipeline.runs.results import LABELS
-from warpgs.pipeline.farm.ensure_run import Outcome
 from warpgs.pipeline.study.plots import Line, Panel, forest
 from warpgs.pipeline.study.qualitative import strips
 from warpgs.pipeline.study.statistics import paired_difference, sample
