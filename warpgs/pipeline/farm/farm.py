@@ -54,8 +54,8 @@ def run_farm(
     """Run jobs until each is done or has failed.
 
     A job that is finished and valid is skipped. A job whose process dies, or that has no memory left, is started once more
-    after the others, and goes on from its checkpoint. A folder of a job is locked while it is worked on here; one that is locked by
-    another farm is looked at again later, and its result is taken over.
+    after the others, and goes on from its checkpoint. A folder of a job is locked while it is worked on here; one that
+    another farm has locked is looked at again later, and its result is taken over.
 
     Args:
         jobs: The jobs.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from warpgs.errors import UsageError
@@ -42,14 +43,18 @@ class RayEngine:
         self.slots = slots or int(room)
         if self.slots < 1:
             raise UsageError(f"Ray's cluster has no room for a job of {threads} threads and {gpus:g} GPUs: it has {found}")
-        options = {
+        self._options = {
             "num_cpus": threads,
             "num_gpus": gpus,
             "max_retries": 1,
             "runtime_env": {"env_vars": {"PYTHONSAFEPATH": "1"}},
         }
-        self._task = ray.remote(**options)(run_job)
         self._running: dict[Any, str] = {}
+        self.use(run_job)
+
+    def use(self, work: Callable[[str, int], str]) -> None:
+        """Run jobs by another function than `run_job`, of the same arguments and result."""
+        self._task = self._ray.remote(**self._options)(work)
 
     def start(self, job: FarmJob) -> None:
         """Submit a job."""
