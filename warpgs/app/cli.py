@@ -22,7 +22,7 @@ COMMANDS = {
     "plot": "show a run's cameras and Gaussians in one image",
     "priors": "look at what is known before a fit, or write networks as ONNX",
     "export": "write a run's Gaussians to a file: .ply, .spz, .glb, .html",
-    "convert": "write a file of Gaussians in another format",
+    "convert": "write a file of Gaussians or cameras in another format",
     "mesh": "make a mesh of the surfaces that a run's views see: .ply, .glb",
     "prune": "shrink a finished model as far as its training views allow",
     "eval": "score a run again on its held-out views",

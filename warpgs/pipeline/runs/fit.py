@@ -22,6 +22,7 @@ from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.model.scale_limits import shape_figures, shape_summary
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.runs.coverage_report import coverage_of_run
+from warpgs.pipeline.runs.exposures import exposure_figures
 from warpgs.pipeline.runs.failed_step import FILE as FAILED
 from warpgs.pipeline.runs.failed_step import failed_step, save_failed_step
 from warpgs.pipeline.runs.folder import CONFIG, check_checkpoint, check_same, read_record, record_of, run_folder
@@ -37,6 +38,7 @@ from warpgs.pipeline.train.background import choose_background, over_background
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.complexity import complexity_figures, complexity_summary
 from warpgs.pipeline.train.config import FitConfig, preset_config
+from warpgs.pipeline.train.exposure import EXPOSURE
 from warpgs.pipeline.train.loop import run, train_views
 from warpgs.pipeline.train.time_budget import within_budget
 from warpgs.pipeline.train.trainer import StepReport, Trainer
@@ -290,27 +292,23 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
     on_cuda = job.device.type == "cuda"
     peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(job.device)} if on_cuda else {}
     names = image_names(v.name for v in scene.views)
-    metrics = evaluate_run(
-        job.out, gaussians, train, test, c.rule, scene.background, job.lpips, trainer.max_instances, names=names
-    )
+    scored = (job.out, gaussians, train, test, c.rule, scene.background)
+    metrics = evaluate_run(*scored, job.lpips, trainer.max_instances, names=names)
     if test:
-        metrics["coverage"] = coverage_of_run(
-            job.out, gaussians, train, test, c.rule, scene.background, trainer.max_instances, names=names
-        )
+        metrics["coverage"] = coverage_of_run(*scored, trainer.max_instances, names=names)
     rule = rule_report_of(
-        gaussians,
-        train,
-        c.rule,
-        scene.background,
-        seed=c.seed,
-        half_resolution=trainer.half_resolution,
+        gaussians, train, c.rule, scene.background, seed=c.seed, half_resolution=trainer.half_resolution,
         max_instances=trainer.max_instances,
-    )
+    )  # fmt: skip
     shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.extent, [v.camera for v in train])
     options = options_for(c.rule, scene.background, gaussians, trainer.max_instances)
     fractions = moved_fractions(train, (Rendered(*render_view(gaussians, v, options)) for v in train))
     moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
-    for note in [rule["summary"], shape_summary(shape), *moved_notes(moved)]:
+    exposures = {}
+    if c.exposure:
+        rows = trainer.view_table.params[EXPOSURE]
+        exposures = {"exposure": exposure_figures(job.split.train, rows, test, gaussians, options)}
+    for note in [rule["summary"], shape_summary(shape), *moved_notes(moved), *(e["summary"] for e in exposures.values())]:
         job.notes.append(note)
         job.say(f"  {note}")
     return metrics | {
@@ -319,7 +317,7 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
         "config_hash": c.fingerprint(), "fingerprint": scene.fingerprint, "device": job.where.removeprefix("on "),
         "seconds": {**seconds, "total": time.perf_counter() - job.began}, **peak,
         "memory": trainer.memory.to_json(), "rule": rule, "shape": shape,
-        **event_figures(trainer), **complexity_figures(trainer),
+        **event_figures(trainer), **complexity_figures(trainer), **exposures,
         "photographs": [p.to_json() | {"moved": moved.get(p.name)} for p in job.photographs],
     }  # fmt: skip
 
