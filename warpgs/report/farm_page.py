@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,7 +65,8 @@ def _failures(cards: list[JobCard]) -> str:
     by_message: dict[str, list[str]] = defaultdict(list)
     for card in cards:
         if card.row.state == "failed":
-            message = card.row.message.replace(card.row.name, "SCENE")  # messages about each one's files are one
+            name = rf"(?<!\w){re.escape(card.row.name)}(?!\w)"
+            message = re.sub(name, "SCENE", card.row.message)  # messages about each one's files are one
             by_message[message].append(card.row.name)
     rows = "".join(
         f"<tr><td>{html.escape(message)}</td><td>{len(names)}</td><td>{html.escape(', '.join(names[:20]))}</td></tr>"

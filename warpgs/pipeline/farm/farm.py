@@ -22,7 +22,7 @@ POLL = 2.0
 
 @dataclass
 class JobStatus:
-    """Where a job stands."""
+    """Status of a job."""
 
     job: FarmJob
     state: str = "waiting"
@@ -40,11 +40,11 @@ class JobStatus:
     before: JobRecord | None = None
     """Record from before this farm."""
     notes: list[str] = field(default_factory=list)
-    """What happened to it on the way."""
+    """Failed attempts, and notes on locks."""
 
     @property
     def ended(self) -> bool:
-        """Return whether nothing more will come of it."""
+        """True where nothing more will come of it."""
         return self.state in ("done", "failed")
 
 

@@ -1,4 +1,4 @@
-"""What a farm is given to fit: a folder of scenes, a glob, or a file with a line of JSON for each job."""
+"""Lists of what to fit: a folder of scenes, a glob, or a file with a line of JSON for each job."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ MAX_SLOTS = 256
 
 @dataclass(frozen=True)
 class Slot:
-    """A share of a device."""
+    """A device, or a part of one, for one job at a time."""
 
     device: str
     """cpu or cuda, as the job sees it."""

@@ -105,7 +105,11 @@ def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bo
 
 
 def check_failures(statuses: list[JobStatus]) -> None:
-    """Raise a ResourceError that names the jobs that failed, if any."""
+    """Check that no job failed.
+
+    Raises:
+        ResourceError: Some did; the message names them.
+    """
     failed = [s for s in statuses if s.state == "failed"]
     if failed:
         first = failed[0].record
