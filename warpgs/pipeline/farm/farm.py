@@ -80,6 +80,7 @@ class _Farm:
         self.engine, self.show, self.poll = engine, show, poll
         self.by_name = {s.job.name: s for s in self.all}
         self.held: dict[str, contextlib.ExitStack] = {}
+        self.left, self.running = len(jobs), 0  # counted, since there may be a million
 
     def run(self) -> list[JobStatus]:
         """Run all jobs."""
@@ -90,10 +91,9 @@ class _Farm:
         self.show(self.all)
         waiting = deque(s for s in self.all if not s.ended)
         try:
-            while not all(s.ended for s in self.all):
+            while self.left:
                 self._start(waiting)
-                running = any(s.state == "running" for s in self.all)
-                for event in self.engine.wait(self.poll) if running else self._pause(waiting):
+                for event in self.engine.wait(self.poll) if self.running else self._pause(waiting):
                     self._take(event, waiting)
                 self.show(self.all)
         finally:
@@ -110,13 +110,14 @@ class _Farm:
     def _start(self, waiting: deque[JobStatus]) -> None:
         """Start as many jobs as the engine takes; those of another farm go to the end of the queue."""
         for _ in range(len(waiting)):
-            if sum(s.state == "running" for s in self.all) >= self.engine.slots:
+            if self.running >= self.engine.slots:
                 return
             status = waiting.popleft()
             if not self._claim(status):
                 waiting.append(status)
             elif not status.ended:
                 status.state, status.began, status.attempts = "running", time.monotonic(), status.attempts + 1
+                self.running += 1
                 self.engine.start(status.job)
 
     def _claim(self, status: JobStatus) -> bool:
@@ -144,6 +145,7 @@ class _Farm:
         if event.state == "running":
             status.step = event.step
             return
+        self.running -= 1
         status.seconds += time.monotonic() - status.began
         record = read_record(status.job.folder)
         if event.state == "held":  # a process that a farm left behind works on it
@@ -172,6 +174,7 @@ class _Farm:
     def _end(self, status: JobStatus, record: JobRecord) -> None:
         """End a job with its record."""
         status.state, status.record = record.state, record
+        self.left -= 1
         self._release(status)
 
     def _release(self, status: JobStatus) -> None:
