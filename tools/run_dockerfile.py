@@ -24,8 +24,8 @@ HOME = "/opt/warpgs"
 """Folder of everything that the image's own user writes."""
 KEPT = re.compile(r"PIP_\w+|\w*_proxy|\w*_PROXY|SSL_CERT_\w+|LANG|LC_\w+")
 """Variables of this machine that the lines may see: the way to a package index."""
-CHECK = "warpgs --version && warpgs demo $HOME/scene --views 8 --width 48 --height 36 && " + (
-    "warpgs farm $HOME/scene* --out $HOME/results --steps 2 --preset quick --device cpu && ls $HOME/results"
+CHECK = "warpgs --version && warpgs demo $HOME/scenes/a --views 8 --width 48 --height 36 && " + (
+    "warpgs farm $HOME/scenes --out $HOME/results --steps 2 --preset quick --device cpu && ls $HOME/results"
 )
 """What a user of the image does first."""
 
@@ -34,7 +34,9 @@ def instructions(text: str) -> list[tuple[str, str]]:
     """Return the instructions of a Dockerfile with their arguments, lines joined and comments left out."""
     lines = [line for line in text.splitlines() if not line.lstrip().startswith("#")]
     joined = "\n".join(lines).replace("\\\n", " ")
-    return [(word.upper(), rest.strip()) for word, _, rest in (line.partition(" ") for line in joined.splitlines()) if word.strip()]
+    return [
+        (word.upper(), rest.strip()) for word, _, rest in (line.partition(" ") for line in joined.splitlines()) if word.strip()
+    ]
 
 
 def of_target(found: list[tuple[str, str]], target: str) -> list[tuple[str, str]]:

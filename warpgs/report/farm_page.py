@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import re
+import textwrap
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,8 @@ CARDS = """
 .card b{display:block;font-size:15px;color:var(--ink)}.failed b{color:#c0392b}a{color:inherit}
 .card.failed{border-color:#c0392b}
 """
+SHORT = 120
+"""Letters of a message on a card; the table of failures has all of it."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +53,12 @@ def _card(card: JobCard) -> str:
     image = f'<img loading="lazy" alt="render and photograph of {name}" src="{quote(card.thumbnail)}">'
     if not card.thumbnail:
         image = f'<div class="none">{html.escape(row.state)}</div>'
+    failed = row.state == "failed"
     facts = [
         "" if row.psnr is None else f"PSNR {row.psnr:.2f} dB", "" if card.ssim is None else f"SSIM {card.ssim:.3f}",
         f"{row.gaussians:,} Gaussians" if row.gaussians else "", format_bytes(card.ply_bytes) if card.ply_bytes else "",
-        duration(row.seconds) if row.seconds else "", row.message if row.state == "failed" else "",
+        duration(row.seconds) if row.seconds and not failed else "",
+        textwrap.shorten(row.message, SHORT, placeholder=" ...") if failed else "",
     ]  # fmt: skip
     words = html.escape(", ".join(filter(None, facts)) or row.state)
     image, head = _link(card.report, image), _link(card.report, f"<b>{name}</b>")

@@ -186,7 +186,7 @@ class _Farm:
 
 def seconds_left(statuses: list[JobStatus], slots: int) -> float | None:
     """Return the time until all jobs are done [s], by the mean time of those done here; None before the first one is."""
-    took = [s.seconds for s in statuses if s.ended and s.seconds]
+    took = [s.seconds for s in statuses if s.state == "done" and s.seconds]
     if not took:
         return None
     mean, now = sum(took) / len(took), time.monotonic()
