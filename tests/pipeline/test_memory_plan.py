@@ -84,6 +84,16 @@ def test_plan_covers_the_depth_term(views):
     assert fit.layout.depth_supervised and found <= planned <= 1.25 * found + 20_000
 
 
+@pytest.mark.parametrize(("learned", "size", "count"), [("refine_poses", (40, 32), 20_000), ("exposure", (400, 300), 60)])
+def test_plan_covers_what_is_learned_of_views(learned, size, count):
+    """A gradient of the camera for each Gaussian, and renders with and without their exposure."""
+    fit = Trainer(photos(2, *size), seeds(count), dataclasses.replace(STEADY, **{learned: True}), CPU)
+    fit.advance()
+    found = measured(fit, 2)
+    planned = fit.layout.step(count, instances(fit))
+    assert found <= planned <= 1.25 * found + 20_000
+
+
 def test_plan_covers_density_events():
     """A set that doubles within a step: the heaviest moment is then the growing itself."""
     fit = Trainer(photos(2), seeds(4000), GROWING, CPU)

@@ -37,7 +37,7 @@ def failed_step(trainer: Trainer, view: int, name: str) -> Bundle:
         view: Number of the step's view.
         name: Its name.
     """
-    trainer.show_poses()
+    trainer.show_learned()
     number, shown = trainer.step + 1, trainer.views[view]
     plan = trainer.plan_of(number)
     if plan.half_size:
@@ -115,6 +115,8 @@ def findings(bundle: Bundle) -> list[str]:
             if term.active(plain["step"], config.steps):
                 value = term(render, target, gaussians)
                 lines.append(f"  loss term {term.name}: {float(value.detach()):g}")
+                if not value.requires_grad:  # of the view's own parameters alone
+                    continue
                 of = torch.autograd.grad(value, list(gaussians.tensors().values()), retain_graph=True, allow_unused=True)
                 broken = [n for n, g in zip(gaussians.tensors(), of) if g is not None and not bool(torch.isfinite(g).all())]
                 lines += [f"    its gradient by {n} is not finite" for n in broken]

@@ -25,6 +25,8 @@ from warpgs.scene import Camera, Gaussians
 
 FLOAT = 4
 """Bytes of a float32 or int32."""
+CAMERA = 16 + 9
+"""Numbers of the gradient of view matrix and intrinsics, which each Gaussian has until they are summed."""
 SAMPLED = 8
 """Largest number of views that a sampling event samples in (`importance_sampling.MAX_VIEWS`)."""
 TILE = 16
@@ -74,6 +76,11 @@ class Layout:
     trimmed: bool = False
     """True where the strategy trims the model: with lower degrees, merged and tried, it then stands there three times more."""
 
+    refined: bool = False
+    """True where poses are refined: each Gaussian has a gradient of the camera until these are summed."""
+    exposed: bool = False
+    """True where views have exposures: the render stands there with and without."""
+
     @property
     def row(self) -> int:
         """Bytes of the parameters of a Gaussian."""
@@ -102,6 +109,7 @@ class Layout:
         # three partials for each colour and the gradient; masked copies; the two maps that are correlated, with gradients
         # the difference of opacities and its gradient
         loss = FLOAT * pixels * ((19 if self.masked else 12) + 4 * self.depth_supervised + 3 * self.cutout)
+        loss += FLOAT * pixels * 3 * self.exposed
         if not self.cuda:
             loss += 5 * FLOAT * (3 * self.width + 30) * -(-self.height // 8)
         # an event keeps image, scores and gate of each view until its end
@@ -129,7 +137,7 @@ class Layout:
 
     def _projection(self, count: int) -> int:
         """Return the bytes of projected Gaussians, of their gradient and its copy for statistics, and of other gradients."""
-        return (FLOAT * (3 * PROJECTED_SIZE + 1) + self.row) * count
+        return (FLOAT * (3 * PROJECTED_SIZE + 1 + CAMERA * self.refined) + self.row) * count
 
     def event(self, before: int, after: int) -> int:
         """Return the bytes on top of ``held(after)`` while Gaussians are added: new rows, and one tensor before and after."""
@@ -235,6 +243,8 @@ def layout_of(
     captured: bool = False,
     depth_supervised: bool = False,
     trimmed: bool = False,
+    refined: bool = False,
+    exposed: bool = False,
 ) -> Layout:
     """Return the layout of steps of a fit.
 
@@ -246,6 +256,8 @@ def layout_of(
         captured: True to capture steps as CUDA graphs where the device can.
         depth_supervised: True where the loss has its depth term.
         trimmed: True where the strategy trims the model.
+        refined: True where poses are refined.
+        exposed: True where views have exposures.
     """
     largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
     cuda = table.device.type == "cuda"
@@ -253,7 +265,7 @@ def layout_of(
         table.gaussians.sh.shape[1], largest.width, largest.height, view_bytes([*views, *kept]),
         sum(c.element_size() for c in table.columns.values()), len(views), any(v.mask is not None for v in views),
         scored, depth_supervised, cuda, len({v.kind for v in views}) if cuda and captured else 0,
-        any(v.alpha is not None for v in views), trimmed,
+        any(v.alpha is not None for v in views), trimmed, refined, exposed,
     )  # fmt: skip
 
 

@@ -166,6 +166,12 @@ class Learned:
     centers: torch.Tensor
     """Positions of training cameras [u], which limits of sizes refer to, shape [C, 3]."""
 
+    @torch.no_grad()
+    def posed(self, views: ViewStack) -> ViewStack:
+        """Return the views with their poses as they are now, where these are refined."""
+        rows = [self.views.params[n].index_select(0, views.numbers) for n in (ROTATION, TRANSLATION) if n in self.views.params]
+        return replace(views, viewmats=moved(views.viewmats, views.numbers, *rows)) if rows else views
+
 
 def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer) -> None:
     """Take one training step: render the next view, compute the loss, update all parameters.
@@ -272,7 +278,7 @@ class StepGraphs:
             if (kind, plan) in self._graphs:
                 continue
             views = stacks[kind]
-            capacity = instance_capacity(self.learned.table.gaussians, views, plan.degree, self.rule)
+            capacity = instance_capacity(self.learned.table.gaussians, self.learned.posed(views), plan.degree, self.rule)
             if max_instances is not None and capacity > max_instances:
                 raise OverLimitError(
                     f"a captured step would need capacity for {capacity:,} instances, the limit allows {max_instances:,}"

@@ -19,7 +19,7 @@ from warpgs.pipeline.model.scale_limits import camera_centers, scene_radius
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.exposure import EXPOSURE, check_exposure
+from warpgs.pipeline.train.exposure import EXPOSURE, check_exposure, exposed_views, show_exposures
 from warpgs.pipeline.train.loss import random_shift
 from warpgs.pipeline.train.memory_plan import Layout, layout_of, most_instances, plan
 from warpgs.pipeline.train.refine_poses import ROTATION, TRANSLATION, GivenPoses
@@ -138,6 +138,7 @@ class Trainer:
         views, self.disparities = prepared_views(train, made, config, self.terms, device)
         if config.refine_poses:
             views, self.poses = GivenPoses.owned(views), GivenPoses(views)
+        views = exposed_views(views) if config.exposure else views
         self.set_views(views)
         self.strategy.setup()
 
@@ -317,16 +318,18 @@ class Trainer:
         if not self.strategy.due(self.step):
             return
         self._forget_graphs()
-        self.show_poses()
+        self.show_learned()
         for change in self.strategy.update(self.step):
             self.table.apply(change)
             self.count_changed()
         self.plan_of(self.step).limits.hold(self.table.params, self.learned.centers)
 
-    def show_poses(self) -> None:
-        """Let the views show their poses as they are now, where these are refined."""
+    def show_learned(self) -> None:
+        """Let the views show their poses and exposures as they are now, where these are learned."""
         if self.poses is not None:
             self.poses.show(self.views, self.view_table.params)
+        if self.config.exposure:
+            show_exposures(self.views, self.view_table.params[EXPOSURE])
 
     def _forget_graphs(self) -> None:
         if self.graphs is not None:
@@ -344,6 +347,7 @@ class Trainer:
         layout = layout_of(
             self.table, shown, kept=self.strategy.kept_views(), scored=self.strategy.samples(c), captured=self.captured,
             depth_supervised=c.loss.depth_weight > 0, trimmed=self.strategy.shrinks(c),
+            refined=c.refine_poses, exposed=c.exposure,
         )  # fmt: skip
         cameras = [v.camera for v in shown]
         self.memory, self.layout = plan(

@@ -31,11 +31,12 @@ from warpgs.pipeline.train.strategies.holdout_blocks import (
     gain,
     hide,
     only,
+    rendered,
     sample_blocks,
 )
 from warpgs.pipeline.train.strategies.importance_sampling import EVENT, MAX_VIEWS, ImportanceSampling
 from warpgs.pipeline.train.views import TrainingView
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.rasterize import RasterizeOptions
 from warpgs.runtime.terminal import Detail
 from warpgs.scene import Gaussians
 
@@ -208,9 +209,8 @@ class Holdout(ImportanceSampling):
 
     def _options(self) -> RasterizeOptions:
         t = self.trainer
-        degree = self.sh_degree(t.step)
         return RasterizeOptions(
-            rule=t.config.rule, sh_degree=degree, background=t.background, max_instances=t.max_instances
+            rule=t.config.rule, sh_degree=self.sh_degree(t.step), background=t.background, max_instances=t.max_instances
         )  # fmt: skip
 
     def _errors(self, gaussians: Gaussians) -> torch.Tensor:
@@ -298,7 +298,7 @@ class Holdout(ImportanceSampling):
     def view_psnr(self, gaussians: Gaussians) -> float:
         """Return the mean over the training views of the PSNR over the pixels that count, the error floor included [dB]."""
         options = self._options()
-        errors = [masked_mse(rasterize(gaussians, v.camera, options).rgb, v.image, v.mask).double() for v in self.whole]
+        errors = [masked_mse(rendered(gaussians, v, options), v.image, v.mask).double() for v in self.whole]
         return float((-10 * torch.log10(torch.stack(errors) + FLOOR)).mean())
 
     def psnr_budget(self, psnr: float, step: int) -> float:

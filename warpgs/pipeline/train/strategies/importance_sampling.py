@@ -15,6 +15,7 @@ import torch
 from warpgs import geometry, schema
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.table import Column, DensityUpdate
+from warpgs.pipeline.train.exposure import seen_in
 from warpgs.pipeline.train.strategies import importance as scoring
 from warpgs.pipeline.train.strategies.base import register
 from warpgs.pipeline.train.strategies.clone_split import CloneSplit
@@ -164,7 +165,7 @@ def sample_view(
     valid = valid_pixels(alpha, depth, view.countable, c)
     known = view.semantic is not None
     semantic = view.semantic if known else torch.zeros_like(view.geometry)
-    scores = (scoring.render_score(render.rgb, view.image, valid), semantic, view.geometry)
+    scores = (scoring.render_score(seen_in(view, render.rgb), view.image, valid), semantic, view.geometry)
     score = scoring.importance(scores, config.weights(known))
     wanted = max(1, round(c.fraction * valid.numel()))
     gate, quantile = geometry_gate(view.geometry, valid, c.gate_quantile if config.ra else 0.0, wanted)
