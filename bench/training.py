@@ -15,7 +15,7 @@ from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loop import run
 from warpgs.pipeline.train.loss import LossConfig, built_in_terms
 from warpgs.pipeline.train.schedule import OptimizerConfig
-from warpgs.pipeline.train.step import MAX_BATCH, Learned, StepBuffers, StepGraphs, StepPlan, eager_renderer, step
+from warpgs.pipeline.train.step import MAX_STEPS, Learned, StepBuffers, StepGraphs, StepPlan, eager_renderer, step
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import ViewStack
@@ -154,7 +154,7 @@ class Steps:
         self.views = ViewStack(camera.viewmat, camera.K, target[None], None, {}, numbers)
         self.plan = StepPlan(gaussians.sh_degree, False, tuple(built_in_terms(LossConfig())), None)
         self.graphs = StepGraphs(self.learned, self.buffers, rule, self.background) if device.type == "cuda" else None
-        self._load(range(1, (MAX_BATCH if device.type == "cuda" else 1) + 1))
+        self._load(range(1, (MAX_STEPS if device.type == "cuda" else 1) + 1))
 
     def _load(self, steps: range) -> None:
         config = OptimizerConfig()
@@ -185,7 +185,7 @@ class Steps:
         """
         losses: list[float] = []
         while len(losses) < steps:
-            count = min(MAX_BATCH, steps - len(losses))
+            count = min(MAX_STEPS, steps - len(losses))
             graph = self._graph()
             self._load(range(len(losses) + 1, len(losses) + count + 1))
             for _ in range(count):

@@ -26,7 +26,7 @@ from warpgs.pipeline.train.schedule import plan_phases
 from warpgs.pipeline.train.setup import prepare, prepared_views
 from warpgs.pipeline.train.step import (
     CAPACITY_FACTOR,
-    MAX_BATCH,
+    MAX_STEPS,
     Learned,
     OverLimitError,
     StepBuffers,
@@ -198,7 +198,7 @@ class Trainer:
             raise self._no_memory(e) from e
 
     def _no_memory(self, error: Exception) -> OutOfMemoryError:
-        """Return the error for a step that found no memory; where none of its batch was taken, its views come again."""
+        """Return the error for a step that found no memory; where none of its series was taken, its views come again."""
         chosen, self.chosen = self.chosen, None
         intact = chosen is not None and int(self.buffers.counter) == 0
         if chosen is not None and intact:
@@ -237,7 +237,7 @@ class Trainer:
         plan, count = self.plan_of(first), 1
         if self.layout.graphs:
             while (
-                count < min(limit, MAX_BATCH, self.steps - self.step)
+                count < min(limit, MAX_STEPS, self.steps - self.step)
                 and self.plan_of(first + count) == plan
                 and not self.strategy.due(first + count - 1)
             ):
