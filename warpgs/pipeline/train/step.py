@@ -56,6 +56,22 @@ class StepPlan:
     """Limits that the step holds every Gaussian to."""
 
 
+@dataclass(frozen=True)
+class StepReport:
+    """Figures of one step."""
+
+    step: int
+    """Steps done, from 1."""
+    loss: float
+    """Loss on the step's view, the mean over its views where it has several."""
+    psnr: float
+    """PSNR on the step's view before the update, of the mean squared error over its views where it has several [dB]."""
+    count: int
+    """Number of Gaussians after the step."""
+    seconds: float
+    """Wall time of the step [s]."""
+
+
 class StepBuffers:
     """Tensors that a series of steps reads and writes on the device: views, learning rates, losses, and the stop flag."""
 
@@ -199,9 +215,7 @@ def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPla
     update(learned, plan, found, buffers.stop)
 
 
-def view_gradients(
-    learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer
-) -> ViewGradients:
+def view_gradients(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer) -> ViewGradients:
     """Render the next view and return what it contributes; its loss, and what stops the step, stand in ``buffers``.
 
     Arguments are those of `step`.
@@ -265,7 +279,10 @@ class OverLimitError(ResourceError):
 class StepGraphs:
     """Captured steps, one for each plan and kind of view; made when they are first asked for."""
 
-    def __init__(self, learned: Learned, buffers: StepBuffers, rule: str, background: torch.Tensor):
+    def __init__(
+        self, learned: Learned, buffers: StepBuffers, rule: str, background: torch.Tensor,
+        work: Callable[[Learned, ViewStack, StepBuffers, StepPlan, Renderer], object] = step,
+    ):  # fmt: skip
         """Capture nothing yet.
 
         Args:
@@ -273,7 +290,9 @@ class StepGraphs:
             buffers: Settings and results of steps.
             rule: Cut-offs of the rasterizer.
             background: Colour behind the scene, shape [3].
+            work: Function that is captured.
         """
+        self.work = work
         self.learned, self.buffers, self.rule, self.background = learned, buffers, rule, background
         device = buffers.device
         self.stream = torch.cuda.Stream(device)
@@ -313,12 +332,12 @@ class StepGraphs:
                 )
             self.memory.give_back(0 if max_instances is not None else DEAD_BYTES)
             render = captured_renderer(self.rule, self.background, capacity, self.buffers.stop)
-            work = functools.partial(step, self.learned, views, self.buffers, plan, render)
-            self._graphs[kind, plan] = self._capture(work)
+            work = functools.partial(self.work, self.learned, views, self.buffers, plan, render)
+            self._graphs[kind, plan] = self.capture(work)
         return [self._graphs[kind, plan] for kind in kinds]
 
-    def _capture(self, work: Callable[[], None]) -> CapturedGraph:
-        """Return the graph of a step."""
+    def capture(self, work: Callable[[], object]) -> CapturedGraph:
+        """Return the graph of a function that changes nothing where the stop flag is set."""
         buffers = self.buffers
         here, loaded = torch.cuda.current_stream(buffers.device), buffers.view_rows.clone()
         self.stream.wait_stream(here)

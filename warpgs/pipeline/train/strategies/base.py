@@ -24,8 +24,8 @@ class Strategy:
     """Rules by which Gaussians are added, moved and removed.
 
     A strategy of your own is a class that derives from this one and overrides what it needs; nothing else has to change. The
-    trainer calls, for each step: `phase` on the host; then, as part of the step, `statistics` for each of its views, `lr_factors`
-    and `after_step`; then `due` and, where that is true, `update` on the host.
+    trainer calls, for each step: `phase` on the host; then, as part of the step, `statistics` for each of its views,
+    `lr_factors` and `after_step`; then `due` and, where that is true, `update` on the host.
 
     What is part of a step is captured once as a CUDA graph and replayed, so it must not read back from the device, must write
     its results into tensors that are there already, and may depend on the host only by `phase`.
