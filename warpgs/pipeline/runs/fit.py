@@ -39,7 +39,7 @@ from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.complexity import complexity_figures
 from warpgs.pipeline.train.config import FitConfig, preset_config
 from warpgs.pipeline.train.loop import run, train_views
-from warpgs.pipeline.train.step import StepReport
+from warpgs.pipeline.train.step_report import StepReport
 from warpgs.pipeline.train.time_budget import within_budget
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.warmup import background_warmup

@@ -172,7 +172,7 @@ class BatchSteps:
 def _replayed(graph: CapturedGraph) -> Callable[[], ViewGradients]:
     def work() -> ViewGradients:
         graph.replay()
-        found: ViewGradients = graph.result
-        return found
+        assert isinstance(graph.result, ViewGradients)
+        return graph.result
 
     return work

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 
 from warpgs.errors import OutOfMemoryError, ResourceError
-from warpgs.pipeline.train.step import StepReport
+from warpgs.pipeline.train.step_report import StepReport
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.scene import Scene, View
 

@@ -56,22 +56,6 @@ class StepPlan:
     """Limits that the step holds every Gaussian to."""
 
 
-@dataclass(frozen=True)
-class StepReport:
-    """Figures of one step."""
-
-    step: int
-    """Steps done, from 1."""
-    loss: float
-    """Loss on the step's view, the mean over its views where it has several."""
-    psnr: float
-    """PSNR on the step's view before the update, of the mean squared error over its views where it has several [dB]."""
-    count: int
-    """Number of Gaussians after the step."""
-    seconds: float
-    """Wall time of the step [s]."""
-
-
 class StepBuffers:
     """Tensors that a series of steps reads and writes on the device: views, learning rates, losses, and the stop flag."""
 
@@ -185,7 +169,7 @@ class Learned:
 
 @dataclass(frozen=True)
 class ViewGradients:
-    """What one view contributes to a step."""
+    """Contribution of one view to a step."""
 
     gradients: list[torch.Tensor]
     """Gradients of the loss by the parameters of the Gaussians, then by those of the views, in the order of the tables."""

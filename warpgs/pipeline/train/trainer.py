@@ -34,10 +34,10 @@ from warpgs.pipeline.train.step import (
     StepBuffers,
     StepGraphs,
     StepPlan,
-    StepReport,
     eager_renderer,
     step,
 )
+from warpgs.pipeline.train.step_report import StepReport
 from warpgs.pipeline.train.stored_state import check_state
 from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.views import Kind, TrainingView, half_size, stack_views
@@ -271,12 +271,12 @@ class Trainer:
 
     def _take(self, places: list[tuple[Kind, int]], plan: StepPlan) -> bool:
         """Take steps with views at these places; return False, and take none, where graphs would need too much memory."""
-        kinds, captured = [kind for kind, _ in places], self.graphs is not None and self.layout.graphs > 0
+        kinds, captured = [kind for kind, _ in places], self.layout.graphs > 0
         try:
             if self.batched is not None:
                 settings = [self.settings(self.step + 1, slot) for slot in range(self.batch)]
                 self.batched.take(places, settings, self.stacks, plan, self.max_instances, captured=captured)
-            elif captured:
+            elif captured and self.graphs is not None:
                 for graph in self.graphs.capture_all(kinds, self.stacks, plan, self.max_instances):
                     graph.replay()
             else:
