@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from warpgs.pipeline.model.parameter_bounds import model_bytes as bytes_of
-from warpgs.pipeline.model.table import Table
+from warpgs.pipeline.model.table import DensityUpdate, Table
 from warpgs.pipeline.train.complexity import complexity_figures
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loop import run
@@ -20,6 +20,7 @@ from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import ViewStack
 from warpgs.pipeline.train.warmup import warm_up
+from warpgs.runtime.ranks import ALONE
 from warpgs.scene import Camera, Gaussians, PointCloud, View
 
 BLACK = (0.0, 0.0, 0.0)
@@ -28,10 +29,24 @@ KIND = "image"
 
 
 def make_trainer(
-    views: list[View], points: PointCloud | None, config: FitConfig, device: torch.device, background=BLACK
+    views: list[View], points: PointCloud | None, config: FitConfig, device: torch.device, background=BLACK, ranks=ALONE
 ) -> Trainer:
     """Return a trainer at step 0."""
-    return Trainer(views, points, config, device, background)
+    return Trainer(views, points, config, device, background, ranks=ranks)
+
+
+def set_gaussians(trainer: Trainer, gaussians: Gaussians) -> None:
+    """Replace the Gaussians of a trainer, which then begin without moments."""
+    new = {n: t.detach().to(trainer.device) for n, t in gaussians.tensors().items()}
+    nobody = torch.empty(0, dtype=torch.int64, device=trainer.device)
+    parents = torch.full((len(gaussians),), -1, dtype=torch.int64, device=trainer.device)
+    trainer.table.apply(DensityUpdate(nobody, new, parents))
+    trainer.set_views(trainer.views)
+
+
+def state_tensors(trainer: Trainer) -> list[torch.Tensor]:
+    """Return parameters, moments and columns of the Gaussians, in an order that stays."""
+    return [t for _, t in sorted(trainer.table.state().items())]
 
 
 def compile_kernels(config: FitConfig, device: torch.device) -> None:

@@ -112,11 +112,11 @@ class BatchSteps:
             self.slots.stop.zero_()
             return works[slot - own.start]()
 
-        first = found_in(own.start)  # whose statistics say what is summed
-        finish = self._finish(first, plan, captured)
+        first = [found_in(own.start)]  # whose statistics say what is summed
+        finish = self._finish(first[0], plan, captured)
 
         def add(slot: int, parts: list[torch.Tensor], adds: bool) -> None:
-            self._add(slot, first if slot == own.start else found_in(slot), parts, adds)
+            self._add(slot, first.pop() if first else found_in(slot), parts, adds)
 
         assert self.sums is not None
         self.sums.add_up(add)
