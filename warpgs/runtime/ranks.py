@@ -124,7 +124,7 @@ def _number(name: str, least: int, most: int, default: str | None = None) -> int
     if text is None or not text.isdecimal() or not least <= int(text) <= most:
         raise UsageError(
             f"the environment variable {name} is {text!r}, and must be a whole number from {least} to {most}; start the fit "
-            "with `torchrun --nproc-per-node N -m warpgs fit ...`, or unset RANK and WORLD_SIZE"
+            "with `torchrun --nproc_per_node N -m warpgs fit ...`, or unset RANK and WORLD_SIZE"
         )
     return int(text)
 

@@ -68,7 +68,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         half = float(f"{HALF_RESOLUTION * min(1.0, HALF_VIEWS / views):.2g}")
     steps = config.steps
     if steps is None:
-        steps = -(-steps_by_views(views) // config.batch)
+        steps = steps_by_views(views)
         each = f" of {config.batch} views" if config.batch > 1 else ""
         notes.append(
             f"by the number of views, {views}: at most {steps:,} steps{each}, colours of degree {init.max_sh_degree}, learning "
