@@ -63,8 +63,9 @@ docs: install
 docs-links: install
 	$(BIN)/python -m sphinx --quiet --builder linkcheck docs site/links
 
-# The shell commands of the README and of the pages for users, in temporary folders with a small scene.
+# The commands and snippets of the README and of all pages, in temporary folders with a small scene; installs what pages ask for.
 docs-run: install
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[poses,view,formats]'
 	$(BIN)/python -m tools.run_docs
 
 # Run these before a change is called done: CONTRIBUTING.md says which one when. Properties get more examples here;

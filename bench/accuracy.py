@@ -3,7 +3,7 @@
 usage: python -m bench.accuracy
 
 The figures are those of bench/results/budget_*.json (`python -m tests.numerics.report`) and bench/results/needles_*.json
-(`python -m bench.needles`), a table for each machine, and of bench/results/same_bits.json (`python -m bench.same_bits`).
+(`python -m bench.needles`), tables of the first machine, and of bench/results/same_bits.json (`python -m bench.same_bits`).
 """
 
 from __future__ import annotations
@@ -26,29 +26,40 @@ def _machine(stem: str, result: dict) -> str:
     return f"**{result['machine']['name']}** ({stem}, commit {result['commit']}, {result['date']})."
 
 
+def _worst(row: dict) -> dict[str, float]:
+    """Return the largest figures of images and gradients in a row."""
+    rgb, alpha, depth = (row["pictures"][n] for n in ("rgb", "alpha", "depth"))
+    found = {k: max(rgb[k], alpha[k]) for k in ("E mean", "E max", "P32 max", "A mean", "A max", "allowed")}
+    return found | {"E depth": depth["E max"], "rel L2": max(g["rel L2"] for g in row["gradients"].values())}
+
+
 def budget_text(results: dict[str, dict]) -> str:
-    """Two tables a machine: images and gradients."""
+    """Two tables of the first machine, images and gradients; a sentence on each of the others."""
     parts = []
     for stem, result in results.items():
         images, gradients = [], []
         for row in result["rows"]:
             name = row["scene"] + ("" if row["rule"] == "exact" else f", `{row['rule']}`")
-            rgb, alpha, depth = (row["pictures"][n] for n in ("rgb", "alpha", "depth"))
-            both = {k: max(rgb[k], alpha[k]) for k in ("E mean", "E max", "P32 max", "A mean", "A max")}
+            both, v = _worst(row), row["gradients"]
             images.append([
-                name, _e(both["E mean"]), _e(both["E max"]), _e(max(rgb["allowed"], alpha["allowed"])), _e(both["P32 max"]),
-                _e(depth["E max"]), _e(both["A mean"]), _e(both["A max"]),
+                name, *(_e(both[k]) for k in ("E mean", "E max", "allowed", "P32 max", "E depth", "A mean", "A max")),
                 f"{row['in band']} of {row['pixels']}", str(row["flips"]),
             ])  # fmt: skip
-            v = row["gradients"]
-            worst = max(v, key=lambda n: v[n]["rel L2"])
+            name_of_worst = max(v, key=lambda n: v[n]["rel L2"])
             gradients.append([
-                name, f"{_e(v[worst]['rel L2'])} ({worst})", _e(max(e["1 - cosine"] for e in v.values())),
-                _e(max(e["bias"] for e in v.values())), _e(max(e["E max"] for e in v.values())),
-                _e(max(e["P32 max"] for e in v.values())), _e(max(e["A max"] for e in v.values())),
+                name, f"{_e(both['rel L2'])} ({name_of_worst})",
+                *(_e(max(e[k] for e in v.values())) for k in ("1 - cosine", "bias", "E max", "P32 max", "A max")),
                 str(sum(e["wrong zeros"] for e in v.values())),
             ])  # fmt: skip
         kept = "Every line is kept." if not result["broken"] else "Broken: " + "; ".join(result["broken"]) + "."
+        if parts:
+            most = {k: max(_worst(row)[k] for row in result["rows"]) for k in ("E mean", "E max", "rel L2")}
+            parts.append(
+                f"{_machine(stem, result)} {kept} Largest over all scenes: mean E {_e(most['E mean'])}, max E "
+                f"{_e(most['E max'])}, relative L2 of a gradient {_e(most['rel L2'])}; each: "
+                f"`bench/results/budget_{stem}.json`.\n"
+            )
+            continue
         head = ["images", "mean E", "max E", "allowed", "max P32", "max E depth", "mean A", "max A", "band", "flips"]
         parts += [f"{_machine(stem, result)} {kept}\n", _table(head, images)]
         head = ["gradients", "relative L2", "1 - cosine", "bias", "max E", "max P32", "max A", "wrong zeros"]
@@ -57,9 +68,9 @@ def budget_text(results: dict[str, dict]) -> str:
 
 
 def needles_text(results: dict[str, dict]) -> str:
-    """A table a machine: max and mean errors by length, and how many times the factor form is better."""
+    """A table of the first machine: max and mean errors by length, and how many times the factor form is better."""
     parts = []
-    for stem, result in results.items():
+    for stem, result in list(results.items())[:1]:
         rows = []
         for row in result["rows"]:
             line = [f"{row['sigma']:,}"]
@@ -71,6 +82,7 @@ def needles_text(results: dict[str, dict]) -> str:
         head = ["length [px]", "weight: factor", "conic", "plain", "times", "image: factor", "conic", "plain", "times"]
         of = f"Max / mean over {result['needles']} needles (weight) and {result['images']} (image, gradient)."
         parts += [f"{_machine(stem, result)} {of}\n", _table([*head, "gradient: factor", "plain", "times"], rows)]
+    parts += [f"The same of another machine: `bench/results/needles_{stem}.json`.\n" for stem in list(results)[1:]]
     return "\n".join(parts)
 
 

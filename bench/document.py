@@ -8,7 +8,7 @@ from __future__ import annotations
 from bench import result_file
 from bench.harness import DISTURBED, OURS
 from bench.plot import Line, Panel, chart
-from bench.points import BASE
+from bench.points import BASE, DIAGONAL
 from bench.series import SIZES, Series, along, diagonal, exponent, tasks
 
 COLORS = {
@@ -21,18 +21,20 @@ INTRODUCTION = """# Performance
 
 Written by `python -m bench.document` from `bench/results/ops_*.json`; do not edit. To measure a machine:
 
+<!-- docs-run: hours, or a GPU -->
 ```bash
 python -m bench.ops --out bench/results/ops_MACHINE.json   # CUDA where there is a device; --device cpu, --budget SECONDS
 python -m bench.document
 ```
 
-Times are wall times in ms of one call with its inputs loaded, from an idle device to an idle device: the median, and in
-brackets the quartiles. Programs that are compared run in turn, one repeat each, unless one is over 30 times slower. `both`
-is forward and backward together, `step` a training step: rendering, loss, backward pass, Adam. A star marks figures during
-which other programs kept more than 0.2 cores busy, also on a second try.
+Times are wall times in ms of one call with its inputs loaded, from an idle device to an idle device: the median, whose
+quartiles stand in the results. Programs that are compared run in turn, one repeat each, unless one is over 30 times slower.
+`both` is forward and backward together, `step` a training step: rendering, loss, backward pass, Adam. A star marks figures
+during which other programs kept more than 0.2 cores busy, also on a second try.
 
 The scene is a random cloud whose Gaussians shrink as their number grows, rendered under rule `exact`. One size varies at a time
-around 100,000 Gaussians, 504 x 378 px, degree 3, one camera; a few points let Gaussians and image grow together.
+around 100,000 Gaussians, 504 x 378 px, degree 3, one camera; a few points let Gaussians and image grow together. The tables
+have that point and those; the charts, and the results, have all.
 
 Other programs: `torch conv2d` is SSIM as most trainers write it, `torch dense` a rasterizer without tiles in plain torch, up
 to 1,000 Gaussians, `naive` a kernel with one thread per pixel, `numpy` the paths of a sweep, a line at a time in numpy,
@@ -77,22 +79,34 @@ def _key(row: dict) -> tuple:
 def _timing(row: dict | None) -> str:
     if row is None:
         return ""
-    low, high = row["quartiles_ms"]
-    star = "*" if row.get("others_cores", 0.0) > DISTURBED else ""
-    return f"{figure(row['median_ms'])}{star} ({figure(low)} to {figure(high)})"
+    return figure(row["median_ms"]) + ("*" if row.get("others_cores", 0.0) > DISTURBED else "")
 
 
 def _name(program: str, direction: str) -> str:
     return direction if program == OURS else f"{program}, {direction}"
 
 
+def _shown(rows: list[dict]) -> list[dict]:
+    """Return the rows at the base point and along the diagonal; all of an op that was measured at neither."""
+    points = {(BASE.count, BASE.width), *((count, width) for count, width, _ in DIAGONAL[2:])}
+
+    def wanted(r: dict) -> bool:
+        if r.get("degree", BASE.degree) != BASE.degree or r.get("cameras", 1) != 1 or "threads" in r:
+            return False
+        n, width = r.get("N"), r.get("width")
+        return any((n is None or n == count) and (width is None or width == side) for count, side in points)
+
+    kept = [r for r in rows if wanted(r)]
+    return kept or rows
+
+
 def op_tables(rows: list[dict]) -> str:
     """Per op a table of sizes by programs and directions; on CUDA a second one with GPU time and memory."""
     parts = []
     for op in dict.fromkeys(r["op"] for r in rows):
-        own = [r for r in rows if r["op"] == op]
+        own = _shown([r for r in rows if r["op"] == op])
         by_task = {(r["program"], r["direction"], _key(r)): r for r in own}
-        sizes, columns = {_key(r): r for r in sorted(own, key=_key)}, _columns(own)
+        sizes, columns = {_key(r): r for r in sorted(own, key=_key)}, [c for c in _columns(own) if c in ("N", "image")]
         done = [(program, direction) for _, program, direction in tasks(own)]
         head = [*columns, *(_name(*t) for t in done)]
         body = [[*_sizes(r, columns), *(_timing(by_task.get((*t, key))) for t in done)] for key, r in sizes.items()]
@@ -108,27 +122,25 @@ def _device(row: dict | None) -> str:
 
 
 def peer_table(rows: list[dict]) -> str:
-    """Every size at which another program did the same work."""
+    """The largest size at which another program did the same work."""
     ours = {(r["op"], r["direction"], _key(r)): r for r in rows if r["program"] == OURS}
-    body, peers = [], [r for r in rows if r["program"] != OURS]
-    columns = _columns(peers)
-    for r in sorted(peers, key=lambda r: (r["op"], r["direction"], r["program"], _key(r))):
-        own = ours.get((r["op"], r["direction"], _key(r)))
-        if own:
-            ratio = f"{figure(r['median_ms'] / own['median_ms'])}"
-            body.append([r["op"], r["direction"], *_sizes(r, columns), r["program"], _timing(r), _timing(own), ratio])
+    peers = [r for r in rows if r["program"] != OURS and (r["op"], r["direction"], _key(r)) in ours]
+    columns, body = _columns(peers), []
+    for op, program, direction in sorted(tasks(peers), key=lambda t: (t[0], t[2], t[1])):
+        r = max((r for r in peers if (r["op"], r["program"], r["direction"]) == (op, program, direction)), key=_key)
+        mine = ours[r["op"], r["direction"], _key(r)]
+        ratio = figure(r["median_ms"] / mine["median_ms"])
+        body.append([op, direction, *_sizes(r, columns), program, _timing(r), _timing(mine), ratio])
     return table(["op", "direction", *columns, "peer", "peer [ms]", "warpgs [ms]", "peer / warpgs"], body) if body else ""
 
 
 def roof_table(rows: list[dict]) -> str:
-    """Our own tasks against the roof: at the base point, and where each was measured at its heaviest."""
+    """Our own tasks against the roof, where each was measured at its heaviest."""
     body = []
     for op, program, direction in tasks(rows):
         own = [r for r in rows if (r["op"], r["program"], r["direction"]) == (op, program, direction) and "roof_ms" in r]
-        base = {**BASE.sizes(("count", "image", "degree", "cameras"))}
-        chosen = [r for r in own if all(r[s] == base[s] for s in base if s in r)]
-        chosen += sorted(own, key=lambda r: r["roof_ms"])[-1:]
-        for r in {_key(r): r for r in chosen}.values():
+        if own:
+            r = max(own, key=lambda r: r["roof_ms"])
             cells = [op, direction, *_sizes(r, ["N", "image", "degree", "cameras"])]
             cells += [figure(r["bytes"] / 1e6), figure(r["operations"] / 1e6), figure(r["roof_ms"]), r["bound"]]
             body.append([*cells, figure(r.get("gpu_ms", r["median_ms"])), f"{figure(100 * r['fraction'])} %"])
@@ -164,11 +176,16 @@ def exponent_table(rows: list[dict]) -> str:
     return table(["op", "program", "direction", "over N", "up to N", "over pixels", "up to pixels"], body)
 
 
-def skipped_table(skipped: list[dict]) -> str:
-    """Return a table of the tasks not measured, with the reasons."""
-    columns = _columns(skipped)
-    body = [[s["op"], s["program"], s["direction"], *_sizes(s, columns), s["reason"]] for s in skipped]
-    return table(["op", "program", "direction", *columns, "reason"], body)
+def skipped_list(skipped: list[dict]) -> str:
+    """Return a list of the tasks not measured: how many sizes of each, and the reason at the first."""
+    groups: dict[tuple[str, str, str], list[str]] = {}
+    for r in skipped:
+        groups.setdefault((r["op"], r["program"], r["direction"]), []).append(r["reason"])
+    lines = [
+        f"- {op}, {program}, {direction}: {len(why)} size{'s' if len(why) > 1 else ''}, the first because: {why[0]}"
+        for (op, program, direction), why in groups.items()
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def _lines(series: list[Series], name) -> tuple[Line, ...]:
@@ -249,7 +266,7 @@ def machine_text(stem: str, result: dict, plots: list[str]) -> str:
         roof_table(rows),
     ]
     if result["skipped"]:
-        parts += ["### Skipped\n", skipped_table(result["skipped"])]
+        parts += ["### Skipped\n", skipped_list(result["skipped"])]
     return "\n".join(parts)
 
 

@@ -1,17 +1,14 @@
-"""Size, error and cost in PSNR of each file format, on the held-out views of runs, and with cleaning.
+"""Size of each file format, and its cost in PSNR on the held-out views of runs, whole and cleaned.
 
-usage: python -m bench.formats RUN ... [--splat-transform CLI] [--out bench/results/formats_cpu2.json]
+usage: python -m bench.formats RUN ... [--out bench/results/formats_fern_cpu2.json]
 
-A run is written in each format, read back and rendered at its held-out views; the difference to the PSNR of the model in memory
-is what the format costs. CLI is the command of npm's @playcanvas/splat-transform (such as "node cli.mjs"): with it, each file
-is read by that program, too, written as PLY, and compared with what this program reads.
+A run is written in each format, read back and rendered at its held-out views; what the PSNR is lower than that of the model in
+memory is what the format costs. The last rows are SPZ in each version.
 """
 
 from __future__ import annotations
 
 import argparse
-import shlex
-import subprocess
 import tempfile
 import time
 from pathlib import Path
@@ -23,49 +20,38 @@ from warpgs.coordinates import convert_gaussians
 from warpgs.export import spz
 from warpgs.export.arrays import arrays_of
 from warpgs.export.formats import FORMATS, read_gaussians
-from warpgs.geometry import rotation_matrices
 from warpgs.pipeline.runs.commands import scene_of
 from warpgs.pipeline.runs.folder import StoredRun, open_run
 from warpgs.pipeline.runs.results import evaluate_run
-from warpgs.pipeline.runs.share import Filters, export
+from warpgs.pipeline.runs.share import export
+from warpgs.pipeline.runs.share_filters import Filters
 from warpgs.scene import Gaussians
 
-WHAT = "file size, differences from the model and loss of PSNR on held-out views of each file format"
+WHAT = "file size, and loss of PSNR on held-out views, of each file format"
 
 
-def _scores(run: StoredRun, gaussians: Gaussians, views: tuple) -> float:
-    metrics = evaluate_run(None, gaussians, *views, run.rule, run.background)
-    return float(metrics["test"]["psnr"])
+class Scorer:
+    """The held-out views of a run, and the PSNR of its own model on them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.run: StoredRun = open_run(folder, "cpu")
+        _, train, test = scene_of(self.run)
+        self.views = (train, test)
+        self.own = self._psnr(self.run.gaussians())
+
+    def _psnr(self, gaussians: Gaussians) -> float:
+        metrics = evaluate_run(None, gaussians, *self.views, self.run.rule, self.run.background)
+        return float(metrics["test"]["psnr"])
+
+    def loss(self, gaussians: Gaussians) -> float:
+        """Return by how much the PSNR of Gaussians in file units is lower than that of the run's own model [dB]."""
+        return self.own - self._psnr(convert_gaussians(gaussians, self.run.normalization, "file", "scene"))
 
 
-def _foreign(command: str, file: Path, folder: Path) -> dict:
-    """Return how another program's reading of a file differs from ours; both keep the order of the file."""
-    target = folder / "foreign.ply"
-    subprocess.run([*shlex.split(command), "-w", "-q", str(file), str(target)], check=True, capture_output=True)
-    ours, theirs = read_gaussians(file), read_gaussians(target)
-    out: dict = {"count": len(theirs), "same_count": len(ours) == len(theirs)}
-    for name in ("means", "log_scales", "logit_opacities", "sh"):
-        a, b = (getattr(g, name).double() for g in (ours, theirs))
-        if name == "logit_opacities":
-            a, b = a.sigmoid(), b.sigmoid()
-        out[name] = float((a.mean(0) - b.mean(0)).abs().max())
-    out["box"] = max(float((f(ours.means, 0) - f(theirs.means, 0)).abs().max()) for f in (torch.amin, torch.amax))
-    out["rotation"] = float((_axes(ours) - _axes(theirs)).abs().max())
-    return out
-
-
-def _axes(g: Gaussians) -> torch.Tensor:
-    """Return the rotation matrices [N, 3, 3] without the signs of the axes, which change no Gaussian."""
-    return torch.as_tensor(rotation_matrices(torch.nn.functional.normalize(g.quats.double(), dim=1))).abs()
-
-
-def rows_of(folder: Path, command: str | None) -> list[dict]:
-    """Return a row for each format of a run, and one for each with cleaning."""
-    run = open_run(folder, "cpu")
-    _, train, test = scene_of(run)
-    views, reference = (train, test), run.gaussians()
-    base = _scores(run, reference, views)
-    rows = []
+def rows_of(folder: Path) -> list[dict]:
+    """Return a row for each format of a run whole and cleaned, and one for each version of SPZ."""
+    scorer, rows = Scorer(folder), []
+    known = {"run": folder.name, "of": len(scorer.run.gaussians()), "psnr": scorer.own}
     with tempfile.TemporaryDirectory() as name:
         for suffix in FORMATS:
             for clean in (False, True):
@@ -73,25 +59,19 @@ def rows_of(folder: Path, command: str | None) -> list[dict]:
                 start = time.perf_counter()
                 lines = export(folder, file, Filters(clean=clean))
                 written = time.perf_counter() - start
-                start = time.perf_counter()
                 back = read_gaussians(file)
-                seconds = {"write_s": round(written, 2), "read_s": round(time.perf_counter() - start, 2)}
-                there = convert_gaussians(back, run.normalization, "file", "scene")
-                row = {
-                    "run": folder.name, "format": suffix, "clean": clean, "gaussians": len(back), "degree": back.sh_degree,
-                    "of": len(reference), "of_degree": reference.sh_degree, "bytes": file.stat().st_size, **seconds,
-                    "psnr": base, "loss_db": base - _scores(run, there, views), "said": lines[:-1],
-                }  # fmt: skip
-                if command and not clean and suffix in (".ply", ".compressed.ply", ".splat", ".spz", ".sog"):
-                    row["splat_transform"] = _foreign(command, file, Path(name))
-                rows.append(row)
+                rows.append(known | {
+                    "format": suffix, "clean": clean, "gaussians": len(back), "degree": back.sh_degree,
+                    "bytes": file.stat().st_size, "write_s": round(written, 2), "loss_db": scorer.loss(back),
+                    "said": lines[:-1],
+                })  # fmt: skip
+        export(folder, whole := Path(name) / "whole.ply", Filters(clean=False))
         for version in spz.VERSIONS:
             file = Path(name) / "version.spz"
-            file.write_bytes(b"".join(spz.encode(arrays_of(read_gaussians(Path(name) / "model.ply")), version)))
-            there = convert_gaussians(read_gaussians(file), run.normalization, "file", "scene")
-            rows.append({
-                "run": folder.name, "format": f".spz version {version}", "clean": True, "bytes": file.stat().st_size,
-                "psnr": base, "loss_db": base - _scores(run, there, views),
+            file.write_bytes(b"".join(spz.encode(arrays_of(read_gaussians(whole)), version)))
+            rows.append(known | {
+                "format": f".spz version {version}", "clean": False, "gaussians": known["of"], "bytes": file.stat().st_size,
+                "loss_db": scorer.loss(read_gaussians(file)),
             })  # fmt: skip
     return rows
 
@@ -100,14 +80,13 @@ def main() -> None:
     """Measure, print and write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", nargs="+", type=Path)
-    parser.add_argument("--splat-transform")
     parser.add_argument("--out", type=Path)
     a = parser.parse_args()
-    rows = [row for run in a.runs for row in rows_of(run, a.splat_transform)]
+    rows = [row for run in a.runs for row in rows_of(run)]
     for row in rows:
         print(
-            f"{row['run']:<12} {row['format']:<18} clean {row['clean']!s:<5} {row['bytes'] / 2**20:8.3f} MiB  "
-            f"{row['loss_db']:+.4f} dB  {row.get('splat_transform', '')}"
+            f"{row['run']:<12} {row['format']:<18} clean {row['clean']!s:<5} {row['gaussians']:>8,} Gaussians "
+            f"{row['bytes'] / 2**20:8.3f} MiB {row['loss_db']:+.4f} dB"
         )
     result_file.write(a.out, result_file.result(WHAT, torch.device("cpu"), rows))
 

@@ -14,6 +14,7 @@ import torch
 
 import warpgs
 from bench import gsplat_trainer
+from bench.experiments import left_out_view  # noqa: F401 (registers its strategy)
 from bench.experiments.leave_one_out import trial_config
 from bench.mcmc import scores
 from bench.rows import folds, scene_at

@@ -31,8 +31,8 @@ def by_seed(rows: list[dict]) -> dict[tuple[str, str], dict[int, dict]]:
 def rival(scores: dict[str, dict[int, float]], base: str) -> tuple[Difference, list[str]]:
     """Return the paired difference of the base to the best of the others, and who that was.
 
-    For each seed the rival is the preset of the best mean over the other seeds: picked on the seeds that are compared it
-    would owe part of its lead to luck.
+    For each seed that all have, the rival is the preset of the best mean over the other seeds: picked on the seeds that are
+    compared it would owe part of its lead to luck. With seeds that some lack, a weaker one could stand for a missing best.
 
     Args:
         scores: PSNR by preset and seed [dB].
@@ -44,16 +44,12 @@ def rival(scores: dict[str, dict[int, float]], base: str) -> tuple[Difference, l
     if not scores.get(base):
         raise ValueError(f"no score of {base}: name another with --base, of {', '.join(scores)}")
     ours, theirs, names = [], [], []
-    for seed, score in scores[base].items():
-        means = {}
-        for name, own in scores.items():
-            others = [v for s, v in own.items() if s != seed]
-            if name != base and seed in own and others:
-                means[name] = statistics.mean(others)
-        if means:
-            names.append(max(means, key=lambda n: means[n]))
-            ours.append(score)
-            theirs.append(scores[names[-1]][seed])
+    common = set.intersection(*(set(own) for own in scores.values()))
+    for seed in sorted(common) if len(common) > 1 else ():
+        means = {n: statistics.mean(own[s] for s in common - {seed}) for n, own in scores.items() if n != base}
+        names.append(max(means, key=lambda n: means[n]))
+        ours.append(scores[base][seed])
+        theirs.append(scores[names[-1]][seed])
     return paired_difference(ours, theirs), list(dict.fromkeys(names))
 
 

@@ -7,11 +7,6 @@ import warpgs
 
 sys.path.insert(0, str(Path(__file__).parent))  # mathml.py
 
-EXPECTED = (
-    "install", "quickstart", "your-photos", "poses", "presets", "troubleshooting", "viewer", "films", "mesh", "formats",
-    "python", "measured",
-)  # fmt: skip
-"""Pages in the navigation that are still being written."""
 HIDDEN_COLON = "\N{OBJECT REPLACEMENT CHARACTER}"
 
 project = "warpgs"
@@ -43,13 +38,6 @@ python_use_unqualified_type_names = True
 linkcheck_ignore = [r"https?://(127\.0\.0\.1|localhost)"]
 
 
-def drop_missing_pages(app, docname: str, source: list[str]) -> None:
-    """Leave the pages of EXPECTED out of the navigation while there are none."""
-    for page in EXPECTED:
-        if docname == "index" and not (Path(app.srcdir) / f"{page}.md").exists():
-            source[0] = source[0].replace(f"\n{page}\n", "\n")
-
-
 def hide_colons(app, what: str, name: str, value: object, options: object, lines: list[str]) -> None:
     """Hide colons from napoleon, which reads the words before the first one in a field's docstring as its type."""
     if what in ("attribute", "property"):
@@ -63,6 +51,5 @@ def show_colons(app, what: str, name: str, value: object, options: object, lines
 
 def setup(app) -> None:
     """Connect to Sphinx, which calls this once the settings are read."""
-    app.connect("source-read", drop_missing_pages)
     app.connect("autodoc-process-docstring", hide_colons, priority=400)  # napoleon has 500
     app.connect("autodoc-process-docstring", show_colons, priority=600)

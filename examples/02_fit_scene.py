@@ -23,7 +23,7 @@ def main(arguments: list[str] | None = None) -> float:
     parser.add_argument("--width", type=int, default=96, help="width of the synthetic images [px]")
     a = parser.parse_args(arguments)
 
-    split = None
+    split = "every:8"
     if a.scene is None:
         from warpgs.synthetic.demo import write_demo
 

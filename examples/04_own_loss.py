@@ -63,7 +63,7 @@ def main(arguments: list[str] | None = None) -> float:
     a = parser.parse_args(arguments)
 
     with tempfile.TemporaryDirectory() as folder:
-        split = None
+        split = "every:8"
         if a.scene is None:
             from warpgs.synthetic.demo import write_demo
 

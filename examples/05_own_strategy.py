@@ -93,7 +93,7 @@ def main(arguments: list[str] | None = None) -> float:
     )
     configs = [dataclasses.replace(base, strategy_config=SproutConfig(growth=growth)) for growth in (0.0, 0.1)]
     with tempfile.TemporaryDirectory() as folder:
-        split = None
+        split = "every:8"
         if a.scene is None:
             from warpgs.synthetic.demo import write_demo
 

@@ -40,22 +40,26 @@ for words in (
     ["render", run, "--path", "views", *cpu],
     ["render", run, "--path", "turntable", "--frames", "3", *cpu],
     ["export", run, "--to", str(out / "a.ply")],
+    ["export", run, "--to", str(out / "cameras" / "sparse")],
+    ["export", run, "--to", str(out / "cameras.json")],
+    ["convert", str(out / "a.ply"), str(out / "a.sog")],
+    ["mesh", run, "--out", str(out / "m.glb"), "--resolution", "24", *cpu],
     ["prune", run, "--keep-psnr", "3", *cpu],
     ["priors", "show", scene, *split, "--out", str(out / "priors")],
     ["compare", scene, *split, "--out", str(out / "study"), "--presets", "3dgs,mcmc", "--seeds", "1", "--steps", "2", *cpu],
 ):
     assert main(words) == 0, words
 
-pruned = {p: s for p, s in placed.items() if p.is_dir()}
-assert list(pruned) == [out / "run-pruned"], pruned
-assert OWN_NAMES.fullmatch(pruned[out / "run-pruned"].name)
+folders = {p: s for p, s in placed.items() if p.is_dir()}
+assert set(folders) == {out / "run-pruned", out / "cameras" / "sparse"}, folders
+assert all(OWN_NAMES.fullmatch(source.name) for source in folders.values())
 for path in opened:
     own = OWN_NAMES.fullmatch(path.name) or path.name == LOCK or path.name == "metrics.jsonl"
     assert own, f"{path} was opened to be written"
 there = [p for p in out.rglob("*") if p.is_file()]
 for path in there:
     # a folder that is renamed as a whole takes its files along
-    was = next((source / path.relative_to(folder) for folder, source in pruned.items() if folder in path.parents), path)
+    was = next((source / path.relative_to(folder) for folder, source in folders.items() if folder in path.parents), path)
     assert was in placed and OWN_NAMES.fullmatch(placed[was].name), f"{path} was not put in place"
 assert len(there) > 60, len(there)
 assert not [p for p in there if OWN_NAMES.fullmatch(p.name) or p.name == LOCK]

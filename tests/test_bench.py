@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import pytest
 import torch
 
-from bench import document, harness, inputs, peers, predict, result_file
+from bench import document, harness, inputs, measured, peers, predict, result_file
 from bench.ops import OPS, Bench, run
 from bench.points import Point, growth, points
 from bench.series import exponent
@@ -199,8 +199,8 @@ def test_the_document_says_what_the_results_say():
     assert files == document.generate(json.loads(json.dumps(dict(reversed(results.items())))))
     text = files["performance.md"]
     assert text.index("(a)\n") < text.index("(b)\n")
-    assert "| 100,000 | 504 x 378 | 100 (0.5 to 2) | 200 (0.5 to 2) |" in text
-    assert "| 100,000 | 504 x 378 | gsplat | 200 (0.5 to 2) | 100 (0.5 to 2) | 2 |" in text
+    assert "| 100,000 | 504 x 378 | 100 | 200 |" in text
+    assert "| 100,000 | 504 x 378 | gsplat | 200 | 100 | 2 |" in text
     assert "| render | warpgs | both | 1.00 | 100,000 |" in text
     assert "| ssim | warpgs | forward |  |  | 1.00 |" in text
     assert "predicted 9 s" in text and "naive: not there" in text and "0.5 / 1 |" in text
@@ -217,3 +217,9 @@ def test_the_document_is_that_of_the_committed_results():
     for path, text in files.items():
         assert (docs / path).read_text("utf-8") == text, f"{path} is stale: run python -m bench.document"
     assert {f"plots/{p.name}" for p in (docs / "plots").glob("*.svg")} == set(files) - {"performance.md"}
+
+
+def test_the_page_of_measured_figures_is_that_of_the_committed_results():
+    """docs/measured.md is what `python -m bench.measured` writes."""
+    text = (result_file.ROOT / measured.PAGE).read_text("utf-8")
+    assert text == measured.page(), "stale: run python -m bench.measured"

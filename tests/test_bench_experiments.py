@@ -10,7 +10,16 @@ import pytest
 import torch
 
 from bench import result_file
-from bench.experiments import bucket, complexity, pareto, scale_limits, tradeoff, tradeoff_kernel, tradeoff_outcome
+from bench.experiments import (
+    bucket,
+    complexity,
+    left_out_view,
+    pareto,
+    scale_limits,
+    tradeoff,
+    tradeoff_kernel,
+    tradeoff_outcome,
+)
 from bench.experiments.bucket_kernel import SIZES, make_backward
 from bench.experiments.depth_order import depth_order, main
 from bench.experiments.frozen import scenes
@@ -19,12 +28,17 @@ from bench.experiments.settings import UNCUT, Setting, settings
 from tests.gaussians import camera, cloud
 from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference
+from tests.scenes import photos, seeds
 from warpgs.app.cli import main as warpgs
 from warpgs.errors import UsageError
 from warpgs.geometry import focus_point, project_points
 from warpgs.io.load import load_scene
+from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.request import SceneRequest
-from warpgs.pipeline.train.config import PRESETS
+from warpgs.pipeline.train.config import PRESETS, FitConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.strategies.holdout_blocks import HoldoutConfig
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.render.rule_costs import RULE_COSTS
 from warpgs.synthetic.demo import split_spec, write_demo
@@ -259,3 +273,19 @@ def test_scale_limits_are_compared_from_beside_the_cameras(tmp_path):
     row = {"scene": "a", "psnr": 20.0, "ssim": 0.5, "gaussians": 9} | dict.fromkeys(scale_limits.FIGURES, 0.25)
     rows = [row | {"limits": kind, "seed": seed} for kind in ("off", "on") for seed in (0, 1)]
     assert scale_limits.table(rows).count("\n| a | ") == 2 and "| on | 2 | 20.00 |" in scale_limits.table(rows)
+
+
+def test_the_central_view_is_left_out_until_growth_ends():
+    init = InitConfig(source="points", max_sh_degree=1)
+    density = DensityConfig(start=10, every=5, gradient=1e-5)
+    held = HoldoutConfig(levels=2, trim_db=0)
+    config = FitConfig(steps=60, sh_every=15, strategy="left_out_view", init=init, holdout=held, density=density)
+    fit = Trainer(photos(5), seeds(), config, torch.device("cpu"))
+    centers = torch.stack([left_out_view.center(v.camera.viewmat) for v in fit.strategy.whole])
+    chosen = int((centers[:, None] - centers).norm(dim=2).sum(1).argmin())
+    assert [len(b) > 0 for b in fit.strategy.blocks] == [i == chosen for i in range(5)]
+    assert len(fit.views) == 4
+    while fit.step < config.steps:
+        fit.advance()
+    assert fit.strategy.closed is not None and fit.strategy.levels
+    assert len(fit.views) == 5

@@ -104,6 +104,10 @@ def test_the_rival_is_picked_on_the_other_seeds():
     d, names = rival({k: dict(enumerate(v)) for k, v in scores.items()}, "default")
     assert sorted(names) == ["even", "lucky"]
     assert d.mean == pytest.approx(((20 - 19) + (20 - 20.1) + (20 - 19)) / 3) and d.count == 3
+    shorter, _ = rival(
+        {"default": {0: 20.0, 1: 20.0, 2: 20.0}, "weak": {0: 1.0, 1: 1.0, 2: 1.0}, "best": {0: 21.0, 1: 21.0}}, "default"
+    )
+    assert shorter.count == 2 and shorter.mean == pytest.approx(-1), "seeds that the best lacks are not compared"
 
 
 def test_tables_say_worst_seed_times_and_failures():

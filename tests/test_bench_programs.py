@@ -1,6 +1,7 @@
 """Programs of the suite run on tiny sizes, their peers agree, and the kept results are of one format."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 
 import warpgs
 from bench import __main__ as bench_main
-from bench import accuracy, many, needles, ranks, result_file, step, training
+from bench import accuracy, many, needles, ranks, result_file, splat_transform, step, training
 from bench.inputs import camera as bench_camera
 from bench.inputs import gaussians, image
 from bench.naive import rasterize
@@ -55,6 +56,18 @@ def test_a_result_says_what_it_was_made_by(tmp_path, monkeypatch):
     assert result_file.read(tmp_path / "a.json") == made
     with pytest.raises(ValueError, match="versions"):
         result_file.write(tmp_path / "b.json", {k: v for k, v in made.items() if k != "versions"})
+
+
+def test_statistics_of_exchanged_files():
+    """Those of the same Gaussians are equal, also after another quaternion of the same rotation; a moved column is named."""
+    g = cloud(30, degree=1)
+    ours, axes = splat_transform.statistics(g), splat_transform.statistics(g, axes=True)
+    assert len(ours) == 23 and len(axes) == 28 and splat_transform.difference(ours, ours)["largest_of_range"] == 0
+    other = replace(g, quats=-2 * g.quats)
+    assert splat_transform.difference(axes, splat_transform.statistics(other, axes=True))["largest_of_range"] < 1e-6
+    moved = splat_transform.difference(ours, ours | {"y": [ours["y"][0] - 1, *ours["y"][1:]]})
+    assert moved["column"] == "y min" and moved["same_columns"]
+    assert not splat_transform.difference(ours, {"x": ours["x"]})["same_columns"]
 
 
 def test_stages_of_a_step(device):

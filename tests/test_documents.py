@@ -2,8 +2,12 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+
+from warpgs import PRESETS
+from warpgs.pipeline.train.by_views import settings_by_views
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -41,3 +45,19 @@ def test_named_flags_are_there(page):
     parts = {flag: [part.replace("-", "_") for part in flag.split(".")] for flag in flags}
     missing = sorted(f for f, names in parts.items() if not all(n in known or n.removeprefix("no_") in known for n in names))
     assert not missing, f"{page.name} names flags that no command has: {', '.join(missing)}"
+
+
+def test_the_page_on_presets_says_what_the_rule_chooses():
+    """The columns of its table are the settings for so many views."""
+    text = (ROOT / "docs/presets.md").read_text("utf-8")
+    rows = [[c.strip() for c in line.split("|")[3:-1]] for line in text[text.index("| setting | rule |") :].splitlines()[:7]]
+    counts = [int(cell.split()[0]) for cell in rows[0]]
+    assert len(counts) >= 5
+    for column, views in enumerate(counts):
+        train = [SimpleNamespace(camera=SimpleNamespace(width=8, height=6))] * views
+        config, _ = settings_by_views(PRESETS["default"], train, "cuda")
+        chosen = (
+            config.steps, config.init.max_sh_degree, config.optimizer.scales_lr, config.optimizer.opacities_lr,
+            config.half_resolution,
+        )  # fmt: skip
+        assert tuple(float(row[column].replace(",", "")) for row in rows[2:]) == chosen, views

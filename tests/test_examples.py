@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from warpgs.synthetic.demo import write_demo
+
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SMALL = {
     "01_fit_image": (["--steps", "40", "--count", "150", "--size", "40"], "fitted.png", lambda gain: gain > 3),
@@ -36,6 +38,16 @@ def test_examples_show_what_they_promise(name, tmp_path, monkeypatch, capsys):
     assert promised(figure), printed
     assert re.search(r"\d\.\d", printed)
     assert np.asarray(Image.open(tmp_path / image)).std() > 5
+
+
+@pytest.mark.parametrize("name", ["02_fit_scene", "04_own_loss"])
+def test_examples_take_a_scene(name, tmp_path, monkeypatch, capsys):
+    """A folder that is given is fitted, with views held out to score."""
+    monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "cache"))
+    write_demo(tmp_path / "scene", views=8, width=48, height=36)
+    flags = ["--steps", "5"] + (["--frames", "2"] if name == "02_fit_scene" else [])
+    run(name, [str(tmp_path / "scene"), *flags, "--out", str(tmp_path / ("out" if "scene" in name else "out.png"))])
+    assert "held-out PSNR" in capsys.readouterr().out
 
 
 def test_every_example_says_how_it_is_run():

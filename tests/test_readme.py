@@ -1,4 +1,4 @@
-"""The README's example does what it says."""
+"""The examples of the README and of the page on Python do what they say."""
 
 import dataclasses
 import re
@@ -15,24 +15,25 @@ from warpgs.synthetic.demo import write_demo
 ROOT = Path(__file__).parent.parent
 
 
-def snippets() -> list[str]:
-    return re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)
+def snippets(page: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)
 
 
-def test_the_first_example_fits_an_image(capsys):
+def test_the_example_of_the_rasterizer_fits_an_image(capsys):
     """Run as printed, it ends near the target."""
-    assert len(snippets()[0].splitlines()) <= 28
-    exec(compile(snippets()[0], "README.md", "exec"), {})
+    text = snippets("docs/python.md")[-1]
+    assert len(text.splitlines()) <= 28
+    exec(compile(text, "docs/python.md", "exec"), {})
     assert float(capsys.readouterr().out.split()[-1]) < 0.06
 
 
-def test_the_second_example_fits_a_scene(tmp_path, monkeypatch):
+def test_the_example_fits_a_scene(tmp_path, monkeypatch):
     """Run as printed beside a tiny scene, with fewer steps: the PLY is there, in file units."""
     write_demo(tmp_path / "scene", views=8, width=48, height=36)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(PRESETS, "quick", dataclasses.replace(PRESETS["quick"], steps=5))
-    exec(compile(snippets()[1], "README.md", "exec"), {})
-    ours, runs = (read_ply(tmp_path / name) for name in ("model.ply", "run/point_cloud.ply"))
+    exec(compile(snippets("README.md")[0], "README.md", "exec"), {})
+    ours, runs = (read_ply(tmp_path / name) for name in ("model.ply", "fitted/point_cloud.ply"))
     assert torch.equal(ours.means, runs.means)
 
 

@@ -1,16 +1,17 @@
 """The commands of the pages are found, left out with a reason, and their failures seen."""
 
 import shutil
+from pathlib import Path
 
 import pytest
 
-from tools.run_docs import collect, run_blocks, shortened
+from tools.run_docs import ROOT, collect, pages, prepare, run_blocks, shortened
 
 PAGE = """Words.
 
 ```bash
 echo first > a
-pip install "warpgs[view]"
+ssh -L 8080:127.0.0.1:8080 you@there
 ```
 
 <!-- docs-run: needs a GPU -->
@@ -20,7 +21,7 @@ echo never > b
 
 ```
 $ warpgs export run --to a.ply
-warpgs view run
+warpgs fit scene --out x --device cuda
 ```
 
 ```{math}
@@ -28,7 +29,7 @@ warpgs view run
 ```
 
 ```python
-print("not a shell")
+open("p", "w").write("python")
 ```
 
 ```
@@ -38,10 +39,12 @@ a table without a language
 
 
 def test_blocks_and_reasons():
-    first, marked, bare = collect("x.md", PAGE)
-    assert (first.line, first.code, first.left_out) == (4, "echo first > a", ("network or another machine",))
-    assert (marked.code, marked.left_out) == ("", ("needs a GPU",))
-    assert (bare.code, bare.left_out) == ("warpgs export run --to a.ply", ("stays open",))
+    first, marked, bare, python = collect("x.md", PAGE)
+    assert (first.line, first.code) == (4, "echo first > a")
+    assert first.left_out == (("ssh -L 8080:127.0.0.1:8080 you@there", "another machine"),)
+    assert (marked.code, marked.left_out) == ("", (("echo never > b", "needs a GPU"),))
+    assert (bare.code, bare.left_out[0][1]) == ("warpgs export run --to a.ply", "GPU")
+    assert python.python and python.code.startswith("open(") and not first.python
 
 
 def test_a_marker_says_why():
@@ -51,12 +54,30 @@ def test_a_marker_says_why():
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
 def test_blocks_run_in_order_and_failures_are_named(tmp_path):
-    text = "```bash\necho 1 > a\n```\n```bash\ncat a\nfalse\ntouch late\n```\n```bash\ncp a b\n```\n"
+    text = "```python\nopen('a', 'w')\n```\n```bash\ncat a\nfalse\ntouch late\n```\n```bash\ncp a b\n```\n"
     (line,) = run_blocks(collect("x.md", text), tmp_path, tmp_path)
     assert line.startswith("x.md, line 5: exit code 1") and (tmp_path / "b").exists() and not (tmp_path / "late").exists()
 
 
-def test_only_what_is_not_said_is_made_short():
+def test_a_page_gets_what_it_uses_and_does_not_make(tmp_path):
+    made, folder = tmp_path / "made", tmp_path / "page"
+    for name in ("scene", "run", "photos"):
+        (made / name).mkdir(parents=True)
+    folder.mkdir()
+    prepare(folder, "warpgs fit scene/ --out run/\nwarpgs render run/", made)
+    assert [p.name for p in folder.iterdir()] == ["scene"]
+
+
+def test_only_what_is_long_is_made_short():
     assert shortened(["fit", "s", "--out", "r"])[-2:] == ["--steps", "40"]
+    assert shortened(["compare", "s", "--seeds", "5", "--steps=9"]) == ["compare", "s", "--seeds", "1", "--steps=9"]
+    assert shortened(["fit", "s", "--steps=3", "--view"])[2:] == ["--steps=3", "--view", "--view-port", "0"]
     for words in (["fit", "s", "--steps=3"], ["fit", "--help"], ["export", "run"], []):
         assert shortened(words) == words
+
+
+def test_every_page_can_be_read():
+    """No marker lacks its reason, and hardly anything is left out."""
+    blocks = [b for p in pages() for b in collect(p, Path(ROOT / p).read_text("utf-8"))]
+    assert sum(bool(b.code) for b in blocks) > 20
+    assert sum(len(b.left_out) for b in blocks) <= 20

@@ -1,11 +1,13 @@
-"""Run the shell commands of the README and of the pages for users, as a reader would type them (`make docs-run`).
+"""Run the commands and the Python snippets of the README and of all pages, as a reader would type them (`make docs-run`).
 
 Each page has a temporary folder of its own, in which its blocks run one after the other. What a page uses and does not make
-itself is put there first: `scene` (the demo scene, small), `photos` (its images alone) and `run` (a short fit). A program
-`warpgs` before all others on the path adds flags that make commands short; see `shortened`.
+itself is put there first (`INPUTS`). A program `warpgs` before all others on the path makes commands short (`LIMITS`), and ends
+the viewer once it says where it is.
 
-A block that cannot run here stands below a comment with the reason, `<!-- docs-run: REASON -->`. Single lines that begin with
-what `LEFT_OUT` names are left out, too. Both are counted.
+A block that cannot run here stands below a comment with the reason, `<!-- docs-run: REASON -->`; single lines that begin with
+what `LEFT_OUT` names are left out, too. Each is printed at the end with its reason.
+
+usage: python -m tools.run_docs [--install] [PAGE ...]    --install types docs/install.md in a fresh copy, with a network
 """
 
 from __future__ import annotations
@@ -21,11 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = (
-    "README.md", "docs/install.md", "docs/quickstart.md", "docs/your-photos.md", "docs/poses.md", "docs/viewer.md",
-    "docs/films.md", "docs/mesh.md", "docs/formats.md",
-)  # fmt: skip
-"""Pages for users; those that are not there are passed over."""
+INSTALL = "docs/install.md"
 FENCE = re.compile(
     r"(?:<!-- docs-run: (?P<reason>[^\n]*?) -->\s*\n)?^```(?P<kind>[^\n`]*)\n(?P<code>.*?)^```", re.DOTALL | re.MULTILINE
 )
@@ -33,78 +31,143 @@ SHELLS = {"bash", "sh", "shell", "console"}
 PROGRAMS = ("warpgs ", "pip ", "ssh ", "make ", "python ", "git ")
 """First words of a block without a language that make it one for a shell."""
 LEFT_OUT = (
-    (r"(sudo |apt|brew|git|curl|wget|ssh|pip|python3? -m (pip|venv))\b", "network or another machine"),
-    (r"(make|source|\.) ", "the reader's environment"),
-    (r"warpgs view\b", "stays open"),
+    (r"ssh ", "another machine"),
     (r"warpgs .*--device cuda\b", "GPU"),
+    (r"make (demo|test|install)\b", "the workflow test runs it"),
+    (r"(python3 -m venv|source .*activate|pip install (\.|torch)|git clone)", "installing, which --install runs"),
 )
 """Beginnings of lines that are left out, and why."""
-LIMIT = 900
+INPUTS = ("scene", "photos", "photographs", "PHOTOGRAPHS", "run", "scenes", "keyframes.json", "examples")
+"""What pages may use: the small demo scene; its images alone; a short fit; a folder of scenes; cameras of a film; examples."""
+MAKE_INPUTS = """
+warpgs demo scene --views 8 && mkdir scenes && cp -r scene scenes/demo
+python -c "from warpgs.synthetic.demo import write_demo; write_demo('large', views=8, width=160, height=120)"
+for name in photos photographs PHOTOGRAPHS; do cp -r large/images $name; done
+warpgs fit scene --out run --split every:4
+python - <<'END'
+import json, numpy, warpgs
+cameras = warpgs.open_run("run").cameras(units="file").values()
+keys = [{"c2w": numpy.linalg.inv(c.viewmat).tolist(), "fov_y": 0.8, "seconds": float(i)} for i, c in enumerate(cameras)]
+open("keyframes.json", "w").write(json.dumps(keys))
+END
+"""
+LIMITS = {
+    "demo": {"--width": "96", "--height": "72"}, "fit": {"--steps": "40"}, "render": {"--frames": "4"},
+    "compare": {"--steps": "20", "--seeds": "1", "--downscale": "1"}, "view": {"--port": "0"},
+    "ablate": {"--steps": "20", "--seeds": "1", "--downscale": "1"},
+}  # fmt: skip
+"""Largest values of flags of a command; each is given where a page gives none or more."""
+TIME = 900
 """Seconds that a block may take."""
+VIEWER_TIME = 120
+"""Seconds within which the viewer says where it is."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """A block of shell commands in a page."""
+    """A block of commands, or of Python, in a page."""
 
     page: str
     """Path of the page from the root of the project."""
     line: int
     """Line of the page in which its first command stands."""
     code: str
-    """Commands that run."""
-    left_out: tuple[str, ...]
-    """Reasons, one for each line that does not run, or for the whole block."""
+    """What runs: words for bash, or for Python."""
+    python: bool
+    """True for Python."""
+    left_out: tuple[tuple[str, str], ...]
+    """Lines that do not run, or the first of a block that does not, each with its reason."""
 
 
-def collect(page: str, text: str) -> list[Block]:
-    """Return the blocks of shell commands of a page, in order; ValueError where a marker gives no reason."""
+def pages() -> list[str]:
+    """Return all pages, by path from the root of the project."""
+    found = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md"]
+    return [p.relative_to(ROOT).as_posix() for p in (*found, *sorted((ROOT / "docs").rglob("*.md")))]
+
+
+def collect(page: str, text: str, left_out: tuple[tuple[str, str], ...] = LEFT_OUT) -> list[Block]:
+    """Return the blocks of a page, in order; ValueError where a marker gives no reason."""
     blocks = []
     for match in FENCE.finditer(text):
-        code, reason = match["code"], match["reason"]
-        if match["kind"].strip() not in SHELLS and (match["kind"] or not code.removeprefix("$ ").startswith(PROGRAMS)):
+        code, reason, kind = match["code"], match["reason"], match["kind"].strip()
+        python = kind == "python"
+        if not python and kind not in SHELLS and (kind or not code.removeprefix("$ ").startswith(PROGRAMS)):
             continue
         line = text[: match.start("code")].count("\n") + 1
         if reason is not None and not reason.strip():
             raise ValueError(f"{page}, line {line}: the marker says not why the block cannot run")
         if reason is not None:
-            blocks.append(Block(page, line, "", (reason,)))
+            blocks.append(Block(page, line, "", python, ((code.splitlines()[0], reason),)))
             continue
-        kept, reasons = [], []
-        for command in (row.removeprefix("$ ") for row in code.splitlines()):
-            why = next((why for start, why in LEFT_OUT if re.match(start, command)), None)
+        kept, left = [], []
+        for command in [code] if python else [row.removeprefix("$ ") for row in code.splitlines()]:
+            why = None if python else next((why for start, why in left_out if re.match(start, command)), None)
             kept.append("" if why else command)
-            reasons += [why] if why else []
-        blocks.append(Block(page, line, "\n".join(kept).strip(), tuple(reasons)))
+            left += [(command, why)] if why else []
+        blocks.append(Block(page, line, "\n".join(kept).strip(), python, tuple(left)))
     return blocks
 
 
 def shortened(words: list[str]) -> list[str]:
-    """Return the words of a `warpgs` command with few steps, frames, seeds and pixels, where it does not say how many."""
-    few = {
-        "fit": {"--steps": "40"}, "compare": {"--steps": "20", "--seeds": "1"}, "ablate": {"--steps": "20", "--seeds": "1"},
-        "render": {"--frames": "4"}, "demo": {"--width": "96", "--height": "72"},
-    }  # fmt: skip
-    stop = {"--help", "-h", "--help-all", "--time-budget", "--seconds"}
-    if not words or stop & set(words):
+    """Return the words of a `warpgs` command within `LIMITS`."""
+    if not words or {"--help", "-h", "--help-all", "--time-budget"} & set(words):
         return words
-    given = {word.partition("=")[0] for word in words}
-    return words + [w for flag, value in few.get(words[0], {}).items() if flag not in given for w in (flag, value)]
+    words = [*words]
+    limits = {**LIMITS.get(words[0], {}), **({"--view-port": "0"} if "--view" in words else {})}
+    for flag, most in limits.items():
+        at = next((i for i, w in enumerate(words) if w.partition("=")[0] == flag), None)
+        if at is None:
+            words += [flag, most] if flag != "--downscale" else []
+        elif "=" in words[at]:
+            words[at] = f"{flag}={min(float(words[at].partition('=')[2]), float(most)):.0f}"
+        else:
+            words[at + 1] = f"{min(float(words[at + 1]), float(most)):.0f}"
+    return words
 
 
-def _shell(code: str, folder: Path, programs: Path) -> str:
-    """Run commands in bash until one fails; return what is wrong, empty where nothing is."""
-    path = os.pathsep.join([str(programs), str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+def main_of_warpgs(words: list[str]) -> int:
+    """Run a `warpgs` command shortened; the viewer is interrupted once it prints an address. Return the exit code."""
+    command = [sys.executable, "-m", "warpgs.app.cli", *shortened(words)]
+    if words[:1] != ["view"] or "--help" in words:
+        return subprocess.run(command, check=False).returncode
+    with tempfile.TemporaryFile("w+", encoding="utf-8") as output:
+        plain = {**os.environ, "PYTHONUNBUFFERED": "1"}  # a file is no terminal: lines would stay in a buffer
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background would ignore it, and its children
+        process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=plain)
+        told = False
+        try:
+            for _ in range(10 * VIEWER_TIME):
+                try:
+                    process.wait(0.1)
+                    break
+                except subprocess.TimeoutExpired:
+                    output.seek(0)
+                    told = "http://" in output.read()
+                    if told:
+                        break
+            process.send_signal(signal.SIGINT)
+            ended = process.wait(60)
+        finally:
+            process.kill()
+        output.seek(0)
+        print(output.read())
+        return 0 if told and ended in (0, 130) else 1
+
+
+def _run(words: list[str], folder: Path, programs: Path | None, code: str = "") -> str:
+    """Run a program in a folder; return what is wrong, empty where nothing is."""
+    first = [str(programs), str(Path(sys.executable).parent)] if programs else []
+    path = os.pathsep.join([*first, os.environ.get("PATH", "")])
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as output:
         process = subprocess.Popen(
-            ["bash", "-e", "-c", code], cwd=folder, env={**os.environ, "PATH": path}, stdin=subprocess.DEVNULL, stdout=output,
-            stderr=subprocess.STDOUT, start_new_session=True,
+            words, cwd=folder, env={**os.environ, "PATH": path}, stdin=subprocess.PIPE, stdout=output, text=True,
+            encoding="utf-8", stderr=subprocess.STDOUT, start_new_session=True,
         )  # fmt: skip
         try:
-            ended = process.wait(LIMIT)
-            why = f"exit code {ended}" if ended else ""
+            process.communicate(code, TIME)
+            why = f"exit code {process.returncode}" if process.returncode else ""
         except subprocess.TimeoutExpired:
-            why = f"not done after {LIMIT} s"
+            why = f"not done after {TIME} s"
         finally:
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGKILL)
@@ -113,63 +176,90 @@ def _shell(code: str, folder: Path, programs: Path) -> str:
         return "\n    ".join([why, *output.read().splitlines()[-5:]]) if why else ""
 
 
-def write_program(folder: Path) -> None:
-    """Write the program `warpgs` that runs short."""
-    program = folder / "warpgs"
-    program.write_text(
-        f"#!{sys.executable}\nimport sys\nsys.path.insert(0, {str(ROOT)!r})\nfrom tools.run_docs import shortened\n"
-        "from warpgs.app.cli import main\nsys.exit(main(shortened(sys.argv[1:])))\n"
-    )
-    program.chmod(0o755)
+def run_block(block: Block, folder: Path, programs: Path | None) -> str:
+    """Run a block in a folder; return what is wrong, empty where nothing is."""
+    if block.python:
+        return _run([sys.executable, "-"], folder, programs, block.code)
+    return _run(["bash", "-e", "-c", block.code], folder, programs) if block.code else ""
 
 
-def _prepare(folder: Path, code: str, made: Path) -> None:
-    """Put into the folder of a page what its commands use and do not make."""
-    own = {word.strip("'\"").rstrip("/") for word in re.findall(r"(?:warpgs demo|--out)[ =](\S+)", code)}
-    for name in ("scene", "photos", "run"):
-        if name not in own:
-            shutil.copytree(made / name, folder / name)
-
-
-def run_blocks(blocks: list[Block], folder: Path, programs: Path) -> list[str]:
+def run_blocks(blocks: list[Block], folder: Path, programs: Path | None) -> list[str]:
     """Run the blocks of a page in order; return a line for each that failed."""
     failed = []
     for block in blocks:
-        why = _shell(block.code, folder, programs) if block.code else ""
+        why = run_block(block, folder, programs)
         if why:
             failed.append(f"{block.page}, line {block.line}: {why}")
     return failed
 
 
-def main() -> int:
-    """Run all pages, or those named; returns 1 where a block failed."""
-    failed: list[str] = []
-    pages = [p for p in (sys.argv[1:] or PAGES) if (ROOT / p).is_file()]
+def write_program(folder: Path) -> None:
+    """Write the program `warpgs` that runs short."""
+    program = folder / "warpgs"
+    program.write_text(
+        f"#!{sys.executable}\nimport sys\nsys.path.insert(0, {str(ROOT)!r})\nfrom tools.run_docs import main_of_warpgs\n"
+        "sys.exit(main_of_warpgs(sys.argv[1:]))\n"
+    )
+    program.chmod(0o755)
+
+
+def prepare(folder: Path, code: str, made: Path) -> None:
+    """Put into the folder of a page what its blocks use and do not make."""
+    own = {word.strip("'\"),").rstrip("/") for word in re.findall(r"(?:warpgs demo |--out[ =]|out=)(\S+)", code)}
+    for name in INPUTS:
+        if name not in own and re.search(rf"(?<![\w./-]){re.escape(name)}\b", code):
+            source = ROOT / name if name == "examples" else made / name
+            (shutil.copytree if source.is_dir() else shutil.copy)(source, folder / name)
+
+
+def run_page(page: str, made: Path, programs: Path) -> tuple[int, list[str], list[str]]:
+    """Run the blocks of a page; return how many ran, a line for each that failed, and one for each line left out."""
+    blocks = collect(page, (ROOT / page).read_text("utf-8"))
+    folder = made.parent / page.replace("/", "-")
+    folder.mkdir()
+    prepare(folder, "\n".join(b.code for b in blocks), made)
+    failed = run_blocks(blocks, folder, programs)
+    left = [f"{page}, line {b.line}: {words.split('  ')[0]} ({why})" for b in blocks for words, why in b.left_out]
+    return sum(bool(b.code) for b in blocks), failed, left
+
+
+def install(folder: Path) -> list[str]:
+    """Type docs/install.md into a fresh copy of the project; return a line for each block that failed."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"], cwd=ROOT, capture_output=True, check=True
+    )
+    for name in filter(None, listed.stdout.decode().split("\0")):
+        if (ROOT / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, folder / name)
+    return run_blocks(collect(INSTALL, (ROOT / INSTALL).read_text("utf-8"), ()), folder, None)
+
+
+def main(arguments: list[str]) -> int:
+    """Run all pages, or those named; return 1 where a block failed."""
+    failed, left = [], []
     with tempfile.TemporaryDirectory(prefix="docs-run-") as name:
         made, programs = Path(name) / "made", Path(name) / "bin"
         made.mkdir()
+        if "--install" in arguments:
+            failed = install(made)
+            print("\n".join(failed) or f"{INSTALL}: installed")
+            return int(bool(failed))
         programs.mkdir()
         write_program(programs)
-        why = _shell("warpgs demo scene --views 8 && cp -r scene/images photos && warpgs fit scene --out run", made, programs)
+        why = _run(["bash", "-e", "-c", MAKE_INPUTS], made, programs)
         if why:
-            print(f"the scene and the run that pages start from: {why}")
+            print(f"what pages start from could not be made: {why}")
             return 1
-        for page in pages:
-            blocks = collect(page, (ROOT / page).read_text("utf-8"))
-            folder = Path(name) / page.replace("/", "-")
-            folder.mkdir()
-            _prepare(folder, "\n".join(b.code for b in blocks), made)
-            wrong = run_blocks(blocks, folder, programs)
-            ran, left = sum(bool(b.code) for b in blocks), [why for b in blocks for why in b.left_out]
-            about = "; ".join(f"{left.count(why)} x {why}" for why in sorted(set(left)))
-            print(
-                f"{page}: {ran} blocks ran, {len(wrong)} failed, {len(left)} left out{f' ({about})' if about else ''}",
-                flush=True,
-            )
+        for page in arguments or pages():
+            ran, wrong, rest = run_page(page, made, programs)
+            if ran or rest:
+                print(f"{page}: {ran} blocks ran, {len(wrong)} failed, {len(rest)} left out", *wrong, sep="\n", flush=True)
             failed += wrong
-    print("\n".join(failed))
+            left += rest
+    print("\n".join(["", "left out:", *left, "", f"{len(failed)} blocks failed"]))
     return int(bool(failed))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))

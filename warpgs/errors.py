@@ -38,6 +38,10 @@ class ResourceError(WarpgsError):
     exit_code = 4
 
 
+class FolderHeldError(ResourceError):
+    """Another process holds a folder that it writes into."""
+
+
 class OutOfMemoryError(ResourceError):
     """A step of a fit asked for more memory than the device had."""
 

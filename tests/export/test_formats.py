@@ -251,6 +251,7 @@ def set_to(*keys, value):
         (set_to("count", value=10**12), "Gaussians in"),
         (set_to("count", value=1000), "pixels for 1000"),
         (set_to("version", value=1), "version 2"),
+        (set_to("model", value="antialiased"), "model 'antialiased'"),
         (set_to("means", "files", 0, value="../../etc/passwd"), "not in the archive"),
         (set_to("means", "mins", 0, value=1e300), "not finite"),
         (set_to("scales", "codebook", value=[1.0]), "codebook"),

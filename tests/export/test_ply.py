@@ -181,6 +181,7 @@ MALFORMED = {
     "odd type": (ply(["element vertex 0", "property half x"]), "makes no sense"),
     "twice": (ply(["element vertex 1", *PROPERTIES, "property float x"], ROW * 2), "appears twice"),
     "missing": (ply(["element vertex 1", *PROPERTIES[1:]], ROW), "missing: x"),
+    "flat": (ply(["element vertex 1", *(p for p in PROPERTIES if "scale_2" not in p)], ROW), "2DGS"),
     "half a degree": (ply(["element vertex 0", *PROPERTIES, *RESET_FREE_STEPS[:5]]), "5 f_rest"),
     "gap": (ply(["element vertex 0", *PROPERTIES, *RESET_FREE_STEPS[:8], "property float f_rest_9"]), "missing: f_rest_8"),
     "vertex list": (ply(["element vertex 0", *PROPERTIES, "property list uchar int i"]), "lists in element 'vertex'"),
@@ -201,6 +202,24 @@ def test_malformed_files_are_told_with_path_and_remedy(tmp_path, name):
     with pytest.raises(DataError, match=message) as error:
         read_ply(path)
     assert str(path) in str(error.value) and "Export" in str(error.value)
+
+
+def test_infinite_logits_and_axes_without_length(tmp_path):
+    """Other programs write them for opacities of 0 and 1, and for flat Gaussians; infinities elsewhere are refused."""
+    inf, path = np.float32(np.inf), tmp_path / "a.ply"
+    header = ply(["element vertex 1", *PROPERTIES])
+    for logit, wanted in ((inf, 1.0), (-inf, 0.0)):
+        row = np.frombuffer(ROW, "<f4").copy()
+        row[NAMES.index("opacity")], row[NAMES.index("scale_2")] = logit, -inf
+        path.write_bytes(header + row.tobytes())
+        model = read_ply(path)
+        assert abs(float(model.logit_opacities.sigmoid()) - wanted) < 1e-12 and 0 < float(model.log_scales.exp()[0, 2]) < 1e-36
+    for name in ("x", "scale_0", "f_dc_0", "rot_0"):
+        row = np.frombuffer(ROW, "<f4").copy()
+        row[NAMES.index(name)] = inf
+        path.write_bytes(header + row.tobytes())
+        with pytest.raises(DataError, match=f"{name} of Gaussian 0 is not finite"):
+            read_ply(path)
 
 
 @pytest.fixture(scope="module")

@@ -51,7 +51,7 @@ def register(target: Target) -> Target:
 
 def all_targets() -> dict[str, Target]:
     """Return every registered reader by name."""
-    from tests.faults import image_targets, model_targets, scene_targets  # noqa: F401 - they register
+    from tests.faults import format_targets, image_targets, model_targets, scene_targets  # noqa: F401 - they register
 
     return TARGETS
 

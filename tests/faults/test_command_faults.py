@@ -16,8 +16,9 @@ from warpgs.errors import ResourceError
 
 pytestmark = pytest.mark.fault
 COUNT = int(os.environ.get("WARPGS_KILLS", "0")) // 2
-COMMANDS = ("fit", "fit", "fit", "resume", "resume", "render", "eval", "prune", "export", "export")
-CASES = [(COMMANDS[i % len(COMMANDS)], i) for i in range(COUNT)] or [("render", 5), ("eval", 6), ("prune", 7)]
+COMMANDS = ("fit", "fit", "fit", "resume", "resume", "render", "eval", "prune", "export", "convert", "mesh")
+FEW = [("render", 5), ("eval", 6), ("prune", 7), ("convert", 9), ("mesh", 10)]
+CASES = [(COMMANDS[i % len(COMMANDS)], i) for i in range(COUNT)] or FEW
 
 
 def drawn(reference: Reference, command: str, index: int) -> tuple[int, Fault]:

@@ -103,7 +103,7 @@ def check_command(reference, command, work, before, capfd, make_room):
     check_right(reference, command, work, before)
 
 
-@pytest.mark.parametrize("command", ["fit", "render", "export", "eval", "prune"])
+@pytest.mark.parametrize("command", ["fit", "render", "export", "convert", "mesh", "eval", "prune"])
 @pytest.mark.parametrize("room", sizes(0, 4 * KIB, 8 * KIB, 16 * KIB, 32 * KIB, 64 * KIB, 128 * KIB, 512 * KIB, 8192 * KIB))
 def test_a_disk_that_fills(reference, disk, capfd, command, room):
     """What was there before stays, and with more room the command comes to its end."""
@@ -125,7 +125,7 @@ def test_a_disk_without_room_for_names(reference, disk, capfd, command, names):
     check_command(reference, command, work, before, capfd, lambda: disk("nr_inodes=1000"))
 
 
-@pytest.mark.parametrize("command", ["fit", "resume", "render", "export", "eval", "prune"])
+@pytest.mark.parametrize("command", ["fit", "resume", "render", "export", "convert", "mesh", "eval", "prune"])
 def test_a_disk_that_cannot_be_written(reference, disk, capfd, command):
     work = disk("size=64m") / "work"
     reference.before(command, work)

@@ -30,7 +30,9 @@ from warpgs.files import LOCK, OWN_NAMES
 
 pytestmark = pytest.mark.fault
 KILLS = int(os.environ.get("WARPGS_KILLS", "0"))
-SHARES = {"fit": 0.45, "resume": 0.26, "eval": 0.1, "render": 0.09, "prune": 0.06, "export": 0.04}
+SHARES = {
+    "fit": 0.45, "resume": 0.26, "eval": 0.1, "render": 0.08, "prune": 0.05, "export": 0.02, "convert": 0.02, "mesh": 0.02,
+}  # fmt: skip
 """Parts of all kills by command, as their numbers of calls are to one another, but for the short ones, which get more."""
 CASES = [(c, i) for c in COMMANDS for i in range(round(SHARES[c] * KILLS))] or [("fit", 0)]
 

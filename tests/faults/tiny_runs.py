@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from tests.faults.child import run
+from warpgs.export.formats import read_gaussians
 from warpgs.export.ply import read_ply
 from warpgs.files import LOCK, OWN_NAMES
 from warpgs.pipeline.runs.checkpoint import load_checkpoint
@@ -25,13 +26,13 @@ ROOT = Path(__file__).parent.parent.parent
 STEPS, FRAMES, VIEWS = 60, 4, 8
 HALF_WAY = 33
 """Step at which the run is interrupted that the other commands start from; its checkpoint is of step 30."""
-COMMANDS = ("fit", "resume", "render", "export", "prune", "eval")
-SAME_BYTES = (".ply", ".png", ".mp4", ".safetensors")
+COMMANDS = ("fit", "resume", "render", "export", "convert", "mesh", "prune", "eval")
+SAME_BYTES = (".ply", ".spz", ".glb", ".png", ".mp4", ".safetensors")
 """Suffixes of files that are the same whenever they are written again; the others hold times and places."""
 
 OWN = {
     "fit": ("run/",), "resume": ("run/",), "eval": ("run/eval.json", "run/renders/", "run/depth/"), "render": ("film/",),
-    "prune": ("run-pruned/",), "export": ("a.ply",),
+    "prune": ("run-pruned/",), "export": ("a.ply",), "convert": ("b.spz",), "mesh": ("m.glb",),
 }  # fmt: skip
 """Beginnings of the paths that a command writes."""
 
@@ -48,6 +49,8 @@ def words_of(command: str, scene: Path, work: Path) -> list[str]:
         "resume": [*fit, "--resume"],
         "render": ["render", run, "--path", "turntable", "--frames", str(FRAMES), "--out", str(work / "film"), *cpu],
         "export": ["export", run, "--to", str(work / "a.ply")],
+        "convert": ["convert", str(work / "a.ply"), str(work / "b.spz")],
+        "mesh": ["mesh", run, "--out", str(work / "m.glb"), "--resolution", "24", *cpu],
         "prune": ["prune", run, "--keep-psnr", "3", *cpu],
         "eval": ["eval", run, *cpu],
     }[command]
@@ -138,6 +141,10 @@ def check_whole(folder: Path, *, ended: bool) -> None:
             assert _decoded_sizes(path) == [(48, 36)] * FRAMES, path
         elif path.suffix == ".ply":
             assert len(read_ply(path)), path
+        elif path.suffix == ".spz":
+            assert len(read_gaussians(path)), path
+        elif path.suffix == ".glb":
+            assert int.from_bytes(path.read_bytes()[8:12], "little") == path.stat().st_size, path
         elif path.suffix == ".safetensors":
             load_checkpoint(path.parent)
         else:
@@ -192,8 +199,9 @@ def build_reference(folder: Path) -> None:
     assert child(work, words("fit"), kill_at=at).code not in range(6)
     (work / "other.txt").write_text("the user's own")
     # older results of the same commands: what they replace must not get lost
-    older = [words("render"), words("export"), words("eval"), keep("interrupted")]
-    last = [words(c) for c in ("render", "export", "prune", "eval")]
+    older = [*(words(c) for c in ("render", "export", "convert", "mesh", "eval")), keep("interrupted")]
+    # convert comes first, since export replaces what it reads
+    last = [words(c) for c in ("convert", "render", "export", "mesh", "prune", "eval")]
     done = succeeded(here(work, *older, words("resume"), keep("finished"), *last))
     after |= {"resume": digests(folder / "finished")} | {w[0]: digests(work) for w in last}
     calls = done.calls | {"fit": alone, "resume": done.calls["fit"]}

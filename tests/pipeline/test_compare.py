@@ -21,7 +21,7 @@ from warpgs.pipeline.runs.checkpoint import TENSORS
 from warpgs.pipeline.runs.fit import fit_request
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest, read_scene
 from warpgs.pipeline.study.compare import ABLATION_ROWS, _places, ablation_variants, preset_variants, run_study
-from warpgs.pipeline.study.ensure_run import ensure_run
+from warpgs.pipeline.farm.ensure_run import ensure_run
 from warpgs.pipeline.study.statistics import paired_difference
 from warpgs.pipeline.study.study import FILES, SWITCHES, StudyRequest, run_folder
 from warpgs.pipeline.train import config
@@ -161,7 +161,7 @@ def test_runs_of_another_kind_are_moved_aside_and_said(finished, tmp_path):
 def test_what_makes_a_run_another_run(finished, tmp_path, monkeypatch, key, value, word):
     """Each of these alone forbids to keep it."""
     monkeypatch.setattr(
-        "warpgs.pipeline.study.ensure_run.fit_request", lambda request: SimpleNamespace(metrics={"fitted": request.resume})
+        "warpgs.pipeline.farm.ensure_run.fit_request", lambda request: SimpleNamespace(metrics={"fitted": request.resume})
     )
     request = copy_of(finished, tmp_path)
     folder = run_folder(request, "still", "a", 0)
@@ -181,7 +181,7 @@ def test_a_failed_run_is_left_out_of_its_pairs_and_named(finished, tmp_path, mon
     def fail(*_):
         raise DataError("no luck")
 
-    monkeypatch.setattr("warpgs.pipeline.study.ensure_run.fit_request", fail)
+    monkeypatch.setattr("warpgs.pipeline.farm.ensure_run.fit_request", fail)
     run_study(request)
     text = (request.out / "table.md").read_text()
     assert states(request) == ["kept", "kept", "kept", "failed"]
@@ -268,7 +268,7 @@ def test_command_ablates(scene, tmp_path, capsys, monkeypatch):
         asked.append((request.config.seed, request.config.method))
         return fit_request(request)
 
-    monkeypatch.setattr("warpgs.pipeline.study.ensure_run.fit_request", noted)
+    monkeypatch.setattr("warpgs.pipeline.farm.ensure_run.fit_request", noted)
     flags = ["--preset", "whole", "--seeds", "1", "--steps", "2", "--device", "cpu", "--out", str(tmp_path / "out")]
     assert main(["ablate", scene.path, "--split", scene.split, *flags]) == 0
     assert "[2/2] still, no pm, seed 0" in capsys.readouterr().out

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests.gaussians import cloud
+from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
 from warpgs.export.formats import read_gaussians, write_gaussians
 from warpgs.geometry import rotation_matrices
@@ -22,7 +23,8 @@ from warpgs.pipeline.model.filters import (
     rotate,
     rotation_about,
 )
-from warpgs.pipeline.runs.share import Filters, convert
+from warpgs.pipeline.runs.share import convert
+from warpgs.pipeline.runs.share_filters import Filters
 
 TURN = rotation_about(np.array([1.0, -2.0, 0.5]), 1.1)
 
@@ -111,8 +113,10 @@ def test_convert_says_what_it_did(tmp_path):
     lines = convert(tmp_path / "a.ply", tmp_path / "b.spz", Filters(sh_degree=1))
     assert any("removed: 1 larger than the scene, 0 needles" in line for line in lines)
     assert any("above degree 1 are left out, as asked" in line for line in lines)
+    assert any("SPZ has y up" in line for line in lines)
     assert "99 Gaussians in" in lines[-1] and read_gaussians(tmp_path / "b.spz").sh.shape == (99, 4, 3)
     lines = convert(tmp_path / "b.spz", tmp_path / "c.ply", Filters(crop="-1,-1,3,1,1,5", rotate="0,0,1,180"))
+    assert "SPZ has y up" in lines[0]
     assert not any("removed" in line for line in lines) and any("turned by 180.0 degrees" in line for line in lines)
     assert float(read_gaussians(tmp_path / "c.ply").means[:, :2].abs().max()) <= 1
     convert(tmp_path / "a.ply", tmp_path / "d.ply")
@@ -123,9 +127,42 @@ def test_convert_says_what_it_did(tmp_path):
     assert not (tmp_path / "f.glb").exists()
 
 
+def test_boxes_of_files(tmp_path):
+    """As the viewer saves them; the box is in the units of the source, whatever the rotation."""
+    made, path = cloud(100), tmp_path / "crop.json"
+    path.write_text('{"center": [1, 0, 4], "size": [2, 4, 4]}')
+    assert box_of(str(path)) == box_of('{"center": [1, 0, 4], "size": [2, 4, 4]}')
+    write_gaussians(tmp_path / "a.ply", made, units="file")
+    lines = convert(tmp_path / "a.ply", tmp_path / "b.ply", Filters(crop=str(path), rotate="0,0,1,180"))
+    assert f"{int((made.means[:, 0] < 0).sum())} Gaussians lie outside" in lines[0]
+    assert float(read_gaussians(tmp_path / "b.ply").means[:, 0].max()) <= 0
+    for text, match in (("[1, 2]", "no JSON object"), ('{"center": 1}', "center takes 3"), (" " * 70000, "no JSON object")):
+        path.write_text(text)
+        with pytest.raises(DataError, match=match):
+            box_of(str(path))
+    with pytest.raises(DataError, match="cannot be read as a box"):
+        box_of(str(tmp_path / "none.json"))
+
+
 @pytest.mark.parametrize("wish,match", [("level", "cameras of a run"), ("0,0,0,9", "no length"), ("1,2", "x,y,z,degrees")])
 def test_rotations_that_are_none(wish, match, tmp_path):
     write_gaussians(tmp_path / "a.ply", cloud(5), units="file")
     with pytest.raises(UsageError, match=match):
         convert(tmp_path / "a.ply", tmp_path / "b.ply", Filters(rotate=wish))
     assert math.isclose(float(np.trace(rotation_about(np.array([0, 0, 2.0]), math.pi))), -1)
+
+
+@pytest.mark.parametrize(
+    "suffix,flags,count",
+    [
+        ("spz", [], 99), ("ply", [], 100), ("spz", ["--no-clean"], 100), ("ply", ["--clean"], 99),
+        ("glb", ["--crop", "-9,-9,-9,9,9,9"], 99),
+    ],
+)  # fmt: skip
+def test_files_for_strangers_are_cleaned_unless_asked_otherwise(suffix, flags, count, tmp_path):
+    made = cloud(100)
+    made.log_scales[7] = 4
+    write_gaussians(tmp_path / "a.ply", made, units="file")
+    words = ["convert", str(tmp_path / "a.ply"), str(tmp_path / f"b.{suffix}")]
+    assert main([*words, *flags]) == 0 and len(read_gaussians(tmp_path / f"b.{suffix}")) == count
+    assert main([*words, "--clean", "--no-clean"]) == UsageError.exit_code

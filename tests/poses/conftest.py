@@ -26,6 +26,12 @@ def with_exif(image: np.ndarray, orientation: int) -> bytes:
     return stored.getvalue()
 
 
+@pytest.fixture
+def sfm():
+    """Skip where pycolmap is missing."""
+    pytest.importorskip("pycolmap")
+
+
 @pytest.fixture(scope="session")
 def still_life_views():
     """Cameras and images, uint8 [H, W, 3], of six neighbouring places."""

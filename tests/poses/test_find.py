@@ -14,11 +14,6 @@ from warpgs.poses.find import find_poses, needs_poses
 from warpgs.poses.photographs import prepare
 
 
-@pytest.fixture
-def sfm():
-    pytest.importorskip("pycolmap")
-
-
 def test_all_photographs_get_the_poses_that_they_were_taken_from(found, still_life_views):
     """Up to a similarity: rotations, and the shape of the cameras' path."""
     out, record = found
@@ -90,6 +85,34 @@ def test_photographs_that_cannot_work(sfm, tmp_path, capsys, kind, count, messag
     with pytest.raises(DataError, match=message):
         raise DataError(said)
     assert [p.name for p in tmp_path.iterdir()] == ["in"]
+
+
+@pytest.mark.parametrize("command", ["poses", "fit"])
+def test_photographs_of_an_unread_format_are_named(sfm, tmp_path, capsys, command):
+    """Alone they are an error that says what to do, a damaged one as well; among others they are told of, not passed over."""
+    source = tmp_path / "in"
+    source.mkdir()
+    for name in ("a.heic", "b.HEIC"):
+        (source / name).write_bytes(b"\0\0\0\x18ftypheic")
+    words = [command, str(source), "--out", str(tmp_path / "out")]
+    assert main(words) == DataError.exit_code
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1 and "a.heic is a HEIC photograph, which is not read: convert" in said
+    assert "(2 such files)" in said
+    for i in range(2):
+        noise(source / f"{i}.png", i, 2)
+    assert main(words) == DataError.exit_code
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert "has 2 photographs" in said and "left out: a.heic is a HEIC" in said
+    assert [p.name for p in tmp_path.iterdir()] == ["in"]
+
+
+def test_a_broken_video_is_told_of_once(sfm, tmp_path, capfd):
+    """OpenCV's own warnings, written past Python, are not shown."""
+    (tmp_path / "a.mp4").write_bytes(b"")
+    assert main(["poses", str(tmp_path / "a.mp4"), "--out", str(tmp_path / "out")]) == DataError.exit_code
+    said = capfd.readouterr().err
+    assert said.startswith("warpgs: ") and len(said.splitlines()) == 1
 
 
 def test_a_video_of_one_frame(sfm, tmp_path):

@@ -105,6 +105,13 @@ def test_every_number_given_is_shown_as_given(tmp_path):
     assert json.loads("".join(page.text("pre"))) == values["details"]
 
 
+def test_settings_hold_no_folder_of_the_machine(tmp_path):
+    details = {"scene": {"path": "/home/me/fern", "masks": r"C:\Users\me\m.png"}, "tried": ["/data/a.py:Own", "data/fern", 7]}
+    _, text, page = write(tmp_path / "report.html", details=details)
+    shown = {"scene": {"path": "fern", "masks": "m.png"}, "tried": ["a.py:Own", "data/fern", 7]}
+    assert json.loads("".join(page.text("pre"))) == shown and "/me" not in text
+
+
 def test_every_view_has_a_slider_a_keyboard_reaches(tmp_path):
     _, text, page = write(tmp_path / "report.html")
     sliders = page.all("input")

@@ -8,9 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import warpgs
 from warpgs.app.cli import main
+from warpgs.coordinates import convert_gaussians
 from warpgs.errors import DataError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.synthetic.demo import split_spec, write_demo
@@ -18,6 +20,7 @@ from warpgs.viewer import watch
 from warpgs.viewer.content import content_of_ply, content_of_run, views_of
 from warpgs.viewer.maps import COVERAGE, DEPTH, ERROR, GAUSSIANS, MAPS, RENDER, placed
 from warpgs.viewer.panel import COARSE, FINE
+from warpgs.viewer.saved import CROP, PATH, keyframe
 from warpgs.viewer.server import open_server, stop_server
 from warpgs.viewer.window import Window
 
@@ -111,6 +114,30 @@ def test_layers_and_the_crop_box_choose_what_is_shown(window):
     panel._crop.value = False
 
 
+def test_what_is_saved_is_rendered_and_exported(window, tmp_path):
+    """Keyframes are cameras of `warpgs render`, and the box is that of `warpgs export`: the same images and Gaussians."""
+    panel, content, run = window.panel, window.content, str(window.content.stem)
+    n, names = content.model.normalization, content.model.train[:2]
+    panel._save(PATH, [keyframe(content.model.scene_cameras[name], 0.5 * i, n) for i, name in enumerate(names)])
+    words = ["--path", f"{run}/{PATH}", "--frames", "2", "--out", str(tmp_path / "film"), "--device", "cpu"]
+    assert main(["render", run, *words]) == 0
+    for i, name in enumerate(names):
+        camera = content.model.scene_cameras[name]
+        K = camera.K.copy()
+        K[:2, 2] = camera.width / 2, camera.height / 2  # a browser's camera has its principal point in the middle
+        camera = dataclasses.replace(camera, K=K)
+        wanted = warpgs.rasterize(content.model.gaussians(), camera, content.model.options()).rgb.detach().clamp(0, 1).numpy()
+        image = np.asarray(Image.open(tmp_path / "film" / f"{i:04d}.png").convert("RGB")) / 255
+        assert image.shape == wanted.shape and np.abs(image - wanted).max() < 0.01
+    panel._crop.value = True
+    panel._save(CROP, panel.crop_box().to_json(n))
+    whole = ["export", run, "--to", str(tmp_path / "a.ply")]
+    assert main([*whole, "--crop", f"{run}/{CROP}"]) == 0
+    shown = convert_gaussians(window.shown(), n, "scene", "file").means
+    panel._crop.value = False
+    assert torch.equal(warpgs.read_ply(tmp_path / "a.ply").means, shown)
+
+
 def test_a_browser_gets_the_image_that_it_asks_for(window):
     """Once for each camera and wish; Gaussians again where they are asked for."""
     camera = window.content.model.scene_cameras[window.content.model.train[0]]
@@ -161,12 +188,13 @@ def test_a_run_is_followed_until_it_is_interrupted(folder, monkeypatch, capsys):
 
 
 def test_a_page_names_nobody(folder, tmp_path, capsys):
-    """One file without a path, an image's name or an address in the network; and it starts at a training camera."""
-    assert main(["export", str(folder / "run"), "--to", str(tmp_path / "scene.html")]) == 0
+    """One file without a path, an image's name or an address in the network; cleaned, and it starts at a training camera."""
+    assert main(["export", str(folder / "run"), "--to", str(tmp_path / "scene.html"), "--rotate", "level"]) == 0
     text = (tmp_path / "scene.html").read_text("utf-8")
     assert "default-src 'none'" in text and "<title>warpgs</title>" in text
     head, _, data = text.partition('__VISER_EMBED_DATA__="')
     assert str(folder) not in text and "warpgs/" not in head
     scene = zstandard.ZstdDecompressor().decompressobj().decompress(base64.b64decode(data.partition('"')[0])[8:])
     assert b"/gaussians" in scene and not [w for w in (b".png", b"run", str(folder).encode()) if w in scene]
-    assert "without a network" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "without a network" in said and "removed: " in said and "turned by" in said

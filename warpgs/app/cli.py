@@ -23,13 +23,14 @@ COMMANDS = {
     "plot": "show a run's cameras and Gaussians in one image",
     "priors": "look at what is known before a fit, or write networks as ONNX",
     "export": "write a run's Gaussians to a file: .ply, .spz, .glb, .html",
-    "convert": "write a file of Gaussians in another format",
+    "convert": "write a file of Gaussians or cameras in another format",
     "mesh": "make a mesh of the surfaces that a run's views see: .ply, .glb",
     "prune": "shrink a finished model as far as its training views allow",
     "eval": "score a run again on its held-out views",
     "compare": "fit presets to scenes with several seeds; tables and plots",
     "ablate": "fit a preset with its parts off one at a time; the same tables",
     "convert-lpips": "join LPIPS weights into the file that --lpips-weights takes",
+    "farm": "fit many scenes, on all GPUs, with Ray or on Slurm",
     "doctor": "say what this machine has, what is missing, and how to get it",
 }
 """Commands by name, in the order of the help, each with a line about it."""
@@ -39,6 +40,7 @@ GROUPS = {
     "look": ("view", "render", "plot", "priors"),
     "share": ("export", "convert", "mesh", "prune"),
     "measure": ("eval", "compare", "ablate", "convert-lpips"),
+    "many scenes": ("farm",),
     "this machine": ("doctor",),
 }
 """Names of the commands by purpose."""

@@ -74,6 +74,22 @@ def settings_of(kind: type[Settings], flags: Any) -> Settings:
     return kind(**{n: settings_of(hints[n], v) if dataclasses.is_dataclass(hints[n]) else v for n, v in values.items()})
 
 
+def either(flags: Any, name: str) -> bool | None:
+    """Return True for a flag, False for the same with no- before it, None where neither is given.
+
+    Args:
+        flags: Parsed flags with booleans ``name`` and ``no_name``.
+        name: Name of the flag.
+
+    Raises:
+        UsageError: Both are given.
+    """
+    yes, no = getattr(flags, name), getattr(flags, f"no_{name}")
+    if yes and no:
+        raise UsageError(f"--{name} and --no-{name} exclude each other; give one of them")
+    return True if yes else False if no else None
+
+
 MAX_WHOLE = 2**63 - 1
 """Largest whole number that a flag takes: that of 64 bits."""
 MAX_THREADS = 4096

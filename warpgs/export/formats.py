@@ -40,13 +40,19 @@ class Format:
     """True where Gaussians that are near each other in space should be so in the file."""
     max_degree: int = 3
     """Highest degree of harmonics that it holds."""
+    note: str = ""
+    """Sentence for users on its axes, where programs disagree on them."""
 
 
+_SPZ_NOTE = (
+    "SPZ has y up, as Niantic defines it; SuperSplat, splat-transform 3, gsply and gaussforge take its axes for those of PLY: "
+    "--rotate 1,0,0,180 turns a file from them or for them"
+)
 FORMATS = {
     ".compressed.ply": Format("compressed PLY", compressed_ply.encode, compressed_ply.decode, sorted=True),
     ".ply": Format("PLY", None, None, cleaned=False),
     ".splat": Format("splat", splat.encode, splat.decode, max_degree=0),
-    ".spz": Format("SPZ", spz.encode, spz.decode, sorted=True),
+    ".spz": Format("SPZ", spz.encode, spz.decode, sorted=True, note=_SPZ_NOTE),
     ".sog": Format("SOG", sog.encode, sog.decode, sorted=True),
     ".glb": Format("glTF (binary)", gltf.encode_glb, gltf.decode),
     ".gltf": Format("glTF (text)", gltf.encode_gltf, gltf.decode),

@@ -6,6 +6,7 @@ first, the rest channel-major), opacity as a logit, log scales, rotation wxyz as
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from pathlib import Path
@@ -21,6 +22,10 @@ from warpgs.scene import Gaussians, Normalization
 
 CHUNK_ROWS = 65536
 """Number of Gaussians written at a time, so that the interleaved copy of a large model never exists as a whole."""
+OPAQUE = 30.0
+"""Logit of an opacity that is 1 in float32, and whose negative is one that nobody sees: it stands for infinity."""
+FLAT = math.log(1e-37)
+"""Logarithm of an axis without length, as short as float32 holds; it stands for minus infinity."""
 
 _POSITION = ("x", "y", "z")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -70,8 +75,9 @@ def write_ply(
 def read_ply(path: str | os.PathLike[str], normalization: Normalization | None = None, *, units: str = "file") -> Gaussians:
     """Read Gaussians from a PLY file in the INRIA 3DGS layout, binary little endian.
 
-    Properties and elements that are not part of the layout are ignored. The number of rows is checked against the size of
-    the file before memory is allocated.
+    Properties and elements that are not part of the layout are ignored. Other programs write opacities of 0 and 1 as infinite
+    logits, and axes of no length as infinite log scales: these become `OPAQUE` and `FLAT`, which look the same. The number of
+    rows is checked against the size of the file before memory is allocated.
 
     Args:
         path: The file, written by `write_ply` or by another program of that layout.
@@ -83,8 +89,8 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
         opacities [N], spherical harmonics [N, K, 3] with K in {1, 4, 9, 16}.
 
     Raises:
-        warpgs.errors.DataError: The file is missing, malformed, cut short, or holds a NaN, an infinity or a rotation of zero
-            length; the message names the place.
+        warpgs.errors.DataError: The file is missing, malformed, cut short, or holds a NaN, another infinity or a rotation
+            of zero length; the message names the place.
         warpgs.errors.UsageError: The units are unknown, or scene units are asked for without a normalization.
     """
     path = Path(path)
@@ -158,6 +164,8 @@ def _check_properties(path: Path, vertex: Element) -> int:
         raise ply_error(path, f"it has {rest} f_rest properties, but degrees 0 to 3 have 0, 9, 24 or 45")
     # Normals carry nothing, and some tools leave them out.
     missing = sorted(set(_names(rest)) - set(names) - {"nx", "ny", "nz"})
+    if missing == ["scale_2"]:
+        raise ply_error(path, "its Gaussians are flat (2DGS), without scale_2, which this program does not render")
     if missing:
         raise ply_error(path, f"properties missing: {', '.join(missing[:8])}{' ...' if len(missing) > 8 else ''}")
     return rest
@@ -167,12 +175,13 @@ def _assemble(path: Path, rows: np.ndarray, rest: int) -> Gaussians:
     """Return the Gaussians of structured rows, shape [N]; DataError where a value cannot be used."""
     import torch
 
-    def columns(names: list[str] | tuple[str, ...]) -> np.ndarray:
+    def columns(names: list[str] | tuple[str, ...], least: float = -np.inf, most: float = np.inf) -> np.ndarray:
         out = np.empty((len(rows), len(names)), np.float32)
         # A double beyond float32 becomes an infinity, and the check below names it.
         with np.errstate(over="ignore", invalid="ignore"):
             for i, name in enumerate(names):
                 out[:, i] = rows[name]
+        out[out == -np.inf], out[out == np.inf] = least, most
         bad = ~np.isfinite(out)
         if bad.any():
             row, column = np.argwhere(bad)[0]
@@ -191,7 +200,7 @@ def _assemble(path: Path, rows: np.ndarray, rest: int) -> Gaussians:
     return Gaussians(
         means=torch.from_numpy(columns(_POSITION)),
         quats=torch.from_numpy(quats),
-        log_scales=torch.from_numpy(columns(_SCALE)),
-        logit_opacities=torch.from_numpy(columns(["opacity"])[:, 0]),
+        log_scales=torch.from_numpy(columns(_SCALE, least=FLAT)),
+        logit_opacities=torch.from_numpy(columns(["opacity"], -OPAQUE, OPAQUE)[:, 0]),
         sh=torch.from_numpy(sh),
     )

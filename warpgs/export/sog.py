@@ -152,6 +152,8 @@ def decode(path: Path, data: bytes) -> Arrays:
         n = meta.get("count") if isinstance(meta, dict) else None
         if not isinstance(meta, dict) or meta.get("version") != 2:
             raise malformed(path, "its meta.json is not of version 2")
+        if meta.get("model", "default") != "default":
+            raise malformed(path, f"it is for the model {str(meta['model'])[:40]!r}, which this program does not render")
         if type(n) is not int or not 0 < n <= MAX_PER_BYTE * len(data):
             raise malformed(path, f"{str(n)[:20]} Gaussians in {len(data)} bytes")
 

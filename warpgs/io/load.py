@@ -18,6 +18,7 @@ from warpgs.io.normalize import fingerprint, normalization_of, normalize_points,
 from warpgs.io.poses import rigid
 from warpgs.io.readers import Reader, ReadOptions, all_readers, find_reader, image_scale
 from warpgs.io.score_masks import FOLDER, add_score_masks
+from warpgs.io.unread_formats import unread_note
 from warpgs.scene import Normalization, Scene, View
 
 
@@ -103,6 +104,8 @@ def detect(root: Path) -> tuple[Reader, list[str]]:
         raise DataError(f"{root}: {broken[0]}, and there is no other format. Copy the whole reconstruction")
     if not complete:
         images = ". It holds images without cameras: `warpgs poses` finds those" if list_images(root) else ""
+        if not images and (unread := unread_note(root)):
+            raise DataError(f"{root}: {unread}")
         raise DataError(f"{root}: no scene format found. Looked for: {', '.join(r.description for r in readers)}{images}")
     taken, *others = complete
     notes = [f"{lack}; passed over, {taken.name} is complete" for lack in broken]

@@ -122,7 +122,12 @@ def lens_of(frame: dict, shared: dict, width: int, height: int, where: str) -> L
     return Lens(K, width, height, tuple(distortion) if any(distortion) else (), model).checked(where)
 
 
-def _matrix(frame: dict, where: str) -> np.ndarray:
+def matrix_of(frame: dict, where: str) -> np.ndarray:
+    """Return the transform_matrix of a frame, shape [3, 4] or [4, 4].
+
+    Raises:
+        DataError: It is missing, or not made of rows of numbers.
+    """
     try:
         # through object, so that ragged rows and huge integers are caught here and strings are not parsed
         rows = [[float(x) if not isinstance(x, (str, bool)) else math.nan for x in row] for row in frame["transform_matrix"]]
@@ -174,7 +179,7 @@ class _Reading:
         name = view_name_of(path, self.root)
         self.outside += name.startswith("outside/")
         where = f"{where} ({name})"
-        viewmat = from_camera_to_world(_matrix(frame, where), where, opengl=True)
+        viewmat = from_camera_to_world(matrix_of(frame, where), where, opengl=True)
         loaded = self.scene.image(
             path,
             lambda width, height: lens_of(frame, shared, width, height, where),

@@ -46,4 +46,7 @@ def unread_format(path: Path, head: bytes) -> str | None:
 def unread_note(folder: Path) -> str:
     """Return a sentence on the photographs of a folder that are known by their suffix and not read; empty for none."""
     files = sorted(p for p in folder.glob("*") if p.suffix.lower() in SUFFIXES and p.name[0] != ".") if folder.is_dir() else []
-    return f"{files[0].name} is {REMEDIES[SUFFIXES[files[0].suffix.lower()]]}" if files else ""
+    if not files:
+        return ""
+    first = f"{files[0].name} is {REMEDIES[SUFFIXES[files[0].suffix.lower()]]}"
+    return first if len(files) == 1 else f"{first} ({len(files)} such files)"

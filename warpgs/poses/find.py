@@ -12,6 +12,7 @@ from warpgs.errors import DataError, UsageError
 from warpgs.files import filling, is_empty, make_folder, write_bytes
 from warpgs.io.decoding import MAX_PIXELS, read_image_file
 from warpgs.io.readers import all_readers
+from warpgs.io.unread_formats import unread_note
 from warpgs.poses.advice import MIN_KEYPOINTS
 from warpgs.poses.mapping import Mapping, camera_groups, check_installed, find_model
 from warpgs.poses.photographs import Photograph, find_photographs, image_root, prepare, write_copy
@@ -112,9 +113,8 @@ def _check(source: Path, out: Path) -> None:
             what = "is no video that is read (mp4, mov, m4v, avi, mkv, webm)" if source.is_file() else "does not exist"
             raise DataError(f"{source}: {what}; give a folder of photographs, or a video")
         if not is_video(source) and not find_photographs(source):
-            raise DataError(
-                f"{source}: holds no image file that is read (JPEG, PNG, TIFF, BMP, WebP); give the folder of photographs"
-            )
+            none = "holds no image file that is read (JPEG, PNG, TIFF, BMP, WebP); give the folder of photographs"
+            raise DataError(f"{source}: {unread_note(source) or none}")
         if out.exists() and not (out.is_dir() and is_empty(out)):
             raise UsageError(f"{out} exists already; choose another --out, or remove it")
     except OSError as e:
@@ -132,12 +132,14 @@ def _prepared(
         total = write_frames(source, root, frames, progress)
         notes.append(f"{min(frames, total)} of {total} frames are taken: the sharpest of as many equal stretches of the video")
     root = image_root(root)
-    paths = find_photographs(root)
+    paths, unread = find_photographs(root), unread_note(root)
+    if unread:
+        notes.append(f"left out: {unread}")
     if len(paths) < MIN_PHOTOGRAPHS:
         what = "frame" if is_video(source) else "photograph"
         raise DataError(
             f"{source}: has {len(paths)} {what}{'s' if len(paths) != 1 else ''}; poses need at least {MIN_PHOTOGRAPHS}, "
-            "better 8 to 20 that overlap by two thirds"
+            f"better 8 to 20 that overlap by two thirds{'; left out: ' + unread if unread else ''}"
         )
     photographs, names = [], []
     for i, path in enumerate(paths):

@@ -31,7 +31,12 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # it writes about broken files past everything
     import cv2
 
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # of a broken file it says the same, in its own words
+    try:
+        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
     try:
         if not capture.isOpened():
             raise DataError(

@@ -6,7 +6,7 @@ import base64
 import html
 import json
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from warpgs.files import write_text
 
@@ -145,6 +145,16 @@ def _document(title: str, body: str) -> str:
     )
 
 
+def _without_folders(value: object) -> object:
+    """Return JSON values whose absolute paths are cut to their last names, since a report is sent to others."""
+    if isinstance(value, dict):
+        return {k: _without_folders(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_folders(v) for v in value]
+    absolute = isinstance(value, str) and (PurePosixPath(value).is_absolute() or PureWindowsPath(value).is_absolute())
+    return PureWindowsPath(value).name if absolute else value  # its separators are / and \\
+
+
 def write_page(
     path: Path,
     *,
@@ -175,7 +185,7 @@ def write_page(
         sampling: The fit's sampling events, or None where it had none.
         overview: Image of cameras and points, or None.
         protocol: Settings in which two scores must agree to be compared, and the definition of each figure, by name.
-        details: Configuration, versions and data, shown as JSON on request.
+        details: Configuration, versions and data, shown as JSON on request; of paths the last name alone.
         coverage: Scores of held-out views by what training views saw, or None.
 
     Raises:
@@ -203,7 +213,7 @@ def write_page(
         sections.append(_sampling(sampling))
     if overview:
         sections.append("<h2>Cameras and Gaussians</h2>" + _figure(overview, "training cameras teal, held-out cameras orange"))
-    settings = html.escape(json.dumps(details, indent=1))
+    settings = html.escape(json.dumps(_without_folders(details), indent=1))
     sections.append(
         f"<h2>Settings</h2><details><summary>configuration, versions, data</summary><pre>{settings}</pre></details>"
     )

@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 from filelock import lock_descriptor
 
-from warpgs.errors import ResourceError
+from warpgs.errors import FolderHeldError, ResourceError
 from warpgs.files import LOCK, make_folder, remove_leftovers
 
 NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
@@ -41,7 +41,8 @@ def hold_folder(folder: Path, *parts: str) -> Iterator[list[str]]:
         A note for the user where the file system has no locks; else nothing.
 
     Raises:
-        ResourceError: Another process holds the folder, or it cannot be written.
+        FolderHeldError: Another process holds the folder.
+        ResourceError: It cannot be written.
     """
     made = make_folder(folder)
     try:
@@ -99,7 +100,8 @@ def _lock(file: BinaryIO, folder: Path) -> bool:
     """Lock an open file; return False where its file system has no locks.
 
     Raises:
-        ResourceError: Another process holds it.
+        FolderHeldError: Another process holds it.
+        ResourceError: It cannot be locked.
     """
     try:
         if lock_descriptor(file.fileno(), blocking=False):
@@ -108,7 +110,7 @@ def _lock(file: BinaryIO, folder: Path) -> bool:
         if e.errno in NO_LOCKS:
             return False
         raise ResourceError(f"{folder}: cannot be locked ({e.strerror or e}); choose another folder") from e
-    raise ResourceError(
+    raise FolderHeldError(
         f"{folder}: {_holder(file)} is writing there. Wait until it has ended, or end it, or choose another folder"
     )
 

@@ -1,4 +1,4 @@
-"""Output of native libraries that would only puzzle the user."""
+"""Output of this process, that of native libraries included: hidden where it would only puzzle the user, or sent elsewhere."""
 
 from __future__ import annotations
 
@@ -20,3 +20,22 @@ def hidden_stderr() -> Iterator[None]:
         os.dup2(saved, 2)
         os.close(saved)
         os.close(sink)
+
+
+@contextlib.contextmanager
+def output_to(descriptor: int) -> Iterator[None]:
+    """Send what is written to stdout and stderr in the block to an open file, by native libraries and other threads too."""
+    streams = (sys.stdout, sys.stderr)
+    for stream in streams:
+        stream.flush()
+    saved = [os.dup(number) for number in (1, 2)]
+    try:
+        for number in (1, 2):
+            os.dup2(descriptor, number)
+        yield
+    finally:
+        for stream in streams:
+            stream.flush()
+        for number, old in zip((1, 2), saved, strict=True):
+            os.dup2(old, number)
+            os.close(old)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -51,6 +52,14 @@ class ProcessFailed(Exception):
         self.code, self.errors = code, errors
 
 
+def _environment(more: dict[str, str] | None) -> dict[str, str]:
+    """Return the variables of a process that runs this package, wherever that was imported from, and nothing of its folder."""
+    home = str(Path(__file__).parents[2])
+    search = os.pathsep.join(p for p in (home, os.environ.get("PYTHONPATH", "")) if p)
+    own = {"PYTHONPATH": search, "PYTHONSAFEPATH": "1", "PYTHONIOENCODING": "utf-8"}
+    return {**os.environ, **own, **(more or {})}
+
+
 def python_lines(module: str, *arguments: str, folder: Path, environment: dict[str, str] | None = None) -> Iterator[str]:
     """Run a module of this package in another process, and yield the lines of its stdout as they come.
 
@@ -65,12 +74,9 @@ def python_lines(module: str, *arguments: str, folder: Path, environment: dict[s
     Raises:
         ProcessFailed: It ended with another exit code than 0.
     """
-    home = str(Path(__file__).parents[2])  # of the package, wherever that was imported from
-    search = os.pathsep.join(p for p in (home, os.environ.get("PYTHONPATH", "")) if p)
-    own = {"PYTHONPATH": search, "PYTHONSAFEPATH": "1", "PYTHONIOENCODING": "utf-8"}
     with tempfile.TemporaryFile() as errors:
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", module, *arguments], env={**os.environ, **own, **(environment or {})}, cwd=folder,
+            [sys.executable, "-P", "-m", module, *arguments], env=_environment(environment), cwd=folder,
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors, text=True, encoding="utf-8", errors="replace",
         )  # fmt: skip
         try:
@@ -82,3 +88,62 @@ def python_lines(module: str, *arguments: str, folder: Path, environment: dict[s
         finally:
             process.kill()
             process.wait()
+
+
+class PythonWorker:
+    """A process that runs a module of this package, takes lines on its stdin and answers on its stdout.
+
+    It looks for modules in its folder no more than `run_python` does. Ctrl-C in the terminal is for its parent alone: the end of
+    its stdin tells it to stop, which it sees even where the parent was killed.
+    """
+
+    def __init__(self, module: str, *arguments: str, environment: dict[str, str] | None = None):
+        """Start the process.
+
+        Args:
+            module: Full name of the module, run as ``__main__``.
+            arguments: Its ``sys.argv[1:]``.
+            environment: Variables beside those of this process.
+        """
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed by `end`
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-m", module, *arguments], env=_environment(environment), stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE, stderr=self._errors, text=True, encoding="utf-8", errors="replace", start_new_session=True,
+        )  # fmt: skip
+
+    @property
+    def number(self) -> int:
+        """Number of the process."""
+        return self._process.pid
+
+    def send(self, line: str) -> bool:
+        """Send a line; return False where the process has ended."""
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(f"{line}\n")
+            self._process.stdin.flush()
+        except (OSError, ValueError):
+            return False
+        return True
+
+    def lines(self) -> Iterator[str]:
+        """Yield the lines that it answers, until it ends."""
+        assert self._process.stdout is not None
+        yield from self._process.stdout
+
+    def end(self, seconds: float) -> tuple[int, str]:
+        """Tell it to stop, and end it where it takes longer; return its exit code, and the end of what it wrote to stderr."""
+        with contextlib.suppress(OSError):
+            if self._process.stdin is not None:
+                self._process.stdin.close()
+        try:
+            self._process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        if self._errors.closed:
+            return self._process.returncode, ""
+        with self._errors:
+            self._errors.seek(0, os.SEEK_END)
+            self._errors.seek(max(0, self._errors.tell() - 2000))
+            return self._process.returncode, self._errors.read().decode("utf-8", "replace").strip()

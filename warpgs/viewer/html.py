@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from warpgs.coordinates import convert_camera, convert_gaussians
 from warpgs.errors import DataError
 from warpgs.files import write_text
 from warpgs.pipeline.runs.folder import open_run
+from warpgs.pipeline.runs.share_filters import NO_FILTERS, Filters, file_gaussians, filtered, rotate_camera
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Camera, Gaussians
@@ -123,17 +125,31 @@ def write_html(
     return notes
 
 
-def export_html(folder: Path, target: Path) -> list[str]:
+def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> list[str]:
     """Write a run as one HTML file that starts at its first training camera; returns lines for the user.
 
+    Args:
+        folder: The run folder.
+        target: The file to write.
+        filters: Filters of the model; it is cleaned where they do not say.
+
     Raises:
-        DataError: The folder is no run.
+        DataError: The folder is no run, or nothing is left of its model.
         ResourceError: viser is not installed, another process writes into the file's folder, or it cannot be written.
+        UsageError: A filter makes no sense.
     """
     require_viser()
     run = open_run(folder, "cpu")
-    cameras = run.cameras()
+    gaussians, rotation, lines = filtered(file_gaussians(run), run, filters, cleaned=True)
+    if not len(gaussians):
+        raise DataError(f"{target}: not written, no Gaussian is left. Give a larger box, or --no-clean")
+    cameras, found = [run.cameras("file")[n] for n in run.train], run.normalization
+    if rotation is not None:
+        cameras = [rotate_camera(c, rotation) for c in cameras]
+    gaussians = convert_gaussians(gaussians, found, "file", "scene")
     with hold_folder(target.parent) as held:
-        notes = write_html(target, run.gaussians(), [cameras[n] for n in run.train], run.background)
+        cameras = [convert_camera(c, found, "file", "scene") for c in cameras]
+        notes = write_html(target, gaussians, cameras, run.background)
     size = format_bytes(target.stat().st_size)
-    return [*held, *notes, f"{len(run.gaussians()):,} Gaussians in {target}, {size}; open it in any browser, without a network"]
+    last = f"{len(gaussians):,} Gaussians in {target}, {size}; open it in any browser, without a network"
+    return [*held, *lines, *notes, last]

@@ -29,7 +29,7 @@ def run(arguments: list[str], about: str) -> int:
         return 0
     if a.warm:
         with fast_imports():
-            from warpgs.app.precompile import print_warming
+            from warpgs.pipeline.runs.precompile import print_warming
         print_warming()
         return 0
     from warpgs.app.doctor import diagnose, print_report

@@ -253,5 +253,5 @@ def run(arguments: list[str], about: str) -> int:
     from warpgs.viewer.watch import live_view
 
     with live_view(request.out, request.view_port) as live:
-        fit_request(request, live.look, ranks)
+        fit_request(request, on_model=live.look, ranks=ranks)
     return 0

@@ -4,17 +4,26 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from warpgs.app.flags import check_range, parse_flags
+from warpgs.errors import UsageError
 from warpgs.runtime.terminal import say
 
 
 def run(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` heads its help."""
+    """Run the command; ``about`` heads its help.
+
+    Raises:
+        UsageError: Cameras or a rule are given for a run.
+    """
     import tyro
 
     @dataclass(frozen=True)
     class Render:
         run: tyro.conf.Positional[Path]
-        """Run folder of `warpgs fit`."""
+        """Run folder of `warpgs fit`, or a file of Gaussians trained anywhere: .ply, .spz, .sog, .glb and others."""
+        cameras: Path | None = None
+        """Cameras that a file of Gaussians is seen through: cameras.json, transforms.json, COLMAP's folder, or a scene."""
+        rule: str | None = None
+        """Cut-offs that a file of Gaussians was trained with: inria, gsplat or exact. inria where not given."""
         path: str = "auto"
         """auto (what suits how the photographs were taken), turntable, spiral, interpolate (through the training views), views
         (every view of the scene), or a .json file of keyframes."""
@@ -47,6 +56,12 @@ def run(arguments: list[str], about: str) -> int:
     from warpgs.pipeline.runs.film_plan import FilmSettings
 
     settings = FilmSettings(a.frames, a.seconds, a.fps, a.size, None if a.fov is None else radians(a.fov))
-    for line in render(a.run, a.path, a.out, settings, a.device, background=a.background, coverage=a.coverage, sheet=a.sheet):
+    if a.run.is_dir() and (a.cameras is not None or a.rule is not None):
+        raise UsageError("--cameras and --rule are for files of Gaussians; a run has its own")
+    given = (a.cameras, a.rule) if a.run.is_file() else None
+    for line in render(
+        a.run, a.path, a.out, settings, a.device,
+        background=a.background, coverage=a.coverage, sheet=a.sheet, file_of=given,
+    ):  # fmt: skip
         say(line)
     return 0

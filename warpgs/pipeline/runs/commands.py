@@ -16,6 +16,8 @@ from warpgs.pipeline.runs.failed_step import findings, read_failed_step
 from warpgs.pipeline.runs.film_plan import FilmSettings, plan_film
 from warpgs.pipeline.runs.folder import IMAGE_FOLDERS, StoredRun, open_run
 from warpgs.pipeline.runs.image_names import image_names, renaming_notes
+from warpgs.pipeline.runs.model_and_cameras import open_file
+from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.pipeline.runs.paths import COVERAGE, FILM, render_film, sheet_path
 from warpgs.pipeline.runs.refined_poses import with_cameras
 from warpgs.pipeline.runs.request import choose_device, read_scene
@@ -106,36 +108,45 @@ def _view_line(row: dict[str, Any]) -> str:
 def render(
     folder: Path, path: str, out: Path | None, settings: FilmSettings, device_name: str, *,
     background: str = "auto", coverage: bool = False, sheet: bool = False,
+    file_of: tuple[Path | None, str | None] | None = None,
 ) -> list[str]:  # fmt: skip
-    """Render a run along a path to PNG files and a film, or to a film alone; returns lines for the user.
+    """Render a run or a file of Gaussians along a path to PNG files and a film, or to a film alone; returns lines for the user.
 
     Args:
-        folder: The run folder.
+        folder: The run folder; or the file, where ``file_of`` is given.
         path: One of `PATHS`, or a JSON file of keyframes.
-        out: Folder or film to write; None for `path-PATH` in the run folder.
+        out: Folder or film to write; None for `path-PATH` in the run folder, or beside the file.
         settings: Settings of the film; their background is not looked at.
         device_name: auto, cpu or cuda.
         background: Colour behind the scene; auto for that of the fit, and transparent images of cut-out objects.
         coverage: Whether to write images of what no training view saw, too.
         sheet: Whether to write six frames in one image, too.
+        file_of: Cameras and rule of a file of Gaussians, as `open_file` takes them; None for a run.
 
     Raises:
-        DataError: The folder is no run, or the keyframes cannot be read.
+        DataError: The folder is no run, or the file, its cameras or the keyframes cannot be read.
         ResourceError: A file cannot be written.
         UsageError: The path is unknown, the background is no colour, or a number is out of its range.
     """
     color = color_of(background)
     if color is None and background != "auto":
         raise UsageError(f"--background {background}: a render takes auto, black, white, #rrggbb or r,g,b")
-    out = folder / f"path-{Path(path).stem}" if out is None else out
-    stored, tell = open_run(folder, device_name), Stages()
+    home = folder if file_of is None else folder.parent
+    out = home / f"path-{Path(path).stem}" if out is None else out
+    notes: list[str] = []
+    stored: FittedModel
+    if file_of is None:
+        stored = open_run(folder, device_name)
+    else:
+        stored, notes = open_file(folder, *file_of, device_name)
+        notes += ["black lies behind the Gaussians; --background gives another colour"] if color is None else []
+    tell = Stages()
     settings = replace(settings, background=color)
     plan = plan_film(stored, path, settings)
     training: list[View] | bool = False
-    notes = []
     if coverage:
         try:
-            training = scene_of(stored)[1]
+            training = scene_of(stored)[1] if isinstance(stored, StoredRun) else True
         except WarpgsError as e:
             training = True
             notes.append(f"what masks of training views hide counts as seen, since the scene cannot be read: {e}")

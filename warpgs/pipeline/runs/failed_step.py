@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ from warpgs.files import write_bytes
 from warpgs.kernels.dropout import opacity_dropout
 from warpgs.pipeline.runs.checkpoint import safetensors_chunks
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import Target, built_in_terms, over
+from warpgs.pipeline.train.exposure import EXPOSURE, exposed, exposure_of
+from warpgs.pipeline.train.loss import Target, over
+from warpgs.pipeline.train.setup import terms_of
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import half_size
 from warpgs.render.rasterize import RasterizeOptions, rasterize
@@ -35,6 +38,7 @@ def failed_step(trainer: Trainer, view: int, name: str, slot: int = 0) -> Bundle
         name: Its name.
         slot: Its number among the views of the step.
     """
+    trainer.show_poses()
     number, shown = trainer.step + 1, trainer.views[view]
     plan = trainer.plan_of(number)
     if plan.half_size:
@@ -48,6 +52,8 @@ def failed_step(trainer: Trainer, view: int, name: str, slot: int = 0) -> Bundle
     tensors |= {f"params.{n}": t for n, t in trainer.gaussians.tensors().items()}
     tensors |= {f"maps.{n}": t for n, t in shown.maps.items()}
     tensors |= {f"own.{n}": t.detach()[view] for n, t in trainer.view_table.params.items()}
+    if (own := trainer.view_table.params.get(EXPOSURE)) is not None:
+        tensors[f"own.{EXPOSURE}"] = exposure_of(own, own[view]).detach()
     if shown.mask is not None:
         tensors["mask"] = shown.mask
     if shown.alpha is not None:
@@ -104,7 +110,9 @@ def findings(bundle: Bundle) -> list[str]:
         lines += [f"  {name}: {_state(t)}" for name, t in tensors.items()]
         render = _rendered(gaussians, bundle, config)
         lines += [f"  rendered {n}: {_state(getattr(render, n))}" for n in ("rgb", "alpha", "depth")]
-        for term in (*built_in_terms(config.loss, "alpha" in tensors), *config.loss_terms):
+        if config.exposure:
+            render = replace(render, rgb=exposed(render.rgb, parts["own"][EXPOSURE]))
+        for term in terms_of(config, "alpha" in tensors):
             if term.active(plain["step"], config.steps):
                 value = term(render, target, gaussians)
                 lines.append(f"  loss term {term.name}: {float(value.detach()):g}")

@@ -22,6 +22,7 @@ from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.model.scale_limits import shape_figures, shape_summary
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.runs.coverage_report import coverage_of_run
+from warpgs.pipeline.runs.exposures import exposure_figures
 from warpgs.pipeline.runs.failed_step import FILE as FAILED
 from warpgs.pipeline.runs.failed_step import failed_step, save_failed_step
 from warpgs.pipeline.runs.folder import CONFIG, check_checkpoint, check_same, read_record, record_of, run_folder
@@ -38,6 +39,7 @@ from warpgs.pipeline.train.background import choose_background, over_background
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.complexity import complexity_figures
 from warpgs.pipeline.train.config import FitConfig, preset_config
+from warpgs.pipeline.train.exposure import EXPOSURE
 from warpgs.pipeline.train.loop import run, train_views
 from warpgs.pipeline.train.step_report import StepReport
 from warpgs.pipeline.train.time_budget import within_budget
@@ -155,9 +157,8 @@ def fit(
     check_shared(scene, config, ranks, time_budget, resume)
     verbose, own = verbose and ranks.first, out if ranks.first else None
     progress = Stages() if verbose else Stages(lambda line: None)
-    folder: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
-    if own is not None:
-        folder = run_folder(own, resume)
+    nothing: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
+    folder = nothing if own is None else run_folder(own, resume)
     with folder as held, told_of_compiling(lambda name: progress("compiling kernels, once on this machine")):
         if out is not None and resume:
             read_record(out)  # a run of another version is refused before anything takes time
@@ -177,8 +178,8 @@ def fit(
         job.notes += chosen
         trainer, state, record = _prepare(job, out if resume else None)
         result = _finish(job, trainer, state, record, resume)
-        ranks.leave()
-        return result
+    ranks.leave()
+    return result
 
 
 def _set_background(job: _Job) -> None:
@@ -188,14 +189,12 @@ def _set_background(job: _Job) -> None:
     job.notes += [note] if note else []
 
 
-def fit_request(
-    request: FitRequest, on_model: Callable[[FittedModel], object] | None = None, ranks: Ranks = ALONE
-) -> FitResult:
-    """Run `fit` as the command line or a study asks for it."""
+def fit_request(request: FitRequest, **others: Any) -> FitResult:
+    """Run `fit` as the command line, a study or a farm asks for it; ``others`` are its on_model, on_step and ranks."""
     r = request
     return fit(
         r.scene, r.config, out=r.out, device=r.device, resume=r.resume, lpips_weights=r.lpips_weights,
-        time_budget=r.time_budget, notes=r.notes, on_model=on_model, ranks=ranks,
+        time_budget=r.time_budget, notes=r.notes, **others,
     )  # fmt: skip
 
 
@@ -308,13 +307,10 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
     on_cuda = job.device.type == "cuda"
     peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(job.device)} if on_cuda else {}
     names = image_names(v.name for v in scene.views)
-    metrics = evaluate_run(
-        job.out, gaussians, train, test, c.rule, scene.background, job.lpips, trainer.max_instances, names=names
-    )
+    scored = (job.out, gaussians, train, test, c.rule, scene.background)
+    metrics = evaluate_run(*scored, job.lpips, trainer.max_instances, names=names)
     if test:
-        metrics["coverage"] = coverage_of_run(
-            job.out, gaussians, train, test, c.rule, scene.background, trainer.max_instances, names=names
-        )
+        metrics["coverage"] = coverage_of_run(*scored, trainer.max_instances, names=names)
     rule = rule_report_of(
         gaussians, train, c.rule, scene.background, seed=c.seed, half_resolution=trainer.half_resolution,
         max_instances=trainer.max_instances,
@@ -323,7 +319,11 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
     options = options_for(c.rule, scene.background, gaussians, trainer.max_instances)
     fractions = moved_fractions(train, (Rendered(*render_view(gaussians, v, options)) for v in train))
     moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
-    for note in [rule["summary"], shape_summary(shape), *moved_notes(moved)]:
+    exposures = {}
+    if c.exposure:
+        rows = trainer.view_table.params[EXPOSURE]
+        exposures = {"exposure": exposure_figures(job.split.train, rows, test, gaussians, options)}
+    for note in [rule["summary"], shape_summary(shape), *moved_notes(moved), *(e["summary"] for e in exposures.values())]:
         job.notes.append(note)
         job.say(f"  {note}")
     return metrics | {
@@ -333,7 +333,7 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
         "config_hash": c.fingerprint(), "fingerprint": scene.fingerprint, "device": job.where.removeprefix("on "),
         "seconds": {**seconds, "total": time.perf_counter() - job.began}, **peak,
         "memory": trainer.memory.to_json(), "rule": rule, "shape": shape,
-        **event_figures(trainer), **complexity_figures(trainer),
+        **event_figures(trainer), **complexity_figures(trainer), **exposures,
         "photographs": [p.to_json() | {"moved": moved.get(p.name)} for p in job.photographs],
     }  # fmt: skip
 

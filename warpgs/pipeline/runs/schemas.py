@@ -115,6 +115,10 @@ METRICS = fields(
         "poses": fields({
             "views": items(fields({"name": _view_name, "degrees": number(0), "units": number(0)})), "summary": text,
         }),
+        "exposure": fields({
+            "views": items(fields({"name": _view_name, "affine": items(items(number(), 4), 3), "gain": number()})),
+            "matched_psnr": or_null(real), "summary": text,
+        }),
         "coverage": fields({
             "classes": _COVERED, "views": items(fields({"name": text, "classes": _COVERED})), "tolerance": number(0),
             "depth_differences": items(number(0)), "photo_psnr": or_null(items(or_null(real))), "summary": text,

@@ -1,148 +1,130 @@
-"""Models for others: a run or a file, filtered, in any format."""
+"""Models for others: a run or a file, filtered, in any format, and its cameras."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 
-from warpgs.coordinates import convert_gaussians
 from warpgs.errors import DataError, UsageError
+from warpgs.export.cameras import holds_cameras, write_cameras
 from warpgs.export.formats import Format, format_of, read_gaussians, write_gaussians
+from warpgs.io.camera_files import read_cameras
 from warpgs.kernels.knn import morton_codes
-from warpgs.pipeline.model.compress import drop_unused_sh
-from warpgs.pipeline.model.coverage import coverage
-from warpgs.pipeline.model.filters import box_of, disturbing, inside, levelling, limit_degree, rotate, rotation_about, select
+from warpgs.pipeline.model.filters import limit_degree, select
 from warpgs.pipeline.runs.folder import StoredRun, open_run
-from warpgs.pipeline.runs.mesh import upwards
+from warpgs.pipeline.runs.share_filters import (
+    NO_FILTERS,
+    Filters,
+    file_gaussians,
+    filtered,
+    rotate_camera,
+    rotation_of,
+    training_cameras,
+    turned_line,
+)
 from warpgs.runtime.folder_lock import hold_folder
-from warpgs.scene import Gaussians
+from warpgs.scene import Camera, Gaussians
+
+ROUNDING = 1e-4
+"""Change of a log scale below which nothing is said: a hundredth of a percent."""
 
 
-@dataclass(frozen=True)
-class Filters:
-    """Choices of what is done to a model on its way into a file."""
-
-    crop: str | None = None
-    """Box to keep, as `box_of` takes it; None for everything."""
-    clean: bool | None = None
-    """True to remove what only disturbs; None for what suits the format (`Format.cleaned`)."""
-    sh_degree: int | None = None
-    """Highest degree of harmonics; None for all that the format holds."""
-    rotate: str | None = None
-    """Axis and angle as x,y,z,degrees, or level: up as the cameras of a run say, to -y; None for no rotation."""
-
-
-def convert(source: Path, target: Path, filters: Filters = Filters()) -> list[str]:
-    """Write a file of Gaussians in another format; returns lines for the user.
+def convert(source: Path, target: Path, filters: Filters = NO_FILTERS) -> list[str]:
+    """Write a file of Gaussians, or of cameras, in another format; returns lines for the user.
 
     Args:
-        source: The file to read.
-        target: The file to write; its suffix says the format.
-        filters: Filters, applied in the order rotate, crop, clean, sh_degree.
+        source: The file to read; of cameras also a folder with a COLMAP reconstruction.
+        target: The file to write; its name says the format.
+        filters: Filters; cameras are rotated only.
 
     Raises:
         DataError: The file cannot be read or is malformed, or nothing is left of it.
         ResourceError: Another process writes into the target's folder, or it cannot be written.
         UsageError: A suffix is unknown, a filter makes no sense, or needs the cameras of a run.
     """
-    kind = format_of(target)
-    format_of(source)
-    if filters.rotate == "level":
-        raise UsageError("--rotate level needs the cameras of a run: use warpgs export RUN, or give x,y,z,degrees")
-    return _written(read_gaussians(source), None, target, kind, filters)
+    if holds_cameras(target):
+        _check_for_cameras(filters)
+        found, notes = read_cameras(source)
+        return [*notes, *_cameras_written(list(found.values()), list(found.values()), target, filters)]
+    kind, read = format_of(target), format_of(source)
+    rotation_of(filters.rotate, None)  # before anything is read
+    lines = _written(read_gaussians(source), None, target, kind, filters)
+    return [read.note, *lines] if read.note and not kind.note else lines
 
 
-def export(folder: Path, target: Path, filters: Filters = Filters()) -> list[str]:
-    """Write a run's Gaussians to a file, in the units of the scene's files; returns lines for the user.
+def export(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> list[str]:
+    """Write a run's Gaussians, or its cameras, to a file, in the units of the scene's files; returns lines for the user.
 
     Args:
         folder: The run folder.
-        target: The file to write; its suffix says the format.
-        filters: Filters, applied in the order rotate, crop, clean, sh_degree.
+        target: The file to write; its name says the format.
+        filters: Filters; cameras are rotated only.
 
     Raises:
         DataError: The folder is no run, or nothing is left of its model.
         ResourceError: Another process writes into the target's folder, or it cannot be written.
-        UsageError: The suffix is not supported, or a filter makes no sense.
+        UsageError: The name says no format, or a filter makes no sense.
     """
+    if holds_cameras(target):
+        _check_for_cameras(filters)
+        stored = open_run(folder, torch.device("cpu"))
+        return _cameras_written(list(stored.cameras("file").values()), training_cameras(stored), target, filters)
     kind = format_of(target)
     stored = open_run(folder, torch.device("cpu"))
-    gaussians = convert_gaussians(drop_unused_sh(stored.gaussians()), stored.normalization, "scene", "file")
-    return _written(gaussians, stored, target, kind, filters)
+    return _written(file_gaussians(stored), stored, target, kind, filters)
 
 
 def _written(gaussians: Gaussians, stored: StoredRun | None, target: Path, kind: Format, filters: Filters) -> list[str]:
     """Filter Gaussians in file units, and write them; returns lines for the user."""
-    gaussians, lines = _filtered(gaussians, stored, filters, kind.cleaned if filters.clean is None else filters.clean)
+    gaussians, _, lines = filtered(gaussians, stored, filters, kind.cleaned)
     if not len(gaussians):
         raise DataError(f"{target}: not written, no Gaussian is left. Give a larger box, or --no-clean")
-    degree = min(kind.max_degree, gaussians.sh_degree, 3 if filters.sh_degree is None else filters.sh_degree)
-    if degree < gaussians.sh_degree:
-        why = "as asked" if degree == filters.sh_degree else f"{kind.name} holds none"
-        lines.append(f"harmonics above degree {degree} are left out, {why}")
-    gaussians = limit_degree(gaussians, degree)
+    if kind.max_degree < gaussians.sh_degree:
+        lines.append(f"harmonics above degree {kind.max_degree} are left out, {kind.name} holds none")
+        gaussians = limit_degree(gaussians, kind.max_degree)
+    if stored is not None and any(stored.background):
+        color = "".join(f"{round(255 * v):02x}" for v in stored.background)
+        lines.append(f"the file does not hold the colour behind the scene, which was #{color} in the fit")
     if kind.sorted:
         gaussians = select(gaussians, torch.argsort(morton_codes(gaussians.means), stable=True))
     with hold_folder(target.parent) as notes:
         write_gaussians(target, gaussians, units="file")
     lines += _changes(target, gaussians) if kind.encode is not None else []
+    lines += [kind.note] if kind.note else []
     return [*notes, *lines, f"{len(gaussians):,} Gaussians in {target}, {target.stat().st_size / 2**20:.2f} MiB"]
 
 
-def _filtered(gaussians: Gaussians, stored: StoredRun | None, filters: Filters, clean: bool) -> tuple[Gaussians, list[str]]:
-    """Rotate, crop and clean Gaussians in file units; returns what is left, and lines for the user."""
-    lines = []
-    keep = torch.ones(len(gaussians), dtype=torch.bool)
-    removed = disturbing(gaussians, None if stored is None else _maxima(stored)) if clean else {}
-    if filters.rotate is not None:
-        rotation = _rotation(filters.rotate, stored)
-        gaussians = rotate(gaussians, rotation)
-        degrees = math.degrees(math.acos(min(1.0, max(-1.0, (float(np.trace(rotation)) - 1) / 2))))
-        lines.append(f"turned by {degrees:.1f} degrees about the origin; cameras of the scene no longer fit this file")
-    if filters.crop is not None:
-        keep = inside(gaussians, box_of(filters.crop))
-        lines.append(f"{int((~keep).sum()):,} Gaussians lie outside of the box")
-    if removed:
-        counts = ", ".join(f"{int((where & keep).sum()):,} {reason}" for reason, where in removed.items())
-        lines.append(f"removed: {counts} (--no-clean keeps them)")
-        keep &= ~torch.stack(list(removed.values())).any(0)
-    return select(gaussians, keep), lines
-
-
 def _changes(target: Path, gaussians: Gaussians) -> list[str]:
-    """Return a line on what the format changed, from the file itself."""
+    """Return a line on what the format rounded, from the file itself; none for what float32 rounds."""
     back = read_gaussians(target)
     moved = float((back.means.double() - gaussians.means.double()).abs().max())
     scales = (back.log_scales.double() - gaussians.log_scales.double()).abs().amax(1)
-    clamped = int((scales > 0.1).sum())
-    if moved == 0 and not scales.any():
+    if moved == 0 and float(scales.max()) < ROUNDING:
         return []
+    other = int((scales > 0.1).sum())
     text = f"rounded by the format: positions by at most {moved:.2g} of the scene's units"
-    return [text + (f"; {clamped:,} Gaussians are of another size by more than a tenth" if clamped else "")]
+    return [text + (f"; {other:,} Gaussians have an axis that is off by more than a tenth" if other else "")]
 
 
-def _maxima(stored: StoredRun) -> torch.Tensor:
-    """Return the largest blending weight of each Gaussian of a run over its training views, shape [N]."""
-    gaussians = stored.gaussians()
-    like = gaussians.means.new_tensor
-    cameras = [stored.scene_cameras[name] for name in stored.train]
-    tensors = [replace(c, viewmat=like(c.viewmat), K=like(c.K)) for c in cameras]
-    return coverage(gaussians, tensors, stored.options()).maxima
+def _check_for_cameras(filters: Filters) -> None:
+    """Check that only a rotation is asked for.
+
+    Raises:
+        UsageError: Another filter is, which cameras do not have.
+    """
+    if any(v is not None for v in (filters.crop, filters.clean, filters.sh_degree)):
+        raise UsageError("--crop, --clean and --sh-degree are for Gaussians; cameras are turned by --rotate only")
 
 
-def _rotation(wish: str, stored: StoredRun | None) -> np.ndarray:
-    """Return the rotation [3, 3] that a user asks for; UsageError where the text is none."""
-    if wish == "level" and stored is not None:
-        up = upwards([stored.scene_cameras[name] for name in stored.train])
-        if up is None:
-            raise UsageError("--rotate level: the cameras do not agree on an upward direction; give x,y,z,degrees")
-        return levelling(up)
-    try:
-        x, y, z, degrees = map(float, wish.split(","))
-    except ValueError as e:
-        raise UsageError(f"--rotate {wish[:60]}: give x,y,z,degrees, or level") from e
-    return rotation_about(np.array([x, y, z]), math.radians(degrees))
+def _cameras_written(cameras: list[Camera], level: list[Camera], target: Path, filters: Filters) -> list[str]:
+    """Turn cameras in file units, and write them; ``level`` are those that say where up is. Returns lines for the user."""
+    rotation, lines = rotation_of(filters.rotate, level), []
+    if rotation is not None:
+        cameras = [rotate_camera(c, rotation) for c in cameras]
+        lines.append(turned_line(rotation))
+    with hold_folder(target.parent) as notes:
+        lines += write_cameras(target, cameras)
+    sizes = sorted({(c.width, c.height) for c in cameras})
+    some = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (" ..." if len(sizes) > 3 else "")
+    return [*notes, *lines, f"{len(cameras):,} cameras for images of {some} px, named by number, in {target}"]

@@ -11,8 +11,9 @@ from warpgs.errors import DataError, UsageError
 from warpgs.io.splits import held_out_split, split_views
 from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.runs.request import FitRequest, choose_device, read_scene
-from warpgs.pipeline.study.ensure_run import ensure_run
+from warpgs.pipeline.farm.ensure_run import ensure_run
 from warpgs.pipeline.study.study import FILES, SWITCHES, Place, Runs, StudyRequest, run_folder, scene_name, write_study
+from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import PRESETS, FitConfig
 from warpgs.pipeline.train.loop import train_views
 from warpgs.runtime.folder_lock import hold_folder
@@ -68,7 +69,7 @@ def _places(request: StudyRequest) -> list[Place]:
             wanted, split = dataclasses.replace(wanted, split=spec), split_views(scene, spec)
         if not split.test:
             raise DataError(f"{wanted.path}: no view is held out, so there is nothing to compare; choose another --split")
-        places.append(Place(scene_name(wanted), wanted, scene.fingerprint, split, train_views(scene, split.test)))
+        places.append(Place(scene_name(wanted), wanted, scene.fingerprint, split, *(train_views(scene, n) for n in (split.train, split.test))))
     return places
 
 
@@ -84,7 +85,9 @@ def _run_all(request: StudyRequest, places: list[Place], device: torch.device, l
                     place.request, run_folder(request, place.name, name, seed), dataclasses.replace(config, seed=seed),
                     request.device, lpips_weights=request.lpips_weights,
                 )  # fmt: skip
-                outcome = ensure_run(fit, place.fingerprint, place.split, device.type, lpips)
+                outcome = ensure_run(
+                    fit, place.fingerprint, place.split, device.type, lpips, settings_by_views(fit.config, place.train, device.type)[0]
+                )
                 if outcome.state != "fitted":
                     say(f"  {outcome.state}{': ' if outcome.note else ''}{outcome.note}")
                 runs[place.name, name, seed] = outcome

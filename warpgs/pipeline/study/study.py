@@ -16,7 +16,7 @@ from warpgs.files import write_bytes, write_json, write_text
 from warpgs.io.splits import Split
 from warpgs.pipeline.runs.request import SceneRequest
 from warpgs.pipeline.runs.results import LABELS
-from warpgs.pipeline.study.ensure_run import Outcome
+from warpgs.pipeline.farm.ensure_run import Outcome
 from warpgs.pipeline.study.plots import Line, Panel, forest
 from warpgs.pipeline.study.qualitative import strips
 from warpgs.pipeline.study.statistics import paired_difference, sample
@@ -86,6 +86,8 @@ class Place:
     """Fingerprint of its data."""
     split: Split
     """Views to fit and those held out."""
+    train: list[View]
+    """Views to fit."""
     test: list[View]
     """Held-out views."""
 

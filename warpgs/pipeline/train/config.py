@@ -63,6 +63,9 @@ class FitConfig:
     refine_poses: bool = False
     """Learn an increment of each training camera but the first with the Gaussians, for poses that are a little off
     (docs/your-photos.md)."""
+    exposure: bool = False
+    """Learn an affine map of colours for each training view with the Gaussians, for photographs that differ in brightness or
+    white balance; no held-out view has one (docs/your-photos.md)."""
     max_gaussians: int = 1_000_000
     """Largest number of Gaussians, from the start on."""
     background: str = "scene"

@@ -42,8 +42,11 @@ class LossConfig:
     alpha_weight: float = 1.0
     """Weight of the mean absolute difference of opacities, in views that know theirs, in [0, 1000]; 0 for no such term."""
 
+    exposure_weight: float = 0.01
+    """Weight of the sum of squares of each view's exposure less the identity, where exposures are learned, in [0, 1000]."""
+
     def __post_init__(self) -> None:
-        for name, most in (("depth_weight", 1000), ("depth_until", 1), ("alpha_weight", 1000)):
+        for name, most in (("depth_weight", 1000), ("depth_until", 1), ("alpha_weight", 1000), ("exposure_weight", 1000)):
             if not 0 <= getattr(self, name) <= most:
                 raise UsageError(f"loss {name.replace('_', ' ')} {getattr(self, name)} must lie between 0 and {most}")
         if not 0 <= self.ssim_weight <= 1:

@@ -51,6 +51,10 @@ class OptimizerConfig:
     """The same of their translations, times the scene's extent."""
     pose_decay: float = 0.01
     """Fraction of both that is left at the last step; log-linear between."""
+    exposure_lr: float = 5e-3
+    """Learning rate of the training views' exposures at the start, where these are learned."""
+    exposure_decay: float = 0.1
+    """Fraction of it that is left at the last step; log-linear between."""
 
     def __post_init__(self):
         for name, value in vars(self).items():
@@ -79,6 +83,10 @@ class OptimizerConfig:
         """Return the learning rates of rotations [rad] and translations [u] of cameras; arguments are those of `lrs`."""
         left = log_linear(1.0, self.pose_decay, progress)
         return self.pose_rotation_lr * left, self.pose_translation_lr * extent * left
+
+    def exposure_lr_at(self, progress: float) -> float:
+        """Return the learning rate of exposures at a fraction of the fit, in [0, 1]."""
+        return self.exposure_lr * log_linear(1.0, self.exposure_decay, progress)
 
     @property
     def head_lrs(self) -> dict[str, float]:

@@ -10,10 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from warpgs.errors import UsageError
 from warpgs.pipeline.metrics.region import fitted_region
 from warpgs.pipeline.model.init import Start, check_points, initial_points, subsample
 from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.exposure import ExposurePenalty, first_exposures
 from warpgs.pipeline.train.loss import LossTerm, built_in_terms, collect
+from warpgs.pipeline.train.refine_poses import first_increments
 from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.strategies.importance_sampling import scored
 from warpgs.pipeline.train.views import TrainingView, with_alpha
@@ -79,8 +82,30 @@ def prepare(
 
 def needs_priors(config: FitConfig) -> bool:
     """Return whether sampling or a loss term needs the priors of the views."""
-    terms = (*built_in_terms(config.loss), *config.loss_terms)
-    return find_strategy(config.strategy).samples(config) or any(t.needs_priors for t in terms)
+    return find_strategy(config.strategy).samples(config) or any(t.needs_priors for t in terms_of(config))
+
+
+def terms_of(config: FitConfig, cutout: bool = False) -> tuple[LossTerm, ...]:
+    """Return all loss terms of a fit by its settings; ``cutout`` says that its views know their opacity."""
+    exposure = (ExposurePenalty(config.loss.exposure_weight),) if config.exposure else ()
+    return (*built_in_terms(config.loss, cutout), *exposure, *config.loss_terms)
+
+
+def view_parameters(
+    terms: tuple[LossTerm, ...], config: FitConfig, views: int, device: torch.device
+) -> tuple[dict[str, torch.Tensor], dict[str, float]]:
+    """Return the parameters of as many training views before the first step, [V, ...] by name, and learning rates of terms'.
+
+    Raises:
+        UsageError: Two loss terms, or a loss term and the fit itself, use one name.
+    """
+    own = collect(terms, lambda t: t.view_parameters(), "view parameter")
+    first = {n: torch.tensor(p.initial, dtype=torch.float32, device=device).repeat(views, 1) for n, p in own.items()}
+    fit = first_increments(views, device) if config.refine_poses else {}
+    fit |= first_exposures(views, device) if config.exposure else {}
+    for name in own.keys() & fit.keys():
+        raise UsageError(f"a loss term and the fit itself both have a view parameter {name!r}; rename the term's")
+    return first | fit, {n: p.lr for n, p in own.items()}
 
 
 def prepared_views(

@@ -23,6 +23,7 @@ from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, bin_tiles
 from warpgs.pipeline.metrics.psnr import masked_mse
 from warpgs.pipeline.model.scale_limits import NO_LIMITS, Limits
 from warpgs.pipeline.model.table import Table
+from warpgs.pipeline.train.exposure import EXPOSURE, exposed, exposure_of
 from warpgs.pipeline.train.loss import LossTerm, Target, over
 from warpgs.pipeline.train.refine_poses import ROTATION, TRANSLATION, moved
 from warpgs.pipeline.train.strategies.base import Strategy
@@ -211,6 +212,8 @@ def view_gradients(learned: Learned, views: ViewStack, buffers: StepBuffers, pla
     own = {n: t.index_select(0, number)[0] for n, t in learned.views.params.items()}  # not t[number], which reads it back
     if ROTATION in own:
         viewmat = moved(viewmat, number, own[ROTATION][None], own[TRANSLATION][None])
+    if EXPOSURE in own:
+        own[EXPOSURE] = exposure_of(learned.views.params[EXPOSURE], own[EXPOSURE])
     alpha = shift = None
     if views.alphas is not None:
         alpha, shift = buffers.of_view(views.alphas), settings[3:]
@@ -220,6 +223,8 @@ def view_gradients(learned: Learned, views: ViewStack, buffers: StepBuffers, pla
     if learned.dropout_seed is not None:
         factors = opacity_dropout(len(table), settings[:2], learned.dropout_seed)
     rendered = render(table.gaussians, Camera(viewmat, K, **views.size), plan.degree, factors, shift)
+    if EXPOSURE in own:
+        rendered = replace(rendered, rgb=exposed(rendered.rgb, own[EXPOSURE]))
     loss = total_loss(plan, rendered, target, table.gaussians, strategy)
 
     projected = rendered.projected

@@ -20,11 +20,12 @@ from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.batch import BatchSteps
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import built_in_terms, collect, random_shift
+from warpgs.pipeline.train.exposure import EXPOSURE, check_exposure
+from warpgs.pipeline.train.loss import random_shift
 from warpgs.pipeline.train.memory_plan import Layout, layout_of, most_instances, plan
-from warpgs.pipeline.train.refine_poses import ROTATION, TRANSLATION, GivenPoses, first_increments
+from warpgs.pipeline.train.refine_poses import ROTATION, TRANSLATION, GivenPoses
 from warpgs.pipeline.train.schedule import plan_phases
-from warpgs.pipeline.train.setup import prepare, prepared_views
+from warpgs.pipeline.train.setup import prepare, prepared_views, terms_of, view_parameters
 from warpgs.pipeline.train.slots import Tree, check_batch
 from warpgs.pipeline.train.step import (
     CAPACITY_FACTOR,
@@ -74,11 +75,13 @@ class Trainer:
 
         Raises:
             DataError: There is nothing to start from.
-            UsageError: The memory limit is below what the smallest step needs, a plug-in is not there, or two loss terms use
-                one name for a map or a parameter.
+            UsageError: The memory limit is below what the smallest step needs, a plug-in is not there, two loss terms use one
+                name for a map or a parameter, or views that know their opacity were to have exposures.
         """
         if not train:
             raise DataError("there is no training view; name at least one in --split")
+        if config.exposure:
+            check_exposure(train)
         config, chosen = settings_by_views(config, train, device.type)
         check_batch(config.batch, config.steps, ranks)
         self.config, self.device, self.ranks, self.batch = config, device, ranks, config.batch
@@ -102,7 +105,7 @@ class Trainer:
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
         """Dropout probability at the last step."""
         self.cutout = any(v.alpha is not None and not v.alpha_estimated for v in train)  # all have an opacity then
-        self.terms = (*built_in_terms(config.loss, self.cutout), *config.loss_terms)
+        self.terms = terms_of(config, self.cutout)
         self.step = 0
         """Steps taken."""
         self.memory_limit, self.captured = config.memory_limit, config.cuda_graph
@@ -112,14 +115,10 @@ class Trainer:
 
         self.strategy = find_strategy(config.strategy)(self)
         self.table = Table.of_gaussians(initial_gaussians(cloud, config.init, self.extent, device), self.strategy.columns())
-        own = collect(self.terms, lambda t: t.view_parameters(), "view parameter")
-        first = {n: torch.tensor(p.initial, dtype=torch.float32, device=device).repeat(len(train), 1) for n, p in own.items()}
         self.poses: GivenPoses | None = None
         """Training poses as given, where they are refined."""
-        if config.refine_poses:
-            first |= first_increments(len(train), device)
+        first, self.view_lrs = view_parameters(self.terms, config, len(train), device)
         self.view_table = Table(first, {}, device, len(train))
-        self.view_lrs = {n: p.lr for n, p in own.items()}
         self.table.batch = self.view_table.batch = self.batch
         self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(first)))
         dropout_seed, centers = config.seed if self.dropout > 0 else None, camera_centers(cameras, device)
@@ -293,10 +292,12 @@ class Trainer:
 
     def _lr_row(self, step: int) -> list[float]:
         row = self.table.lr_row(self.lrs(step), step, self.config.optimizer.head_lrs)
-        lrs = dict(self.view_lrs)
+        lrs, optimizer = dict(self.view_lrs), self.config.optimizer
         if self.poses is not None:
-            rates = self.config.optimizer.pose_lrs(self.progress(step), self.extent)
+            rates = optimizer.pose_lrs(self.progress(step), self.extent)
             lrs |= {ROTATION: rates[0], TRANSLATION: rates[1]}
+        if self.config.exposure:
+            lrs[EXPOSURE] = optimizer.exposure_lr_at(self.progress(step))
         return row + self.view_table.lr_row(lrs, step, {})
 
     def agreed(self, stopped: bool) -> bool:
@@ -327,13 +328,13 @@ class Trainer:
         if not self.strategy.due(self.step):
             return
         self.forget_graphs()
-        self._show_poses()
+        self.show_poses()
         for change in self.strategy.update(self.step):
             self.table.apply(change)
             self.count_changed()
         self.plan_of(self.step).limits.hold(self.table.params, self.learned.centers)
 
-    def _show_poses(self) -> None:
+    def show_poses(self) -> None:
         """Let the views show their poses as they are now, where these are refined."""
         if self.poses is not None:
             self.poses.show(self.views, self.view_table.params)

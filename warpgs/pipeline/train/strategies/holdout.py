@@ -23,6 +23,7 @@ from warpgs.pipeline.train.strategies.base import register
 from warpgs.pipeline.train.strategies.holdout_blocks import (
     FLOOR,
     MIN_BLOCKS,
+    Blocks,
     Gain,
     Level,
     block_errors,
@@ -45,7 +46,6 @@ LATELY = 1.5
 NEAR = 4.0
 """Distance below `HoldoutConfig.enough_db` over which the loss that a trim may cause falls to 0 [dB]. With a threshold instead,
 a tenth of a decibel decided whether a smooth wall kept 167 or 696 Gaussians (docs/complexity.md)."""
-
 
 _COUNT = schema.whole(0)
 _LEVEL = {f.name: _COUNT if f.name in ("step", "count") else schema.real for f in fields(Level)}
@@ -113,12 +113,11 @@ class Holdout(ImportanceSampling):
         self.marks = sorted(marks)
         """Steps done when the blocks are measured: before growth, and after each level."""
         self.whole = t.views
-        self.blocks = sample_blocks(t.views, c.holdout.fraction, c.seed)
+        self.blocks, shown = self.hold_out(t.views)
         held = sum(map(len, self.blocks))
-        self.measuring = held >= MIN_BLOCKS and ends < c.steps
-        """True where blocks are held out and growth is measured on them."""
+        self.measuring = held >= MIN_BLOCKS and ends < c.steps  # growth is measured on held-out blocks
         if self.measuring:
-            t.set_views([hide(v, b) for v, b in zip(self.whole, self.blocks)])
+            t.set_views(shown)
             pixels = sum(len(b) * b.side**2 for b in self.blocks) / sum(v.camera.width * v.camera.height for v in t.views)
             t.notes.append(
                 f"holdout: {held} blocks, {pixels:.1%} of the pixels, are held out until growth ends, by step {ends}"
@@ -126,6 +125,11 @@ class Holdout(ImportanceSampling):
         else:
             few = f"the images hold only {held} blocks" if held < MIN_BLOCKS else "growth lasts to the end of the fit"
             t.notes.append(f"holdout: nothing is held out, since {few}; the fit is as without this strategy")
+
+    def hold_out(self, views: list[TrainingView]) -> tuple[list[Blocks], list[TrainingView]]:
+        """Return what is held out of each view until growth ends, and the views that are trained on until then."""
+        blocks = sample_blocks(views, self.trainer.config.holdout.fraction, self.trainer.config.seed)
+        return blocks, [hide(v, b) for v, b in zip(views, blocks)]
 
     @property
     def _growth_ends(self) -> int:
@@ -194,8 +198,7 @@ class Holdout(ImportanceSampling):
 
     def after_step(self, phase, settings, going):
         """Apply the bounds of each Gaussian, and raise the opacities of protected ones; ``settings`` [3], ``going`` [1]."""
-        c = self.trainer.config.holdout
-        if c.bounds or c.degrees or c.trim_db > 0:
+        if self.trainer.config.holdout.bounds or self.shrinks(self.trainer.config):
             enforce_bounds(self.trainer.table)
         super().after_step(phase, settings, going)
 

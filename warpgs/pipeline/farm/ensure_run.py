@@ -1,8 +1,9 @@
-"""Runs of a study: each is kept where it is finished and the same, continued where it is half done, else fitted."""
+"""Runs of a study or a farm: each is kept where it is finished and the same, continued where it is half done, else fitted."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from warpgs.pipeline.runs.fit import fit_request
 from warpgs.pipeline.runs.folder import CONFIG, read_record
 from warpgs.pipeline.runs.request import FitRequest
 from warpgs.pipeline.runs.schemas import METRICS
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.step_report import StepReport
 from warpgs.runtime.folder_lock import hold_folder
 
 
@@ -29,6 +32,8 @@ class Outcome:
     """Contents of metrics.json, or of eval.json where LPIPS was measured later; None where it failed."""
     note: str = ""
     """Note on this run for readers of the study; empty where nothing is special."""
+    error: WarpgsError | None = None
+    """Error that it failed with, if any."""
 
 
 def _scores(path: Path) -> dict[str, Any] | None:
@@ -41,13 +46,13 @@ def _scores(path: Path) -> dict[str, Any] | None:
     return value
 
 
-def _difference(record: dict[str, Any], request: FitRequest, fingerprint: str, split: Split, device: str) -> str:
+def _difference(record: dict[str, Any], config: FitConfig, fingerprint: str, split: Split | None, device: str) -> str:
     """Name the properties in which a stored run differs from the one that is wanted; empty where in none."""
     wanted = {
-        "configuration": (record.get("config_hash"), request.config.fingerprint()),
+        "configuration": (record.get("config_hash"), config.fingerprint()),
         "data": (record.get("fingerprint"), fingerprint),
-        "training views": (record.get("train"), list(split.train)),
-        "held-out views": (record.get("test"), list(split.test)),
+        "training views": (record.get("train"), split and list(split.train)),
+        "held-out views": (record.get("test"), split and list(split.test)),
         "device": (record.get("device"), device),
         "version of warpgs": ((record.get("versions") or {}).get("warpgs"), __version__),
     }
@@ -82,7 +87,15 @@ def _with_lpips(metrics: dict[str, Any], folder: Path, request: FitRequest, vari
     return metrics | {k: written[k] for k in ("test", "views", "variants")}
 
 
-def ensure_run(request: FitRequest, fingerprint: str, split: Split, device: str, variants: dict[str, str]) -> Outcome:
+def ensure_run(
+    request: FitRequest,
+    fingerprint: str,
+    split: Split | None,
+    device: str,
+    variants: dict[str, str],
+    resolved: FitConfig | None = None,
+    on_step: Callable[[StepReport], object] | None = None,
+) -> Outcome:
     """Ensure that a run folder holds the finished run that is asked for.
 
     A finished run of the same configuration, data, views, kind of device and version is kept. A half-finished one is
@@ -91,30 +104,37 @@ def ensure_run(request: FitRequest, fingerprint: str, split: Split, device: str,
     Args:
         request: The fit; ``out`` is its folder, ``resume`` is decided here.
         fingerprint: Fingerprint of the scene's data.
-        split: The views that train and those held out.
+        split: The views that train and those held out; None where no run can be the same.
         device: cpu or cuda.
         variants: Names of the LPIPS scores that must be there, with their definitions; empty for none.
+        resolved: The settings of ``request`` with those chosen that it leaves open; None where it leaves none open.
+        on_step: As in `fit`.
 
     Returns:
         The outcome. It holds the error of this one run, if any, so that the others can go on.
     """
     try:
-        return _outcome(request, fingerprint, split, device, variants)
+        record, why = _stored(request.out)
+        gap = "" if record is None else _difference(record, resolved or request.config, fingerprint, split, device)
+        return _outcome(request, record, gap, why, variants, {} if on_step is None else {"on_step": on_step})
     except WarpgsError as e:
-        return Outcome("failed", None, f"failed: {e}")
+        return Outcome("failed", None, f"failed: {e}", e)
 
 
-def _outcome(request: FitRequest, fingerprint: str, split: Split, device: str, variants: dict[str, str]) -> Outcome:
-    """Return the outcome of `ensure_run`, or raise what keeps it from beginning."""
-    folder, note, state = request.out, "", "fitted"
-    resume, why = False, "is no run"
-    record = None
+def _stored(folder: Path) -> tuple[dict[str, Any] | None, str]:
+    """Return the record of a run folder, or None and why it has none."""
     try:
-        record = read_record(folder) if (folder / CONFIG).exists() else None
+        return (read_record(folder) if (folder / CONFIG).exists() else None), "is no run"
     except DataError as e:
-        why = f"cannot be used ({e})"
+        return None, f"cannot be used ({e})"
+
+
+def _outcome(
+    request: FitRequest, record: dict[str, Any] | None, gap: str, why: str, variants: dict[str, str], watchers: dict[str, Any]
+) -> Outcome:
+    """Return the outcome of `ensure_run`, or raise what keeps it from beginning."""
+    folder, note, state, resume = request.out, "", "fitted", False
     if record is not None:
-        gap = _difference(record, request, fingerprint, split, device)
         metrics = _scores(folder / "metrics.json")
         if gap:
             note = f"the run that was there had another {gap}; moved to {_set_aside(folder).name} and done anew"
@@ -123,7 +143,7 @@ def _outcome(request: FitRequest, fingerprint: str, split: Split, device: str, v
             try:
                 scores = _with_lpips(metrics, folder, request, variants) if variants else metrics
             except WarpgsError as e:
-                return Outcome("failed", None, f"scoring it again: {e}")
+                return Outcome("failed", None, f"scoring it again: {e}", e)
             return Outcome("kept", scores)
         else:
             resume, state, note = True, "continued", "was half done and has been continued from its last checkpoint"
@@ -132,7 +152,7 @@ def _outcome(request: FitRequest, fingerprint: str, split: Split, device: str, v
         state = "redone"
 
     def fit(go_on: bool) -> dict[str, Any]:
-        return fit_request(replace(request, resume=go_on)).metrics
+        return fit_request(replace(request, resume=go_on), **watchers).metrics
 
     try:
         try:
@@ -143,4 +163,4 @@ def _outcome(request: FitRequest, fingerprint: str, split: Split, device: str, v
             note = f"was half done and could not be continued ({e}); moved to {_set_aside(folder).name} and done anew"
             return Outcome("redone", fit(False), note)
     except WarpgsError as e:
-        return Outcome("failed", None, f"{note + '; ' if note else ''}failed: {e}")
+        return Outcome("failed", None, f"{note + '; ' if note else ''}failed: {e}", e)

@@ -1,0 +1,145 @@
+"""Gaussians trained elsewhere render through cameras from a file."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.gaussians import cloud
+from tests.io import scenes
+from warpgs.errors import DataError, UsageError
+from warpgs.export.cameras import NAMES, write_cameras
+from warpgs.export.formats import write_gaussians
+from warpgs.files import make_folder
+from warpgs.geometry import look_at
+from warpgs.io.camera_files import read_cameras
+from warpgs.pipeline.runs.commands import render
+from warpgs.pipeline.runs.film_plan import FilmSettings
+from warpgs.pipeline.runs.model_and_cameras import open_file
+from warpgs.pipeline.runs.share import convert
+from warpgs.pipeline.runs.share_filters import Filters
+from warpgs.render.rasterize import rasterize
+from warpgs.scene import Camera
+
+
+def make_cameras(count=3):
+    K = np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+    up, target = np.array([0.0, -1, 0]), np.array([0.0, 0, 4])
+    return [Camera(look_at(np.array([0.5 * i - 0.5, 0.2 * i, 0.0]), target, up), K, 64, 48) for i in range(count)]
+
+
+def torch_camera(camera):
+    return Camera(*(torch.from_numpy(np.asarray(m)).float() for m in (camera.viewmat, camera.K)), camera.width, camera.height)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_cameras_read_back(name, tmp_path):
+    made = make_cameras()
+    assert write_cameras(tmp_path / name, made) == []
+    found, notes = read_cameras(tmp_path / name if name != "sparse" else tmp_path)
+    text = "".join(p.read_text() for p in tmp_path.rglob("*") if p.is_file())
+    assert len(found) == 3 and not notes and str(tmp_path) not in text
+    for a, b in zip(made, found.values()):
+        assert np.allclose(a.viewmat, b.viewmat) and np.allclose(a.K, b.K) and (a.width, a.height) == (b.width, b.height)
+    with pytest.raises(UsageError, match=r"cameras\.json or transforms\.json"):
+        write_cameras(tmp_path / "poses.json", made)
+    made[0].K[0, 2] += 2
+    make_folder(tmp_path / "b")
+    notes = write_cameras(tmp_path / "b" / name, made)
+    assert ("up to 2.0 px" in notes[0]) if name == "cameras.json" else not notes
+
+
+def test_a_reconstruction_is_not_replaced(tmp_path):
+    scenes.write_colmap(tmp_path)
+    with pytest.raises(UsageError, match="is there already"):
+        write_cameras(tmp_path / "sparse", make_cameras())
+
+
+def test_colmap_reads_our_cameras(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    write_cameras(tmp_path / "sparse", made := make_cameras())
+    found = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    assert len(found.images) == 3 and len(found.cameras) == 1
+    for image in found.images.values():
+        pose = np.asarray(image.cam_from_world().matrix())
+        assert np.allclose(pose, made[int(image.name[:4])].viewmat[:3])
+
+
+def test_cameras_turn_with_their_gaussians(tmp_path):
+    """A model and its cameras, both converted with the same rotation, give the same image."""
+    made, cameras = cloud(50, degree=2), make_cameras()
+    write_gaussians(tmp_path / "a.ply", made, units="file")
+    write_cameras(tmp_path / "cameras.json", cameras)
+    turn = Filters(rotate="1,2,3,70")
+    convert(tmp_path / "a.ply", tmp_path / "b.ply", turn)
+    lines = convert(tmp_path / "cameras.json", tmp_path / "b" / "transforms.json", turn)
+    assert "turned by 70.0 degrees" in lines[0] and "3 cameras for images of 64 x 48 px, named by number" in lines[-1]
+    models = [open_file(tmp_path / f"{x}.ply", tmp_path / y, "inria", "cpu")[0] for x, y in (
+        ("a", "cameras.json"), ("b", "b/transforms.json"))]  # fmt: skip
+    images = [rasterize(m.gaussians(), torch_camera(list(m.cameras().values())[1])).rgb for m in models]
+    assert float((images[0] - images[1]).abs().max()) < 1e-3 and float(images[0].max()) > 0.1
+    with pytest.raises(UsageError, match="are for Gaussians"):
+        convert(tmp_path / "cameras.json", tmp_path / "c" / "cameras.json", Filters(clean=True))
+    convert(tmp_path / "cameras.json", tmp_path / "l" / "cameras.json", Filters(rotate="level"))
+    with pytest.raises(UsageError, match="not supported"):
+        convert(tmp_path / "cameras.json", tmp_path / "c.txt")
+
+
+def test_cameras_of_colmap(tmp_path):
+    scenes.write_colmap(tmp_path)
+    found, _ = read_cameras(tmp_path)
+    assert len(found) == 5 and list(found) == sorted(found)
+    for below in ("sparse", "sparse/0"):
+        assert list(read_cameras(tmp_path / below)[0]) == list(found)
+
+
+ROW = '"position": [0, 0, %s], "width": 9, "height": 9, "fx": 9, "fy": 9}]'
+
+
+@pytest.mark.parametrize(
+    "text,match",
+    [
+        ("[]", "holds no camera"), ("{}", "no list 'frames'"), ("[1]", "camera 0: needs"),
+        ("[" * 10000, "cannot be read as JSON"),
+        ('[{"rotation": [[1,0,0],[0,1,0],[0,0,1]], ' + ROW % "1e999", "camera 0"),
+        ('[{"rotation": [[2,0,0],[0,1,0],[0,0,1]], ' + ROW % "0", "camera 0"),
+        ('{"frames": [{"transform_matrix": [[1]], "w": 9, "h": 9, "fl_x": 9}]}', "frame 0"),
+        ('{"frames": [{"transform_matrix": [[1]], "fl_x": 9}]}', "gives no w and h"),
+    ],
+)  # fmt: skip
+def test_files_that_hold_no_cameras(text, match, tmp_path):
+    (tmp_path / "cameras.json").write_text(text)
+    with pytest.raises(DataError, match=match):
+        read_cameras(tmp_path / "cameras.json")
+
+
+@pytest.mark.parametrize("rule", ["inria", "gsplat"])
+def test_a_file_shows_what_it_held(rule, tmp_path):
+    made, cameras = cloud(50), make_cameras()
+    write_gaussians(tmp_path / "a.ply", made, units="file")
+    write_cameras(tmp_path / "cameras.json", cameras)
+    model, notes = open_file(tmp_path / "a.ply", tmp_path / "cameras.json", rule, "cpu")
+    assert "50 Gaussians, 3 cameras" in notes[-1] and model.rule == rule
+    for there, c in zip(model.cameras().values(), cameras):
+        image = rasterize(model.gaussians(), torch_camera(there)).rgb
+        want = rasterize(made, torch_camera(c)).rgb
+        assert float((image - want).abs().max()) < 1e-3 and float(want.max()) > 0.1
+
+
+def test_render_of_a_file(tmp_path):
+    write_gaussians(tmp_path / "a.spz", cloud(50), units="file")
+    write_cameras(tmp_path / "cameras.json", make_cameras())
+    out, settings = tmp_path / "out", FilmSettings(frames=1)
+    lines = render(tmp_path / "a.spz", "views", out, settings, "cpu", file_of=(tmp_path / "cameras.json", None))
+    assert any("cut-offs of inria" in line for line in lines) and any("black lies behind" in line for line in lines)
+    assert len(list(out.glob("*.png"))) == 3
+    write_cameras(tmp_path / "transforms.json", [replace(c, K=1000 * c.K, width=20000, height=20000) for c in make_cameras()])
+    with pytest.raises(DataError, match="20000 x 20000 px has more than 100,000,000 pixels"):
+        render(tmp_path / "a.spz", "views", out, settings, "cpu", file_of=(tmp_path / "transforms.json", None))
+    with pytest.raises(UsageError, match="has no cameras"):
+        render(tmp_path / "a.spz", "views", out, settings, "cpu", file_of=(None, None))
+    with pytest.raises(UsageError, match="--rule other"):
+        render(tmp_path / "a.spz", "views", out, settings, "cpu", file_of=(tmp_path / "cameras.json", "other"))
+    assert json.loads((tmp_path / "cameras.json").read_text())[0]["img_name"] == "0000"

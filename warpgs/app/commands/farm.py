@@ -1,0 +1,91 @@
+"""`warpgs farm`: fit many scenes. Parses, calls, prints; no logic."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+from warpgs.app.commands.fit import request_of
+from warpgs.app.flags import parse_flags
+from warpgs.errors import UsageError
+from warpgs.pipeline.farm.listing import FARM_FLAGS, ListedJob
+
+OWN = ("engine", "slots", "per-gpu", "threads", "minutes", "partition", "slurm-local", "out", "help")
+"""Flags of the farm itself; all others are those of `warpgs fit`."""
+SWITCHES = ("slurm-local", "help")
+"""Flags of these that take no value."""
+
+
+def run(arguments: list[str], about: str) -> int:
+    """Run the command; ``about`` heads its help."""
+    import tyro
+
+    from warpgs.pipeline.farm.run import EngineRequest, check_failures, make_engine, run_and_show
+
+    own, shared = _divided(arguments)
+
+    @dataclass(frozen=True, kw_only=True)
+    class Farm:
+        jobs: tyro.conf.Positional[str]
+        """Folder of scenes, a glob in quotes, or a .jsonl file: {"scene": FOLDER, "steps": 500} a line, with any flags of
+        `warpgs fit`."""
+        out: Path
+        """Folder of the results; the same command on it goes on where it stopped, several at once share the work."""
+        engine: str = "local"
+        """local (processes of this machine), ray or slurm."""
+        slots: int | None = None
+        """Jobs at a time; where not given, one for each GPU times --per-gpu, one on a CPU, or what the cluster has."""
+        per_gpu: int = 1
+        """Jobs that share a GPU."""
+        threads: int = 1
+        """CPU threads of a job with ray or slurm; local jobs share all cores."""
+        minutes: int = 240
+        """Time after which slurm ends a job [min]."""
+        partition: str | None = None
+        """Slurm's partition."""
+        slurm_local: bool = False
+        """Run slurm's jobs as processes of this machine, to try it."""
+
+    more = "All flags of `warpgs fit` but those of one run hold for every job: --preset, --split, --steps, --device, ..."
+    a = parse_flags(Farm, own, "warpgs farm", f"{about}\n\n{more}")
+    from warpgs.pipeline.farm.listing import list_jobs
+
+    jobs = _jobs(list_jobs(a.jobs), shared, a.out)
+    names = [f.name for f in dataclasses.fields(EngineRequest)]
+    engine = make_engine(EngineRequest(**{n: getattr(a, n) for n in names}), jobs[0].request.device, a.out)
+    check_failures(run_and_show(jobs, engine, a.out))
+    return 0
+
+
+def _divided(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """Divide the words of a command line into those of the farm and those of every fit."""
+    own: list[str] = []
+    shared: list[str] = []
+    target = own
+    for word in arguments:
+        flag, given, _ = word.removeprefix("--").partition("=")
+        name = flag.replace("_", "-")
+        if not word.startswith("--"):
+            target.append(word)  # the value of the flag before it, or the jobs
+            target = own
+            continue
+        if name in FARM_FLAGS and name not in (*OWN, "device", "allow-outside"):
+            raise UsageError(f"--{name} is of one fit alone: leave it out of a farm")
+        group = own if name in OWN else shared
+        group.append(word)
+        target = own if given or name in SWITCHES else group
+    return own, shared
+
+
+def _jobs(listed: list[ListedJob], shared: list[str], out: Path) -> list:
+    """Return the jobs, each with the settings that the words of all and its own make."""
+    from warpgs.pipeline.farm.job import FarmJob
+
+    requests: dict = {}
+    jobs = []
+    for job in listed:
+        if job.flags not in requests:
+            requests[job.flags] = request_of(["SCENE", "--out", "RUN", *shared, *job.flags], "")
+        request, folder = requests[job.flags], out / job.name
+        scene = dataclasses.replace(request.scene, path=str(job.scene))
+        jobs.append(FarmJob(job.name, dataclasses.replace(request, scene=scene, out=folder / "run"), folder))
+    return jobs

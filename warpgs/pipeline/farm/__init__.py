@@ -1,0 +1,1 @@
+"""Farms: many fits, several at a time, on the engines that exist."""

@@ -1,0 +1,40 @@
+"""What a farm asks of an engine: to run jobs, and to say what becomes of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from warpgs.pipeline.farm.job import FarmJob
+
+
+@dataclass(frozen=True)
+class Event:
+    """News of a job."""
+
+    name: str
+    """Name of the job."""
+    state: str
+    """running; or the last news: done, failed, held (another process works on it) or crashed (its process ended)."""
+    message: str = ""
+    """Reason of a crash."""
+    step: int = 0
+    """Steps done, 0 where nobody knows."""
+
+
+class Engine(Protocol):
+    """A place where jobs run."""
+
+    name: str
+    """Name for people."""
+    slots: int
+    """Jobs that it runs at a time."""
+
+    def start(self, job: FarmJob) -> None:
+        """Start a job; called while fewer than `slots` run."""
+
+    def wait(self, seconds: float) -> list[Event]:
+        """Return news; waits so long where there is none."""
+
+    def close(self) -> None:
+        """End all that runs. A fit saves its state where it can, and is continued by the next farm."""

@@ -1,0 +1,66 @@
+"""A job of a farm: a fit, where its results lie, and the same as text for another process."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from warpgs import schema
+from warpgs.io.readers import READERS
+from warpgs.pipeline.runs.request import FitRequest, SceneRequest
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loss import LOSS_TERMS
+from warpgs.pipeline.train.strategies.base import STRATEGIES
+
+
+@dataclass(frozen=True)
+class FarmJob:
+    """A fit that an engine runs."""
+
+    name: str
+    """Name, unique in the farm."""
+    request: FitRequest
+    """The fit; ``out`` is its run folder."""
+    folder: Path
+    """Folder of the job's record, log and thumbnail, which is locked while a farm works on it."""
+
+    def identity(self) -> str:
+        """Return the first 16 hexadecimal digits of the SHA-256 of all that the result depends on but the images."""
+        r = self.request
+        weights = None if r.lpips_weights is None else str(r.lpips_weights)
+        values = [dataclasses.asdict(r.scene.with_scale()), r.config.to_json(), weights]
+        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def job_text(job: FarmJob) -> str:
+    """Return a job as one line of JSON."""
+    r = job.request
+    request = {
+        "scene": dataclasses.asdict(r.scene), "out": str(r.out.resolve()), "config": r.config.to_json(), "device": r.device,
+        "lpips_weights": None if r.lpips_weights is None else str(r.lpips_weights.resolve()), "notes": r.notes,
+    }  # fmt: skip
+    return json.dumps({"name": job.name, "folder": str(job.folder.resolve()), "request": request})
+
+
+def job_of(text: str) -> FarmJob:
+    """Return the job of `job_text`; code of the user's own that it names is imported, as in the process that wrote it.
+
+    Raises:
+        UsageError: That code is not there.
+    """
+    values = schema.parse(text)
+    r = values["request"]
+    scene, config = SceneRequest(**r["scene"]), r["config"]
+    if scene.reader is not None:
+        READERS.load(scene.reader)
+    STRATEGIES.load(config["strategy"])
+    for term in config["loss_terms"]:
+        LOSS_TERMS.load(term["name"])
+    weights = None if r["lpips_weights"] is None else Path(r["lpips_weights"])
+    request = FitRequest(
+        scene, Path(r["out"]), FitConfig.from_json(config), r["device"], lpips_weights=weights, notes=tuple(r["notes"])
+    )
+    return FarmJob(values["name"], request, Path(values["folder"]))

@@ -1,0 +1,122 @@
+"""What a farm is given to fit: a folder of scenes, a glob, or a file with a line of JSON for each job."""
+
+from __future__ import annotations
+
+import glob
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from warpgs import schema
+from warpgs.errors import DataError, UsageError
+from warpgs.io.readers import all_readers
+
+NAME = re.compile(r"[^\W_][^/\\:*?\"<>|\x00-\x1f]{0,99}")
+"""Names of jobs: those of a folder below the results on any system."""
+OWN_FILES = ("index.html", "results.csv")
+"""Names in a results folder that are no job's."""
+PLUGINS = ("strategy", "loss-terms", "reader")
+"""Flags that can name code: a file of jobs may name only that of warpgs."""
+FARM_FLAGS = (
+    "out", "resume", "view", "view-port", "device", "threads", "time-budget", "allow-outside", "help", "help-all", "h",
+)  # fmt: skip
+"""Flags of `warpgs fit` that no single job may have: they are the farm's, or the user's alone."""
+
+
+@dataclass(frozen=True)
+class ListedJob:
+    """A scene to fit, and the flags that it adds to those of all jobs."""
+
+    name: str
+    """Name, unique in the farm; the folder of its results."""
+    scene: Path
+    """Folder of the scene, or a video."""
+    flags: tuple[str, ...] = ()
+    """Words for the command line of `warpgs fit`."""
+
+
+def list_jobs(jobs: str) -> list[ListedJob]:
+    """List the jobs of a folder of scenes, a glob, or a .jsonl file, by name or as the file has them.
+
+    Raises:
+        DataError: A line of the file is no job.
+        UsageError: There is nothing to fit, the folder is one scene, or two jobs have one name.
+    """
+    path = Path(jobs)
+    if path.is_dir():
+        if any(r.probe(path) is not None for r in all_readers()):
+            raise UsageError(f"{jobs} is one scene: fit it with `warpgs fit`, or give the folder above it, or {jobs.rstrip('/')}*")
+        found = _named(sorted(p for p in path.iterdir() if p.is_dir() and not p.name.startswith(".")))
+    elif path.suffix == ".jsonl":
+        found = _read(path)
+    else:
+        found = _named(sorted(Path(p) for p in glob.glob(jobs)))
+    if not found:
+        raise UsageError(f"{jobs}: there is no scene; give a folder of scenes, a glob in quotes, or a .jsonl file")
+    taken: dict[str, ListedJob] = {}
+    for job in found:
+        if not NAME.fullmatch(job.name) or job.name.endswith((".", " ")) or job.name in OWN_FILES:
+            raise DataError(f"{job.name[:100]!r} cannot be the name of a job, and so of a folder; name it in a .jsonl file")
+        if job.name.casefold() in taken:
+            raise UsageError(f"two jobs have the name {job.name!r}; give each line of a .jsonl file a name of its own")
+        taken[job.name.casefold()] = job
+    return found
+
+
+def _named(scenes: list[Path]) -> list[ListedJob]:
+    """Name scenes by their folders, or by the whole path below the folder of all where two folders have one name."""
+    scenes = [Path(os.path.abspath(s)) for s in scenes]
+    if len({s.name.casefold() for s in scenes}) == len(scenes):
+        return [ListedJob(s.name, s) for s in scenes]
+    above = os.path.commonpath(scenes)
+    return [ListedJob("-".join(s.relative_to(above).parts), s) for s in scenes]
+
+
+def _read(path: Path) -> list[ListedJob]:
+    """Read a file of jobs: ``{"scene": FOLDER}`` a line, with a ``name`` and flags of `warpgs fit` beside it."""
+    try:
+        if not path.is_file():
+            raise OSError("it is no file")
+        with path.open("rb") as f:
+            data = f.read(schema.MAX_BYTES + 1)
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({e}); give a file with a line of JSON for each job") from e
+    if len(data) > schema.MAX_BYTES:
+        raise DataError(f"{path}: is larger than {schema.MAX_BYTES / 2**20:.0f} MiB; split it into several farms")
+    found = []
+    for number, line in enumerate(data.splitlines(), 1):
+        if line.strip():
+            try:
+                found.append(_job(schema.parse(line), path.parent))
+            except schema.SchemaError as e:
+                raise DataError(f'{path}, line {number}: {e}; write {{"scene": FOLDER, "steps": 500}}') from e
+    return found
+
+
+_LINE = schema.fields({"scene": schema.text}, {"name": schema.text})
+
+
+def _job(values: Any, folder: Path) -> ListedJob:
+    """Return the job of a line; SchemaError where it is none."""
+    _LINE(values, "")
+    scene = Path(os.path.abspath(folder / values["scene"]))
+    flags = [word for key, value in values.items() if key not in ("scene", "name") for word in _flag(key, value)]
+    return ListedJob(values.get("name", scene.name), scene, tuple(flags))
+
+
+def _flag(key: str, value: Any) -> list[str]:
+    """Return a setting of a line as words of a command line."""
+    name = key.replace("_", "-")
+    if not re.fullmatch(r"[a-zA-Z][a-zA-Z0-9.-]{0,99}", name) or name in FARM_FLAGS:
+        raise schema.SchemaError(f"{key[:40]!r} cannot be set for one job")
+    if isinstance(value, bool):
+        group, dot, last = name.rpartition(".")
+        return [f"--{name}" if value else f"--{group}{dot}no-{last}"]
+    if not isinstance(value, (str, int, float)):
+        raise schema.SchemaError(f"{key[:40]} must be text, a number, true or false")
+    schema.text(str(value), key[:40])
+    if name in PLUGINS and ":" in str(value):
+        raise schema.SchemaError(f"{key} names code of your own: give --{name} on the command line of the farm")
+    return [f"--{name}={value}"]

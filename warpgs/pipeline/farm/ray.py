@@ -1,0 +1,69 @@
+"""The engine for clusters that Ray runs: a task for each job, with a fraction of a GPU. Extra `ray`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from warpgs.errors import UsageError
+from warpgs.pipeline.farm.engine import Event
+from warpgs.pipeline.farm.job import FarmJob, job_text
+from warpgs.pipeline.farm.work import run_job
+
+
+class RayEngine:
+    """Runs each job as a task of Ray, which finds a machine for it and starts it once more where its process dies."""
+
+    name = "ray"
+
+    def __init__(self, device: str, slots: int | None, per_gpu: int, threads: int = 1, address: str | None = None):
+        """Connect to a cluster, or start Ray on this machine.
+
+        Args:
+            device: cpu or cuda.
+            slots: Jobs at a time; None for as many as the cluster has room for now.
+            per_gpu: Jobs that share a GPU.
+            threads: CPU threads of a job.
+            address: Address of the cluster; None for the one that RAY_ADDRESS names, or a new one on this machine.
+
+        Raises:
+            UsageError: Ray is not installed, or the cluster has no room for a job.
+        """
+        try:
+            import ray
+        except ImportError as e:
+            raise UsageError("--engine ray needs Ray: pip install 'warpgs[ray]'") from e
+        self._ray, self._threads = ray, threads
+        if not ray.is_initialized():
+            own = {} if address else {"include_dashboard": False}
+            ray.init(address=address, log_to_driver=False, logging_level="warning", **own)
+        gpus = 1 / per_gpu if device == "cuda" else 0
+        found = ray.cluster_resources()
+        room = min(found.get("CPU", 0) / threads, found.get("GPU", 0) / gpus if gpus else float("inf"))
+        self.slots = slots or int(room)
+        if self.slots < 1:
+            raise UsageError(f"Ray's cluster has no room for a job of {threads} threads and {gpus:g} GPUs: it has {found}")
+        options = {"num_cpus": threads, "num_gpus": gpus, "max_retries": 1, "runtime_env": {"env_vars": {"PYTHONSAFEPATH": "1"}}}
+        self._task = ray.remote(**options)(run_job)
+        self._running: dict[Any, str] = {}
+
+    def start(self, job: FarmJob) -> None:
+        """Submit a job."""
+        self._running[self._task.remote(job_text(job), self._threads)] = job.name
+
+    def wait(self, seconds: float) -> list[Event]:
+        """Return the jobs that have ended."""
+        ended, _ = self._ray.wait(list(self._running), timeout=seconds)
+        return [self._event(self._running.pop(reference), reference) for reference in ended]
+
+    def _event(self, name: str, reference: Any) -> Event:
+        try:
+            return Event(name, self._ray.get(reference))
+        except self._ray.exceptions.RayError as e:  # its process died twice, or a record could not be written
+            return Event(name, "crashed", str(e).strip().splitlines()[-1])
+
+    def close(self) -> None:
+        """Cancel what runs, and leave the cluster."""
+        for reference in self._running:
+            self._ray.cancel(reference)  # KeyboardInterrupt there: the fit saves its state
+        self._ray.wait(list(self._running), num_returns=len(self._running), timeout=60) if self._running else None
+        self._ray.shutdown()

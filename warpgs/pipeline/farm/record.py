@@ -1,0 +1,141 @@
+"""The record of a job: job.json in its folder says what became of it, with checksums by which it is known to be whole."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from warpgs import __version__, schema
+from warpgs.errors import ResourceError
+from warpgs.files import write_json
+from warpgs.pipeline.farm.job import FarmJob
+from warpgs.pipeline.runs.folder import CONFIG
+
+RECORD = "job.json"
+LOG = "log.txt"
+"""Name of the file with what a job printed."""
+THUMBNAIL = "thumbnail.jpg"
+PLY = "point_cloud.ply"
+CHECKED = (PLY, "metrics.json", CONFIG)
+"""Files of a run whose checksums the record holds."""
+FORMAT = 1
+MOST_FILES = 100_000
+"""Files of a scene that are listed; one with more is read by the fit to know whether it is the same."""
+
+_DIGEST = schema.text
+_SCHEMA = schema.fields(
+    {
+        "name": schema.text, "identity": schema.text, "state": schema.one_of("done", "failed"), "how": schema.text,
+        "message": schema.text, "again": schema.flag, "source": schema.text, "seconds": schema.number(0),
+        "psnr": schema.or_null(schema.real), "ssim": schema.or_null(schema.real), "gaussians": schema.whole(0),
+        "steps": schema.whole(0), "ply_bytes": schema.whole(0), "files": schema.mapping(_DIGEST), "version": schema.text,
+        "format": schema.one_of(FORMAT),
+    },
+    others=False,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class JobRecord:
+    """What became of a job."""
+
+    name: str
+    identity: str
+    """As `FarmJob.identity`."""
+    state: str
+    """done or failed."""
+    how: str = ""
+    """kept, continued, fitted or redone."""
+    message: str = ""
+    """Error of a failed job, or a note on a finished one."""
+    again: bool = False
+    """Whether a failed job may succeed when it is tried again."""
+    source: str = ""
+    """SHA-256 of the scene's file names, sizes and times; empty where nobody knows them."""
+    seconds: float = 0.0
+    """Wall time of the job, reading and scores included [s]."""
+    psnr: float | None = None
+    """Mean over held-out views [dB]; None where none is held out."""
+    ssim: float | None = None
+    """Mean over held-out views."""
+    gaussians: int = 0
+    steps: int = 0
+    ply_bytes: int = 0
+    """Size of the PLY file."""
+    files: dict[str, str] = field(default_factory=dict)
+    """SHA-256 of files by their names in the run folder."""
+    version: str = __version__
+    """Version of warpgs."""
+    format: int = FORMAT
+
+
+def write_record(folder: Path, record: JobRecord) -> None:
+    """Write the record of a job.
+
+    Raises:
+        ResourceError: It cannot be written.
+    """
+    write_json(folder / RECORD, asdict(record))
+
+
+def read_record(folder: Path) -> JobRecord | None:
+    """Read the record of a job; None where there is none, or it is not whole."""
+    try:
+        values = schema.read(folder / RECORD)
+        _SCHEMA(values, "")
+    except (OSError, schema.SchemaError):
+        return None
+    return JobRecord(**values)
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file, in hexadecimal digits.
+
+    Raises:
+        ResourceError: It cannot be read.
+    """
+    try:
+        with path.open("rb") as f:
+            return hashlib.file_digest(f, "sha256").hexdigest()
+    except OSError as e:
+        raise ResourceError(f"{path}: cannot be read ({e.strerror or e}); check the disk, and fit the scene again") from e
+
+
+def source_stamp(scene: Path) -> str:
+    """Return the SHA-256 of the names, sizes and times of a scene's files; empty where they cannot be listed or are many."""
+    rows = []
+    try:
+        if scene.is_file():
+            found = scene.stat()
+            rows.append((scene.name, found.st_size, found.st_mtime_ns))
+        for folder, _, names in os.walk(scene, followlinks=True):
+            for name in names:
+                path = Path(folder, name)
+                found = path.stat()
+                rows.append((path.relative_to(scene).as_posix(), found.st_size, found.st_mtime_ns))
+                if len(rows) > MOST_FILES:
+                    return ""
+    except OSError:  # the fit says what is wrong
+        return ""
+    return hashlib.sha256(json.dumps(sorted(rows)).encode()).hexdigest() if rows else ""
+
+
+def is_whole(folder: Path, record: JobRecord) -> bool:
+    """Return whether the files of a finished run are those of its record, byte by byte."""
+    try:
+        return set(record.files) == set(CHECKED) and all(file_digest(folder / n) == d for n, d in record.files.items())
+    except ResourceError:
+        return False
+
+
+def finished(job: FarmJob) -> JobRecord | None:
+    """Return the record of a job that is finished and valid: same scene, settings and version, and whole files; else None."""
+    record = read_record(job.folder)
+    if record is None or record.state != "done" or record.identity != job.identity() or record.version != __version__:
+        return None
+    if not record.source or record.source != source_stamp(Path(job.request.scene.path)):
+        return None
+    return record if is_whole(job.request.out, record) else None

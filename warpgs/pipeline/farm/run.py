@@ -1,0 +1,116 @@
+"""A farm as the command line asks for it: jobs, an engine, a display, and an index of the results."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from warpgs.errors import ResourceError, UsageError
+from warpgs.files import make_folder
+from warpgs.pipeline.farm.engine import Engine
+from warpgs.pipeline.farm.farm import JobStatus, run_farm, seconds_left
+from warpgs.pipeline.farm.index import INDEX, TABLE, row_of, write_index
+from warpgs.pipeline.farm.job import FarmJob
+from warpgs.pipeline.farm.local import LocalEngine, local_slots
+from warpgs.pipeline.runs.request import choose_device
+from warpgs.report.farm_table import FarmTable
+from warpgs.runtime.terminal import say
+
+ENGINES = ("local", "ray", "slurm")
+INDEX_INTERVAL = 30.0
+"""Time between two writings of the index while jobs run [s]."""
+
+
+@dataclass(frozen=True)
+class EngineRequest:
+    """An engine and how many jobs it runs at a time."""
+
+    engine: str = "local"
+    """local (processes of this machine), ray or slurm."""
+    slots: int | None = None
+    """Jobs at a time; None for as many as there are GPUs times ``per_gpu``, one on a CPU, or what the cluster has."""
+    per_gpu: int = 1
+    """Jobs that share a GPU."""
+    threads: int = 1
+    """CPU threads of a job of ray or slurm."""
+    minutes: int = 240
+    """Time after which slurm ends a job [min]."""
+    partition: str | None = None
+    """Slurm's partition."""
+    slurm_local: bool = False
+    """Slurm's jobs are processes of this machine."""
+
+
+def make_engine(request: EngineRequest, device: str, folder: Path) -> Engine:
+    """Make the engine that is asked for.
+
+    Raises:
+        ResourceError: The device is not there.
+        UsageError: There is no such engine, what it needs is not installed, or it cannot have so many slots.
+    """
+    r = request
+    if r.engine not in ENGINES:
+        raise UsageError(f"--engine {r.engine!r} is not one of {', '.join(ENGINES)}")
+    if r.engine == "local":
+        return LocalEngine(local_slots(device, r.slots, r.per_gpu))
+    if min(r.slots or 1, r.per_gpu, r.threads, r.minutes) < 1:
+        raise UsageError("--slots, --per-gpu, --threads and --minutes must be at least 1")
+    if r.engine == "ray":
+        from warpgs.pipeline.farm.ray import RayEngine
+
+        return RayEngine(choose_device(device)[0].type, r.slots, r.per_gpu, r.threads)
+    from warpgs.pipeline.farm.slurm import SlurmEngine
+
+    kind = choose_device(device)[0].type if r.slurm_local or device == "auto" else device
+    return SlurmEngine(folder / ".slurm", kind, r.slots, r.threads, r.minutes, r.partition, r.slurm_local)
+
+
+def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bool | None = None) -> list[JobStatus]:
+    """Run a farm, show its progress, and write its index.
+
+    Args:
+        jobs: The jobs, whose folders lie below ``results``.
+        engine: The engine; it is closed.
+        results: Folder of the results.
+        live: As in `FarmTable`.
+
+    Returns:
+        The status of each job.
+
+    Raises:
+        ResourceError: The folder cannot be written, or no job could be started.
+    """
+    make_folder(results)
+    began = time.monotonic()
+    written = began - INDEX_INTERVAL
+    say(f"{len(jobs)} jobs, engine {engine.name}, {engine.slots} at a time; results: {results / INDEX}, {TABLE}")
+    try:
+        with FarmTable(live=live) as table:
+
+            def show(statuses: list[JobStatus]) -> None:
+                nonlocal written
+                table.update([row_of(s) for s in statuses], seconds_left(statuses, engine.slots))
+                now = time.monotonic()
+                if now - written >= INDEX_INTERVAL or all(s.ended for s in statuses):
+                    write_index(results, statuses, now - began)
+                    written = now
+
+            return run_farm(jobs, engine, show)
+    except KeyboardInterrupt:
+        say("the same command goes on from here: finished jobs are kept, half-finished ones are continued")
+        raise
+    finally:
+        engine.close()
+
+
+def check_failures(statuses: list[JobStatus]) -> None:
+    """Raise a ResourceError that names the jobs that failed, if any."""
+    failed = [s for s in statuses if s.state == "failed"]
+    if failed:
+        first = failed[0].record
+        names = ", ".join(s.job.name for s in failed[:5]) + ("" if len(failed) <= 5 else f" and {len(failed) - 5} more")
+        raise ResourceError(
+            f"{len(failed)} of {len(statuses)} jobs failed: {names}; their messages stand in {INDEX}. The first: "
+            f"{first.message.rstrip('.') if first else 'unknown'}. The same command tries them again"
+        )

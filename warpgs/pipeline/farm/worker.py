@@ -1,0 +1,89 @@
+"""The process of a device slot: takes jobs as lines on stdin, one after another, and answers with lines of JSON.
+
+It serves until its stdin ends or a job fails: what a failure left in memory is nobody's to clean. A line is ``{"kernels":
+"cpu"}``, to compile kernels before the first job, or ``{"job": TEXT, "threads": N}``. An answer holds ``step`` and ``steps``, or
+``state``, the last one on a job. Where stdin ends during a job, that saves its state and stops.
+"""
+
+from __future__ import annotations
+
+import _thread
+import json
+import os
+import queue
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+
+STEP_INTERVAL = 0.5
+"""Time between two lines about steps [s]."""
+
+
+def _answers() -> Callable[..., None]:
+    """Return a function that answers; what else is printed goes to stderr from now on."""
+    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+
+    def answer(**values: object) -> None:
+        out.write(json.dumps(values) + "\n")
+        out.flush()
+
+    return answer
+
+
+def _read(lines: queue.SimpleQueue[str | None], working: threading.Event) -> None:
+    """Pass on the lines of stdin; at its end interrupt the job that is worked on."""
+    for line in sys.stdin:
+        lines.put(line)
+    lines.put(None)
+    if working.is_set():
+        _thread.interrupt_main(signal.SIGINT)
+
+
+def _work(values: dict[str, object], answer: Callable[..., None]) -> str:
+    """Do what a line asks for; return the state."""
+    if "kernels" in values:
+        import torch
+
+        from warpgs.pipeline.runs.precompile import precompile_kernels
+
+        for _ in precompile_kernels([torch.device("cpu")] if values["kernels"] == "cpu" else None):
+            pass
+        return "done"
+    from warpgs.pipeline.farm.work import run_job
+    from warpgs.pipeline.train.step_report import StepReport
+
+    told = 0.0
+
+    def on_step(report: StepReport) -> None:
+        nonlocal told
+        if time.monotonic() - told >= STEP_INTERVAL:
+            told = time.monotonic()
+            answer(step=report.step)
+
+    return run_job(str(values["job"]), int(str(values["threads"])), on_step)
+
+
+def main() -> int:
+    """Serve; return the exit code."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the farm was started to ignore it
+    answer, lines, working = _answers(), queue.SimpleQueue[str | None](), threading.Event()
+    threading.Thread(target=_read, args=(lines, working), daemon=True).start()
+    while (line := lines.get()) is not None:
+        working.set()
+        try:
+            state = _work(json.loads(line), answer)
+        except KeyboardInterrupt:
+            return 130
+        finally:
+            working.clear()
+        answer(state=state)
+        if state == "failed":
+            return 0
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

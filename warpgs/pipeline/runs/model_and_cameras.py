@@ -1,0 +1,73 @@
+"""Files of Gaussians, trained anywhere, with cameras from another file: models that render as runs do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from warpgs.constants import RULES
+from warpgs.coordinates import convert_camera
+from warpgs.errors import DataError, UsageError
+from warpgs.export.formats import format_of, read_gaussians
+from warpgs.io.camera_files import colmap_folder, read_cameras
+from warpgs.io.decoding import MAX_PIXELS
+from warpgs.io.load import load_scene
+from warpgs.pipeline.runs.model_file import FittedModel
+from warpgs.pipeline.runs.request import choose_device
+from warpgs.scene import Camera, Gaussians, Normalization
+
+RULE = "inria"
+"""Rule that files of Gaussians are rendered with where none is named: most were trained with it."""
+
+
+def open_file(
+    path: Path,
+    cameras: Path | None,
+    rule: str | None = None,
+    device: str = "auto",
+) -> tuple[FittedModel, list[str]]:
+    """Read a file of Gaussians and the cameras that it is seen through; returns the model and notes for the user.
+
+    Args:
+        path: The file, in any format of `warpgs.export.formats`.
+        cameras: cameras.json, transforms.json, a COLMAP reconstruction, or a scene folder of any format.
+        rule: Name of the cut-offs that it was trained with: inria, gsplat or another of `RULES`; None for inria, which is said.
+        device: auto, cpu or cuda.
+
+    Raises:
+        DataError: The model or the cameras cannot be read, or an image would be larger than any photograph may be.
+        ResourceError: The device is not there.
+        UsageError: No cameras are given, or the rule is unknown.
+    """
+    if cameras is None:
+        raise UsageError(
+            f"{path}: a file of Gaussians has no cameras; give --cameras cameras.json, transforms.json, or a scene"
+        )
+    if rule is not None and rule not in RULES:
+        raise UsageError(f"--rule {rule}: choose one of {', '.join(RULES)}")
+    where, _ = choose_device(device)
+    found, notes = _cameras_of(cameras)
+    for name, c in found.items():
+        if c.width * c.height > MAX_PIXELS:
+            raise DataError(
+                f"{cameras}, {name}: an image of {c.width} x {c.height} px has more than {MAX_PIXELS:,} pixels; write less"
+            )
+    # the unit stays that of the file, in which the near plane of a rule is given
+    normalization = Normalization(np.mean([c.center for c in found.values()], axis=0))
+    gaussians = read_gaussians(path, normalization, units="scene")
+    gaussians = Gaussians(**{name: t.to(where) for name, t in gaussians.tensors().items()})
+    notes += [note] if (note := format_of(path).note) else []
+    if rule is None:
+        notes.append(f"rendered by the cut-offs of {RULE}; --rule gsplat suits models of gsplat and nerfstudio")
+    in_scene = {name: convert_camera(c, normalization, "file", "scene") for name, c in found.items()}
+    model = FittedModel(gaussians, normalization, in_scene, tuple(in_scene), (), rule or RULE, (0.0, 0.0, 0.0), 0)
+    return model, [*notes, f"{len(gaussians):,} Gaussians, {len(found)} cameras"]
+
+
+def _cameras_of(path: Path) -> tuple[dict[str, Camera], list[str]]:
+    """Return cameras by name in file units, and notes; a folder may hold a scene of any format."""
+    if path.is_dir() and ((path / "images").is_dir() or colmap_folder(path) is None):
+        scene = load_scene(path)
+        return {v.name: convert_camera(v.camera, scene.normalization, "scene", "file") for v in scene.views}, list(scene.notes)
+    return read_cameras(path)

@@ -1,0 +1,123 @@
+"""Progress of a farm: a live table in a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from warpgs.report.progress import PLAIN_INTERVAL, duration
+from warpgs.runtime.terminal import printable, say
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+STATES = ("waiting", "running", "elsewhere", "done", "failed")
+STYLES = {"running": "bold", "elsewhere": "dim", "done": "green", "failed": "bold red"}
+LAST = 6
+"""Rows of jobs that ended last."""
+MOST_RUNNING = 12
+"""Rows of running jobs."""
+
+
+@dataclass(frozen=True)
+class JobRow:
+    """A job as people see it."""
+
+    name: str
+    state: str
+    """waiting, running, elsewhere, done or failed."""
+    step: int = 0
+    """Steps done, 0 where nobody knows."""
+    seconds: float = 0.0
+    """Time that it has taken [s]."""
+    psnr: float | None = None
+    """Mean over held-out views [dB]."""
+    gaussians: int = 0
+    message: str = ""
+    """Reason of a failure, or a note."""
+
+
+def row_values(row: JobRow) -> tuple[str, ...]:
+    """Return the cells of a row: name, state, steps, time, PSNR, Gaussians, message."""
+    return (
+        row.name, row.state, f"{row.step:,}" if row.step else "", duration(row.seconds) if row.seconds else "",
+        "" if row.psnr is None else f"{row.psnr:.2f} dB", f"{row.gaussians:,}" if row.gaussians else "", row.message,
+    )  # fmt: skip
+
+
+class FarmTable:
+    """Context manager that shows how many jobs wait, run, are done and failed, those at work, those that ended last, time left."""
+
+    def __init__(self, *, live: bool | None = None):
+        """Prepare; ``live`` None shows the table where stdout is a terminal."""
+        self.live = sys.stdout.isatty() if live is None else live
+        self.began = self.printed = time.monotonic()
+        self.rows: list[JobRow] = []
+        self.left: float | None = None
+        self.order: dict[str, None] = {}
+        self.display: Any = None
+
+    def __enter__(self) -> FarmTable:
+        """Start the display."""
+        if self.live:
+            from rich.live import Live
+
+            self.display = Live(self.panel(), refresh_per_second=4)
+            self.display.__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        """Show the last state and stop."""
+        if self.display is not None:
+            self.display.update(self.panel())
+            self.display.__exit__(*error)
+        elif error[0] is not None:
+            say(self.summary())
+
+    def update(self, rows: list[JobRow], left: float | None) -> None:
+        """Show the jobs, and the time left [s] where it is known."""
+        ended = [r for r in rows if r.state in ("done", "failed") and r.name not in self.order]
+        self.order |= dict.fromkeys(r.name for r in ended)
+        self.rows, self.left = rows, left
+        if self.display is not None:
+            self.display.update(self.panel())
+            return
+        for row in ended:
+            say("  ".join(filter(None, row_values(row))))
+        if ended or time.monotonic() - self.printed >= PLAIN_INTERVAL:
+            self.printed = time.monotonic()
+            say(self.summary())
+
+    def summary(self) -> str:
+        """Return the numbers of jobs by state, the time that passed, and the time left."""
+        counts = Counter(r.state for r in self.rows)
+        states = "  ".join(f"{counts[s]:,} {s}" for s in STATES if counts[s] or s != "elsewhere")
+        left = "" if self.left is None or not self.left else f"  left {duration(self.left)}"
+        return f"{states}  after {duration(time.monotonic() - self.began)}{left}"
+
+    def panel(self) -> RenderableType:
+        """Return the table."""
+        from rich.console import Group
+        from rich.progress_bar import ProgressBar
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
+        for name in ("scene", "state", "step", "time", "PSNR", "Gaussians"):
+            table.add_column(name, justify="left" if name in ("scene", "state") else "right", no_wrap=True)
+        table.add_column("", overflow="ellipsis", no_wrap=True)
+        by_name = {r.name: r for r in self.rows}
+        last = [by_name[n] for n in list(self.order)[-LAST:] if n in by_name]
+        running = [r for r in self.rows if r.state == "running"]
+        for row in [*running[:MOST_RUNNING], *reversed(last)]:
+            cells = [Text(printable(c)) for c in row_values(row)]
+            table.add_row(*cells, style=STYLES.get(row.state, ""))
+        done = sum(r.state in ("done", "failed") for r in self.rows)
+        bar = Table.grid()  # alone, the bar does not end its line
+        bar.add_row(ProgressBar(total=max(1, len(self.rows)), completed=done, width=78))
+        more = len(running) - MOST_RUNNING
+        rest = [Text(f"and {more} more at work", style="dim")] if more > 0 else []
+        return Group(bar, Text(self.summary(), style="bold"), table, *rest)
