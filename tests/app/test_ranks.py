@@ -12,7 +12,7 @@ import pytest
 from tests.app import rank_that_dies
 from warpgs.app.cli import main
 from warpgs.errors import UsageError
-from warpgs.runtime import ranks
+from warpgs.runtime import rank_watch, ranks
 from warpgs.synthetic.demo import write_demo
 
 LONGEST = 30
@@ -96,14 +96,46 @@ def test_a_process_alone_joins_nobody(monkeypatch):
     assert ranks.join("cpu") is ranks.ALONE
 
 
+class Store(dict):
+    """A store as torch's is, in this process."""
+
+    def set(self, key, value):
+        self[key] = value.encode()
+
+    def check(self, keys):
+        return all(k in self for k in keys)
+
+    def add(self, key, number):
+        self[key] = self.get(key, 0) + number
+        return self[key]
+
+
+def test_silence_of_another_machine_is_a_loss_after_a_while(monkeypatch, capsys):
+    """Not at once, nor where the process has said goodbye; and of two that find it one alone says so."""
+    now = [100.0]
+    monkeypatch.setattr(rank_watch.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(rank_watch.time, "sleep", lambda seconds: None)
+    monkeypatch.setattr(rank_watch.threading.Thread, "start", lambda self: None)
+    store = Store()
+    first, second = (rank_watch.RankWatch(rank, 3, store, store) for rank in (0, 1))
+    assert not first.is_lost(2)  # it is still to come
+    store.set("beat/2", "7|1234|another machine")
+    for seconds, lost in ((0, False), (rank_watch.LOST_SECONDS - 1, False), (2, True)):
+        now[0] += seconds
+        assert first.is_lost(2) is lost
+    first.fail("warpgs: rank 2 is gone")
+    second.fail("warpgs: rank 2 is gone")
+    assert capsys.readouterr().err.splitlines() == ["warpgs: rank 2 is gone"]
+    store.set("left/2", "")
+    assert not first.is_lost(2)
+
+
 def test_the_end_of_a_process_is_seen():
     """This one is there, and one that has ended is gone, also while its parent has not asked."""
-    from warpgs.runtime.rank_watch import is_gone, machine
-
     ended = subprocess.Popen([sys.executable, "-c", ""], stdout=subprocess.PIPE)
     ended.stdout.read()
     until = time.monotonic() + 60
-    while not is_gone(ended.pid) and time.monotonic() < until:
+    while not rank_watch.is_gone(ended.pid) and time.monotonic() < until:
         time.sleep(0.01)
-    assert is_gone(ended.pid) and not is_gone(os.getpid()) and machine() == machine() != ""
+    assert rank_watch.is_gone(ended.pid) and not rank_watch.is_gone(os.getpid())
     ended.wait()

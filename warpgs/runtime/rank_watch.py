@@ -92,7 +92,7 @@ class RankWatch:
                 self._beat(number)
                 if self._own.check(["spoke"]):  # somebody else has said why all end
                     os._exit(ResourceError.exit_code)
-                lost = next((r for r in range(self.count) if r != self.rank and self._is_lost(r)), None)
+                lost = next((r for r in range(self.count) if r != self.rank and self.is_lost(r)), None)
             except RuntimeError:  # the store is gone, and with it the process that held it
                 lost = 0
             if lost is not None and not self.leaving.is_set():
@@ -102,7 +102,7 @@ class RankWatch:
                 )
                 os._exit(ResourceError.exit_code)
 
-    def _is_lost(self, rank: int) -> bool:
+    def is_lost(self, rank: int) -> bool:
         """Return whether a process has ended without a word, or has been silent for too long."""
         if not self._own.check([f"beat/{rank}"]):
             return False  # it is still to come
