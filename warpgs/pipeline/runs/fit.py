@@ -29,24 +29,27 @@ from warpgs.pipeline.runs.folder import CONFIG, check_checkpoint, check_same, re
 from warpgs.pipeline.runs.image_names import image_names, renaming_notes
 from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.pipeline.runs.refined_poses import refined_scene
-from warpgs.pipeline.runs.request import NO_SCORES, FitRequest, SceneRequest, choose_device, choose_split, read_scene
-from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line, write_report
+from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device, choose_split, read_scene
+from warpgs.pipeline.runs.results import evaluate_run, protocol_of, result_lines, write_report
 from warpgs.pipeline.runs.rule_report import rule_report_of
 from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, sampling_report_of
+from warpgs.pipeline.runs.shared import check_shared, shared_notes
 from warpgs.pipeline.runs.with_poses import with_poses
 from warpgs.pipeline.train.background import choose_background, over_background
 from warpgs.pipeline.train.by_views import settings_by_views
-from warpgs.pipeline.train.complexity import complexity_figures, complexity_summary
+from warpgs.pipeline.train.complexity import complexity_figures
 from warpgs.pipeline.train.config import FitConfig, preset_config
 from warpgs.pipeline.train.exposure import EXPOSURE
 from warpgs.pipeline.train.loop import run, train_views
+from warpgs.pipeline.train.step_report import StepReport
 from warpgs.pipeline.train.time_budget import within_budget
-from warpgs.pipeline.train.trainer import StepReport, Trainer
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.warmup import background_warmup
 from warpgs.priors.photo_checks import PhotoCheck, check_photos, photo_notes
 from warpgs.report.events import EventLog
 from warpgs.report.progress import Progress, Stages
 from warpgs.runtime.load_module import told_of_compiling
+from warpgs.runtime.ranks import ALONE, Ranks
 from warpgs.runtime.stop_signals import noted_signals
 from warpgs.runtime.terminal import say
 from warpgs.scene import Camera, Gaussians, Normalization, Scene, View
@@ -88,6 +91,7 @@ class _Job:
     began: float
     progress: Callable[[str], object]
     on_model: Callable[[FittedModel], object] | None
+    ranks: Ranks
     photographs: list[PhotoCheck] = field(default_factory=list)
 
     @property
@@ -120,6 +124,7 @@ def fit(
     notes: tuple[str, ...] = (),
     verbose: bool = True,
     on_model: Callable[[FittedModel], object] | None = None,
+    ranks: Ranks = ALONE,
 ) -> FitResult:
     """Fit Gaussians to a scene: the same code as `warpgs fit`.
 
@@ -138,6 +143,8 @@ def fit(
         notes: Choices made before, to be printed and recorded with the fit's own.
         verbose: Whether to print.
         on_model: Called after every step with the model as it is, for those who look on: the next step overwrites its tensors.
+        ranks: Processes that fit together, from `warpgs.runtime.ranks.join`, all with the same arguments. The first alone
+            prints, writes and scores; the others return a result without metrics.
 
     Raises:
         UsageError: Settings, a preset or a split cannot be, ``out`` holds something already, or ``resume`` comes without it.
@@ -146,10 +153,12 @@ def fit(
     out = None if out is None else Path(out)
     if resume and out is None:
         raise UsageError("resume needs the run folder that it continues: give out")
+    config = preset_config(config)
+    check_shared(scene, config, ranks, time_budget, resume)
+    verbose, own = verbose and ranks.first, out if ranks.first else None
     progress = Stages() if verbose else Stages(lambda line: None)
-    folder: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
-    if out is not None:
-        folder = run_folder(out, resume)
+    nothing: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
+    folder = nothing if own is None else run_folder(own, resume)
     with folder as held, told_of_compiling(lambda name: progress("compiling kernels, once on this machine")):
         if out is not None and resume:
             read_record(out)  # a run of another version is refused before anything takes time
@@ -159,8 +168,7 @@ def fit(
         request, read, parts, found = _scene_of(scene, split, out, progress)
         notes = (*notes, *held, *found, *([] if out is None else renaming_notes(image_names(v.name for v in read.views))))
         job = _Job(
-            read, request, parts, preset_config(config), *where, out, lpips, [*notes], verbose, on_step, began,
-            progress, on_model,
+            read, request, parts, config, *where, own, lpips, [*notes], verbose, on_step, began, progress, on_model, ranks,
         )  # fmt: skip
         if time_budget is not None:
             job.config, note = within_budget(job.config, time_budget, job.train, job.device)
@@ -169,7 +177,9 @@ def fit(
         job.config, chosen = settings_by_views(job.config, job.train, job.device.type)
         job.notes += chosen
         trainer, state, record = _prepare(job, out if resume else None)
-        return _finish(job, trainer, state, record, resume)
+        result = _finish(job, trainer, state, record, resume)
+    ranks.leave()
+    return result
 
 
 def _set_background(job: _Job) -> None:
@@ -179,12 +189,12 @@ def _set_background(job: _Job) -> None:
     job.notes += [note] if note else []
 
 
-def fit_request(request: FitRequest, **watchers: Any) -> FitResult:
-    """Run `fit` as the command line, a study or a farm asks for it; ``watchers`` are its on_model and on_step."""
+def fit_request(request: FitRequest, **others: Any) -> FitResult:
+    """Run `fit` as the command line, a study or a farm asks for it; ``others`` are its on_model, on_step and ranks."""
     r = request
     return fit(
         r.scene, r.config, out=r.out, device=r.device, resume=r.resume, lpips_weights=r.lpips_weights,
-        time_budget=r.time_budget, notes=r.notes, **watchers,
+        time_budget=r.time_budget, notes=r.notes, **others,
     )  # fmt: skip
 
 
@@ -216,7 +226,8 @@ def _prepare(job: _Job, resumed: Path | None) -> tuple[Trainer, State | None, di
     c = job.config
     with background_warmup(c, job.device) as ready:
         job.photographs = check_photos([*job.train, *job.test], job.progress)
-        trainer = Trainer(job.train, job.scene.points, c, job.device, job.scene.background, ready=ready, progress=job.progress)
+        of = job.train, job.scene.points, c, job.device, job.scene.background
+        trainer = Trainer(*of, ready=ready, progress=job.progress, ranks=job.ranks)
     if job.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(job.device)  # the steps' need is told, not the start's or an earlier fit's
     return trainer, state, record
@@ -239,6 +250,9 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
         _train(job, trainer, images_written)
     _tell(job, trainer)  # of images that were written last
     training = time.perf_counter() - job.began - setup
+    job.ranks.part()
+    if not job.ranks.first:
+        return FitResult(*_model_fields(job, trainer), job.config, {}, tuple(job.notes), None)
     poses = _refined(job, trainer)
     if job.out is not None:
         write_ply(job.out / "point_cloud.ply", drop_unused_sh(trainer.gaussians), job.scene.normalization)
@@ -250,7 +264,8 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
         note = write_report(job.out, job.scene, job.split, trainer.gaussians, metrics, record, report)
         if note:
             job.say(f"  {note}")
-    _print_result(job, metrics)
+    for line in result_lines(metrics, job.out):
+        job.say(line)
     return FitResult(
         *_model_fields(job, trainer), job.config, metrics, tuple(job.notes), job.out,
         transparent=job.scene.transparent,
@@ -278,7 +293,7 @@ def _refined(job: _Job, trainer: Trainer) -> dict[str, Any]:
 
 def _announce(job: _Job, trainer: Trainer) -> None:
     """Print what is fitted and every choice made for the user."""
-    job.notes += [*photo_notes(job.photographs), *trainer.notes, trainer.memory.summary()]
+    job.notes += [*photo_notes(job.photographs), *trainer.notes, *shared_notes(job.config, job.ranks), trainer.memory.summary()]
     train, test = job.train, job.test
     size = f"{train[0].camera.width} x {train[0].camera.height} px"
     job.say(f"{job.scene.path}: {job.scene.format}, {len(train)} views to fit, {len(test)} held out, {size}, {job.where}")
@@ -313,7 +328,8 @@ def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, 
         job.say(f"  {note}")
     return metrics | {
         "protocol": protocol_of(scene, job.request.split, job.request.downscale or 1, train, test),
-        "steps": trainer.step, "gaussians": len(gaussians), "preset": c.preset, "seed": c.seed,
+        "steps": trainer.step, "batch": c.batch, "ranks": job.ranks.count,
+        "gaussians": len(gaussians), "preset": c.preset, "seed": c.seed,
         "config_hash": c.fingerprint(), "fingerprint": scene.fingerprint, "device": job.where.removeprefix("on "),
         "seconds": {**seconds, "total": time.perf_counter() - job.began}, **peak,
         "memory": trainer.memory.to_json(), "rule": rule, "shape": shape,
@@ -360,9 +376,11 @@ def _train(job: _Job, trainer: Trainer, images_written: Callable[[], None]) -> N
                 run(trainer, on_step, save, stopped, restore)
         except NotFiniteError as e:
             if out is None or e.view is None:
+                if e.view is not None:
+                    job.ranks.leave()  # all have this loss, and the first says so
                 raise
             name = job.split.train[e.view]
-            save_failed_step(out / FAILED, failed_step(trainer, e.view, name))
+            save_failed_step(out / FAILED, failed_step(trainer, e.view, name, e.slot))
             save(trainer)
             raise NotFiniteError(
                 f"{e}, on {name}. The state before is saved, and so is what that step computed with: `warpgs doctor --repeat "
@@ -380,19 +398,3 @@ def _tell(job: _Job, trainer: Trainer) -> None:
         job.notes.append(trainer.messages.pop(0))
         trainer.notes.append(job.notes[-1])  # a continued run has them in its report, too
         job.say(f"  {job.notes[-1]}")
-
-
-def _print_result(job: _Job, metrics: dict[str, Any]) -> None:
-    """Print scores, sizes and where the results are."""
-    if metrics["test"]:
-        job.say(f"held-out {score_line(metrics['test'])} over {len(metrics['views'])} views")
-        job.say(f"  {metrics['coverage']['summary']}")
-        for name, value in metrics["baselines"].items():
-            job.say(f"  without a fit, the {name.replace('_', ' ')} scores {value:.2f} dB")
-    else:
-        job.say(NO_SCORES)
-    job.say(complexity_summary(metrics))
-    if job.out is None:
-        job.say(f"{metrics['gaussians']:,} Gaussians; no folder was asked for, so nothing is written")
-    else:
-        job.say(f"{metrics['gaussians']:,} Gaussians; report: {job.out / 'report.html'}  images: {job.out / 'renders'}")

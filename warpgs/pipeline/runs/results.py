@@ -25,6 +25,8 @@ from warpgs.pipeline.metrics.evaluate import (
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.runs.coverage_report import coverage_section
 from warpgs.pipeline.runs.image_names import image_names
+from warpgs.pipeline.runs.request import NO_SCORES
+from warpgs.pipeline.train.complexity import complexity_summary
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.report.curve import curve
 from warpgs.report.events import read_events
@@ -63,6 +65,20 @@ def score_line(scores: dict[str, float]) -> str:
         opacity.insert(0, f", PSNR of the foreground {scores['psnr_foreground']:.2f} dB")
     lpips = "".join(distances) or ", LPIPS not measured"
     return f"PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f}{''.join(opacity)}{lpips}"
+
+
+def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
+    """Return what a finished fit says of its scores and sizes, and of where the results are."""
+    lines = []
+    if metrics["test"]:
+        lines += [f"held-out {score_line(metrics['test'])} over {len(metrics['views'])} views"]
+        lines += [f"  {metrics['coverage']['summary']}"]
+        lines += [f"  without a fit, the {n.replace('_', ' ')} scores {v:.2f} dB" for n, v in metrics["baselines"].items()]
+    else:
+        lines += [NO_SCORES]
+    where = f"report: {out / 'report.html'}  images: {out / 'renders'}" if out else ""
+    where = where or "no folder was asked for, so nothing is written"
+    return [*lines, complexity_summary(metrics), f"{metrics['gaussians']:,} Gaussians; {where}"]
 
 
 def protocol_of(scene: Scene, spec: str | None, downscale: int, train: list[View], test: list[View]) -> dict[str, Any]:
