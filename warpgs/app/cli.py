@@ -8,6 +8,7 @@ from warpgs import __version__
 from warpgs.app.failures import report_defect, report_no_memory
 from warpgs.app.fit_help import help_lines, wants_help
 from warpgs.errors import UsageError, WarpgsError
+from warpgs.report.progress import waiting
 from warpgs.runtime.device_memory import is_out_of_memory
 from warpgs.runtime.imports import fast_imports
 from warpgs.runtime.ranks import last_words
@@ -84,9 +85,12 @@ def _run(arguments: list[str]) -> int:
             for line in help_lines(COMMANDS[name]):
                 say(line)
             return 0
-        with fast_imports():
-            command = importlib.import_module(f"warpgs.app.commands.{name.replace('-', '_')}")
-        code: int = command.run(arguments[1:], COMMANDS[name])
+        with waiting() as wait:
+            if not {"-h", "--help"} & {*arguments}:  # until the command tells of what it does
+                wait(f"starting {name}")
+            with fast_imports():
+                command = importlib.import_module(f"warpgs.app.commands.{name.replace('-', '_')}")
+            code: int = command.run(arguments[1:], COMMANDS[name])
         return code
     except WarpgsError as e:
         return last_words(f"warpgs: {e}", e.exit_code)

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import sys
 import unicodedata
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeVar
+
+T = TypeVar("T")
 
 HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 """Categories of characters that move the cursor, turn the direction of text, end a line, or are half of one."""
 JOINERS = "\u200c\u200d"
 """Characters of these categories that scripts and emoji need, and that change nothing but the letters beside them."""
+
+
+class Detail(str):
+    """A note that nobody acts on: it stands in the files of a run and in its report's last section, not on the terminal."""
+
+    __slots__ = ()
 
 
 def printable(text: object) -> str:
@@ -42,6 +52,20 @@ def say(line: object = "", *, error: bool = False) -> None:
     stream = sys.stderr if error else sys.stdout
     encoding = getattr(stream, "encoding", None) or "utf-8"
     print(printable(line).encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
+
+
+def counted(items: Sequence[T], tell: Callable[[str], object], what: str, unit: str) -> Iterator[T]:
+    """Yield items, and tell before each how many are done: ``scoring: 3 of 12 views``.
+
+    Args:
+        items: The items.
+        tell: Takes a line.
+        what: What is done with the items.
+        unit: Word for several of them.
+    """
+    for done, item in enumerate(items):
+        tell(f"{what}: {done} of {len(items)} {unit}")
+        yield item
 
 
 def accept_all_letters() -> None:

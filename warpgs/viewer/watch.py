@@ -16,6 +16,7 @@ from warpgs.export.formats import FORMATS
 from warpgs.pipeline.runs.folder import CONFIG, read_record
 from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.pipeline.runs.request import choose_device
+from warpgs.report.progress import waiting
 from warpgs.runtime.terminal import say
 from warpgs.scene import Gaussians
 from warpgs.viewer.content import Content, content_of_file, content_of_run, modified, views_of
@@ -68,14 +69,16 @@ def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None 
 
 def _follow(server: viser.ViserServer, path: Path, device: str, reader: str | None) -> None:
     """Show what there is, and every checkpoint that replaces it."""
-    window, seen = None, None
+    window, seen, stages = None, None, waiting()
     if path.is_dir() and modified(path) is None:
+        stages("waiting")
         say("waiting for the first checkpoint of the fit")
     while True:
         found = modified(path) if path.is_dir() else 0.0
         if found is not None and found != seen:
             seen = found
             if window is None:
+                stages(f"reading {path}")
                 content = (
                     content_of_run(path, device) if path.is_dir() else content_of_file(path, choose_device(device)[0].type)
                 )
@@ -83,6 +86,7 @@ def _follow(server: viser.ViserServer, path: Path, device: str, reader: str | No
                 for note in notes:
                     say(f"  {note}")
                 window = Window(server, replace(content, views=views))
+                stages.clear()
                 say(f"  {content.title}: {len(content.model.gaussians()):,} Gaussians")
             else:
                 _update(window, path, device)

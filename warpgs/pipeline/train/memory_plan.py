@@ -20,6 +20,7 @@ from warpgs.kernels.tiles import LIST_BYTES, MAX_INSTANCES, grid
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.runtime.byte_units import format_bytes
+from warpgs.runtime.terminal import Detail
 from warpgs.scene import Camera, Gaussians
 
 FLOAT = 4
@@ -227,7 +228,8 @@ class MemoryPlan:
                 text += (
                     f"; the {format_bytes(self.available)} that are free are reached at about {reached:,}, --memory-limit helps"
                 )
-            return text
+                return text
+            return text if self.chunked else Detail(text)
         text += f"; limit {format_bytes(self.limit)}"
         if self.lowered_from is not None:
             text += f", so there will be at most {self.cap:,} Gaussians, not {self.lowered_from:,}"

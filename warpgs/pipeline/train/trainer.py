@@ -45,6 +45,7 @@ from warpgs.pipeline.train.views import Kind, TrainingView, half_size, stack_vie
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.device_memory import available_bytes, is_out_of_memory, no_memory_message
 from warpgs.runtime.ranks import ALONE, Ranks
+from warpgs.runtime.terminal import Detail
 from warpgs.scene import Gaussians, PointCloud, Prior, View
 
 
@@ -106,8 +107,7 @@ class Trainer:
         """Dropout probability at the last step."""
         self.cutout = any(v.alpha is not None and not v.alpha_estimated for v in train)  # all have an opacity then
         self.terms = terms_of(config, self.cutout)
-        self.step = 0
-        """Steps taken."""
+        self.step = 0  # taken
         self.memory_limit, self.captured = config.memory_limit, config.cuda_graph
         """Bytes that steps may take, None for no limit; and whether they may be captured (`spare_memory`)."""
         self.order: list[int] = []
@@ -360,10 +360,10 @@ class Trainer:
             depth_supervised=c.loss.depth_weight > 0, trimmed=self.strategy.shrinks(c), refined=c.refine_poses,
             exposed=c.exposure, sums=0 if self.batched is None else self.batched.tree.buffers,
         )  # fmt: skip
-        cameras = [v.camera for v in shown]
+        most = most_instances(self.gaussians, [v.camera for v in shown], c.rule)
         self.memory, self.layout = plan(
-            layout, count=len(self.table), instances=most_instances(self.gaussians, cameras, c.rule), most=c.max_gaussians,
-            limit=self.memory_limit, available=available_bytes(self.device), capacity_factor=CAPACITY_FACTOR,
+            layout, count=len(self.table), instances=most, most=c.max_gaussians, limit=self.memory_limit,
+            available=available_bytes(self.device), capacity_factor=CAPACITY_FACTOR,
         )  # fmt: skip
         self.count_changed()
 
@@ -378,8 +378,8 @@ class Trainer:
         views = {f"views.{n}": t for n, t in self.view_table.state().items()}
         tensors = {**self.table.state(), **views, **tensors, "generator": self.generator.get_state()}
         plain = {
-            "step": self.step, "order": self.order, "extent": self.extent, "notes": self.notes,
-            "config": self.config.to_json(), "strategy": strategy, "stable_start": self.phases.stable_start, "steps": self.steps,
+            "step": self.step, "order": self.order, "extent": self.extent, "notes": self.notes, "strategy": strategy,
+            "config": self.config.to_json(), "stable_start": self.phases.stable_start, "steps": self.steps,
         }  # fmt: skip
         return tensors, plain
 
@@ -392,7 +392,7 @@ class Trainer:
         check_state(tensors, plain, views=len(self.views), steps=self.phases.planned, strategy=self.strategy.STATE)
         self.step, self.order = plain["step"], list(plain["order"])
         self.phases = dataclasses.replace(self.phases, stable_start=plain["stable_start"], steps=plain["steps"])
-        self.extent, self.notes = plain["extent"], plain["notes"]
+        self.extent, self.notes = plain["extent"], [*map(Detail, plain["notes"])]  # they were shown when the fit began
         self.table.load(tensors)
         self.view_table.load({n.removeprefix("views."): t for n, t in tensors.items() if n.startswith("views.")})
         self.strategy.load(tensors, plain["strategy"])
