@@ -53,7 +53,8 @@ open("keyframes.json", "w").write(json.dumps(keys))
 END
 """
 LIMITS = {
-    "demo": {"--width": "96", "--height": "72"}, "fit": {"--steps": "40"}, "farm": {"--steps": "40"}, "render": {"--frames": "4"},
+    "demo": {"--width": "96", "--height": "72"}, "fit": {"--steps": "40"}, "farm": {"--steps": "40"},
+    "render": {"--frames": "4"},
     "compare": {"--steps": "20", "--seeds": "1", "--downscale": "1"}, "view": {"--port": "0"},
     "ablate": {"--steps": "20", "--seeds": "1", "--downscale": "1"},
 }  # fmt: skip
