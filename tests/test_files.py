@@ -191,6 +191,8 @@ ELSEWHERE = {
     ("export/ply.py", "open xb"): "the temporary file of `replacing`",
     ("files.py", "open xb"): "the temporary file of `replacing`",
     ("files.py", "open rb+"): "to sync that file",
+    ("pipeline/farm/work.py", "open ab"): "the log of a job grows by lines",
+    ("pipeline/farm/worker.py", "open w"): "a copy of stdout",
     ("runtime/load_module.py", "open ab"): "a lock beside compiled kernels",
     ("runtime/folder_lock.py", "os.open"): "the lock of a folder",
     ("runtime/folder_lock.py", "open r+b"): "the same",

@@ -25,8 +25,8 @@ from bench.experiments.tradeoff_kernel import measure_scene, measured
 from bench.experiments.tradeoff_outcome import measured as measured_fits
 from bench.experiments.tradeoff_outcome import summary, trials
 from warpgs import load_scene
-from warpgs.pipeline.runs.precompile import fit_kernels
 from warpgs.files import write_json, write_text
+from warpgs.pipeline.runs.precompile import fit_kernels
 from warpgs.pipeline.runs.request import choose_device
 from warpgs.runtime.interop import set_threads
 

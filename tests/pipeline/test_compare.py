@@ -12,16 +12,20 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.pipeline.farms import HereEngine
 from tests.pipeline.test_table_files import cells
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
+from warpgs.pipeline.farm.engine import Event
+from warpgs.pipeline.farm.ensure_run import ensure_run
+from warpgs.pipeline.farm.job import job_of
+from warpgs.pipeline.farm.run import EngineRequest
 from warpgs.pipeline.metrics.lpips_weights import NETS, convert_lpips
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.checkpoint import TENSORS
 from warpgs.pipeline.runs.fit import fit_request
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest, read_scene
 from warpgs.pipeline.study.compare import ABLATION_ROWS, _places, ablation_variants, preset_variants, run_study
-from warpgs.pipeline.farm.ensure_run import ensure_run
 from warpgs.pipeline.study.statistics import paired_difference
 from warpgs.pipeline.study.study import FILES, SWITCHES, StudyRequest, run_folder
 from warpgs.pipeline.train import config
@@ -238,6 +242,25 @@ def test_several_scenes_are_averaged_by_seed(finished, scene, tmp_path):
     d = paired_difference(psnr["b b"], psnr["a"])
     assert tables[1][2][1].removesuffix(" \\*") == f"{d.mean:+.2f} [{d.low:+.2f}, {d.high:+.2f}]"
     assert "they say nothing of other scenes" in (request.out / "table.md").read_text()
+
+
+def test_a_study_on_a_farm_is_the_same_study(finished, tmp_path, monkeypatch):
+    """Its runs are jobs; what failed there is a failed run, and is not fitted again in this process."""
+    monkeypatch.setattr("warpgs.pipeline.farm.run.LocalEngine", lambda slots: HereEngine(slots=len(slots)))
+    request = dataclasses.replace(finished[0], out=tmp_path / "out", seeds=1, engine=EngineRequest(slots=2))
+    run_study(request)
+    assert states(request) == ["fitted", "fitted"] and (request.out / "index.html").is_file()
+    for variant in request.variants:
+        there, here = (run_folder(r, "still", variant, 0) / "point_cloud.ply" for r in (finished[0], request))
+        assert there.read_bytes() == here.read_bytes()
+    shutil.rmtree(run_folder(request, "still", "a", 0))
+    monkeypatch.setattr("warpgs.pipeline.farm.run.LocalEngine", lambda slots: HereEngine(fail))
+    with pytest.raises(DataError, match=r"every run of a failed.*its process ended \(2 attempts\)"):
+        run_study(request)
+
+
+def fail(text):
+    return Event(job_of(text).name, "crashed", "its process ended")
 
 
 FULL = dataclasses.replace(A, preset="whole", method=MethodConfig(events=True, hier=True))

@@ -8,11 +8,11 @@ import torch
 import warp as wp
 
 from tests.scenes import photos, priors, seeds
-from warpgs.pipeline.runs import precompile
 from warpgs.app.cli import main
-from warpgs.pipeline.runs.precompile import fit_kernels
 from warpgs.pipeline.metrics.evaluate import render_view, score
 from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.runs import precompile
+from warpgs.pipeline.runs.precompile import fit_kernels
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LossConfig
 from warpgs.pipeline.train.schedule import PhaseConfig

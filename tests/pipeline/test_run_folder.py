@@ -11,11 +11,11 @@ import warpgs
 from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.files import LOCK
+from warpgs.pipeline.farm import ensure_run
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs import fit as fit_module
 from warpgs.pipeline.runs.checkpoint import TENSORS
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest
-from warpgs.pipeline.farm import ensure_run
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.synthetic.demo import write_demo
 

@@ -1,6 +1,7 @@
 """What lies in the current folder never runs: a scene may come from anybody, and may hold a numpy.py."""
 
 import ast
+import json
 import os
 import subprocess
 import sys
@@ -87,7 +88,8 @@ def test_the_program_runs_nothing_from_the_current_folder(trap, program):
 def test_no_command_runs_what_lies_beside_a_scene(trap, tmp_path, program):
     """Every command of the program, called in a scene that holds modules of well-known names, with all it starts."""
     folder, mark = trap
-    out = str(tmp_path / "run")
+    out, jobs = str(tmp_path / "run"), tmp_path / "jobs.jsonl"
+    jobs.write_text(json.dumps({"scene": str(folder)}))
     for name in EARLY:
         (folder / f"{name}.py").write_text((folder / "json.py").read_text())
     commands = {
@@ -103,6 +105,7 @@ def test_no_command_runs_what_lies_beside_a_scene(trap, tmp_path, program):
         "demo": (0, ["demo", "new", "--views", "8", "--width", "32", "--height", "32"]), "doctor": (0, ["doctor"]),
         "view": (3, ["view", "."]), "convert": (3, ["convert", "a.ply", str(tmp_path / "b.spz")]),
         "poses": (0 if find_spec("pycolmap") else 4, ["poses", "images", "--out", str(tmp_path / "found")]),
+        "farm": (0, ["farm", str(jobs), *FIT, "--out", str(tmp_path / "farm")]),
         "mesh": (3, ["mesh", out, "--out", str(tmp_path / "a.glb"), "--device", "cpu"]),
     }  # fmt: skip
     assert {c.split()[0] for c in commands} == {"help", *COMMANDS}

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import html
+import re
+import textwrap
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +25,8 @@ CARDS = """
 .card b{display:block;font-size:15px;color:var(--ink)}.failed b{color:#c0392b}a{color:inherit}
 .card.failed{border-color:#c0392b}
 """
+SHORT = 120
+"""Letters of a message on a card; the table of failures has all of it."""
 
 
 @dataclass(frozen=True)
@@ -49,13 +53,16 @@ def _card(card: JobCard) -> str:
     image = f'<img loading="lazy" alt="render and photograph of {name}" src="{quote(card.thumbnail)}">'
     if not card.thumbnail:
         image = f'<div class="none">{html.escape(row.state)}</div>'
+    failed = row.state == "failed"
     facts = [
         "" if row.psnr is None else f"PSNR {row.psnr:.2f} dB", "" if card.ssim is None else f"SSIM {card.ssim:.3f}",
         f"{row.gaussians:,} Gaussians" if row.gaussians else "", format_bytes(card.ply_bytes) if card.ply_bytes else "",
-        duration(row.seconds) if row.seconds else "", row.message if row.state == "failed" else "",
+        duration(row.seconds) if row.seconds and not failed else "",
+        textwrap.shorten(row.message, SHORT, placeholder=" ...") if failed else "",
     ]  # fmt: skip
     words = html.escape(", ".join(filter(None, facts)) or row.state)
-    return f'<div class="card {html.escape(row.state)}">{_link(card.report, image)}<p>{_link(card.report, f"<b>{name}</b>")}{words}</p></div>'
+    image, head = _link(card.report, image), _link(card.report, f"<b>{name}</b>")
+    return f'<div class="card {html.escape(row.state)}">{image}<p>{head}{words}</p></div>'
 
 
 def _failures(cards: list[JobCard]) -> str:
@@ -63,7 +70,8 @@ def _failures(cards: list[JobCard]) -> str:
     by_message: dict[str, list[str]] = defaultdict(list)
     for card in cards:
         if card.row.state == "failed":
-            message = card.row.message.replace(card.row.name, "SCENE")  # messages about each one's files are one
+            name = rf"(?<!\w){re.escape(card.row.name)}(?!\w)"
+            message = re.sub(name, "SCENE", card.row.message)  # messages about each one's files are one
             by_message[message].append(card.row.name)
     rows = "".join(
         f"<tr><td>{html.escape(message)}</td><td>{len(names)}</td><td>{html.escape(', '.join(names[:20]))}</td></tr>"
@@ -92,7 +100,8 @@ def farm_page(title: str, cards: list[JobCard], seconds: float) -> str:
     cells = "".join(f"<div><b>{html.escape(v)}</b><span>{html.escape(k)}</span></div>" for k, v in figures)
     body = (
         f'<h1>{html.escape(title)}</h1><p class="sub">{line} <a href="results.csv">results.csv</a></p>'
-        f'<div class="figures">{cells}</div>{_failures(cards)}<h2>Scenes</h2><div class="cards">{"".join(map(_card, cards))}</div>'
+        f'<div class="figures">{cells}</div>{_failures(cards)}<h2>Scenes</h2>'
+        f'<div class="cards">{"".join(map(_card, cards))}</div>'
     )
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,'

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from warpgs.report.progress import PLAIN_INTERVAL, duration
+from warpgs.report.progress import PLAIN_INTERVAL, duration, is_live, waiting
 from warpgs.runtime.terminal import printable, say
 
 if TYPE_CHECKING:
@@ -49,11 +48,11 @@ def row_values(row: JobRow) -> tuple[str, ...]:
 
 
 class FarmTable:
-    """Context manager that shows how many jobs wait, run, are done and failed, those at work, those that ended last, time left."""
+    """Context manager that shows how many jobs wait, run, are done and failed, the running ones, the last ones, time left."""
 
     def __init__(self, *, live: bool | None = None):
         """Prepare; ``live`` None shows the table where stdout is a terminal."""
-        self.live = sys.stdout.isatty() if live is None else live
+        self.live = is_live() if live is None else live
         self.began = self.printed = time.monotonic()
         self.rows: list[JobRow] = []
         self.left: float | None = None
@@ -65,6 +64,7 @@ class FarmTable:
         if self.live:
             from rich.live import Live
 
+            waiting().clear()
             self.display = Live(self.panel(), refresh_per_second=4)
             self.display.__enter__()
         return self
@@ -108,16 +108,19 @@ class FarmTable:
         table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
         for name in ("scene", "state", "step", "time", "PSNR", "Gaussians"):
             table.add_column(name, justify="left" if name in ("scene", "state") else "right", no_wrap=True)
-        table.add_column("", overflow="ellipsis", no_wrap=True)
         by_name = {r.name: r for r in self.rows}
         last = [by_name[n] for n in list(self.order)[-LAST:] if n in by_name]
         running = [r for r in self.rows if r.state == "running"]
         for row in [*running[:MOST_RUNNING], *reversed(last)]:
-            cells = [Text(printable(c)) for c in row_values(row)]
+            cells = [Text(printable(c)) for c in row_values(row)[:-1]]
             table.add_row(*cells, style=STYLES.get(row.state, ""))
         done = sum(r.state in ("done", "failed") for r in self.rows)
         bar = Table.grid()  # alone, the bar does not end its line
         bar.add_row(ProgressBar(total=max(1, len(self.rows)), completed=done, width=78))
         more = len(running) - MOST_RUNNING
         rest = [Text(f"and {more} more at work", style="dim")] if more > 0 else []
-        return Group(bar, Text(self.summary(), style="bold"), table, *rest)
+        messages = [
+            Text(printable(f"{r.name}: {r.message}"), style="dim", no_wrap=True, overflow="ellipsis")
+            for r in reversed(last) if r.message
+        ]  # fmt: skip
+        return Group(bar, Text(self.summary(), style="bold"), table, *rest, *messages)

@@ -93,8 +93,8 @@ def python_lines(module: str, *arguments: str, folder: Path, environment: dict[s
 class PythonWorker:
     """A process that runs a module of this package, takes lines on its stdin and answers on its stdout.
 
-    It looks for modules in its folder no more than `run_python` does. Ctrl-C in the terminal is for its parent alone: the end of
-    its stdin tells it to stop, which it sees even where the parent was killed.
+    It looks for modules in its folder no more than `run_python` does. Ctrl-C in the terminal is for its parent alone: the end
+    of its stdin tells it to stop, which it sees even where the parent was killed.
     """
 
     def __init__(self, module: str, *arguments: str, environment: dict[str, str] | None = None):
@@ -105,7 +105,7 @@ class PythonWorker:
             arguments: Its ``sys.argv[1:]``.
             environment: Variables beside those of this process.
         """
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed by `end`
+        self._errors = tempfile.TemporaryFile()  # closed by `end`
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", module, *arguments], env=_environment(environment), stdin=subprocess.PIPE,
             stdout=subprocess.PIPE, stderr=self._errors, text=True, encoding="utf-8", errors="replace", start_new_session=True,

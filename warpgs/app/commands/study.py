@@ -34,6 +34,11 @@ def study_flags() -> type:
         """Optimisation steps of every run; as in `warpgs fit` where not given."""
         device: str = "auto"
         """auto, cpu or cuda."""
+        slots: int | None = None
+        """Runs at a time, each in a process of its own as `warpgs farm` has it; where neither this nor --per-gpu is given, they
+        run one after another in this one."""
+        per_gpu: int | None = None
+        """Runs that share a GPU."""
         lpips_weights: Path | None = None
         """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
 
@@ -42,12 +47,14 @@ def study_flags() -> type:
 
 def run_study_of(a, variants: dict, marks: dict) -> int:
     """Run the study that parsed flags ask for."""
+    from warpgs.pipeline.farm.run import EngineRequest
     from warpgs.pipeline.runs.request import SceneRequest
     from warpgs.pipeline.study.compare import run_study
     from warpgs.pipeline.study.study import StudyRequest
 
     options = {"allow_outside": a.allow_outside, "max_pixels": a.max_pixels, "max_side": a.max_side}
     scenes = tuple(SceneRequest(str(s), a.split, a.downscale, **options) for s in a.scenes)
-    for line in run_study(StudyRequest(scenes, variants, a.seeds, a.out, a.device, a.lpips_weights, marks)):
+    farm = None if a.slots is None and a.per_gpu is None else EngineRequest(slots=a.slots, per_gpu=a.per_gpu or 1)
+    for line in run_study(StudyRequest(scenes, variants, a.seeds, a.out, a.device, a.lpips_weights, farm, marks)):
         say(line)
     return 0

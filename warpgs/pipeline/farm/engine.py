@@ -1,4 +1,4 @@
-"""What a farm asks of an engine: to run jobs, and to say what becomes of them."""
+"""The engine of a farm: runs jobs, and says what becomes of them."""
 
 from __future__ import annotations
 

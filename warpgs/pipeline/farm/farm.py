@@ -22,7 +22,7 @@ POLL = 2.0
 
 @dataclass
 class JobStatus:
-    """Where a job stands."""
+    """Status of a job."""
 
     job: FarmJob
     state: str = "waiting"
@@ -40,11 +40,11 @@ class JobStatus:
     before: JobRecord | None = None
     """Record from before this farm."""
     notes: list[str] = field(default_factory=list)
-    """What happened to it on the way."""
+    """Failed attempts, and notes on locks."""
 
     @property
     def ended(self) -> bool:
-        """Return whether nothing more will come of it."""
+        """True where nothing more will come of it."""
         return self.state in ("done", "failed")
 
 
@@ -53,9 +53,9 @@ def run_farm(
 ) -> list[JobStatus]:
     """Run jobs until each is done or has failed.
 
-    A job that is finished and valid is skipped. A job whose process dies, or that has no memory left, is started once more after
-    the others, and goes on from its checkpoint. A folder of a job is locked while it is worked on here; one that is locked by
-    another farm is looked at again later, and its result is taken over.
+    A job that is finished and valid is skipped. A job whose process dies, or that has no memory left, is started once more
+    after the others, and goes on from its checkpoint. A folder of a job is locked while it is worked on here; one that
+    another farm has locked is looked at again later, and its result is taken over.
 
     Args:
         jobs: The jobs.
@@ -80,6 +80,7 @@ class _Farm:
         self.engine, self.show, self.poll = engine, show, poll
         self.by_name = {s.job.name: s for s in self.all}
         self.held: dict[str, contextlib.ExitStack] = {}
+        self.left, self.running = len(jobs), 0  # counted, since there may be a million
 
     def run(self) -> list[JobStatus]:
         """Run all jobs."""
@@ -90,10 +91,9 @@ class _Farm:
         self.show(self.all)
         waiting = deque(s for s in self.all if not s.ended)
         try:
-            while not all(s.ended for s in self.all):
+            while self.left:
                 self._start(waiting)
-                running = any(s.state == "running" for s in self.all)
-                for event in self.engine.wait(self.poll) if running else self._pause(waiting):
+                for event in self.engine.wait(self.poll) if self.running else self._pause(waiting):
                     self._take(event, waiting)
                 self.show(self.all)
         finally:
@@ -110,17 +110,18 @@ class _Farm:
     def _start(self, waiting: deque[JobStatus]) -> None:
         """Start as many jobs as the engine takes; those of another farm go to the end of the queue."""
         for _ in range(len(waiting)):
-            if sum(s.state == "running" for s in self.all) >= self.engine.slots:
+            if self.running >= self.engine.slots:
                 return
             status = waiting.popleft()
             if not self._claim(status):
                 waiting.append(status)
             elif not status.ended:
                 status.state, status.began, status.attempts = "running", time.monotonic(), status.attempts + 1
+                self.running += 1
                 self.engine.start(status.job)
 
     def _claim(self, status: JobStatus) -> bool:
-        """Lock the folder of a job; return False where another farm holds it. What another one has finished meanwhile is ended."""
+        """Lock the folder of a job; return False where another farm holds it; end one that has been finished meanwhile."""
         if status.job.name not in self.held:
             with contextlib.ExitStack() as stack:
                 try:
@@ -144,6 +145,7 @@ class _Farm:
         if event.state == "running":
             status.step = event.step
             return
+        self.running -= 1
         status.seconds += time.monotonic() - status.began
         record = read_record(status.job.folder)
         if event.state == "held":  # a process that a farm left behind works on it
@@ -172,6 +174,7 @@ class _Farm:
     def _end(self, status: JobStatus, record: JobRecord) -> None:
         """End a job with its record."""
         status.state, status.record = record.state, record
+        self.left -= 1
         self._release(status)
 
     def _release(self, status: JobStatus) -> None:
@@ -183,7 +186,7 @@ class _Farm:
 
 def seconds_left(statuses: list[JobStatus], slots: int) -> float | None:
     """Return the time until all jobs are done [s], by the mean time of those done here; None before the first one is."""
-    took = [s.seconds for s in statuses if s.ended and s.seconds]
+    took = [s.seconds for s in statuses if s.state == "done" and s.seconds]
     if not took:
         return None
     mean, now = sum(took) / len(took), time.monotonic()

@@ -1,4 +1,4 @@
-"""What a farm is given to fit: a folder of scenes, a glob, or a file with a line of JSON for each job."""
+"""Lists of what to fit: a folder of scenes, a glob, or a file with a line of JSON for each job."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def list_jobs(jobs: str) -> list[ListedJob]:
     path = Path(jobs)
     if path.is_dir():
         if any(r.probe(path) is not None for r in all_readers()):
-            raise UsageError(f"{jobs} is one scene: fit it with `warpgs fit`, or give the folder above it, or {jobs.rstrip('/')}*")
+            raise UsageError(f"{jobs} is one scene: fit it with `warpgs fit`, or give the folder above it")
         found = _named(sorted(p for p in path.iterdir() if p.is_dir() and not p.name.startswith(".")))
     elif path.suffix == ".jsonl":
         found = _read(path)

@@ -22,7 +22,7 @@ MAX_SLOTS = 256
 
 @dataclass(frozen=True)
 class Slot:
-    """A share of a device."""
+    """A device, or a part of one, for one job at a time."""
 
     device: str
     """cpu or cuda, as the job sees it."""
@@ -52,7 +52,9 @@ def local_slots(device: str, slots: int | None, per_gpu: int) -> list[Slot]:
     if not 1 <= count <= MAX_SLOTS or not 1 <= per_gpu <= MAX_SLOTS:
         raise UsageError(f"--slots and --per-gpu must be numbers from 1 to {MAX_SLOTS}, not {slots} and {per_gpu}")
     if gpus and count > gpus * per_gpu:
-        raise UsageError(f"--slots {count}: {gpus} GPUs with --per-gpu {per_gpu} have {gpus * per_gpu}; give a larger --per-gpu")
+        raise UsageError(
+            f"--slots {count}: {gpus} GPUs with --per-gpu {per_gpu} have {gpus * per_gpu}; give a larger --per-gpu"
+        )
     threads = max(1, torch.get_num_threads() // count)
     if not gpus:
         return [Slot("cpu", threads)] * count

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from warpgs.errors import UsageError
@@ -20,13 +21,13 @@ class RayEngine:
 
         Args:
             device: cpu or cuda.
-            slots: Jobs at a time; None for as many as the cluster has room for now.
+            slots: Jobs at a time; None for as many as fit into the cluster now.
             per_gpu: Jobs that share a GPU.
             threads: CPU threads of a job.
             address: Address of the cluster; None for the one that RAY_ADDRESS names, or a new one on this machine.
 
         Raises:
-            UsageError: Ray is not installed, or the cluster has no room for a job.
+            UsageError: Ray is not installed, or no job fits into the cluster.
         """
         try:
             import ray
@@ -41,13 +42,24 @@ class RayEngine:
         room = min(found.get("CPU", 0) / threads, found.get("GPU", 0) / gpus if gpus else float("inf"))
         self.slots = slots or int(room)
         if self.slots < 1:
-            raise UsageError(f"Ray's cluster has no room for a job of {threads} threads and {gpus:g} GPUs: it has {found}")
-        options = {"num_cpus": threads, "num_gpus": gpus, "max_retries": 1, "runtime_env": {"env_vars": {"PYTHONSAFEPATH": "1"}}}
-        self._task = ray.remote(**options)(run_job)
+            raise UsageError(
+                f"no job of {threads} threads and {gpus:g} GPUs fits into Ray's cluster ({found}); give fewer --threads"
+            )
+        self._options = {
+            "num_cpus": threads,
+            "num_gpus": gpus,
+            "max_retries": 1,
+            "runtime_env": {"env_vars": {"PYTHONSAFEPATH": "1"}},
+        }
         self._running: dict[Any, str] = {}
+        self.use(run_job)
+
+    def use(self, work: Callable[[str, int], str]) -> None:
+        """Run jobs by another function than `run_job`, of the same arguments and result."""
+        self._task = self._ray.remote(**self._options)(work)
 
     def start(self, job: FarmJob) -> None:
-        """Submit a job."""
+        """Send a job."""
         self._running[self._task.remote(job_text(job), self._threads)] = job.name
 
     def wait(self, seconds: float) -> list[Event]:
@@ -62,7 +74,7 @@ class RayEngine:
             return Event(name, "crashed", str(e).strip().splitlines()[-1])
 
     def close(self) -> None:
-        """Cancel what runs, and leave the cluster."""
+        """End what runs, and leave the cluster."""
         for reference in self._running:
             self._ray.cancel(reference)  # KeyboardInterrupt there: the fit saves its state
         self._ray.wait(list(self._running), num_returns=len(self._running), timeout=60) if self._running else None

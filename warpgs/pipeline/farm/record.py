@@ -40,11 +40,11 @@ _SCHEMA = schema.fields(
 
 @dataclass(frozen=True)
 class JobRecord:
-    """What became of a job."""
+    """Outcome of a job."""
 
     name: str
     identity: str
-    """As `FarmJob.identity`."""
+    """Digest of the job, `FarmJob.identity`."""
     state: str
     """done or failed."""
     how: str = ""
@@ -52,7 +52,7 @@ class JobRecord:
     message: str = ""
     """Error of a failed job, or a note on a finished one."""
     again: bool = False
-    """Whether a failed job may succeed when it is tried again."""
+    """True where a failed job may succeed when it is tried again."""
     source: str = ""
     """SHA-256 of the scene's file names, sizes and times; empty where nobody knows them."""
     seconds: float = 0.0

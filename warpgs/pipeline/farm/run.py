@@ -18,6 +18,8 @@ from warpgs.report.farm_table import FarmTable
 from warpgs.runtime.terminal import say
 
 ENGINES = ("local", "ray", "slurm")
+SHOW_INTERVAL = 0.2
+"""Shortest time between two states of the table [s]."""
 INDEX_INTERVAL = 30.0
 """Time between two writings of the index while jobs run [s]."""
 
@@ -83,20 +85,25 @@ def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bo
     """
     make_folder(results)
     began = time.monotonic()
-    written = began - INDEX_INTERVAL
+    shown = written = began - INDEX_INTERVAL
     say(f"{len(jobs)} jobs, engine {engine.name}, {engine.slots} at a time; results: {results / INDEX}, {TABLE}")
     try:
         with FarmTable(live=live) as table:
 
             def show(statuses: list[JobStatus]) -> None:
-                nonlocal written
+                nonlocal shown, written
+                if time.monotonic() - shown < SHOW_INTERVAL:
+                    return
                 table.update([row_of(s) for s in statuses], seconds_left(statuses, engine.slots))
-                now = time.monotonic()
-                if now - written >= INDEX_INTERVAL or all(s.ended for s in statuses):
-                    write_index(results, statuses, now - began)
-                    written = now
+                shown = time.monotonic()
+                if shown - written >= INDEX_INTERVAL:
+                    write_index(results, statuses, shown - began)
+                    written = shown
 
-            return run_farm(jobs, engine, show)
+            statuses = run_farm(jobs, engine, show)
+            table.update([row_of(s) for s in statuses], None)
+            write_index(results, statuses, time.monotonic() - began)
+            return statuses
     except KeyboardInterrupt:
         say("the same command goes on from here: finished jobs are kept, half-finished ones are continued")
         raise
@@ -105,7 +112,11 @@ def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bo
 
 
 def check_failures(statuses: list[JobStatus]) -> None:
-    """Raise a ResourceError that names the jobs that failed, if any."""
+    """Check that no job failed.
+
+    Raises:
+        ResourceError: Some did; the message names them.
+    """
     failed = [s for s in statuses if s.state == "failed"]
     if failed:
         first = failed[0].record

@@ -80,6 +80,6 @@ class SlurmEngine:
         return Event(name, "crashed", str(error).strip().splitlines()[-1])
 
     def close(self) -> None:
-        """Cancel what runs or is queued."""
+        """End what runs or is queued."""
         for job in self._running.values():
             job.cancel()

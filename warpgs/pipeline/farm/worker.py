@@ -1,8 +1,8 @@
 """The process of a device slot: takes jobs as lines on stdin, one after another, and answers with lines of JSON.
 
 It serves until its stdin ends or a job fails: what a failure left in memory is nobody's to clean. A line is ``{"kernels":
-"cpu"}``, to compile kernels before the first job, or ``{"job": TEXT, "threads": N}``. An answer holds ``step`` and ``steps``, or
-``state``, the last one on a job. Where stdin ends during a job, that saves its state and stops.
+"cpu"}``, to compile kernels before the first job, or ``{"job": TEXT, "threads": N}``. An answer holds ``step``, or ``state``,
+the last one on a job. Where stdin ends during a job, that saves its state and stops.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def _work(values: dict[str, object], answer: Callable[..., None]) -> str:
             pass
         return "done"
     from warpgs.pipeline.farm.work import run_job
-    from warpgs.pipeline.train.trainer import StepReport
+    from warpgs.pipeline.train.step_report import StepReport
 
     told = 0.0
 
@@ -67,7 +67,7 @@ def _work(values: dict[str, object], answer: Callable[..., None]) -> str:
 
 
 def main() -> int:
-    """Serve; return the exit code."""
+    """Run jobs until stdin ends or one fails; return the exit code."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the farm was started to ignore it
     answer, lines, working = _answers(), queue.SimpleQueue[str | None](), threading.Event()
     threading.Thread(target=_read, args=(lines, working), daemon=True).start()

@@ -9,9 +9,12 @@ import torch
 
 from warpgs.errors import DataError, UsageError
 from warpgs.io.splits import held_out_split, split_views
+from warpgs.pipeline.farm.ensure_run import Outcome, ensure_run
+from warpgs.pipeline.farm.job import FarmJob
+from warpgs.pipeline.farm.record import JobRecord
+from warpgs.pipeline.farm.run import make_engine, run_and_show
 from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.runs.request import FitRequest, choose_device, read_scene
-from warpgs.pipeline.farm.ensure_run import ensure_run
 from warpgs.pipeline.study.study import FILES, SWITCHES, Place, Runs, StudyRequest, run_folder, scene_name, write_study
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import PRESETS, FitConfig
@@ -69,29 +72,69 @@ def _places(request: StudyRequest) -> list[Place]:
             wanted, split = dataclasses.replace(wanted, split=spec), split_views(scene, spec)
         if not split.test:
             raise DataError(f"{wanted.path}: no view is held out, so there is nothing to compare; choose another --split")
-        places.append(Place(scene_name(wanted), wanted, scene.fingerprint, split, *(train_views(scene, n) for n in (split.train, split.test))))
+        places.append(
+            Place(
+                scene_name(wanted),
+                wanted,
+                scene.fingerprint,
+                split,
+                *(train_views(scene, n) for n in (split.train, split.test)),
+            )
+        )
     return places
 
 
+Key = tuple[str, str, int]
+"""Scene, variant and seed of a run."""
+
+
+def _fits(request: StudyRequest, places: list[Place]) -> dict[Key, tuple[Place, FitRequest]]:
+    """Return all runs, seed by seed, so that an interrupted study holds whole pairs."""
+    return {
+        (place.name, name, seed): (
+            place,
+            FitRequest(
+                place.request, run_folder(request, place.name, name, seed), dataclasses.replace(config, seed=seed),
+                request.device, lpips_weights=request.lpips_weights,
+            ),
+        )
+        for seed in range(request.seeds) for place in places for name, config in request.variants.items()
+    }  # fmt: skip
+
+
+def _farmed(request: StudyRequest, fits: dict[Key, tuple[Place, FitRequest]]) -> dict[Key, JobRecord]:
+    """Run all fits on a farm where one is asked for; return their records."""
+    if request.engine is None:
+        return {}
+    jobs = {}
+    for key, (_, fit) in fits.items():
+        name = "-".join(map(str, key)).replace(" ", "-")
+        jobs[name] = FarmJob(name, fit, request.out / "farm" / name)
+    engine = make_engine(request.engine, request.device, request.out)
+    statuses = run_and_show(list(jobs.values()), engine, request.out)
+    return {key: s.record for key, s in zip(fits, statuses, strict=True) if s.record is not None}
+
+
 def _run_all(request: StudyRequest, places: list[Place], device: torch.device, lpips: dict[str, str]) -> Runs:
-    """Make all runs, seed by seed, so that an interrupted study holds whole pairs."""
+    """Make all runs, and read what a farm has made of them."""
     runs: Runs = {}
-    total = len(places) * request.seeds * len(request.variants)
-    for seed in range(request.seeds):
-        for place in places:
-            for name, config in request.variants.items():
-                say(f"[{len(runs) + 1}/{total}] {place.name}, {name}, seed {seed}")
-                fit = FitRequest(
-                    place.request, run_folder(request, place.name, name, seed), dataclasses.replace(config, seed=seed),
-                    request.device, lpips_weights=request.lpips_weights,
-                )  # fmt: skip
-                outcome = ensure_run(
-                    fit, place.fingerprint, place.split, device.type, lpips, settings_by_views(fit.config, place.train, device.type)[0]
-                )
-                if outcome.state != "fitted":
-                    say(f"  {outcome.state}{': ' if outcome.note else ''}{outcome.note}")
-                runs[place.name, name, seed] = outcome
-                gc.collect()  # a fit and its recorded steps refer to each other: without this their device memory piles up
+    fits = _fits(request, places)
+    farmed = _farmed(request, fits)
+    for key, (place, fit) in fits.items():
+        record = farmed.get(key)
+        if record is None:
+            say(f"[{len(runs) + 1}/{len(fits)}] {key[0]}, {key[1]}, seed {key[2]}")
+        elif record.state == "failed":
+            runs[key] = Outcome("failed", None, f"failed: {record.message}")
+            continue
+        resolved, _ = settings_by_views(fit.config, place.train, device.type)
+        outcome = ensure_run(fit, place.fingerprint, place.split, device.type, lpips, resolved)
+        if record is not None and outcome.state == "kept":
+            outcome = dataclasses.replace(outcome, state=record.how, note=record.message)
+        if record is None and outcome.state != "fitted":
+            say(f"  {outcome.state}{': ' if outcome.note else ''}{outcome.note}")
+        runs[key] = outcome
+        gc.collect()  # a fit and its recorded steps refer to each other: without this their device memory piles up
     return runs
 
 

@@ -14,9 +14,10 @@ import torch
 from warpgs.errors import UsageError
 from warpgs.files import write_bytes, write_json, write_text
 from warpgs.io.splits import Split
+from warpgs.pipeline.farm.ensure_run import Outcome
+from warpgs.pipeline.farm.run import EngineRequest
 from warpgs.pipeline.runs.request import SceneRequest
 from warpgs.pipeline.runs.results import LABELS
-from warpgs.pipeline.farm.ensure_run import Outcome
 from warpgs.pipeline.study.plots import Line, Panel, forest
 from warpgs.pipeline.study.qualitative import strips
 from warpgs.pipeline.study.statistics import paired_difference, sample
@@ -54,6 +55,8 @@ class StudyRequest:
     """auto, cpu or cuda."""
     lpips_weights: Path | None = None
     """File of `warpgs convert-lpips`; without one LPIPS is not measured."""
+    engine: EngineRequest | None = None
+    """Engine of the farm that the runs go to; None for one after another in this process."""
     marks: dict[str, tuple[bool, ...]] = field(default_factory=dict)
     """Check marks of each variant in the order of `SWITCHES`; empty for a comparison of presets."""
 

@@ -1,0 +1,54 @@
+"""Tiny farms: two scenes, a few steps, and an engine that a test holds in its hands."""
+
+import dataclasses
+from pathlib import Path
+
+from warpgs.pipeline.farm.engine import Event
+from warpgs.pipeline.farm.job import FarmJob, job_text
+from warpgs.pipeline.farm.work import run_job
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.runs.request import FitRequest, SceneRequest
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.synthetic.demo import split_spec, write_demo
+
+CONFIG = FitConfig(steps=6, checkpoint_every=2, checkpoint_seconds=0, init=InitConfig(source="random", random_count=60))
+
+
+def write_scenes(folder: Path, count: int = 2) -> Path:
+    """Write scenes with a seed each into a folder."""
+    for i in range(count):
+        write_demo(folder / f"s{i}", views=8, width=48, height=36, seed=i)
+    return folder
+
+
+def jobs_of(scenes: Path, out: Path, **settings) -> list[FarmJob]:
+    """A job for each scene of a folder."""
+    config = dataclasses.replace(CONFIG, **settings)
+    return [
+        FarmJob(p.name, FitRequest(SceneRequest(str(p), split_spec(8)), out / p.name / "run", config, "cpu"), out / p.name)
+        for p in sorted(scenes.iterdir())
+    ]
+
+
+class HereEngine:
+    """Runs jobs in this process, one at a time, when it is asked for news."""
+
+    name = "here"
+
+    def __init__(self, work=run_job, slots: int = 1):
+        """Run jobs by a function of their text."""
+        self.work, self.slots, self.started, self.begun = work, slots, [], []
+
+    def start(self, job: FarmJob) -> None:
+        """Note a job."""
+        self.started.append(job)
+        self.begun.append(job.name)
+
+    def wait(self, seconds: float) -> list[Event]:
+        """Run the oldest job; the function's result is its state, or its whole event."""
+        job = self.started.pop(0)
+        done = self.work(job_text(job))
+        return [done if isinstance(done, Event) else Event(job.name, done)]
+
+    def close(self) -> None:
+        """Do nothing."""

@@ -1,0 +1,66 @@
+"""What a farm is given: folders, globs, and files of jobs that anybody may have written."""
+
+import pytest
+
+from tests.pipeline.farms import write_scenes
+from warpgs.errors import DataError, UsageError
+from warpgs.pipeline.farm.listing import list_jobs
+
+
+def test_folders_and_globs(tmp_path):
+    """Each folder is a scene, hidden ones are not; equal names are told apart by the folders above."""
+    for name in ("b/scene", "a/scene", ".hidden"):
+        (tmp_path / name).mkdir(parents=True)
+    assert [(j.name, j.scene) for j in list_jobs(str(tmp_path))] == [("a", tmp_path / "a"), ("b", tmp_path / "b")]
+    assert [j.name for j in list_jobs(f"{tmp_path}/*/scene")] == ["a-scene", "b-scene"]
+    with pytest.raises(UsageError, match="there is no scene"):
+        list_jobs(f"{tmp_path}/*/nothing")
+
+
+def test_a_scene_is_no_folder_of_scenes(tmp_path):
+    write_scenes(tmp_path, 1)
+    with pytest.raises(UsageError, match="is one scene: fit it with `warpgs fit`"):
+        list_jobs(str(tmp_path / "s0"))
+
+
+def test_lines_are_flags_of_fit(tmp_path):
+    """Relative paths are from the file; booleans are switches, in groups too."""
+    path = tmp_path / "jobs.jsonl"
+    path.write_text('{"scene": "x", "steps": 5, "refine_poses": true, "holdout.bounds": false}\n\n{"scene": "/y", "name": "z"}')
+    first, second = list_jobs(str(path))
+    assert first.scene == tmp_path / "x" and first.flags == ("--steps=5", "--refine-poses", "--holdout.no-bounds")
+    assert (second.name, second.flags) == ("z", ())
+
+
+@pytest.mark.parametrize(
+    ("line", "word"),
+    [
+        ("{", "is no JSON"),
+        ("[]", "must be an object"),
+        ('{"name": "a"}', "scene is missing"),
+        ('{"scene": 3}', "scene must be text"),
+        ('{"scene": "a", "name": "../b"}', "cannot be the name"),
+        ('{"scene": "a", "name": "index.html"}', "cannot be the name"),
+        ('{"scene": "a", "out": "/b"}', "cannot be set for one job"),
+        ('{"scene": "a", "allow_outside": true}', "cannot be set"),
+        ('{"scene": "a", "strategy": "evil.py:Evil"}', "names code of your own"),
+        ('{"scene": "a", "steps": [1]}', "must be text"),
+        ('{"scene": "a", "--steps": 1}', "cannot be set"),
+        ('{"scene": "a\\u0000"}', "without a zero byte"),
+        ('{"scene": "a", "name": ".b"}', "cannot be the name"),
+        ("[" * 60 + "]" * 60, "in each other"),
+    ],
+)
+def test_lines_that_are_no_jobs(tmp_path, line, word):
+    """One sentence, with the number of the line where it is the line's fault."""
+    path = tmp_path / "jobs.jsonl"
+    path.write_text(line)
+    with pytest.raises(DataError, match=word):
+        list_jobs(str(path))
+
+
+def test_two_jobs_need_two_names(tmp_path):
+    path = tmp_path / "jobs.jsonl"
+    path.write_text('{"scene": "a/x"}\n{"scene": "b/X"}')
+    with pytest.raises(UsageError, match="two jobs have the name 'X'"):
+        list_jobs(str(path))
