@@ -86,18 +86,20 @@ def _name(program: str, direction: str) -> str:
     return direction if program == OURS else f"{program}, {direction}"
 
 
+def _plain(row: dict) -> bool:
+    """Return whether a row has the base's degree, one camera, and no number of threads of its own."""
+    return row.get("degree", BASE.degree) == BASE.degree and row.get("cameras", 1) == 1 and "threads" not in row
+
+
 def _shown(rows: list[dict]) -> list[dict]:
     """Return the rows at the base point and along the diagonal; all of an op that was measured at neither."""
     points = {(BASE.count, BASE.width), *((count, width) for count, width, _ in DIAGONAL[2:])}
 
     def wanted(r: dict) -> bool:
-        if r.get("degree", BASE.degree) != BASE.degree or r.get("cameras", 1) != 1 or "threads" in r:
-            return False
         n, width = r.get("N"), r.get("width")
         return any((n is None or n == count) and (width is None or width == side) for count, side in points)
 
-    kept = [r for r in rows if wanted(r)]
-    return kept or rows
+    return [r for r in rows if _plain(r) and wanted(r)] or rows
 
 
 def op_tables(rows: list[dict]) -> str:
@@ -124,8 +126,8 @@ def _device(row: dict | None) -> str:
 def peer_table(rows: list[dict]) -> str:
     """The largest size at which another program did the same work."""
     ours = {(r["op"], r["direction"], _key(r)): r for r in rows if r["program"] == OURS}
-    peers = [r for r in rows if r["program"] != OURS and (r["op"], r["direction"], _key(r)) in ours]
-    columns, body = _columns(peers), []
+    peers = [r for r in rows if r["program"] != OURS and _plain(r) and (r["op"], r["direction"], _key(r)) in ours]
+    columns, body = ["N", "image"], []
     for op, program, direction in sorted(tasks(peers), key=lambda t: (t[0], t[2], t[1])):
         r = max((r for r in peers if (r["op"], r["program"], r["direction"]) == (op, program, direction)), key=_key)
         mine = ours[r["op"], r["direction"], _key(r)]
@@ -139,25 +141,13 @@ def roof_table(rows: list[dict]) -> str:
     body = []
     for op, program, direction in tasks(rows):
         own = [r for r in rows if (r["op"], r["program"], r["direction"]) == (op, program, direction) and "roof_ms" in r]
+        own = [r for r in own if _plain(r)] or own
         if own:
             r = max(own, key=lambda r: r["roof_ms"])
-            cells = [op, direction, *_sizes(r, ["N", "image", "degree", "cameras"])]
+            cells = [op, direction, *_sizes(r, ["N", "image"])]
             cells += [figure(r["bytes"] / 1e6), figure(r["operations"] / 1e6), figure(r["roof_ms"]), r["bound"]]
             body.append([*cells, figure(r.get("gpu_ms", r["median_ms"])), f"{figure(100 * r['fraction'])} %"])
-    head = [
-        "op",
-        "direction",
-        "N",
-        "image",
-        "degree",
-        "cameras",
-        "MB",
-        "Mop",
-        "roof [ms]",
-        "bound by",
-        "measured [ms]",
-        "fraction",
-    ]
+    head = ["op", "direction", "N", "image", "MB", "Mop", "roof [ms]", "bound by", "measured [ms]", "fraction"]
     return table(head, body)
 
 

@@ -74,7 +74,8 @@ def captures() -> str:
 Held-out photographs: PSNR [dB], mean and standard deviation over {min(seeds - {0})} to {max(seeds)} seeds, / SSIM. 504 x 378 px
 (fox 270 x 480, temple 640 x 480 by its foreground). {_where(result)}. Settings were chosen on these scenes by leaving training
 views out, but those of the first points, which were compared on three views with their held-out ones ([decision
-007](decisions/007-coarse-start.md)). `gsplat` is that package's default strategy in 7000 steps from the first points of `default`.
+007](decisions/007-coarse-start.md)). `gsplat` is that package's default strategy in 7000 steps, from the first points
+of `default`.
 
 {words}
 What `default` is and how it was chosen: [decision 013](decisions/013-any-capture.md). Synthetic scenes of smooth surfaces
@@ -202,7 +203,7 @@ The demo from its default fit of {result["views"]} images, against the surfaces 
 per cent of the scene's radius. {_where(result)}.
 
 {table(["voxel", "triangles", "from mesh to surface, mean", "from seen surface to mesh, mean"], body)}
-More: [mesh](mesh.md).
+More: [mesh](mesh.md). What each file format costs: [files to send](formats.md).
 """
 
 

@@ -61,7 +61,7 @@ def test_blocks_run_in_order_and_failures_are_named(tmp_path):
 
 def test_a_page_gets_what_it_uses_and_does_not_make(tmp_path):
     made, folder = tmp_path / "made", tmp_path / "page"
-    for name in ("scene", "run", "photos"):
+    for name in ("scene", "run", "photographs"):
         (made / name).mkdir(parents=True)
     folder.mkdir()
     prepare(folder, "warpgs fit scene/ --out run/\nwarpgs render run/", made)

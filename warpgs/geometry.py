@@ -154,8 +154,20 @@ def back_project_tensors(camera: Camera, pixels: torch.Tensor, depths: torch.Ten
 def in_image(camera: Camera, points: np.ndarray, near: float = 0.0) -> np.ndarray:
     """Return a mask [N], True where a world point [N, 3] is beyond ``near`` [u] and inside the camera's image."""
     pixels, z = project_points(camera, points)
-    inside = (pixels >= 0).all(1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
-    return inside & (z > near)
+    return _inside(camera, pixels) & (z > near)
+
+
+def seen_pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return which world points [N, 3] a camera sees: their numbers, rows, columns and z-depths [u], of shape [S] each."""
+    pixels, z = project_points(camera, points)
+    seen = np.nonzero(_inside(camera, pixels) & (z > 0))[0]
+    columns, rows = np.floor(pixels[seen]).astype(int).T
+    return seen, rows, columns, z[seen]
+
+
+def _inside(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    x, y = pixels.T
+    return (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
 
 
 def camera_extent(cameras: list[Camera]) -> float:

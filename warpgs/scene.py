@@ -184,6 +184,8 @@ class ViewDepth:
     not valid."""
     notes: tuple[str, ...] = ()
     """Messages for the user: pairs left out, files missing, nothing found."""
+    searched: bool = True
+    """False where the view's depth was not looked for, because there are others enough."""
 
     @property
     def coverage(self) -> float:

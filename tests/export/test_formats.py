@@ -15,8 +15,9 @@ import torch
 from tests.gaussians import cloud
 from warpgs.errors import DataError, UsageError
 from warpgs.export import compressed_ply, gltf, sog, splat, spz
-from warpgs.export.arrays import arrays_of, half_turn
+from warpgs.export.arrays import arrays_of, gaussians_of, half_turn
 from warpgs.export.formats import FORMATS, format_of, read_gaussians, write_gaussians
+from warpgs.geometry import rotation_matrices
 from warpgs.kernels.sh import basis
 from warpgs.scene import Normalization
 
@@ -161,6 +162,36 @@ def test_golden_files(suffix):
         assert difference <= limit, (name, difference)
 
 
+FOREIGN = {  # name of the file: limits on means, log scales, opacity, entries of rotation matrices, degree 0, the rest
+    "splat_transform.glb": (1e-6, 2e-6, 2e-7, 1e-6, 1e-6, 1e-6),
+    "splat_transform.sog": (1e-3, 2 * LOG_SPAN / 255, 1.01 / 255, 0.03, 0.02, 0.002),
+    "splat_transform.compressed.ply": (*QUANTA[".compressed.ply"][:3], 0.01, *QUANTA[".compressed.ply"][4:]),
+    "splat_transform_3.spz": (2e-4, 0.51 / 16, 0.51 / 255, 0.01, 0.51 / 38.25, 0.54 / 8),
+    "splat_transform_4.spz": (2e-4, 0.51 / 16, 0.51 / 255, 0.01, 0.51 / 38.25, 0.54 / 8),
+}
+"""Files that splat-transform 3.7.0 wrote of the same Gaussians. Its SPZ has harmonics of 4 bits above degree 1."""
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_files_of_splat_transform(name):
+    """In any order, with any quaternion of the same shape; its SPZ is in the axes of PLY."""
+    if name.endswith("4.spz"):
+        pytest.importorskip("zstandard")
+    made, back = model(n=20, degree=3, seed=5), read_gaussians(GOLDEN / name)
+    if name.endswith(".spz"):
+        back = gaussians_of(GOLDEN / name, half_turn(arrays_of(back), "x"))
+    order = torch.cdist(made.means, back.means).argmin(1)
+    assert len(back) == 20 and sorted(order.tolist()) == list(range(20))
+    back = type(back)(**{n: t[order] for n, t in back.tensors().items()})
+    found = differences(made, back)
+    axes = [rotation_matrices(torch.nn.functional.normalize(g.quats.double(), dim=1)).abs() for g in (made, back)]
+    found["rotation"] = float((axes[0] - axes[1]).abs().max())
+    if name.endswith(".sog"):  # its 16 rows of harmonics are means of one to three Gaussians each
+        found["rest"] = float((made.sh - back.sh)[:, 1:].abs().amax((1, 2)).median())
+    for (attribute, difference), limit in zip(found.items(), FOREIGN[name]):
+        assert difference <= limit, (attribute, difference)
+
+
 # ---- strangers' files ------------------------------------------------------------------------------------------------
 
 
@@ -207,6 +238,8 @@ def test_counts_beyond_the_size_are_refused(tmp_path):
     head = spz.HEADER.pack(spz.MAGIC, 3, 2**31, 3, 12, 0, 0)
     refused(tmp_path / "a.spz", gzip.compress(head + bytes(1000)), "2147483648 Gaussians in")
     refused(tmp_path / "a.spz", gzip.compress(spz.HEADER.pack(spz.MAGIC, 3, 5, 0, 12, 0, 0) + bytes(10**6)), "it has more")
+    bomb = gzip.compress(spz.HEADER.pack(spz.MAGIC, 3, 100_000, 0, 12, 0, 0) + bytes(20 * 100_000))
+    refused(tmp_path / "a.spz", bomb, f"100000 Gaussians in {len(bomb)} bytes")
     refused(tmp_path / "a.spz", gzip.compress(spz.HEADER.pack(spz.MAGIC, 3, 0, 0, 12, 1, 0)), "antialiasing")
     lines = ["ply", "format binary_little_endian 1.0", "element chunk 99999999999", "property float min_x"]
     lines += ["element vertex 1", "property uint packed_position", "end_header\n"]

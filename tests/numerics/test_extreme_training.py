@@ -347,7 +347,7 @@ def test_constant_images_of_any_size(device, dtype, value, height, width):
         assert bool(torch.isfinite(leaf.grad).all())
 
 
-# T9 and T11: settings
+# T11: settings
 
 NUMBERS = [math.nan, math.inf, -1, 0, 1e-300, 1, 3, 1e300]
 KINDS = [

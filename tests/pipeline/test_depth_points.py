@@ -41,6 +41,16 @@ def test_every_confirmed_pixel_becomes_a_point():
     assert notes[-1] == f"{len(cloud):,} points of {len(cloud):,} pixels by flow, and 0 filled"
 
 
+def test_views_whose_depth_was_not_searched_for_neither_fill_nor_hide():
+    """The start is that of the searched views alone: the work for each of many views is bounded."""
+    views, depths = known(0.5)
+    none = np.zeros_like(depths[0].valid)
+    unsearched = ViewDepth(np.zeros_like(depths[0].depth), none, np.full(none.shape, np.inf, np.float32), (), False)
+    few, _ = coarse_points(views[:2], depths[:2], merge_px=0, fill_px=4, source="sweep")
+    more, notes = coarse_points([*views[:2], views[2]], [*depths[:2], unsearched], merge_px=0, fill_px=4, source="sweep")
+    assert np.array_equal(few.points, more.points) and "filled" not in notes[2] and "filled" in notes[1]
+
+
 def test_points_of_the_reconstruction_fill_what_no_depth_confirms():
     """Those that two views saw, where there are none of the sweep's; the others and those seen once are left out."""
     views, depths = known(cut=40)

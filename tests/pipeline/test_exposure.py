@@ -14,7 +14,10 @@ from warpgs.errors import UsageError
 from warpgs.pipeline.metrics.matched_psnr import matched_psnr
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.exposure import EXPOSURE, exposed, exposure_of
+from warpgs.pipeline.train.strategies.holdout_blocks import rendered
 from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.train.views import half_size
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.synthetic.demo import split_spec, write_demo
 
 CPU = torch.device("cpu")
@@ -87,6 +90,21 @@ def test_steps_on_any_number_of_threads_and_continued_ones_have_the_same_bits():
         second.advance()
     assert whole[f"views.params.{EXPOSURE}"].any()
     assert all(torch.equal(t, whole[n]) for n, t in second.state()[0].items())
+
+
+def test_strategies_see_the_exposures_of_now():
+    """Held-out blocks are compared with renders under the exposure of their view: else growth would end too early."""
+    views = dimmed(scenes.photos(4), [0.6, 1, 0.8, 0.9])
+    trainer = Trainer(views, scenes.seeds(), FitConfig(steps=40, exposure=True, half_resolution=0.0), CPU)
+    shown = [v.exposure for v in trainer.views]
+    assert not torch.stack(shown).any()
+    trainer.view_table.params[EXPOSURE].data[0] = 0.3
+    trainer.show_learned()
+    assert torch.stack(shown).abs().min() > 0.05 and torch.stack(shown).mean(0).abs().max() < 1e-6
+    options = RasterizeOptions(background=trainer.background)
+    plain = rasterize(trainer.gaussians, trainer.views[0].camera, options).rgb
+    assert torch.equal(rendered(trainer.gaussians, trainer.views[0], options), exposed(plain, shown[0]))
+    assert half_size(trainer.views[0]).exposure is shown[0]
 
 
 def test_runs_tell_their_exposures(tmp_path):

@@ -53,9 +53,12 @@ def test_the_state_before_is_kept_and_the_step_repeats(tmp_path):
     assert str(again.value) == str(found.value)
 
 
-def test_the_loss_is_that_of_the_fit():
-    """The file's loss is the loss that the next step reports."""
-    fit = Trainer(photos(4), seeds(), dataclasses.replace(BUSY, dropout=0.3), CPU)
+@pytest.mark.parametrize("learned", [False, True], ids=["", "with poses and exposures"])
+def test_the_loss_is_that_of_the_fit(learned):
+    """The file's loss is the loss that the next step reports: with the poses and exposures of now, where they are learned."""
+    rates = dataclasses.replace(BUSY.optimizer, pose_rotation_lr=0.01, exposure_lr=0.05)
+    config = dataclasses.replace(BUSY, dropout=0.3, refine_poses=learned, exposure=learned, optimizer=rates)
+    fit = Trainer(photos(4), seeds(), config, CPU)
     for _ in range(20):
         fit.advance()
     view = fit.order[-1] if fit.order else None
@@ -63,9 +66,9 @@ def test_the_loss_is_that_of_the_fit():
         fit.advance()
         view = fit.order[-1] if fit.order else None
     bundle = failed_step(fit, view, "x")
-    (term,) = [line for line in findings(bundle) if "photometric" in line]
+    terms = [line for line in findings(bundle) if "loss term" in line]
     (report,) = fit.advance()
-    assert float(term.split(": ")[1]) == pytest.approx(report.loss, rel=1e-5)
+    assert len(terms) == 1 + learned and sum(float(t.split(": ")[1]) for t in terms) == pytest.approx(report.loss, rel=1e-5)
 
 
 def test_what_is_not_finite_is_counted(tmp_path, capsys):

@@ -14,6 +14,7 @@ from warpgs.coordinates import convert_camera
 from warpgs.errors import DataError, UsageError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.request import NO_SCORES
+from warpgs.runtime.terminal import Detail
 from warpgs.synthetic.demo import split_spec, write_demo
 
 STEPS, SPLIT = 12, split_spec(8)
@@ -82,7 +83,12 @@ def test_nothing_is_written_or_printed_unless_asked_for(folder, tmp_path, monkey
     loud = warpgs.fit(folder / "scene", few, device="cpu")
     printed = capsys.readouterr().out
     assert printed.splitlines()[0] == f"reading {folder / 'scene'}"
-    assert "views to fit" in printed and "no folder was asked for" in printed and all(n in printed for n in loud.notes)
+    assert "views to fit" in printed and "no folder was asked for" in printed
+    (first,) = (line for line in printed.splitlines() if line.startswith("step 1 of 2"))
+    assert first.endswith("per step -  left -")  # it may have compiled
+    details = [n for n in loud.notes if isinstance(n, Detail)]
+    assert any(n.startswith("shape: ") for n in details) and len(details) < len(loud.notes)
+    assert all((n in printed) != isinstance(n, Detail) for n in loud.notes)
     assert warpgs.fit(folder / "scene", few, device="cpu", verbose=False).notes == loud.notes
     assert capsys.readouterr().out == "" and not list(tmp_path.iterdir())
     with pytest.raises(UsageError, match="preset 'best' is not one of"):

@@ -73,6 +73,16 @@ def test_plan_covers_a_step_and_not_much_more(views, count):
     assert fit.memory.planned >= 0.95 * planned and found <= planned <= 1.25 * found + 20_000
 
 
+@pytest.mark.parametrize("batch", [3, 8])
+def test_plan_covers_the_sums_of_several_views(batch):
+    """Their gradients and statistics, of many Gaussians on few pixels."""
+    fit = Trainer(photos(2), seeds(5000), dataclasses.replace(STEADY, batch=batch), CPU)
+    fit.advance()
+    found = measured(fit, 2)
+    planned = fit.layout.step(5000, instances(fit))
+    assert fit.layout.sums == {3: 1, 8: 3}[batch] and found <= planned <= 1.1 * found
+
+
 @pytest.mark.parametrize("views", [photos(2, 400, 300), masked(photos(2, 400, 300))], ids=["all", "masked"])
 def test_plan_covers_the_depth_term(views):
     """A disparity a pixel that stays, and what a correlation and its gradient take."""
@@ -82,6 +92,16 @@ def test_plan_covers_the_depth_term(views):
     found = measured(fit, 2)
     planned = fit.layout.step(60, instances(fit))
     assert fit.layout.depth_supervised and found <= planned <= 1.25 * found + 20_000
+
+
+@pytest.mark.parametrize(("learned", "size", "count"), [("refine_poses", (40, 32), 20_000), ("exposure", (400, 300), 60)])
+def test_plan_covers_what_is_learned_of_views(learned, size, count):
+    """A gradient of the camera for each Gaussian, and renders with and without their exposure."""
+    fit = Trainer(photos(2, *size), seeds(count), dataclasses.replace(STEADY, **{learned: True}), CPU)
+    fit.advance()
+    found = measured(fit, 2)
+    planned = fit.layout.step(count, instances(fit))
+    assert found <= planned <= 1.25 * found + 20_000
 
 
 def test_plan_covers_density_events():

@@ -9,6 +9,7 @@ import torch
 
 from tests.gaussians import cloud
 from tests.io import scenes
+from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
 from warpgs.export.cameras import NAMES, write_cameras
 from warpgs.export.formats import write_gaussians
@@ -91,6 +92,9 @@ def test_cameras_of_colmap(tmp_path):
     scenes.write_colmap(tmp_path)
     found, _ = read_cameras(tmp_path)
     assert len(found) == 5 and list(found) == sorted(found)
+    lines = convert(tmp_path, tmp_path / "transforms.json")  # names of files may say who and where
+    assert all("photo" in name for name in found) and "5 cameras" in lines[-1]
+    assert "photo" not in (tmp_path / "transforms.json").read_text()
     for below in ("sparse", "sparse/0"):
         assert list(read_cameras(tmp_path / below)[0]) == list(found)
 
@@ -138,6 +142,10 @@ def test_render_of_a_file(tmp_path):
     write_cameras(tmp_path / "transforms.json", [replace(c, K=1000 * c.K, width=20000, height=20000) for c in make_cameras()])
     with pytest.raises(DataError, match="20000 x 20000 px has more than 100,000,000 pixels"):
         render(tmp_path / "a.spz", "views", out, settings, "cpu", file_of=(tmp_path / "transforms.json", None))
+    assert main(["render", str(tmp_path / "none.ply"), "--cameras", str(tmp_path / "cameras.json")]) == DataError.exit_code
+    assert main(["render", str(tmp_path), "--cameras", str(tmp_path / "cameras.json")]) == UsageError.exit_code
+    with pytest.raises(UsageError, match="cameras are named"):
+        convert(tmp_path / "cameras.json", tmp_path / "poses.json")
     with pytest.raises(UsageError, match="has no cameras"):
         render(tmp_path / "a.spz", "views", out, settings, "cpu", file_of=(None, None))
     with pytest.raises(UsageError, match="--rule other"):

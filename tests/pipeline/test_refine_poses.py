@@ -141,13 +141,15 @@ def test_strategies_see_the_poses_of_now_and_steps_count_from_the_given_ones():
     """Views that are set again, as a strategy or a lack of memory asks for, do not get their increments twice."""
     given = noisy(scenes.photos(4))
     trainer = fitted(given, 30)
-    trainer.show_poses()
+    trainer.show_learned()
     shown = [v.camera.viewmat.clone() for v in trainer.views]
     assert torch.equal(shown[0], trainer.poses.viewmats[0]) and not torch.equal(shown[1], trainer.poses.viewmats[1])
     trainer.set_views(trainer.views)
     for stack in trainer.stacks.values():
         assert torch.equal(stack.viewmats, trainer.poses.viewmats[stack.numbers])
-    trainer.show_poses()
+        now = trainer.learned.posed(stack)  # by which a captured step finds its capacity
+        assert torch.equal(now.viewmats, torch.stack(shown)[stack.numbers])
+    trainer.show_learned()
     assert all(torch.equal(v.camera.viewmat, a) for v, a in zip(trainer.views, shown))
 
 

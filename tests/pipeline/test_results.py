@@ -7,7 +7,7 @@ from warpgs.errors import ResourceError
 from warpgs.pipeline.metrics.evaluate import options_for, render_view, score
 from warpgs.pipeline.model.init import InitConfig, initial_gaussians
 from warpgs.pipeline.runs import results
-from warpgs.pipeline.runs.results import evaluate_run
+from warpgs.pipeline.runs.results import evaluate_run, result_lines
 
 BLACK = (0.0, 0.0, 0.0)
 
@@ -51,3 +51,25 @@ def test_a_picture_that_cannot_be_written_is_said(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(results, "write_bytes", full)
     with pytest.raises(ResourceError, match="no space left"):
         evaluate_run(tmp_path, scene[0], scene[1][:1], scene[1][1:3], "exact", BLACK)
+
+
+def test_a_fit_ends_with_its_score_its_size_its_time_and_what_to_do_next(tmp_path):
+    """The commands name the run as a shell takes it; time for kernels is told where there was some."""
+    metrics = {
+        "test": {"psnr": 24.5, "ssim": 0.8}, "train": {"psnr": 30.25}, "views": [{}, {}], "coverage": {"summary": "all seen"},
+        "baselines": {"mean_photo": 12.0, "nearest_photo": 13.5}, "gaussians": 1234, "complexity": {"bytes": 2**20},
+        "seconds": {"total": 75.0, "compiling": 20.0},
+    }  # fmt: skip
+    lines = result_lines(metrics, tmp_path / "my run")
+    assert lines[0].startswith("held-out PSNR 24.50 dB, SSIM 0.800") and lines[0].endswith("over 2 views")
+    assert "the nearest photograph 13.50 dB" in lines[1] and "all seen" in lines[2]
+    assert lines[3] == "1,234 Gaussians, 1.0 MiB, in 1 min 15 s, 20 s of it for kernels, once on this machine"
+    assert lines[4] == f"report: {tmp_path / 'my run' / 'report.html'}"
+    assert [line.split("  ")[1] for line in lines[6:]] == [
+        f"warpgs {words}" for words in (
+            f"view '{tmp_path}/my run'", f"render '{tmp_path}/my run'", f"export '{tmp_path}/my run' --to scene.html"
+        )
+    ]  # fmt: skip
+    unscored = result_lines(metrics | {"test": {}, "seconds": {"total": 5.0}}, None)
+    assert unscored[1:3] == ["training PSNR 30.25 dB", "1,234 Gaussians, 1.0 MiB, in 5 s"]
+    assert "held-out" not in " ".join(unscored) and "next:" not in unscored

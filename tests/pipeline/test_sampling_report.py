@@ -12,7 +12,14 @@ from warpgs.errors import ResourceError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs import sampling_report
 from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
-from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, sampling_report_of, shown_steps, view_sheet
+from warpgs.pipeline.runs.sampling_report import (
+    SHEET_WIDTH,
+    event_figures,
+    images_kept,
+    sampling_report_of,
+    shown_steps,
+    view_sheet,
+)
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
 from warpgs.pipeline.train.strategies.clone_split import DensityConfig
@@ -20,7 +27,7 @@ from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig, P
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.report.contact_sheet import DOT, GAP, HEAD, MARGIN, TITLE_SIZE
-from warpgs.report.images import colored
+from warpgs.report.images import colored, webp
 
 CPU = torch.device("cpu")
 NAMES = ["00.png", "01.png", "02.png"]
@@ -123,7 +130,7 @@ def test_story_follows_the_switches(run, tmp_path):
     story = sampling_report_of(fit, out)
     assert "sampled at random" in story.words and "above its 0.6 quantile" in story.words and "rendered depth" in story.words
     assert [c for c, _ in story.images] == [f"sampling after step {s}" for s in sorted(shown_steps(fit.phases))]
-    assert story.images[0][1] == next(iter(sorted((out / "sampling").iterdir()))).read_bytes()
+    assert story.images[0][1] == webp(next(iter(sorted((out / "sampling").iterdir()))).read_bytes(), SHEET_WIDTH, 70)
     assert dict(zip(*story.table))["sampling events"] == str(len(fit.strategy.events))
     sampler = dataclasses.replace(METHOD.sampler, fraction=0.2, depth="consistent")
     method = dataclasses.replace(METHOD, agp=False, sampler=sampler)

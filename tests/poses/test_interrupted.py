@@ -12,7 +12,11 @@ import pytest
 @pytest.mark.parametrize("everyone", [False, True], ids=["warpgs alone", "its group, as a terminal does"])
 def test_ctrl_c_ends_both_processes_and_leaves_nothing(sfm, tmp_path, photographs, everyone):
     """One sentence, exit code 130, no process and no file left."""
-    command = [sys.executable, "-m", "warpgs", "poses", str(photographs), "--out", str(tmp_path / "deep" / "scene")]
+    # tests may run in the background, where a shell has Ctrl-C ignored and their children inherit that
+    heeding = (
+        "import signal, sys; signal.signal(2, signal.default_int_handler); from warpgs.app.cli import main; sys.exit(main())"
+    )
+    command = [sys.executable, "-c", heeding, "poses", str(photographs), "--out", str(tmp_path / "deep" / "scene")]
     process = subprocess.Popen(
         [*command, "--threads", "1"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
@@ -22,7 +26,7 @@ def test_ctrl_c_ends_both_processes_and_leaves_nothing(sfm, tmp_path, photograph
         if "finding features" in line:
             break
     (os.killpg if everyone else os.kill)(process.pid, signal.SIGINT)
-    _, errors = process.communicate()
+    _, errors = process.communicate(timeout=60)
     assert (process.returncode, errors) == (130, "warpgs: interrupted\n"), lines
     with pytest.raises(ProcessLookupError):
         os.killpg(process.pid, 0)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from warpgs.files import write_bytes
-from warpgs.report.images import GRAY, depth_map, error_map, png, side_by_side
+from warpgs.report.images import GRAY, depth_map, error_map, png, side_by_side, webp
 
 
 def decode(data):
@@ -58,3 +58,14 @@ def test_threads_may_write_one_file(tmp_path):
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda c: [write_bytes(tmp_path / "a.png", c) for _ in range(20)], contents))
     assert (tmp_path / "a.png").read_bytes() in contents and len(list(tmp_path.iterdir())) == 1
+
+
+def test_webp_is_small_and_shows_the_same():
+    """A smooth image is off by a few of 255; a wide one is reduced in proportion; a file's contents count as an image."""
+    y, x = np.mgrid[0:60, 0:90] / 90
+    image = np.stack([x, y, 0.5 + 0.4 * np.sin(9 * x * y)], 2)
+    data = webp(image)
+    assert data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) < len(png(image)) / 4
+    assert np.abs(decode(data) - 255 * image).mean() < 3
+    assert decode(webp(png(image), width=45)).shape == (30, 45, 3)
+    assert decode(webp(np.zeros((3, 4000, 3)), width=100)).shape == (1, 100, 3)

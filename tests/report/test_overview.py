@@ -8,6 +8,7 @@ from warpgs.report import overview as module
 from warpgs.report.overview import probe_rendering, render_overview
 from warpgs.scene import Camera
 
+UP = np.array([0.0, -1, 0])
 K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
 
 
@@ -28,7 +29,7 @@ def cloud():
 
 def test_overview_is_an_image_or_a_reason_with_a_remedy():
     """Either result is right; the graphics libraries of the machine decide."""
-    data, why = render_overview([camera(a) for a in (-0.4, 0.0, 0.4)], [camera(0.2)], *cloud())
+    data, why = render_overview([camera(a) for a in (-0.4, 0.0, 0.4)], [camera(0.2)], *cloud(), UP)
     if data is None:
         assert "libegl1" in why
         return
@@ -59,7 +60,7 @@ def test_a_crash_of_vtk_is_a_note_and_not_ours(monkeypatch, code, text):
         return subprocess.CompletedProcess(command, code, "", "no display\n" if code > 0 else "")
 
     monkeypatch.setattr(module.subprocess, "run", crash)
-    data, why = render_overview([camera(0)], [], *cloud())
+    data, why = render_overview([camera(0)], [], *cloud(), UP)
     assert data is None and text in why and "apt-get install libegl1 libgl1 libgl1-mesa-dri" in why
     ok, why = probe_rendering()
     assert not ok and text in why and "libegl1" in why
@@ -71,12 +72,12 @@ def test_a_hanging_driver_is_given_up(monkeypatch):
         raise subprocess.TimeoutExpired(command, timeout)
 
     monkeypatch.setattr(module.subprocess, "run", hang)
-    assert "did not finish" in render_overview([camera(0)], [], *cloud())[1]
+    assert "did not finish" in render_overview([camera(0)], [], *cloud(), UP)[1]
 
 
 def test_nothing_to_draw_is_a_note():
     for train, points in (([camera(0)], np.zeros((0, 3))), ([], np.zeros((5, 3)))):
-        data, why = render_overview(train, [], points, np.zeros_like(points))
+        data, why = render_overview(train, [], points, np.zeros_like(points), UP)
         assert data is None and "no points or no training cameras" in why
 
 

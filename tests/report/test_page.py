@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from warpgs.report.curve import curve
-from warpgs.report.images import png
+from warpgs.report.images import png, webp
 from warpgs.report.page import SamplingReport, ViewImages, write_page
+from warpgs.runtime.terminal import Detail
 
 VOID = {"meta", "img", "input", "br", "hr", "link"}
 
@@ -61,7 +62,7 @@ def write(path, **changes):
         "table": [["view", "PSNR [dB]"], ["images/0.png", "20.25"], ["images/1.png", "21.25"]],
         "views": views, "curves": [curve("Training loss", [1, 2, 3], [0.3, 0.2, 0.1])],
         "sampling": SamplingReport("Two sentences.", [("first", image(0.31)), ("later", image(0.32))], [["added"], ["12"]]),
-        "overview": image(0.7), "protocol": {"ground truth": "images_8 as stored", "LPIPS": "not measured"},
+        "overview": webp(np.full((6, 8, 3), 0.7)), "protocol": {"ground truth": "images_8 as stored", "LPIPS": "not measured"},
         "details": {"config": {"steps": 2000}, "versions": {"torch": "2"}},
     }  # fmt: skip
     values |= changes
@@ -76,7 +77,7 @@ def test_nothing_is_loaded_from_anywhere(tmp_path):
     assert not page.all("link") and not re.search(r"@import|url\(", text)
     for _, attrs in page.tags:
         assert not {"href", "srcset", "action"} & set(attrs)
-        assert attrs.get("src", "data:").startswith("data:image/png;base64,") or "src" not in attrs
+        assert re.match("data:image/(png|webp);base64,", attrs.get("src", "data:image/png;base64,"))
 
 
 def test_all_images_are_embedded_byte_for_byte(tmp_path):
@@ -136,14 +137,29 @@ def test_parts_that_are_not_there_leave_no_empty_heading(tmp_path):
     _, _, page = write(
         tmp_path / "report.html", notes=[], table=[["view"]], views=[], curves=[], sampling=None, overview=None, protocol={}
     )
-    assert page.text("h2") == ["Settings"] and not page.all("img")
+    assert page.text("h2") == ["Details"] and not page.all("img") and not page.all("ul")
+
+
+def test_what_nobody_acts_on_stands_in_the_last_section(tmp_path):
+    """Notes for the user come first, details last, and nothing twice; the overview is the first image."""
+    notes = ["every 8th view held out", Detail("memory: 14 MiB planned")]
+    _, text, page = write(tmp_path / "report.html", notes=notes)
+    assert page.text("li") == notes
+    assert text.index("Choices made for you") < text.index(notes[0]) < text.index("<h2>Details") < text.index(notes[1])
+    assert "the Gaussians" in page.all("img")[0]["alt"] and page.all("img")[0]["src"].startswith("data:image/webp")
+
+
+@pytest.mark.parametrize("held_out, words", [(True, "not seen"), (False, "trained on")])
+def test_views_are_called_what_they_are(tmp_path, held_out, words):
+    _, _, page = write(tmp_path / "report.html", held_out=held_out)
+    assert any(words in t for t in page.text("h2"))
 
 
 def test_sampling_shows_the_first_image_and_the_others_on_request(tmp_path):
     """The first event is open under its text, later ones in a fold with their caption."""
     _, text, page = write(tmp_path / "report.html")
     assert "Why Gaussians were placed" in page.text("h2") and "Two sentences." in page.text("p")
-    section = text[text.index("Why Gaussians") : text.index("Cameras and Gaussians")]
+    section = text[text.index("Why Gaussians") : text.index("<h2>Details")]
     assert section.count("<details>") == 1 and section.index('alt="first"') < section.index("<details>")
     assert section.index("<summary>later</summary>") < section.index('alt="later"')
 

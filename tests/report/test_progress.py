@@ -1,7 +1,33 @@
+import io
+
 import pytest
 
 from warpgs.report import progress as module
-from warpgs.report.progress import Progress, Stages, duration
+from warpgs.report.progress import Progress, Stages, duration, waiting
+from warpgs.runtime.terminal import counted, say
+
+
+class Terminal(io.StringIO):
+    """Stdout that is a terminal."""
+
+    encoding = "utf-8"
+
+    def isatty(self) -> bool:
+        """Return True."""
+        return True
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    """Return a function that puts a terminal, whose text can be read, in the place of stdout; no line is left on it."""
+
+    def put() -> Terminal:
+        monkeypatch.setattr("sys.stdout", Terminal())
+        monkeypatch.setenv("TERM", "xterm")
+        return module.sys.stdout
+
+    yield put
+    module._STATUS.clear()
 
 
 @pytest.fixture
@@ -16,7 +42,7 @@ def test_plain_lines_come_about_every_ten_seconds(capsys, clock):
     with Progress(100, live=False) as progress:
         for step in range(1, 101):
             clock[0] += 0.5
-            progress.update(step=step, loss=0.25, psnr=20.5, count=12345)
+            progress.update(step=step, loss=0.25, psnr=20.5, count=12345, seconds=0.5)
     lines = capsys.readouterr().out.splitlines()
     assert 5 <= len(lines) <= 7
     assert all("\x1b" not in line for line in lines)
@@ -26,11 +52,15 @@ def test_plain_lines_come_about_every_ten_seconds(capsys, clock):
 
 
 def test_time_left_is_that_of_the_steps_to_come(capsys, clock):
+    """Steps that took longer than others will, as those that compile do, say nothing of it: there is no time left yet."""
     with Progress(1000, done=400, live=False) as progress:
         clock[0] += 20
-        progress.update(step=410, loss=0.1, psnr=30.0, count=5)
-        line = capsys.readouterr().out
-    assert "step 410 of 1,000" in line and "per step 2000 ms" in line and "left 19 min 40 s" in line
+        progress.update(step=401, loss=0.1, psnr=30.0, count=5)
+        clock[0] += 20
+        progress.update(step=410, loss=0.1, psnr=30.0, count=5, seconds=2.0)
+        first, second = capsys.readouterr().out.splitlines()
+    assert "step 401 of 1,000" in first and first.endswith("per step -  left -")
+    assert "step 410 of 1,000" in second and "per step 2000 ms" in second and "left 19 min 40 s" in second
 
 
 def test_nothing_done_prints_nothing(capsys):
@@ -51,7 +81,7 @@ def test_pytest_has_no_terminal_so_lines_are_plain():
 def test_live_view_shows_all_values_and_ends_cleanly(capsys):
     with Progress(10, live=True) as progress:
         for step in range(1, 11):
-            progress.update(step=step, loss=0.125, psnr=33.0, count=4321)
+            progress.update(step=step, loss=0.125, psnr=33.0, count=4321, seconds=0.1)
     out = capsys.readouterr().out
     for word in ("10 of 10", "0.1250", "33.00 dB", "4,321", "left"):
         assert word in out
@@ -75,3 +105,46 @@ def test_stages_of_the_set_up_are_shown_at_once_and_then_every_few_seconds(clock
     stages("compiling kernels")
     stages("compiling kernels")
     assert lines == [*(f"finding depth: view {v} of 20" for v in (0, 5, 10, 15)), "compiling kernels"]
+
+
+def test_in_a_terminal_a_stage_has_one_line_with_a_bar(terminal):
+    """Stage and count stand on it; what is said meanwhile stands above; at the end it is gone, and the cursor is there."""
+    out = terminal()
+    with Stages() as stages:
+        for view in counted(range(3), stages, "scoring", "views"):
+            assert view in range(3)
+        say("a note")
+        assert Stages().live  # what stands before stdout now is still a terminal
+        stages("reading fern: image 12")
+    text = out.getvalue()
+    assert "scoring" in text and "0 of 3 views" in text and "a note\n" in text and "image 12" in text
+    assert text.count("scoring\n") == 0 and text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")
+    assert module._STATUS.display is None
+
+
+def test_while_steps_are_taken_their_panel_shows_the_stages(terminal):
+    """One display has the terminal: what is told beside the steps, such as a wait for kernels, stands below the panel."""
+    out, stages = terminal(), Stages()
+    stages("setting up")
+    with Progress(10, live=True) as progress:
+        assert module._STATUS.display is None
+        stages("compiling kernels")
+        assert module._STATUS.display is None and progress.doing == "compiling kernels"
+        progress.display.refresh()
+        assert "compiling kernels" in out.getvalue()
+        progress.update(step=1, loss=0.1, psnr=20.0, count=5)
+        assert progress.doing == ""
+    stages("scoring")
+    assert module._STATUS.display is not None
+
+
+def test_a_wait_is_told_to_terminals_alone(monkeypatch, terminal):
+    """Not to files and pipes, nor to a terminal that cannot go back."""
+    out = terminal()
+    waiting()("starting")
+    assert "starting" in out.getvalue()
+    for change in (lambda: monkeypatch.setenv("TERM", "dumb"), lambda: monkeypatch.setattr("sys.stdout", io.StringIO())):
+        module._STATUS.clear()
+        change()
+        waiting()("starting again")
+        assert module._STATUS.display is None and "starting again" not in out.getvalue()

@@ -70,14 +70,15 @@ def test_a_loaded_module_takes_no_lock(cache, monkeypatch):
 
 def test_a_listener_hears_of_modules_that_the_cache_lacks(cache, monkeypatch):
     """Once: not of one that the cache holds by now, nor after the block."""
-    cpu, heard = wp.get_device("cpu"), []
+    cpu, heard, took = wp.get_device("cpu"), [], []
     for _ in range(2):
         monkeypatch.setattr(load_module, "_LOADED", set())
         mark.module.unload()
-        with load_module.told_of_compiling(heard.append):
+        with load_module.told_of_compiling(heard.append) as seconds:
             load_module.load_module(mark.module, cpu, 1)
+        took.append(len(seconds))
         assert heard == [mark.module.get_module_identifier(1)]
-    assert not load_module._LISTENERS
+    assert not load_module._LISTENERS and took == [1, 0]
 
 
 def test_a_file_system_without_locks_is_no_obstacle(tmp_path, monkeypatch):

@@ -10,9 +10,10 @@ from tests.gaussians import cloud
 from tests.scenes import ring, three_gaussians
 from warpgs.coordinates import convert_camera, convert_gaussians
 from warpgs.geometry import rotation_matrices
+from warpgs.pipeline.runs.rig import up_of
 from warpgs.scene import Normalization
 from warpgs.viewer.packing import LARGEST_HALF, packed
-from warpgs.viewer.poses import camera_at, camera_before, distance_ahead, fov_y, stands_at, up_of, wxyz_of
+from warpgs.viewer.poses import camera_at, camera_before, distance_ahead, fov_y, stands_at, wxyz_of
 from warpgs.viewer.saved import CropBox, keyframe
 
 
@@ -55,7 +56,8 @@ def test_poses_there_and_back():
         np.testing.assert_allclose(back.viewmat, c.viewmat, atol=1e-12)
         assert abs(back.K[1, 1] - c.K[1, 1]) < 1e-9 and stands_at(back, c, 1e-9)
     first, second = ring(2)
-    assert not stands_at(first, second, 1.0) and up_of(ring(5)) @ [0, -1, 0] > 0.99
+    assert not stands_at(first, second, 1.0) and up_of(ring(5), np.zeros((1, 3))) @ [0, -1, 0] > 0.99
+    assert up_of([camera_before(three_gaussians())], three_gaussians().means.numpy()) @ [0, -1, 0] > 0.99
     assert abs(distance_ahead(first, three_gaussians()) - 2.2) < 0.4
     assert distance_ahead(camera_before(three_gaussians()), three_gaussians()) > 0.3
 

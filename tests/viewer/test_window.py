@@ -17,7 +17,7 @@ from warpgs.errors import DataError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.synthetic.demo import split_spec, write_demo
 from warpgs.viewer import watch
-from warpgs.viewer.content import content_of_ply, content_of_run, views_of
+from warpgs.viewer.content import content_of_file, content_of_run, views_of
 from warpgs.viewer.maps import COVERAGE, DEPTH, ERROR, GAUSSIANS, MAPS, RENDER, placed
 from warpgs.viewer.panel import COARSE, FINE
 from warpgs.viewer.saved import CROP, PATH, keyframe
@@ -159,10 +159,13 @@ def test_a_browser_gets_the_image_that_it_asks_for(window):
 
 def test_a_ply_and_what_is_neither(folder, tmp_path):
     """A PLY file is shown without cameras, about its middle; saved files lie beside it; others are one sentence."""
-    content = content_of_ply(folder / "run" / "point_cloud.ply")
+    content = content_of_file(folder / "run" / "point_cloud.ply")
     assert not content.model.scene_cameras and content.saved("crop.json") == folder / "run" / "point_cloud-crop.json"
     middle = content.model.gaussians().means.double().quantile(0.5, dim=0)
     assert middle.abs().max() < 1
+    assert main(["convert", str(folder / "run" / "point_cloud.ply"), str(tmp_path / "a.sog")]) == 0
+    content = content_of_file(tmp_path / "a.sog")
+    assert len(content.model.gaussians()) > 50 and content.saved("path.json") == tmp_path / "a-path.json"
     (tmp_path / "a.txt").write_text("x")
     for wrong in (tmp_path / "a.txt", tmp_path / "none", tmp_path):
         with pytest.raises(DataError):

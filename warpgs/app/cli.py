@@ -8,8 +8,10 @@ from warpgs import __version__
 from warpgs.app.failures import report_defect, report_no_memory
 from warpgs.app.fit_help import help_lines, wants_help
 from warpgs.errors import UsageError, WarpgsError
+from warpgs.report.progress import waiting
 from warpgs.runtime.device_memory import is_out_of_memory
 from warpgs.runtime.imports import fast_imports
+from warpgs.runtime.ranks import last_words
 from warpgs.runtime.stop_signals import ignored_signals, interrupting_signals
 from warpgs.runtime.terminal import accept_all_letters, say
 
@@ -83,18 +85,19 @@ def _run(arguments: list[str]) -> int:
             for line in help_lines(COMMANDS[name]):
                 say(line)
             return 0
-        with fast_imports():
-            command = importlib.import_module(f"warpgs.app.commands.{name.replace('-', '_')}")
-        code: int = command.run(arguments[1:], COMMANDS[name])
+        with waiting() as wait:
+            if not {"-h", "--help"} & {*arguments}:  # until the command tells of what it does
+                wait(f"starting {name}")
+            with fast_imports():
+                command = importlib.import_module(f"warpgs.app.commands.{name.replace('-', '_')}")
+            code: int = command.run(arguments[1:], COMMANDS[name])
         return code
     except WarpgsError as e:
-        say(f"warpgs: {e}", error=True)
-        return e.exit_code
+        return last_words(f"warpgs: {e}", e.exit_code)
     except KeyboardInterrupt:
         with ignored_signals():
             hint = "; --resume continues from the last checkpoint" if name == "fit" else ""
-            say(f"warpgs: interrupted{hint}", error=True)
-        return 130
+            return last_words(f"warpgs: interrupted{hint}", 130)
     except BrokenPipeError:  # the reader, `head` for one, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0

@@ -22,7 +22,7 @@ from warpgs.runtime.device_memory import ASSUMED_BYTES, machine_memory
 from warpgs.runtime.kernel_cache import prepare_kernel_cache
 from warpgs.runtime.native_output import hidden_stderr
 from warpgs.runtime.processor import processor_name, usable_cores
-from warpgs.runtime.terminal import printable
+from warpgs.runtime.terminal import counted, printable
 
 OK, MISSING, NOTE = "ok", "missing", "note"
 PYTHON = ((3, 11), (3, 14))  # from, and below
@@ -311,15 +311,19 @@ def _findings(check: Callable[[], Iterable[Finding]]) -> list[Finding]:
         return [Finding(topic, NOTE, f"the check itself failed: {_reason(e)}", "report this as a bug")]
 
 
-def diagnose() -> list[Finding]:
+def diagnose(tell: Callable[[str], object] = lambda line: None) -> list[Finding]:
     """Look at everything a fit and its report need.
+
+    Args:
+        tell: Takes a line on each check.
 
     Returns:
         The findings in the order of the report. Nothing is raised: a check that fails is itself a finding.
     """
     with ThreadPoolExecutor(len(APART)) as pool:
         apart = {check: pool.submit(_findings, check) for check in CHECKS if check in APART}
-        here = {check: _findings(check) for check in CHECKS if check not in APART}
+        checks = [check for check in CHECKS if check not in APART]
+        here = {check: _findings(check) for check in counted(checks, tell, "looking at this machine", "parts")}
         return [f for check in CHECKS for f in (here[check] if check in here else apart[check].result())]
 
 

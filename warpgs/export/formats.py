@@ -77,7 +77,10 @@ def format_of(path: str | os.PathLike[str]) -> Format:
     for end, kind in FORMATS.items():
         if name.endswith(end):
             return kind
-    raise UsageError(f"{path}: format {Path(path).suffix or '(none)'} is not supported; use one of {', '.join(FORMATS)}")
+    cameras = "; cameras are named cameras.json, transforms.json or sparse" if name.endswith(".json") else ""
+    raise UsageError(
+        f"{path}: format {Path(path).suffix or '(none)'} is not supported; use one of {', '.join(FORMATS)}{cameras}"
+    )
 
 
 def write_gaussians(

@@ -38,8 +38,9 @@ COLUMNS = 64
 ROUNDS = 12
 """Rounds of Lloyd's algorithm for a codebook."""
 MAX_META_BYTES = 2**20
-MAX_PER_BYTE = 16
-"""Most Gaussians per byte of a file, and most pixels per Gaussian: beyond either, images are bombs."""
+MAX_PER_BYTE, MAX_PIXELS, SMALL = 1, 4, 4096
+"""Most Gaussians per byte of a file, most pixels per Gaussian, and what any file may have of both: real ones have one in ten
+bytes, and one pixel each. Beyond, images are bombs."""
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
@@ -154,7 +155,7 @@ def decode(path: Path, data: bytes) -> Arrays:
             raise malformed(path, "its meta.json is not of version 2")
         if meta.get("model", "default") != "default":
             raise malformed(path, f"it is for the model {str(meta['model'])[:40]!r}, which this program does not render")
-        if type(n) is not int or not 0 < n <= MAX_PER_BYTE * len(data):
+        if type(n) is not int or not 0 < n <= MAX_PER_BYTE * len(data) + SMALL:
             raise malformed(path, f"{str(n)[:20]} Gaussians in {len(data)} bytes")
 
         def pixels(part: str, i: int) -> np.ndarray:
@@ -205,7 +206,7 @@ def _pixels(path: Path, name: str, content: bytes, n: int) -> np.ndarray:
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the bound below is tighter
         try:
             image = Image.open(io.BytesIO(content), formats=["WEBP"])
-            if not n <= image.width * image.height <= MAX_PER_BYTE * n + 4096:
+            if not n <= image.width * image.height <= MAX_PIXELS * n + SMALL:
                 raise malformed(path, f"{name[:40]!r} has {image.width} x {image.height} pixels for {n} values")
             return np.asarray(image.convert("RGBA")).reshape(-1, 4)
         except (OSError, Image.DecompressionBombError, SyntaxError) as e:

@@ -40,8 +40,8 @@ COLOR = 0.15 * 255
 MAX_FRACTIONAL_BITS = 24
 MAX_WINDOW = 2**27
 """Most memory that a zstd stream may ask for [bytes]."""
-MAX_PER_BYTE = 16
-"""Most Gaussians per byte of a file: real ones have one in ten bytes, so that more is a bomb."""
+MAX_RATIO, SMALL = 32, 65536
+"""Most bytes that a byte of a file may unpack to, and bytes that any file may: real ones have 2 or 3, a bomb has 1000."""
 
 
 def fractional_bits(means: np.ndarray) -> int:
@@ -153,11 +153,12 @@ def _checked(path: Path, size: int, header: tuple[int, ...], versions: tuple[int
         raise malformed(path, f"its harmonics are of degree {degree}, and this reads degrees 0 to 3")
     if bits > MAX_FRACTIONAL_BITS:
         raise malformed(path, f"its coordinates have {bits} fractional bits of 24")
-    if n > MAX_PER_BYTE * size:
+    sizes = [9 * n, n, 3 * n, 3 * n, (3 if version == 2 else 4) * n, 3 * (SH_SIZES[degree] - 1) * n]
+    if sum(sizes) > MAX_RATIO * size + SMALL:
         raise malformed(path, f"{n} Gaussians in {size} bytes")
     if flags & 1:
         raise malformed(path, "it was trained with antialiasing (mip-splatting), which this program does not render")
-    return [9 * n, n, 3 * n, 3 * n, (3 if version == 2 else 4) * n, 3 * (SH_SIZES[degree] - 1) * n]
+    return sizes
 
 
 def _streams(path: Path, data: bytes, sizes: list[int], count: int, place: int) -> list[bytes]:

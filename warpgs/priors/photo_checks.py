@@ -162,7 +162,10 @@ def check_photos(views: Sequence[View], progress: Callable[[str], object] = lamb
             if time.monotonic() - began > PROGRESS_INTERVAL:
                 began = time.monotonic()
                 progress(f"comparing photographs: {len(places)} of {count}")
-        found = list(pool.map(lambda pair: _difference(views, places, *pair), pairs))
+        found = []
+        for difference in pool.map(lambda pair: _difference(views, places, *pair), pairs):
+            found.append(difference)
+            progress(f"comparing photographs: {len(found)} of {len(pairs)} pairs")
     differences: list[list[np.ndarray]] = [[] for _ in views]
     for (i, j), difference in zip(pairs, found, strict=True):
         if difference is not None:

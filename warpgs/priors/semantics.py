@@ -6,7 +6,7 @@ Paper, Multi-Modal Importance Assessment: S_semantic = F_seg(I) (omega_boundary 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -16,6 +16,7 @@ from warpgs.errors import DataError
 from warpgs.priors.opencv import single_threaded_opencv, without_ipp
 from warpgs.priors.preprocess import IMAGENET, Preprocessing, resize
 from warpgs.priors.session import Network
+from warpgs.runtime.terminal import counted
 
 CLASSES = 21
 """Number of PASCAL VOC classes: background first, then 20 kinds of things."""
@@ -156,10 +157,14 @@ def classical_semantics(image: np.ndarray) -> SemanticMaps:
     return SemanticMaps(np.maximum(foreground, 1 - foreground), boundary, foreground)
 
 
-def classical_maps(images: Sequence[np.ndarray]) -> list[SemanticMaps]:
-    """Return `classical_semantics` of each image; a thread works on one, so results do not depend on the number of threads."""
+def classical_maps(images: Sequence[np.ndarray], tell: Callable[[str], object] = lambda line: None) -> list[SemanticMaps]:
+    """Return `classical_semantics` of each image; ``tell`` takes a line on each.
+
+    A thread works on one, so results do not depend on the number of threads.
+    """
     with single_threaded_opencv(), ThreadPoolExecutor(os.cpu_count() or 1, initializer=without_ipp) as pool:
-        return list(pool.map(classical_semantics, images))
+        made = [pool.submit(classical_semantics, image) for image in images]
+        return [m.result() for m in counted(made, tell, "finding what stands out", "views")]
 
 
 def knows_foreground(maps: SemanticMaps) -> bool:

@@ -102,7 +102,7 @@ def _at_size(found: ViewDepth, small: View, view: View, notes: Sequence[str]) ->
 
 def _unswept(view: View, note: str) -> ViewDepth:
     shape = view.image.shape[:2]
-    return ViewDepth(np.zeros(shape, np.float32), np.zeros(shape, bool), np.full(shape, np.inf, np.float32), (note,))
+    return ViewDepth(np.zeros(shape, np.float32), np.zeros(shape, bool), np.full(shape, np.inf, np.float32), (note,), False)
 
 
 def sweep_depths(

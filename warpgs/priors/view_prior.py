@@ -16,6 +16,7 @@ from warpgs.priors.depth import complete_disparity, network_disparity
 from warpgs.priors.preprocess import check_value, describe
 from warpgs.priors.semantics import SemanticMaps, boundary_weight, classical_maps, knows_foreground, network_semantics
 from warpgs.priors.session import PROVIDERS, open_network
+from warpgs.runtime.terminal import Detail, counted
 from warpgs.scene import Prior, View
 
 if TYPE_CHECKING:
@@ -113,9 +114,8 @@ def _depth_views(views: Sequence[View], depths: Sequence[ViewDepth] | None, note
         notes.append("depth: none, since there is neither a network nor a depth from other views; geometry does not count")
         return lambda i: (np.zeros(views[i].image.shape[:2], np.float32), "none")
     fractions = [float(d.valid.mean()) for d in depths]
-    notes.append(
-        f"depth: from the other views, {min(fractions):.1%} to {max(fractions):.1%} of a view's pixels, then filled in"
-    )
+    span = f"{min(fractions):.1%} to {max(fractions):.1%}"
+    notes.append(Detail(f"depth: from the other views, {span} of a view's pixels, then filled in"))
     poor = [v.name for v, d in zip(views, depths) if d.valid.sum() < MIN_CONSISTENT]
     if poor:
         notes.append(f"no depth is consistent in {', '.join(poor)}: geometry does not count there; --depth-model would help")
@@ -155,12 +155,11 @@ def _segmentation_network(views: Sequence[View], config: PriorConfig, threads: i
     return maps
 
 
-def _classical(views: Sequence[View], notes: list[str]) -> SemanticsSource:
-    notes.append(
-        "semantics: no network, so saliency stands for foreground and edges for boundaries; --segmentation-model takes one"
-    )
+def _classical(views: Sequence[View], notes: list[str], tell: Callable[[str], object]) -> SemanticsSource:
+    words = "semantics: no network, so saliency stands for foreground and edges for boundaries"
+    notes.append(Detail(f"{words}; --segmentation-model takes one"))
 
-    found = classical_maps([v.image for v in views])
+    found = classical_maps([v.image for v in views], tell)
     return lambda i: (found[i], "saliency and edges")
 
 
@@ -208,6 +207,7 @@ def view_priors(
     regions: Sequence[np.ndarray | None] | None = None,
     threads: int = 0,
     cache: Path | None = None,
+    tell: Callable[[str], object] = lambda line: None,
 ) -> tuple[list[Prior], list[str]]:
     """Return a prior for the pixels of each view, before anything is fitted.
 
@@ -219,6 +219,7 @@ def view_priors(
         regions: For each view the pixels that show its object, bool [H, W], or None; it replaces an unknown foreground.
         threads: CPU threads of a network; 0 for as many as the process may use.
         cache: Folder that keeps the maps of networks; None, or ``config.cache`` False, keeps none.
+        tell: Takes a line on each view.
 
     Returns:
         A prior per view, and notes on what was chosen, assumed or missing.
@@ -235,17 +236,18 @@ def view_priors(
     if config.segmentation_model is not None:
         maps = _segmentation_network(views, config, threads, store, notes)
     else:
-        maps = _classical(views, notes)
-    found = [maps(i) for i in range(len(views))]
+        maps = _classical(views, notes, tell)
+    found = [maps(i) for i in counted(range(len(views)), tell, "finding what stands out", "views")]
     found = _fall_back(found, views, regions or [None] * len(views), config.segmentation_model is None, notes)
     if disparity is None:
         disparity = _depth_views(views, depths(), notes)
     priors = []
-    for i, (m, source) in enumerate(found):
-        d, where = disparity(i)
+    for i in counted(range(len(views)), tell, "finding disparity", "views"):
+        (m, source), (d, where) = found[i], disparity(i)
         priors.append(Prior(d, m.confidence, m.boundary, m.foreground, where, source))
     if store is not None:
         notes += store.notes
         if store.found:
-            notes.append(f"priors: {store.found} of {store.found + store.made} maps were there already, in {store.folder}")
+            words = f"priors: {store.found} of {store.found + store.made} maps were there already, in {store.folder}"
+            notes.append(Detail(words))
     return priors, notes

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from warpgs.report.progress import PLAIN_INTERVAL, duration
+from warpgs.report.progress import PLAIN_INTERVAL, duration, is_live, waiting
 from warpgs.runtime.terminal import printable, say
 
 if TYPE_CHECKING:
@@ -53,7 +52,7 @@ class FarmTable:
 
     def __init__(self, *, live: bool | None = None):
         """Prepare; ``live`` None shows the table where stdout is a terminal."""
-        self.live = sys.stdout.isatty() if live is None else live
+        self.live = is_live() if live is None else live
         self.began = self.printed = time.monotonic()
         self.rows: list[JobRow] = []
         self.left: float | None = None
@@ -65,6 +64,7 @@ class FarmTable:
         if self.live:
             from rich.live import Live
 
+            waiting().clear()
             self.display = Live(self.panel(), refresh_per_second=4)
             self.display.__enter__()
         return self

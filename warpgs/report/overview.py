@@ -108,9 +108,9 @@ def framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray, aspect: fl
 
 
 def render_overview(
-    train: list[Camera], test: list[Camera], points: np.ndarray, colors: np.ndarray
+    train: list[Camera], test: list[Camera], points: np.ndarray, colors: np.ndarray, up: np.ndarray
 ) -> tuple[bytes | None, str]:
-    """Render training and held-out cameras among points [N, 3] [u] with colours in [0, 1] [N, 3].
+    """Render training and held-out cameras among points [N, 3] [u] with colours in [0, 1] [N, 3], ``up`` [3] upwards.
 
     Returns:
         PNG bytes and an empty string; or None and the reason with a remedy, where this machine cannot render.
@@ -122,7 +122,6 @@ def render_overview(
     inside = ((points >= low - (high - low)) & (points <= high + (high - low))).all(1)
     middle, spread = np.median(points, axis=0), float(np.linalg.norm(high - low)) + 1e-9
     forward = np.mean([c.viewmat[2, :3] for c in train], axis=0)
-    up = -np.mean([c.viewmat[1, :3] for c in train], axis=0)
     back = centers.mean(0) - middle
     reach = max(float(np.linalg.norm(back)), 0.5 * spread)
     side = np.cross(forward, up)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from warpgs.files import write_text
+from warpgs.runtime.terminal import Detail
 
 STYLE = """
 :root{--ink:#1b1d21;--soft:#666c76;--line:#dfe2e7;--paper:#fbfbf9;--card:#fff;--accent:#0b6e6e}
@@ -30,7 +31,7 @@ th,td{padding:7px 14px 7px 0;text-align:right;border-bottom:1px solid var(--line
 th{font-weight:500;color:var(--soft);font-size:13px}th:first-child,td:first-child{text-align:left;overflow-wrap:anywhere}
 .view{margin:0 0 40px}.row{display:grid;grid-template-columns:2fr 1fr;gap:10px;align-items:start}
 .wide{margin:14px calc(50% - min(50vw - 24px,800px))}.wide figcaption{padding-left:16px}
-.stack{display:grid;gap:10px}img{display:block;width:100%;height:auto;border-radius:6px}
+.first{margin:24px 0 0}.stack{display:grid;gap:10px}img{display:block;width:100%;height:auto;border-radius:6px}
 figure{margin:0}figcaption{font-size:13px;padding:5px 0 0}
 .slider{position:relative;border-radius:6px;overflow:hidden;touch-action:none;cursor:ew-resize;--cut:50%}
 .slider:focus-within{outline:2px solid var(--accent);outline-offset:2px}
@@ -49,6 +50,7 @@ pre{background:var(--card);border:1px solid var(--line);border-radius:8px;paddin
 font-size:13px;line-height:1.45}
 @media(max-width:700px){.row{grid-template-columns:1fr}.stack{grid-template-columns:1fr 1fr}}
 """
+OVERVIEW = "the Gaussians, training cameras teal, held-out cameras orange"
 SCRIPT = (
     "document.querySelectorAll('.slider input').forEach(i=>i.addEventListener('input',"
     "()=>i.parentElement.style.setProperty('--cut',i.value+'%')))"
@@ -57,7 +59,7 @@ SCRIPT = (
 
 @dataclass(frozen=True)
 class ViewImages:
-    """Images of one held-out view, as PNG bytes."""
+    """Images of one view, as bytes of WebP or PNG files."""
 
     name: str
     caption: str
@@ -74,7 +76,7 @@ class SamplingReport:
     words: str
     """Sentences that explain the images."""
     images: list[tuple[str, bytes]]
-    """Caption and PNG of each event that has an image; the first is open, the others open on request."""
+    """Caption and image file of each event that has an image; the first is open, the others open on request."""
     table: list[list[str]]
     """Header row, then rows."""
 
@@ -88,14 +90,14 @@ class CoverageReport:
     legend: str
     """Meaning of the patterns in the images."""
     images: list[tuple[str, bytes]]
-    """Name and PNG of each view."""
+    """Name and image file of each view."""
     table: list[list[str]]
     """Header row, then rows."""
 
 
 def _embed(data: bytes, alternative: str, style: str = "") -> str:
-    source = base64.b64encode(data).decode()
-    return f'<img alt="{html.escape(alternative)}"{style} src="data:image/png;base64,{source}">'
+    source, kind = base64.b64encode(data).decode(), "webp" if data[:4] == b"RIFF" else "png"
+    return f'<img alt="{html.escape(alternative)}"{style} src="data:image/{kind};base64,{source}">'
 
 
 def _figure(data: bytes, caption: str) -> str:
@@ -137,6 +139,10 @@ def _table(rows: list[list[str]]) -> str:
     return f"<table><tr>{head}</tr>{''.join(f'<tr>{r}</tr>' for r in body)}</table>"
 
 
+def _list(lines: list[str]) -> str:
+    return f"<ul>{''.join(f'<li>{html.escape(n)}</li>' for n in lines)}</ul>" if lines else ""
+
+
 def _document(title: str, body: str) -> str:
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,'
@@ -170,6 +176,7 @@ def write_page(
     protocol: dict[str, str],
     details: dict,
     coverage: CoverageReport | None = None,
+    held_out: bool = True,
 ) -> None:
     """Write the report page: one file that refers to nothing outside it.
 
@@ -178,15 +185,16 @@ def write_page(
         title: Headline.
         subtitle: A line under it.
         figures: Label and value of each key figure.
-        notes: Choices made for the user.
+        notes: Choices made for the user; a `Detail` stands in the last section.
         table: Header row, then a row per held-out view.
-        views: Images of held-out views.
+        views: Images of views.
         curves: SVG charts.
         sampling: The fit's sampling events, or None where it had none.
         overview: Image of cameras and points, or None.
         protocol: Settings in which two scores must agree to be compared, and the definition of each figure, by name.
         details: Configuration, versions and data, shown as JSON on request; of paths the last name alone.
         coverage: Scores of held-out views by what training views saw, or None.
+        held_out: Whether the views are held out; else the fit was trained on them.
 
     Raises:
         ResourceError: The file cannot be written.
@@ -194,12 +202,16 @@ def write_page(
     cells = "".join(f"<div><b>{html.escape(v)}</b><span>{html.escape(k)}</span></div>" for k, v in figures)
     sections = [
         f'<h1>{html.escape(title)}</h1><p class="sub">{html.escape(subtitle)}</p>',
-        f'<div class="figures">{cells}</div>',
     ]
-    if notes:
-        sections.append(f"<h2>Choices made for you</h2><ul>{''.join(f'<li>{html.escape(n)}</li>' for n in notes)}</ul>")
+    if overview:
+        sections.append(f'<div class="first">{_figure(overview, OVERVIEW)}</div>')
+    sections.append(f'<div class="figures">{cells}</div>')
+    choices = [n for n in notes if not isinstance(n, Detail)]
+    if choices:
+        sections.append(f"<h2>Choices made for you</h2>{_list(choices)}")
     if views:
-        sections.append("<h2>Views the fit has not seen</h2>" + "".join(map(_view, views)))
+        heading = "Views the fit has not seen" if held_out else "Views the fit was trained on"
+        sections.append(f"<h2>{heading}</h2>{''.join(map(_view, views))}")
     if len(table) > 1:
         sections.append("<h2>Scores</h2>" + _table(table))
     if coverage:
@@ -211,10 +223,9 @@ def write_page(
         sections.append(f'<h2>The fit</h2><div class="curves">{"".join(curves)}</div>')
     if sampling:
         sections.append(_sampling(sampling))
-    if overview:
-        sections.append("<h2>Cameras and Gaussians</h2>" + _figure(overview, "training cameras teal, held-out cameras orange"))
     settings = html.escape(json.dumps(_without_folders(details), indent=1))
     sections.append(
-        f"<h2>Settings</h2><details><summary>configuration, versions, data</summary><pre>{settings}</pre></details>"
+        f"<h2>Details</h2>{_list([n for n in notes if isinstance(n, Detail)])}"
+        f"<details><summary>configuration, versions, data</summary><pre>{settings}</pre></details>"
     )
     write_text(path, _document(title, "".join(sections)))

@@ -1,19 +1,24 @@
-"""Progress display of a fit: lines on its set-up; then a live panel in a terminal, plain lines elsewhere."""
+"""Progress for people: what is being done now, with a bar; in a terminal in place, elsewhere as plain lines."""
 
 from __future__ import annotations
 
+import os
+import re
 import sys
+import threading
 import time
 from collections.abc import Callable
 
-from warpgs.runtime.terminal import say
+from warpgs.runtime.terminal import printable, say
 
 PLAIN_INTERVAL = 10.0
-"""Seconds between two plain lines."""
+"""Seconds between two plain lines on the steps of a fit."""
 STAGE_INTERVAL = 5.0
-"""Seconds between two lines on one stage of the set-up."""
+"""Seconds between two plain lines on one stage."""
 SMOOTHING = 0.05
 """Weight of the newest value in the running means shown."""
+COUNTED = re.compile(r"(?P<done>[\d,]+) of (?P<total>[\d,]+)")
+"""Part of a line that says how far a stage is."""
 
 
 def duration(seconds: float) -> str:
@@ -26,78 +31,170 @@ def duration(seconds: float) -> str:
     return f"{seconds // 3600} h {seconds % 3600 // 60:02d} min"
 
 
-class Stages:
-    """Lines on what is done before the first step, such as ``finding depth: view 7 of 24``.
+def is_live() -> bool:
+    """Return whether stdout is a terminal in which a line can be written anew."""
+    stdout = getattr(sys.stdout, "rich_proxied_file", sys.stdout)  # while a line is shown, rich stands before it
+    return stdout.isatty() and os.environ.get("TERM") != "dumb"
 
-    What stands before the colon names a stage. The first line of a stage is shown at once, and then one every few seconds.
+
+class _StatusLine:
+    """The line at the bottom of the terminal: spinner, stage, bar, how far, and for how long. One in a process."""
+
+    def __init__(self) -> None:
+        """Begin without a line."""
+        self.lock, self.display, self.task, self.stage = threading.RLock(), None, None, ""
+
+    def show(self, line: str) -> None:
+        """Show a line, such as ``finding depth: view 7 of 24``; what stands before the colon names the stage."""
+        stage, _, detail = printable(line).rpartition(": ")
+        stage, detail = (stage, detail) if stage else (detail, "")
+        counted = COUNTED.search(detail)
+        done, total = (float(n.replace(",", "")) for n in counted.groups()) if counted else (0.0, None)
+        with self.lock:
+            if self.display is None:
+                self.display = self._started()
+            if self.task is None or stage != self.stage:
+                if self.task is not None:
+                    self.display.remove_task(self.task)
+                self.task, self.stage = self.display.add_task(stage, total=total, completed=done, detail=detail), stage
+                self.display.refresh()  # before work that may hold up the thread which draws
+            else:
+                self.display.update(self.task, total=total, completed=done, detail=detail)
+
+    def clear(self) -> None:
+        """Take the line away."""
+        with self.lock:
+            display, self.display, self.task, self.stage = self.display, None, None, ""
+            if display is not None:
+                display.stop()
+
+    def _started(self):
+        """Return rich's display of one task, which draws itself eight times a second until it is stopped."""
+        from rich.console import Console
+        from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import Progress as Display
+
+        console = Console()
+        columns = (
+            SpinnerColumn("dots" if (console.encoding or "").startswith("utf") else "line"),
+            TextColumn("{task.description}", markup=False), BarColumn(24), TextColumn("{task.fields[detail]}", markup=False),
+            TimeElapsedColumn(),
+        )  # fmt: skip
+        own = sys.stderr.isatty()  # else errors go where they were sent, and do not meet the line
+        display = Display(*columns, console=console, transient=True, refresh_per_second=8, redirect_stderr=own)
+        display.start()
+        return display
+
+
+_STATUS = _StatusLine()
+_PANELS: list[Progress] = []
+"""The panel of a fit's steps that has the terminal now, if any."""
+
+
+class Stages:
+    """Lines on what is being done, such as ``finding depth: view 7 of 24``.
+
+    What stands before the last colon names a stage; where numbers follow, ``7 of 24``, there is a bar. In a terminal one line
+    is written in place, with a bar and the time that the stage has taken, until the end of a ``with`` block or `clear`.
+    Elsewhere the first line of a stage is shown at once, and then one every few seconds.
     """
 
-    def __init__(self, show: Callable[[str], object] = say):
-        """Show lines by ``show``."""
+    def __init__(self, show: Callable[[str], object] = say, *, live: bool | None = None):
+        """Show plain lines by ``show``; ``live`` None writes in place where ``show`` is left out and stdout is a terminal."""
         self.show, self.printed = show, {}
+        self.live = (show is say and is_live()) if live is None else live
+
+    def __enter__(self) -> Stages:
+        """Return this."""
+        return self
+
+    def __exit__(self, *error) -> None:
+        """Take the line away."""
+        self.clear()
 
     def __call__(self, line: str) -> None:
-        """Show a line, unless its stage had one a moment ago."""
+        """Show a line; a plain one only unless its stage had one a moment ago."""
+        if self.live and _PANELS:
+            _PANELS[-1].doing = line
+        elif self.live:
+            _STATUS.show(line)
+        else:
+            self._print(line)
+
+    def _print(self, line: str) -> None:
         stage, now = line.rpartition(":")[0] or line, time.perf_counter()
         if now - self.printed.get(stage, -STAGE_INTERVAL) >= STAGE_INTERVAL:
             self.printed[stage] = now
             self.show(line)
 
+    def clear(self) -> None:
+        """Take the line away, for as long as nothing more is told."""
+        if self.live:
+            _STATUS.clear()
+
+
+def waiting() -> Stages:
+    """Return stages that are shown in a terminal and nowhere else, for waits that no log needs to tell of."""
+    return Stages(lambda line: None, live=is_live())
+
 
 class Progress:
-    """Context manager that shows step, loss, PSNR, number of Gaussians, time per step and time left."""
+    """Context manager that shows step, loss, PSNR, number of Gaussians, time per step and time left.
+
+    Times are those of steps that compiled nothing: before one was taken, none is shown.
+    """
 
     def __init__(self, total: int, done: int = 0, *, live: bool | None = None):
         """Prepare for ``total`` steps of which ``done`` are done; ``live`` None shows the panel where stdout is a terminal."""
         self.total, self.first, self.step = total, done, done
-        self.live = sys.stdout.isatty() if live is None else live
-        self.loss = self.psnr = None
+        self.live = is_live() if live is None else live
+        self.loss = self.psnr = self.seconds = None
         self.count, self.began, self.printed = 0, time.perf_counter(), 0.0
-        self.display = None
+        self.doing = "taking the first step"
+        self.display = self.spinner = None
 
     def __enter__(self) -> Progress:
         """Start the display."""
         if self.live:
+            from rich.console import Console
             from rich.live import Live
+            from rich.spinner import Spinner
 
-            self.display = Live(self._panel(), refresh_per_second=8)
+            _STATUS.clear()
+            self.spinner = Spinner("dots" if (sys.stdout.encoding or "").lower().startswith("utf") else "line")
+            own = sys.stderr.isatty()
+            self.display = Live(console=Console(), get_renderable=self._panel, refresh_per_second=8, redirect_stderr=own)
             self.display.__enter__()
+            _PANELS.append(self)
         return self
 
     def __exit__(self, *error) -> None:
         """Show the last state and stop."""
+        self.doing = ""
         if self.display is not None:
-            self.display.update(self._panel())
+            _PANELS.remove(self)
             self.display.__exit__(*error)
         elif error[0] is None and self.step > self.first:
             say(self._line())
 
-    def update(self, *, step: int, loss: float, psnr: float, count: int) -> None:
-        """Show the numbers of one finished step."""
-        self.step, self.count = step, count
-        keep = 1 - SMOOTHING
-        self.loss = loss if self.loss is None else keep * self.loss + SMOOTHING * loss
-        self.psnr = psnr if self.psnr is None else keep * self.psnr + SMOOTHING * psnr
+    def update(self, *, step: int, loss: float, psnr: float, count: int, seconds: float | None = None) -> None:
+        """Show the numbers of one finished step; ``seconds`` that it took, None where that says nothing of those to come."""
+        self.step, self.count, self.doing = step, count, ""
+        self.loss, self.psnr = _mean(self.loss, loss), _mean(self.psnr, psnr)
+        self.seconds = self.seconds if seconds is None else _mean(self.seconds, seconds)
         now = time.perf_counter()
-        if self.display is not None:
-            self.display.update(self._panel())
-        elif now - self.printed >= PLAIN_INTERVAL:
+        if self.display is None and now - self.printed >= PLAIN_INTERVAL:
             self.printed = now
             say(self._line())
 
-    def _times(self) -> tuple[float, float]:
-        seconds = (time.perf_counter() - self.began) / max(1, self.step - self.first)
-        return seconds, seconds * (self.total - self.step)
-
     def _values(self) -> list[tuple[str, str]]:
-        seconds, left = self._times()
         return [
             ("step", f"{self.step:,} of {self.total:,}"),
             ("loss", "-" if self.loss is None else f"{self.loss:.4f}"),
             ("train PSNR", "-" if self.psnr is None else f"{self.psnr:.2f} dB"),
             ("Gaussians", f"{self.count:,}"),
-            ("per step", f"{1000 * seconds:.0f} ms" if self.step > self.first else "-"),
-            ("left", duration(left) if self.step > self.first else "-"),
+            ("per step", "-" if self.seconds is None else f"{1000 * self.seconds:.0f} ms"),
+            ("left", "-" if self.seconds is None else duration(self.seconds * (self.total - self.step))),
         ]
 
     def _line(self) -> str:
@@ -107,12 +204,22 @@ class Progress:
         from rich.console import Group
         from rich.progress_bar import ProgressBar
         from rich.table import Table
+        from rich.text import Text
 
         table = Table.grid(padding=(0, 3))
-        names, values = zip(*self._values())
+        names, values = zip(*self._values(), ("elapsed", duration(time.perf_counter() - self.began)))
         table.add_row(*names, style="dim")
         table.add_row(*values, style="bold")
         # Alone, the bar does not end its line, and the names would follow on it; a grid row does.
         bar = Table.grid()
         bar.add_row(ProgressBar(total=self.total, completed=self.step, width=78))
-        return Group(bar, table)
+        if not self.doing:
+            return Group(bar, table)
+        doing = Table.grid(padding=(0, 1))
+        doing.add_row(self.spinner, Text(printable(self.doing)))
+        return Group(bar, table, doing)
+
+
+def _mean(old: float | None, new: float) -> float:
+    """Return the running mean after a value."""
+    return new if old is None else (1 - SMOOTHING) * old + SMOOTHING * new

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,21 +17,22 @@ from warpgs.runtime.kernel_cache import REMEDY
 _LOADED: set[tuple[wp.Module, object, int]] = set()
 """Modules that this process has loaded, with the context of the device and the threads of a block."""
 
-_LISTENERS: list[Callable[[str], object]] = []
-"""Functions that are told of each module that has to be compiled."""
+_LISTENERS: list[tuple[Callable[[str], object], list[float]]] = []
+"""Functions that are told of each module that has to be compiled, with the seconds that modules took."""
 
 
 @contextlib.contextmanager
-def told_of_compiling(listener: Callable[[str], object]) -> Iterator[None]:
+def told_of_compiling(listener: Callable[[str], object]) -> Iterator[list[float]]:
     """Call ``listener`` within the block with the name of each module that the cache lacks, before it is compiled.
 
-    It may be called from any thread.
+    It may be called from any thread. Yields a list that grows by the time of each module once it is compiled [s].
     """
-    _LISTENERS.append(listener)
+    entry: tuple[Callable[[str], object], list[float]] = listener, []
+    _LISTENERS.append(entry)
     try:
-        yield
+        yield entry[1]
     finally:
-        _LISTENERS.remove(listener)
+        _LISTENERS.remove(entry)
 
 
 def load_module(module: wp.Module, device: wp.Device, block_dim: int):
@@ -46,10 +48,13 @@ def load_module(module: wp.Module, device: wp.Device, block_dim: int):
     locks = cache / "locks"
     make_folder(locks)
     with exclusive(locks / f"{name}.{device.is_cuda:d}"):
-        if not (cache / name).is_dir():
-            for listener in tuple(_LISTENERS):
-                listener(name)
+        compiles, began = not (cache / name).is_dir(), time.perf_counter()
+        told = tuple(_LISTENERS) if compiles else ()
+        for listener, _ in told:
+            listener(name)
         loaded = module.load(device, block_dim=block_dim)
+        for _, seconds in told:
+            seconds.append(time.perf_counter() - began)
     _LOADED.add(key)
     return loaded
 

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import sys
 import unicodedata
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeVar
+
+T = TypeVar("T")
 
 HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 """Categories of characters that move the cursor, turn the direction of text, end a line, or are half of one."""
@@ -11,11 +15,26 @@ JOINERS = "\u200c\u200d"
 """Characters of these categories that scripts and emoji need, and that change nothing but the letters beside them."""
 
 
+class Detail(str):
+    """A note that nobody acts on: it stands in the files of a run and in its report's last section, not on the terminal."""
+
+    __slots__ = ()
+
+
 def printable(text: object) -> str:
     """Return text with every character that a terminal would obey, such as ESC, written as its code."""
     return "".join(
         c.encode("unicode_escape").decode() if unicodedata.category(c) in HIDDEN and c not in JOINERS else c for c in str(text)
     )
+
+
+_quiet = False
+
+
+def be_quiet() -> None:
+    """Print no more lines but errors, since another process prints the same."""
+    global _quiet
+    _quiet = True
 
 
 def say(line: object = "", *, error: bool = False) -> None:
@@ -28,9 +47,25 @@ def say(line: object = "", *, error: bool = False) -> None:
     Raises:
         BrokenPipeError: Nobody reads any more.
     """
+    if _quiet and not error:
+        return
     stream = sys.stderr if error else sys.stdout
     encoding = getattr(stream, "encoding", None) or "utf-8"
     print(printable(line).encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
+
+
+def counted(items: Sequence[T], tell: Callable[[str], object], what: str, unit: str) -> Iterator[T]:
+    """Yield items, and tell before each how many are done: ``scoring: 3 of 12 views``.
+
+    Args:
+        items: The items.
+        tell: Takes a line.
+        what: What is done with the items.
+        unit: Word for several of them.
+    """
+    for done, item in enumerate(items):
+        tell(f"{what}: {done} of {len(items)} {unit}")
+        yield item
 
 
 def accept_all_letters() -> None:

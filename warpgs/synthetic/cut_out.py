@@ -15,6 +15,7 @@ import numpy as np
 
 from warpgs.errors import UsageError
 from warpgs.geometry import look_at, matmul
+from warpgs.runtime.terminal import counted
 from warpgs.scene import Camera
 from warpgs.synthetic import raycast
 from warpgs.synthetic.demo import TAU, checker_texture, colmap_text, surface_points, write_files
@@ -203,11 +204,11 @@ def _transforms(cameras: list[Camera]) -> str:
     return json.dumps({"camera_angle_x": angle, "w": first.width, "h": first.height, "frames": frames}, indent=1)
 
 
-def _files(form: str, views: int, size: tuple[int, int], seed: int) -> dict[str, bytes]:
+def _files(form: str, views: int, size: tuple[int, int], seed: int, tell: Callable[[str], object]) -> dict[str, bytes]:
     """Return the contents of the folder by relative path."""
     shapes, cameras = cut_out_object(seed), ring_cameras(views, *size)
     files = {}
-    for i, camera in enumerate(cameras):
+    for i, camera in enumerate(counted(cameras, tell, "rendering", "views")):
         over_black = raycast.render_rgba(shapes, LIGHT, camera.K, camera.viewmat, *size, SAMPLES)
         alpha = over_black[..., 3:]
         color = np.divide(over_black[..., :3], alpha, out=np.zeros_like(over_black[..., :3]), where=alpha > 0)
@@ -225,8 +226,9 @@ def _files(form: str, views: int, size: tuple[int, int], seed: int) -> dict[str,
 
 
 def write_object(
-    folder: Path, *, form: str = "transforms", views: int = 24, width: int = 320, height: int = 240, seed: int = 0
-) -> str:
+    folder: Path, *, form: str = "transforms", views: int = 24, width: int = 320, height: int = 240, seed: int = 0,
+    tell: Callable[[str], object] = lambda line: None,
+) -> str:  # fmt: skip
     """Write an object as a scene folder: RGBA images with straight colours, or RGB images with soft masks.
 
     The same arguments give the same bytes on the same machine and library versions.
@@ -239,6 +241,7 @@ def write_object(
         width: Image width [px].
         height: Image height [px].
         seed: Decides the object.
+        tell: Takes a line on each view before it is rendered.
 
     Returns:
         The split to use: eight training views around the object, all others held out.
@@ -253,5 +256,5 @@ def write_object(
         raise UsageError(
             f"a demo object needs {MIN_VIEWS} views or more ({TRAIN_VIEWS} to fit, the rest held out), not {views}"
         )
-    write_files(Path(folder), (width, height), lambda: _files(form, views, (width, height), seed))
+    write_files(Path(folder), (width, height), lambda: _files(form, views, (width, height), seed, tell))
     return split_spec(views)

@@ -16,7 +16,7 @@ from warpgs.errors import ResourceError, UsageError
 from warpgs.files import is_empty, make_folder, write_bytes
 from warpgs.geometry import matmul
 from warpgs.runtime.folder_lock import hold_folder
-from warpgs.runtime.terminal import say
+from warpgs.runtime.terminal import counted, say
 from warpgs.scene import Camera
 from warpgs.synthetic import raycast
 
@@ -261,17 +261,18 @@ def _check(folder: Path, width: int, height: int) -> None:
         raise ResourceError(f"cannot look into {folder} ({e.strerror or e}); name a folder that you may write to") from e
 
 
-def _files(views: int, width: int, height: int, seed: int) -> dict[str, bytes]:
+def _files(views: int, width: int, height: int, seed: int, tell: Callable[[str], object]) -> dict[str, bytes]:
     """Return the contents of the demo folder by relative path, all at once, so that an interruption leaves no half a scene."""
     import cv2
 
     shapes, light = still_life(seed), raycast.Light()
     cameras = camera_path(views, width, height)
     files = {}
-    for i, camera in enumerate(cameras):
+    for i, camera in enumerate(counted(cameras, tell, "rendering", "views")):
         rgb = raycast.render(shapes, light, camera.K, camera.viewmat, width, height)
         _, png = cv2.imencode(".png", np.round(255 * rgb[..., ::-1]).astype(np.uint8))
         files[f"images/{i:03d}.png"] = png.tobytes()
+    tell("finding points")
     points = surface_points(shapes, light, cameras, np.random.default_rng([seed, 1]))
     for name, text in colmap_text(cameras, *points).items():
         files[f"sparse/0/{name}"] = text.encode()
@@ -300,7 +301,10 @@ def write_files(folder: Path, size: tuple[int, int], contents: Callable[[], dict
             write_bytes(folder / path, content)
 
 
-def write_demo(folder: Path, *, views: int = 24, width: int = 320, height: int = 240, seed: int = 0) -> str:
+def write_demo(
+    folder: Path, *, views: int = 24, width: int = 320, height: int = 240, seed: int = 0,
+    tell: Callable[[str], object] = lambda line: None,
+) -> str:  # fmt: skip
     """Write the demo scene as a COLMAP folder: images, cameras, and exact points with their tracks.
 
     The same arguments give the same bytes on the same machine and library versions.
@@ -311,6 +315,7 @@ def write_demo(folder: Path, *, views: int = 24, width: int = 320, height: int =
         width: Image width [px].
         height: Image height [px].
         seed: Seed of the patterns and of the choice of points.
+        tell: Takes a line on each view before it is rendered.
 
     Returns:
         The split to use: six training views along the camera path, all others held out.
@@ -321,5 +326,5 @@ def write_demo(folder: Path, *, views: int = 24, width: int = 320, height: int =
     """
     if views < MIN_VIEWS:
         raise UsageError(f"a demo needs at least {MIN_VIEWS} views ({TRAIN_VIEWS} to fit, the rest held out), not {views}")
-    write_files(Path(folder), (width, height), lambda: _files(views, width, height, seed))
+    write_files(Path(folder), (width, height), lambda: _files(views, width, height, seed, tell))
     return split_spec(views)

@@ -12,7 +12,7 @@ import torch
 
 from warpgs.coordinates import convert_gaussians
 from warpgs.errors import DataError, WarpgsError
-from warpgs.export.ply import read_ply
+from warpgs.export.formats import read_gaussians
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
 from warpgs.pipeline.runs.commands import scene_of
 from warpgs.pipeline.runs.folder import StoredRun, open_run
@@ -76,13 +76,13 @@ def views_of(content: Content, reader: str | None = None) -> tuple[dict[str, Vie
     return {v.name: v for v in [*train, *test]}, []
 
 
-def content_of_ply(path: Path, device: str = "cpu") -> Content:
-    """Read a PLY file; it is shown about its own middle, at a size that suits float32 and the viewer's near plane.
+def content_of_file(path: Path, device: str = "cpu") -> Content:
+    """Read a file of Gaussians of any format; it is shown about its own middle, at a size that suits the viewer.
 
     Raises:
         DataError: The file holds no Gaussians.
     """
-    stored = read_ply(path)
+    stored = read_gaussians(path)
     if not len(stored):
         raise DataError(f"{path}: holds no Gaussian; export the model again")
     means = stored.means.double().numpy()

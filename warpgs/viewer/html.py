@@ -15,12 +15,13 @@ from warpgs.coordinates import convert_camera, convert_gaussians
 from warpgs.errors import DataError
 from warpgs.files import write_text
 from warpgs.pipeline.runs.folder import open_run
+from warpgs.pipeline.runs.rig import up_of
 from warpgs.pipeline.runs.share_filters import NO_FILTERS, Filters, file_gaussians, filtered, rotate_camera
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Camera, Gaussians
 from warpgs.viewer.packing import packed
-from warpgs.viewer.poses import camera_before, distance_ahead, fov_y, up_of
+from warpgs.viewer.poses import camera_before, distance_ahead, fov_y
 from warpgs.viewer.server import open_server, require_viser, stop_server
 
 if TYPE_CHECKING:
@@ -40,9 +41,9 @@ Gaussians are blended in the order of the file. Refused here, viser's page start
 
 
 def place_first_camera(server: viser.ViserServer, camera: Camera, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
-    """Have pages start at a camera, with the cameras' upward direction up."""
+    """Have pages start at a camera, with that direction up which films have upwards."""
     forward = np.asarray(camera.viewmat[2, :3])
-    server.scene.set_up_direction(up_of(cameras))
+    server.scene.set_up_direction(up_of(list(cameras), gaussians.means.detach().cpu().double().numpy()))
     server.initial_camera.position = camera.center
     server.initial_camera.look_at = camera.center + distance_ahead(camera, gaussians) * forward
     server.initial_camera.up = -np.asarray(camera.viewmat[1, :3])

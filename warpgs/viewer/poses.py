@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -24,13 +23,6 @@ def wxyz_of(camera: Camera) -> np.ndarray:
 def fov_y(camera: Camera) -> float:
     """Return the vertical field of view [rad], as of a principal point in the middle."""
     return 2 * math.atan(0.5 * camera.height / float(camera.K[1, 1]))
-
-
-def up_of(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the mean upward direction of cameras, of length 1, shape [3]; up in the first camera where they cancel."""
-    up = -np.mean([c.viewmat[1, :3] for c in cameras], axis=0)
-    up = up if np.linalg.norm(up) > 1e-3 else -np.asarray(cameras[0].viewmat[1, :3])
-    return up / np.linalg.norm(up)
 
 
 def distance_ahead(camera: Camera, gaussians: Gaussians) -> float:

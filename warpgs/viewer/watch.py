@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from warpgs.errors import DataError, WarpgsError
+from warpgs.export.formats import FORMATS
 from warpgs.pipeline.runs.folder import CONFIG, read_record
 from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.pipeline.runs.request import choose_device
+from warpgs.report.progress import waiting
 from warpgs.runtime.terminal import say
 from warpgs.scene import Gaussians
-from warpgs.viewer.content import Content, content_of_ply, content_of_run, modified, views_of
+from warpgs.viewer.content import Content, content_of_file, content_of_run, modified, views_of
 from warpgs.viewer.server import HOST, PORT, open_server, require_viser, stop_server
 from warpgs.viewer.window import Window
 
@@ -34,10 +36,10 @@ def address(server: viser.ViserServer) -> str:
 
 
 def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None = None) -> None:
-    """Show a run folder or a PLY file until Ctrl-C; checkpoints of a fit that goes on are shown as they come.
+    """Show a run folder or a file of Gaussians until Ctrl-C; checkpoints of a fit that goes on are shown as they come.
 
     Args:
-        path: Run folder, of a fit that goes on, too; or a PLY file.
+        path: Run folder, of a fit that goes on, too; or a file of any format in `FORMATS`.
         port: Port to listen at; 0 for any free one.
         device: Device that renders images: auto, cpu or cuda.
         reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
@@ -50,8 +52,11 @@ def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None 
     choose_device(device)
     if path.is_dir():
         read_record(path)
-    elif path.suffix.lower() != ".ply" or not path.is_file():
-        raise DataError(f"{path}: is neither a run folder ({CONFIG} in it) nor a PLY file; give one of the two")
+    elif not path.name.lower().endswith(tuple(FORMATS)) or not path.is_file():
+        known = ", ".join(FORMATS)
+        raise DataError(
+            f"{path}: is neither a run folder ({CONFIG} in it) nor a file of Gaussians ({known}); give one of these"
+        )
     require_viser()
     with contextlib.suppress(KeyboardInterrupt):
         server = open_server(port)
@@ -64,19 +69,24 @@ def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None 
 
 def _follow(server: viser.ViserServer, path: Path, device: str, reader: str | None) -> None:
     """Show what there is, and every checkpoint that replaces it."""
-    window, seen = None, None
+    window, seen, stages = None, None, waiting()
     if path.is_dir() and modified(path) is None:
+        stages("waiting")
         say("waiting for the first checkpoint of the fit")
     while True:
         found = modified(path) if path.is_dir() else 0.0
         if found is not None and found != seen:
             seen = found
             if window is None:
-                content = content_of_run(path, device) if path.is_dir() else content_of_ply(path, choose_device(device)[0].type)
+                stages(f"reading {path}")
+                content = (
+                    content_of_run(path, device) if path.is_dir() else content_of_file(path, choose_device(device)[0].type)
+                )
                 views, notes = views_of(content, reader)
                 for note in notes:
                     say(f"  {note}")
                 window = Window(server, replace(content, views=views))
+                stages.clear()
                 say(f"  {content.title}: {len(content.model.gaussians()):,} Gaussians")
             else:
                 _update(window, path, device)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from warpgs.app.flags import check_range, parse_flags
+from warpgs.report.progress import waiting
 from warpgs.runtime.terminal import say
 
 
@@ -37,11 +38,12 @@ def run(arguments: list[str], about: str) -> int:
     if a.object:
         from warpgs.synthetic.cut_out import write_object
 
-        split, masks = write_object(a.folder, form=a.format, **size), " --masks cutout" if a.format == "colmap" else ""
+        split = write_object(a.folder, form=a.format, **size, tell=waiting())
+        masks = " --masks cutout" if a.format == "colmap" else ""
     else:
         from warpgs.synthetic.demo import write_demo
 
-        split, masks = write_demo(a.folder, **size), ""
+        split, masks = write_demo(a.folder, **size, tell=waiting()), ""
     form = "transforms.json" if a.object and a.format == "transforms" else "COLMAP"
     say(f"{a.folder}: {a.views} views of {a.width} x {a.height} px as a {form} folder")
     say(f"next: warpgs fit {a.folder} --split '{split}'{masks} --out run")

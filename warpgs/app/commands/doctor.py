@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from warpgs.app.flags import parse_flags
+from warpgs.report.progress import Stages, waiting
 from warpgs.runtime.imports import fast_imports
 from warpgs.runtime.terminal import say
 
@@ -34,7 +35,9 @@ def run(arguments: list[str], about: str) -> int:
         return 0
     from warpgs.app.doctor import diagnose, print_report
 
-    say("looking at this machine ...")
+    stages = Stages()
+    stages("looking at this machine")
     with fast_imports():
-        findings = diagnose()
+        findings = diagnose(waiting())
+    stages.clear()
     return print_report(findings)

@@ -58,7 +58,7 @@ def run(arguments: list[str], about: str) -> int:
     settings = FilmSettings(a.frames, a.seconds, a.fps, a.size, None if a.fov is None else radians(a.fov))
     if a.run.is_dir() and (a.cameras is not None or a.rule is not None):
         raise UsageError("--cameras and --rule are for files of Gaussians; a run has its own")
-    given = (a.cameras, a.rule) if a.run.is_file() else None
+    given = (a.cameras, a.rule) if a.run.is_file() or a.cameras is not None else None
     for line in render(
         a.run, a.path, a.out, settings, a.device,
         background=a.background, coverage=a.coverage, sheet=a.sheet, file_of=given,

@@ -15,6 +15,7 @@ from warpgs.pipeline.metrics.evaluate import over_white, render_view, to_8_bit
 from warpgs.pipeline.metrics.psnr import psnr_of
 from warpgs.pipeline.metrics.region import scored_region
 from warpgs.render.rasterize import RasterizeOptions
+from warpgs.runtime.terminal import counted
 from warpgs.scene import Gaussians, View
 
 CLASSES = {
@@ -134,6 +135,7 @@ def score_by_coverage(
     test: Sequence[View],
     options: RasterizeOptions,
     show: Callable[[View, np.ndarray, dict[str, np.ndarray]], object] = lambda *_: None,
+    tell: Callable[[str], object] = lambda line: None,
 ) -> dict[str, Any]:
     """Split the scores of held-out views by how many training views saw what their pixels show.
 
@@ -143,6 +145,7 @@ def score_by_coverage(
         test: Held-out views, at least one.
         options: Options of the rasterizer.
         show: Called for each held-out view with its render [H, W, 3] and the pixels of each class, bool [H, W].
+        tell: Takes a line on each view before it is rendered.
 
     Returns:
         ``classes``: over all held-out views together, by class, the number of scored ``pixels``, their ``share_of_pixels`` and
@@ -153,11 +156,12 @@ def score_by_coverage(
     Raises:
         UsageError: A camera is no pinhole.
     """
+    tell("finding what no training view saw")
     training = depth_views(gaussians, [v.camera for v in train], options, [v.mask for v in train])
     errors = photo_errors(train, training)
     transparent = any(v.alpha is not None for v in (*train, *test))
     views, total = [], {c: np.zeros(4) for c in CLASSES}
-    for view in test:
+    for view in counted(test, tell, "finding what no training view saw", "views"):
         image, depth, alpha = render_view(gaussians, view, options)
         surface = torch.from_numpy(np.where(alpha >= MIN_ALPHA, depth, 0)).to(gaussians.means.device)
         found = coverage_map(surface, view.camera, training)

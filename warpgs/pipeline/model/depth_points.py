@@ -75,12 +75,9 @@ def in_free_space(points: np.ndarray, views: Sequence[View], depths: Sequence[np
     """Return a mask [N], True where a point [N, 3] lies before the depths [H, W] (0: none) of a view other than ``without``."""
     hides = np.zeros(len(points), bool)
     for j, (view, depth) in enumerate(zip(views, depths)):
-        if j == without:
-            continue
-        seen = np.nonzero(geometry.in_image(view.camera, points))[0]
-        pixels, z = geometry.project_points(view.camera, points[seen])
-        columns, rows = np.floor(pixels).astype(int).T
-        hides[seen] |= z < FREE_SPACE * depth[rows, columns]
+        if j != without:
+            seen, rows, columns, z = geometry.seen_pixels(view.camera, points)
+            hides[seen] |= z < FREE_SPACE * depth[rows, columns]
     return hides
 
 
@@ -118,10 +115,9 @@ class KnownPoints:
         widths, pixels = np.full(len(cloud), np.inf), []
         for view in views:
             tracked = np.array([view.name in t for t in tracks], bool)
-            seen = np.nonzero(tracked & geometry.in_image(view.camera, cloud.points))[0]
-            at, z = geometry.project_points(view.camera, cloud.points[seen])
-            widths[seen] = np.minimum(widths[seen], z / focal_length(view.camera))
-            columns, rows = np.floor(at).astype(int).T
+            own = np.nonzero(tracked)[0]
+            seen, rows, columns, z = geometry.seen_pixels(view.camera, cloud.points[own])
+            widths[own[seen]] = np.minimum(widths[own[seen]], z / focal_length(view.camera))
             order = np.argsort(-z, kind="stable")  # of two in one pixel the nearer is written last
             pixels.append((rows[order], columns[order], z[order]))
         inside = np.isfinite(widths)
@@ -147,7 +143,8 @@ def coarse_points(
         depths: Geometrically consistent depth of each, confirmed by other views.
         merge_px: Width of the cells in which consistent points become one [px]; 0 keeps every pixel.
         fill_px: Width of the cells of points where no depth is consistent [px]; 0 leaves those places empty. Their depths are
-            those of `complete`; none lies in space that another view looks through, nor beside a consistent point.
+            those of `complete`; none lies in space that another view looks through, nor beside a consistent point. Views whose
+            depth was not searched for have no part in it, so that the work for each view is bounded.
         source: Name of the source in the notes, sweep or flow.
         known: Points of a reconstruction. Those that two of the views saw are taken where no depth is consistent, and their
             depths are filled in around them.
@@ -159,19 +156,21 @@ def coarse_points(
     regions = [fitted_region(v) for v in views]
     consistent = [d.valid if r is None else d.valid & r for d, (r, _) in zip(depths, regions)]
     seen = KnownPoints.of(known, views)
-    completed = []
-    if fill_px > 0:
-        seeds = [seen.with_depths(i, d.depth, s) for i, (d, s) in enumerate(zip(depths, consistent))]
-        completed = [complete(*seed, v.image) for v, seed in zip(views, seeds)]
+    completed = {
+        i: complete(*seen.with_depths(i, depths[i].depth, consistent[i]), view.image)
+        for i, view in enumerate(views)
+        if fill_px > 0 and depths[i].searched
+    }
+    searched = [views[i] for i in completed], list(completed.values())
     found, filled_in, notes = [], [], []
     for i, (view, depth, sure, (region, name)) in enumerate(zip(views, depths, consistent, regions)):
         found.append(_lift(view, depth.depth, sure))
         total = sure.size if region is None else region.sum()
         text = f"{view.name}: {_fraction(sure.sum(), total)} of {'pixels' if region is None else f'the {name}'} by {source}"
-        if fill_px > 0:
+        if i in completed:
             free = ~sure & (completed[i] > 0) if region is None else ~sure & region & (completed[i] > 0)
             points, colors, widths = _lift(view, completed[i], free)
-            keep = ~in_free_space(points, views, completed, i)
+            keep = ~in_free_space(points, *searched, list(completed).index(i))
             filled_in.append((points[keep], colors[keep], widths[keep]))
             text += f", {_fraction(keep.sum(), total)} filled"
         notes.append("; ".join((text, *depth.notes)))
@@ -182,7 +181,7 @@ def coarse_points(
         own = (seen.cloud.points, seen.cloud.colors, seen.widths)
         added, new = _elsewhere(points, widths, *own, merge_px)
         points, widths = np.concatenate([points, own[0][new]]), np.concatenate([widths, own[2][new]])
-    if fill_px > 0:
+    if filled_in:
         filled, _ = _elsewhere(points, widths, *(np.concatenate(a) for a in zip(*filled_in)), fill_px)
     more = f"{len(added):,} of the reconstruction where there were none, " if len(added) else ""
     notes.append(f"{len(cloud):,} points of {pixels:,} pixels by {source}, {more}and {len(filled):,} filled")

@@ -136,14 +136,12 @@ def _seen_colors(shapes: Sequence[Silhouette], cells: np.ndarray, width: float) 
     total, squares, counts = np.zeros((len(cells), 3)), np.zeros((len(cells), 3)), np.zeros(len(cells), int)
     for shape in shapes:
         view = shape.view
-        at, z = geometry.project_points(view.camera, cells)
-        there = np.nonzero(geometry.in_image(view.camera, cells))[0]
-        columns, rows = np.floor(at[there]).astype(int).T
+        there, rows, columns, z = geometry.seen_pixels(view.camera, cells)
         # blocks as wide as two cells: no hole between the cells of a surface
         block = max(1, int(np.ceil(2 * width / _footprint([view.camera], cells))))
         first = np.full((view.camera.height // block + 1, view.camera.width // block + 1), np.inf)
-        np.minimum.at(first, (rows // block, columns // block), z[there])
-        free = z[there] <= first[rows // block, columns // block] + BEHIND_CELLS * width
+        np.minimum.at(first, (rows // block, columns // block), z)
+        free = z <= first[rows // block, columns // block] + BEHIND_CELLS * width
         sure = free & (view.alpha[rows, columns] >= OPAQUE_COLOR)
         seen, colors = there[sure], view.image[rows[sure], columns[sure]].astype(float)
         total[seen] += colors

@@ -161,9 +161,7 @@ def empty_votes(views: list[View], regions: list[tuple[np.ndarray | None, str]],
     for view, (region, name) in zip(views, regions):
         if name not in OBJECTS:
             continue
-        seen = np.nonzero(geometry.in_image(view.camera, points))[0]
-        pixels, _ = geometry.project_points(view.camera, points[seen])
-        columns, rows = np.floor(pixels).astype(int).T
+        seen, rows, columns, _ = geometry.seen_pixels(view.camera, points)
         votes[seen] += ~region[rows, columns]
     return votes
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line
 from warpgs.pipeline.train.background import color_of, over_background
 from warpgs.pipeline.train.loop import train_views
 from warpgs.report.coverage_image import LEGEND
-from warpgs.report.progress import Stages
+from warpgs.report.progress import Stages, waiting
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Scene, View
 
@@ -33,17 +34,20 @@ ALPHAS = {"alpha_empty": "where empty", "alpha_object": "in the object"}
 """Scores of the rendered alpha, with the words for each view's line."""
 
 
-def scene_of(stored: StoredRun, reader: str | None = None) -> tuple[Scene, list[View], list[View]]:
+def scene_of(
+    stored: StoredRun, reader: str | None = None, tell: Callable[[str], object] | None = None
+) -> tuple[Scene, list[View], list[View]]:
     """Read the scene that a run was fitted to; returns it with its training and its held-out views.
 
     Args:
         stored: The run.
         reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
+        tell: Takes a line on each image before it is read.
 
     Raises:
         DataError: The scene is gone, or its images or cameras have changed since the fit.
     """
-    scene, _, _ = read_scene(stored.scene_request(reader))
+    scene, _, _ = read_scene(stored.scene_request(reader), tell)
     if scene.fingerprint != stored.record["fingerprint"]:
         raise DataError(f"{scene.path}: its images or cameras are not those that {stored.folder} was fitted to; restore them")
     if stored.record["config"].get("refine_poses"):
@@ -77,15 +81,17 @@ def evaluate(
     """
     device, _ = choose_device(device_name)
     lpips = None if lpips_weights is None else load_lpips(lpips_weights, device)
-    stored = open_run(folder, device)
-    scene, train, test = scene_of(stored, reader)
+    stored, tell = open_run(folder, device), waiting()
+    scene, train, test = scene_of(stored, reader, tell)
     request = stored.scene_request(reader)
     with hold_folder(folder, *IMAGE_FOLDERS) as notes:
         names = image_names(v.name for v in scene.views)
-        metrics = evaluate_run(folder, stored.gaussians(), train, test, stored.rule, stored.background, lpips, names=names)
+        metrics = evaluate_run(
+            folder, stored.gaussians(), train, test, stored.rule, stored.background, lpips, names=names, tell=tell
+        )
         if by_coverage and test:
             metrics["coverage"] = coverage_of_run(
-                folder, stored.gaussians(), train, test, stored.rule, stored.background, names=names
+                folder, stored.gaussians(), train, test, stored.rule, stored.background, names=names, tell=tell
             )
         metrics |= {
             "protocol": protocol_of(scene, request.split, request.downscale, train, test),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from warpgs.files import make_folder, write_bytes
 from warpgs.pipeline.metrics.coverage_scores import CLASSES, score_by_coverage
 from warpgs.pipeline.metrics.evaluate import options_for
 from warpgs.report.coverage_image import LEGEND, coverage_image
-from warpgs.report.images import png
+from warpgs.report.images import png, webp
 from warpgs.report.page import CoverageReport
 from warpgs.scene import Gaussians, View
 
@@ -35,6 +35,7 @@ def coverage_of_run(
     max_instances: int | None = None,
     *,
     names: Mapping[str, str],
+    tell: Callable[[str], object] = lambda line: None,
 ) -> dict[str, Any]:
     """Split the scores of held-out views by coverage, and save an image of each.
 
@@ -47,6 +48,7 @@ def coverage_of_run(
         background: Colour behind the scene.
         max_instances: As in RasterizeOptions.
         names: Names of image files by view, as `image_names` gives them for the whole scene.
+        tell: Takes a line on each view before it is rendered.
 
     Returns:
         What `score_by_coverage` returns.
@@ -61,7 +63,7 @@ def coverage_of_run(
         if out is not None:
             write_bytes(out / FOLDER / f"{names[view.name]}.png", png(coverage_image(image, classes["0"], classes["1"])))
 
-    return score_by_coverage(gaussians, train, test, options_for(rule, background, gaussians, max_instances), show)
+    return score_by_coverage(gaussians, train, test, options_for(rule, background, gaussians, max_instances), show, tell)
 
 
 def coverage_table(coverage: dict[str, Any]) -> list[list[str]]:
@@ -96,6 +98,6 @@ def coverage_section(out: Path, coverage: dict[str, Any], shown: list[str], name
     head, *rows = coverage_table(coverage)
     return CoverageReport(
         f"{coverage['summary'][0].upper()}{coverage['summary'][1:]}. {EXPECTED}", LEGEND,
-        [(n, f.read_bytes()) for n, f in files.items() if f.is_file()],
+        [(n, webp(f.read_bytes(), 640)) for n, f in files.items() if f.is_file()],
         [head[1:], *(r[1:] for r in rows if r[0] == "all views")],
     )  # fmt: skip

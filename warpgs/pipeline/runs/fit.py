@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.splits import Split
 from warpgs.pipeline.metrics.evaluate import options_for, render_view
-from warpgs.pipeline.metrics.lpips import Lpips, load_lpips
+from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.metrics.moved import Rendered, moved_fractions, moved_notes
 from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.model.scale_limits import shape_figures, shape_summary
@@ -27,31 +28,37 @@ from warpgs.pipeline.runs.failed_step import FILE as FAILED
 from warpgs.pipeline.runs.failed_step import failed_step, save_failed_step
 from warpgs.pipeline.runs.folder import CONFIG, check_checkpoint, check_same, read_record, record_of, run_folder
 from warpgs.pipeline.runs.image_names import image_names, renaming_notes
+from warpgs.pipeline.runs.job import FitJob
 from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.pipeline.runs.refined_poses import refined_scene
-from warpgs.pipeline.runs.request import NO_SCORES, FitRequest, SceneRequest, choose_device, choose_split, read_scene
-from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line, write_report
+from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device, choose_split, read_scene
+from warpgs.pipeline.runs.results import evaluate_run, overview_of, protocol_of, result_lines, write_report
 from warpgs.pipeline.runs.rule_report import rule_report_of
 from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, sampling_report_of
+from warpgs.pipeline.runs.shared import check_shared, shared_notes
 from warpgs.pipeline.runs.with_poses import with_poses
 from warpgs.pipeline.train.background import choose_background, over_background
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.complexity import complexity_figures, complexity_summary
 from warpgs.pipeline.train.config import FitConfig, preset_config
 from warpgs.pipeline.train.exposure import EXPOSURE
-from warpgs.pipeline.train.loop import run, train_views
+from warpgs.pipeline.train.loop import run
+from warpgs.pipeline.train.step_report import StepReport
 from warpgs.pipeline.train.time_budget import within_budget
-from warpgs.pipeline.train.trainer import StepReport, Trainer
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.warmup import background_warmup
-from warpgs.priors.photo_checks import PhotoCheck, check_photos, photo_notes
+from warpgs.priors.photo_checks import check_photos, photo_notes
 from warpgs.report.events import EventLog
 from warpgs.report.progress import Progress, Stages
 from warpgs.runtime.load_module import told_of_compiling
+from warpgs.runtime.ranks import ALONE, Ranks
 from warpgs.runtime.stop_signals import noted_signals
-from warpgs.runtime.terminal import say
-from warpgs.scene import Camera, Gaussians, Normalization, Scene, View
+from warpgs.runtime.terminal import Detail, counted
+from warpgs.scene import Camera, Gaussians, Normalization, Scene
 
 Names = tuple[str, ...]
+COMPILING = "compiling kernels, once on this machine, a minute or two in all"
+"""Line on a wait for kernels."""
 State = tuple[dict[str, torch.Tensor], dict[str, Any]]
 """Tensors and plain values of a checkpoint."""
 
@@ -70,42 +77,6 @@ class FitResult(FittedModel):
     """The run folder; None where none was asked for."""
 
 
-@dataclass
-class _Job:
-    """One fit in progress: its inputs, and what is known of it so far."""
-
-    scene: Scene
-    request: SceneRequest
-    split: Split
-    config: FitConfig
-    device: torch.device
-    where: str
-    out: Path | None
-    lpips: Lpips | None
-    notes: list[str]
-    verbose: bool
-    on_step: Callable[[StepReport], object] | None
-    began: float
-    progress: Callable[[str], object]
-    on_model: Callable[[FittedModel], object] | None
-    photographs: list[PhotoCheck] = field(default_factory=list)
-
-    @property
-    def train(self) -> list[View]:
-        """Views to fit."""
-        return train_views(self.scene, self.split.train)
-
-    @property
-    def test(self) -> list[View]:
-        """Views held out."""
-        return train_views(self.scene, self.split.test)
-
-    def say(self, line: str) -> None:
-        """Print a line for the user, unless the fit is to be silent."""
-        if self.verbose:
-            say(line)
-
-
 def fit(
     scene: Scene | SceneRequest | str | Path,
     config: FitConfig | str | None = None,
@@ -120,6 +91,7 @@ def fit(
     notes: tuple[str, ...] = (),
     verbose: bool = True,
     on_model: Callable[[FittedModel], object] | None = None,
+    ranks: Ranks = ALONE,
 ) -> FitResult:
     """Fit Gaussians to a scene: the same code as `warpgs fit`.
 
@@ -138,6 +110,8 @@ def fit(
         notes: Choices made before, to be printed and recorded with the fit's own.
         verbose: Whether to print.
         on_model: Called after every step with the model as it is, for those who look on: the next step overwrites its tensors.
+        ranks: Processes that fit together, from `warpgs.runtime.ranks.join`, all with the same arguments. The first alone
+            prints, writes and scores; the others return a result without metrics.
 
     Raises:
         UsageError: Settings, a preset or a split cannot be, ``out`` holds something already, or ``resume`` comes without it.
@@ -146,11 +120,13 @@ def fit(
     out = None if out is None else Path(out)
     if resume and out is None:
         raise UsageError("resume needs the run folder that it continues: give out")
-    progress = Stages() if verbose else Stages(lambda line: None)
-    folder: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
-    if out is not None:
-        folder = run_folder(out, resume)
-    with folder as held, told_of_compiling(lambda name: progress("compiling kernels, once on this machine")):
+    config = preset_config(config)
+    check_shared(scene, config, ranks, time_budget, resume)
+    verbose, own = verbose and ranks.first, out if ranks.first else None
+    stages = Stages() if verbose else Stages(lambda line: None)
+    nothing: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
+    folder = nothing if own is None else run_folder(own, resume)
+    with folder as held, stages as progress, told_of_compiling(lambda name: progress(COMPILING)) as compiled:
         if out is not None and resume:
             read_record(out)  # a run of another version is refused before anything takes time
         where = choose_device(device)
@@ -158,9 +134,9 @@ def fit(
         lpips = None if lpips_weights is None else load_lpips(Path(lpips_weights), where[0])
         request, read, parts, found = _scene_of(scene, split, out, progress)
         notes = (*notes, *held, *found, *([] if out is None else renaming_notes(image_names(v.name for v in read.views))))
-        job = _Job(
-            read, request, parts, preset_config(config), *where, out, lpips, [*notes], verbose, on_step, began,
-            progress, on_model,
+        job = FitJob(
+            read, request, parts, config, *where, own, lpips, [*notes], verbose, on_step, began, progress, on_model, ranks,
+            compiled,
         )  # fmt: skip
         if time_budget is not None:
             job.config, note = within_budget(job.config, time_budget, job.train, job.device)
@@ -169,22 +145,24 @@ def fit(
         job.config, chosen = settings_by_views(job.config, job.train, job.device.type)
         job.notes += chosen
         trainer, state, record = _prepare(job, out if resume else None)
-        return _finish(job, trainer, state, record, resume)
+        result = _finish(job, trainer, state, record, resume)
+    ranks.leave()
+    return result
 
 
-def _set_background(job: _Job) -> None:
+def _set_background(job: FitJob) -> None:
     """Put the scene over the background that the settings ask for."""
     color, note = choose_background(job.config.background, job.scene, job.train)
     job.scene = over_background(job.scene, color)
     job.notes += [note] if note else []
 
 
-def fit_request(request: FitRequest, **watchers: Any) -> FitResult:
-    """Run `fit` as the command line, a study or a farm asks for it; ``watchers`` are its on_model and on_step."""
+def fit_request(request: FitRequest, **others: Any) -> FitResult:
+    """Run `fit` as the command line, a study or a farm asks for it; ``others`` are its on_model, on_step and ranks."""
     r = request
     return fit(
         r.scene, r.config, out=r.out, device=r.device, resume=r.resume, lpips_weights=r.lpips_weights,
-        time_budget=r.time_budget, notes=r.notes, **watchers,
+        time_budget=r.time_budget, notes=r.notes, **others,
     )  # fmt: skip
 
 
@@ -204,7 +182,7 @@ def _scene_of(
     return request, read, parts, [*found, *notes]
 
 
-def _prepare(job: _Job, resumed: Path | None) -> tuple[Trainer, State | None, dict[str, Any]]:
+def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, State | None, dict[str, Any]]:
     """Set up the trainer; returns it, the state to continue the run ``resumed`` from, if any, and the record of the run."""
     record, state = record_of(job.request, job.config, job.scene, job.split, job.notes, job.device), None
     if resumed is not None:
@@ -216,13 +194,14 @@ def _prepare(job: _Job, resumed: Path | None) -> tuple[Trainer, State | None, di
     c = job.config
     with background_warmup(c, job.device) as ready:
         job.photographs = check_photos([*job.train, *job.test], job.progress)
-        trainer = Trainer(job.train, job.scene.points, c, job.device, job.scene.background, ready=ready, progress=job.progress)
+        of = job.train, job.scene.points, c, job.device, job.scene.background
+        trainer = Trainer(*of, ready=ready, progress=job.progress, ranks=job.ranks)
     if job.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(job.device)  # the steps' need is told, not the start's or an earlier fit's
     return trainer, state, record
 
 
-def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, Any], resume: bool) -> FitResult:
+def _finish(job: FitJob, trainer: Trainer, state: State | None, record: dict[str, Any], resume: bool) -> FitResult:
     """Take the steps, score the model, and write the run folder where there is one."""
     if job.out is not None and not resume:
         write_json(job.out / CONFIG, record)
@@ -232,25 +211,34 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
         except DataError as e:
             raise DataError(f"{job.out}/{TENSORS}: {e}") from e
         job.notes.append(f"continued from step {trainer.step}")
-    _announce(job, trainer)
+    shared = shared_notes(job.config, job.ranks)
+    job.announce([*photo_notes(job.photographs), *trainer.notes, *shared, trainer.memory.summary()])
     setup = time.perf_counter() - job.began
     nothing = contextlib.nullcontext(lambda: None)
     with nothing if job.out is None else images_kept(trainer, list(job.split.train), job.out) as images_written:
         _train(job, trainer, images_written)
     _tell(job, trainer)  # of images that were written last
     training = time.perf_counter() - job.began - setup
+    job.ranks.part()
+    if not job.ranks.first:
+        return FitResult(*_model_fields(job, trainer), job.config, {}, tuple(job.notes), None)
     poses = _refined(job, trainer)
     if job.out is not None:
         write_ply(job.out / "point_cloud.ply", drop_unused_sh(trainer.gaussians), job.scene.normalization)
-    metrics = _score(job, trainer, {"setup": setup, "training": training}) | poses
-    if job.out is not None:
-        write_json(job.out / "metrics.json", metrics)
-        record["notes"] = job.notes
-        report = sampling_report_of(trainer, job.out)
-        note = write_report(job.out, job.scene, job.split, trainer.gaussians, metrics, record, report)
-        if note:
-            job.say(f"  {note}")
-    _print_result(job, metrics)
+    with ThreadPoolExecutor(1) as beside:
+        # its process takes seconds, in which views are scored here
+        overview = beside.submit(overview_of(trainer.gaussians, job.train, job.test)) if job.out is not None else None
+        metrics = _score(job, trainer, {"setup": setup, "training": training}) | poses
+        if job.out is not None and overview is not None:
+            job.progress("making the report")
+            write_json(job.out / "metrics.json", metrics)
+            record["notes"] = job.notes
+            write_report(
+                job.out, job.scene, job.split, trainer.gaussians, metrics, record,
+                sampling=sampling_report_of(trainer, job.out), overview=overview.result(), tell=job.progress,
+            )  # fmt: skip
+    for line in result_lines(metrics, job.out):
+        job.say(line)
     return FitResult(
         *_model_fields(job, trainer), job.config, metrics, tuple(job.notes), job.out,
         transparent=job.scene.transparent,
@@ -258,7 +246,7 @@ def _finish(job: _Job, trainer: Trainer, state: State | None, record: dict[str, 
 
 
 def _model_fields(
-    job: _Job, trainer: Trainer
+    job: FitJob, trainer: Trainer
 ) -> tuple[Gaussians, Normalization, dict[str, Camera], Names, Names, str, tuple[float, float, float], int]:
     """Return the fields of the `FittedModel` that a fit has by now."""
     cameras = {v.name: v.camera for v in job.scene.views}
@@ -266,63 +254,56 @@ def _model_fields(
     return trainer.gaussians, job.scene.normalization, cameras, *names, rule, job.scene.background, trainer.step
 
 
-def _refined(job: _Job, trainer: Trainer) -> dict[str, Any]:
+def _refined(job: FitJob, trainer: Trainer) -> dict[str, Any]:
     """Give the scene its refined poses, and tell of them; returns their entry of metrics.json, if any."""
     if not job.config.refine_poses:
         return {}
     job.scene, figures = refined_scene(job.scene, job.split, trainer.view_table.params)
-    job.notes.append(figures["summary"])
-    job.say(f"  {figures['summary']}")
+    job.note(figures["summary"])
     return {"poses": figures}
 
 
-def _announce(job: _Job, trainer: Trainer) -> None:
-    """Print what is fitted and every choice made for the user."""
-    job.notes += [*photo_notes(job.photographs), *trainer.notes, trainer.memory.summary()]
-    train, test = job.train, job.test
-    size = f"{train[0].camera.width} x {train[0].camera.height} px"
-    job.say(f"{job.scene.path}: {job.scene.format}, {len(train)} views to fit, {len(test)} held out, {size}, {job.where}")
-    for note in job.notes:
-        job.say(f"  {note}")
-
-
-def _score(job: _Job, trainer: Trainer, seconds: dict[str, float]) -> dict[str, Any]:
+def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float]) -> dict[str, Any]:
     """Score the finished fit; returns the contents of metrics.json."""
     c, scene, train, test, gaussians = job.config, job.scene, job.train, job.test, trainer.gaussians
     on_cuda = job.device.type == "cuda"
     peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(job.device)} if on_cuda else {}
     names = image_names(v.name for v in scene.views)
-    scored = (job.out, gaussians, train, test, c.rule, scene.background)
-    metrics = evaluate_run(*scored, job.lpips, trainer.max_instances, names=names)
+    scored, tell = (job.out, gaussians, train, test, c.rule, scene.background), job.progress
+    metrics = evaluate_run(*scored, job.lpips, trainer.max_instances, names=names, tell=tell)
     if test:
-        metrics["coverage"] = coverage_of_run(*scored, trainer.max_instances, names=names)
+        metrics["coverage"] = coverage_of_run(*scored, trainer.max_instances, names=names, tell=tell)
+    tell("comparing renders with float64")
     rule = rule_report_of(
         gaussians, train, c.rule, scene.background, seed=c.seed, half_resolution=trainer.half_resolution,
         max_instances=trainer.max_instances,
     )  # fmt: skip
     shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.extent, [v.camera for v in train])
     options = options_for(c.rule, scene.background, gaussians, trainer.max_instances)
-    fractions = moved_fractions(train, (Rendered(*render_view(gaussians, v, options)) for v in train))
+    shown = counted(train, job.progress, "looking for what moved", "views")
+    fractions = moved_fractions(train, (Rendered(*render_view(gaussians, v, options)) for v in shown))
     moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
-    exposures = {}
+    complexity, exposures = complexity_figures(trainer), {}
     if c.exposure:
         rows = trainer.view_table.params[EXPOSURE]
         exposures = {"exposure": exposure_figures(job.split.train, rows, test, gaussians, options)}
-    for note in [rule["summary"], shape_summary(shape), *moved_notes(moved), *(e["summary"] for e in exposures.values())]:
-        job.notes.append(note)
-        job.say(f"  {note}")
+    details = [rule["summary"], shape_summary(shape), complexity_summary(complexity)]
+    for note in [*map(Detail, details), *moved_notes(moved), *(e["summary"] for e in exposures.values())]:
+        job.note(note)
+    compiling = {"compiling": sum(job.compiled)} if job.compiled else {}
     return metrics | {
         "protocol": protocol_of(scene, job.request.split, job.request.downscale or 1, train, test),
-        "steps": trainer.step, "gaussians": len(gaussians), "preset": c.preset, "seed": c.seed,
+        "steps": trainer.step, "batch": c.batch, "ranks": job.ranks.count,
+        "gaussians": len(gaussians), "preset": c.preset, "seed": c.seed,
         "config_hash": c.fingerprint(), "fingerprint": scene.fingerprint, "device": job.where.removeprefix("on "),
-        "seconds": {**seconds, "total": time.perf_counter() - job.began}, **peak,
+        "seconds": {**seconds, **compiling, "total": time.perf_counter() - job.began}, **peak,
         "memory": trainer.memory.to_json(), "rule": rule, "shape": shape,
-        **event_figures(trainer), **complexity_figures(trainer), **exposures,
+        **event_figures(trainer), **complexity, **exposures,
         "photographs": [p.to_json() | {"moved": moved.get(p.name)} for p in job.photographs],
     }  # fmt: skip
 
 
-def _train(job: _Job, trainer: Trainer, images_written: Callable[[], None]) -> None:
+def _train(job: FitJob, trainer: Trainer, images_written: Callable[[], None]) -> None:
     """Take all remaining steps, with a log and checkpoints where there is a run folder; images come before a checkpoint."""
     out = job.out
     log = None if out is None else EventLog(out / "metrics.jsonl", trainer.step)
@@ -341,12 +322,18 @@ def _train(job: _Job, trainer: Trainer, images_written: Callable[[], None]) -> N
         log.rewind(current.step)
         return True
 
+    slow, compiled = -1, -1  # the last step of those that took longer than steps to come will; kernels compiled by then
+
     with Progress(trainer.steps, trainer.step) if job.verbose else contextlib.nullcontext() as progress:
 
         def on_step(r: StepReport) -> None:
+            nonlocal slow, compiled
+            if len(job.compiled) > compiled:
+                slow, compiled = trainer.step, len(job.compiled)
             if progress is not None:
                 progress.total = trainer.steps  # fewer, once the fit is known to end earlier
-                progress.update(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count)
+                seconds = None if r.step <= slow else r.seconds
+                progress.update(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=seconds)
             if log is not None:
                 log.write(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=round(r.seconds, 6))
             _tell(job, trainer)
@@ -360,9 +347,11 @@ def _train(job: _Job, trainer: Trainer, images_written: Callable[[], None]) -> N
                 run(trainer, on_step, save, stopped, restore)
         except NotFiniteError as e:
             if out is None or e.view is None:
+                if e.view is not None:
+                    job.ranks.leave()  # all have this loss, and the first says so
                 raise
             name = job.split.train[e.view]
-            save_failed_step(out / FAILED, failed_step(trainer, e.view, name))
+            save_failed_step(out / FAILED, failed_step(trainer, e.view, name, e.slot))
             save(trainer)
             raise NotFiniteError(
                 f"{e}, on {name}. The state before is saved, and so is what that step computed with: `warpgs doctor --repeat "
@@ -374,25 +363,8 @@ def _train(job: _Job, trainer: Trainer, images_written: Callable[[], None]) -> N
                 log.close()
 
 
-def _tell(job: _Job, trainer: Trainer) -> None:
+def _tell(job: FitJob, trainer: Trainer) -> None:
     """Print what the fit has to say, and keep it for the report."""
     while trainer.messages:
-        job.notes.append(trainer.messages.pop(0))
-        trainer.notes.append(job.notes[-1])  # a continued run has them in its report, too
-        job.say(f"  {job.notes[-1]}")
-
-
-def _print_result(job: _Job, metrics: dict[str, Any]) -> None:
-    """Print scores, sizes and where the results are."""
-    if metrics["test"]:
-        job.say(f"held-out {score_line(metrics['test'])} over {len(metrics['views'])} views")
-        job.say(f"  {metrics['coverage']['summary']}")
-        for name, value in metrics["baselines"].items():
-            job.say(f"  without a fit, the {name.replace('_', ' ')} scores {value:.2f} dB")
-    else:
-        job.say(NO_SCORES)
-    job.say(complexity_summary(metrics))
-    if job.out is None:
-        job.say(f"{metrics['gaussians']:,} Gaussians; no folder was asked for, so nothing is written")
-    else:
-        job.say(f"{metrics['gaussians']:,} Gaussians; report: {job.out / 'report.html'}  images: {job.out / 'renders'}")
+        trainer.notes.append(trainer.messages.pop(0))  # a continued run has them in its report, too
+        job.note(trainer.notes[-1])

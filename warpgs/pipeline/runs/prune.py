@@ -27,6 +27,7 @@ from warpgs.pipeline.runs.folder import CONFIG, StoredRun, camera_values, open_r
 from warpgs.pipeline.runs.request import choose_device
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.render.rasterize import RasterizeOptions
+from warpgs.report.progress import waiting
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Gaussians, Normalization, View
@@ -100,9 +101,12 @@ def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str, re
     device, _ = choose_device(device_name)
     stored = open_run(folder, device)
     out = _new_folder(folder, out)
-    _, train, test = scene_of(stored, reader)
+    tell = waiting()
+    _, train, test = scene_of(stored, reader, tell)
     before, options = stored.gaussians(), stored.options()
+    tell("finding what the training views can spare")
     made = _pruned(stored, train, options, keep_psnr)
+    tell("scoring")
 
     degrees = compress.stored_degrees(before.sh)
     sizes = [model_bytes(d) for d in (degrees, made.degrees)]

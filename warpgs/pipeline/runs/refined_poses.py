@@ -45,6 +45,27 @@ def _similarity(given: Sequence[Camera], refined: Sequence[Camera]) -> tuple[np.
     return R, scale, b.mean(0) - scale * matmul(R, a.mean(0))
 
 
+def similar_cameras(
+    cameras: Mapping[str, Camera], given: Sequence[Camera], refined: Sequence[Camera], names: Sequence[str]
+) -> dict[str, Camera]:
+    """Return the named cameras after the similarity that takes given cameras to refined ones best, by name.
+
+    Args:
+        cameras: Cameras by name, in the world of the given ones.
+        given: Cameras before.
+        refined: The same cameras after, in the same order.
+        names: Names of the cameras to return.
+    """
+    R, scale, t = _similarity(given, refined)
+    found = {}
+    for name in names:
+        turned, center = matmul(cameras[name].viewmat[:3, :3], R.T), scale * matmul(R, cameras[name].center) + t
+        viewmat = np.eye(4)
+        viewmat[:3, :3], viewmat[:3, 3] = turned, -matmul(turned, center)
+        found[name] = replace(cameras[name], viewmat=viewmat)
+    return found
+
+
 def refined_cameras(
     cameras: Mapping[str, Camera], train: Sequence[str], test: Sequence[str], tensors: Mapping[str, torch.Tensor]
 ) -> dict[str, Camera]:
@@ -62,12 +83,7 @@ def refined_cameras(
     motions, found = _motions(tensors, len(train)), dict(cameras)
     for name, motion in zip(train, motions):
         found[name] = replace(cameras[name], viewmat=matmul(motion, cameras[name].viewmat))
-    R, scale, t = _similarity([cameras[n] for n in train], [found[n] for n in train])
-    for name in test:
-        turned, center = matmul(cameras[name].viewmat[:3, :3], R.T), scale * matmul(R, cameras[name].center) + t
-        viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = turned, -matmul(turned, center)
-        found[name] = replace(cameras[name], viewmat=viewmat)
+    found |= similar_cameras(cameras, [cameras[n] for n in train], [found[n] for n in train], test)
     return found
 
 

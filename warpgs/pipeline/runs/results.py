@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import shlex
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -25,15 +27,21 @@ from warpgs.pipeline.metrics.evaluate import (
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.runs.coverage_report import coverage_section
 from warpgs.pipeline.runs.image_names import image_names
+from warpgs.pipeline.runs.request import NO_SCORES
+from warpgs.pipeline.runs.rig import up_of
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.report.curve import curve
 from warpgs.report.events import read_events
-from warpgs.report.images import depth_map, error_map, png, side_by_side
+from warpgs.report.images import depth_map, error_map, png, side_by_side, webp
 from warpgs.report.overview import render_overview
 from warpgs.report.page import SamplingReport, ViewImages, write_page
+from warpgs.report.progress import duration
 from warpgs.runtime.byte_units import format_bytes
+from warpgs.runtime.terminal import counted
 from warpgs.scene import Gaussians, Scene, View
 
+Overview = tuple[bytes | None, str]
+"""PNG of the 3D overview and an empty text, or None and the reason."""
 LABELS = {
     "psnr": "PSNR [dB]", "psnr_whole": "PSNR, whole image [dB]", "psnr_foreground": "PSNR, foreground [dB]",
     "alpha_empty": "alpha where empty", "alpha_object": "alpha in the object",
@@ -42,6 +50,8 @@ LABELS = {
     "lpips_alex_legacy": "LPIPS-Alex [0, 1]", "lpips_alex_standard": "LPIPS-Alex [-1, 1]", "lpips": "LPIPS",
 }  # fmt: skip
 """Names of scores for people."""
+BASELINES = {"mean_photo": "the mean photograph", "nearest_photo": "the nearest photograph"}
+"""Images that are scored without a fit, for people."""
 SHOWN_VIEWS = 6
 """Held-out views with images in the report; all have files in the run folder."""
 RENDER_WORKERS = 4
@@ -65,6 +75,38 @@ def score_line(scores: dict[str, float]) -> str:
     return f"PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f}{''.join(opacity)}{lpips}"
 
 
+def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
+    """Return the end of a fit for people: scores, size, time, where the report is, and what to do next.
+
+    Args:
+        metrics: Contents of metrics.json.
+        out: The run folder, or None.
+    """
+    if metrics["test"]:
+        best = ", ".join(f"{BASELINES.get(name, name)} {value:.2f} dB" for name, value in metrics["baselines"].items())
+        lines = [
+            f"held-out {score_line(metrics['test'])} over {len(metrics['views'])} views",
+            *([f"  for comparison, without a fit: {best}"] if best else []),
+            f"  {metrics['coverage']['summary']}",
+        ]
+    else:
+        lines = [NO_SCORES, f"training PSNR {metrics['train']['psnr']:.2f} dB"]
+    compiling = metrics["seconds"].get("compiling", 0.0)
+    once = f", {duration(compiling)} of it for kernels, once on this machine" if compiling >= 1 else ""
+    size = format_bytes(metrics["complexity"]["bytes"])
+    lines.append(f"{metrics['gaussians']:,} Gaussians, {size}, in {duration(metrics['seconds']['total'])}{once}")
+    if out is None:
+        return [*lines, "no folder was asked for, so nothing is written"]
+    run = shlex.quote(str(out))
+    commands = {
+        f"warpgs view {run}": "to look around in a browser", f"warpgs render {run}": "for a film",
+        f"warpgs export {run} --to scene.html": "for one file that opens anywhere",
+    }  # fmt: skip
+    width = max(map(len, commands))
+    following = [f"  {command:<{width}}  {purpose}" for command, purpose in commands.items()]
+    return [*lines, f"report: {out / 'report.html'}", "next:", *following]
+
+
 def protocol_of(scene: Scene, spec: str | None, downscale: int, train: list[View], test: list[View]) -> dict[str, Any]:
     """Return the conditions in which scores must agree before they may be compared, for result files and the page."""
     sizes = sorted({(v.camera.width, v.camera.height) for v in test or train})
@@ -86,6 +128,7 @@ def evaluate_run(
     max_instances: int | None = None,
     *,
     names: dict[str, str] | None = None,
+    tell: Callable[[str], object] = lambda line: None,
 ) -> dict[str, Any]:
     """Score held-out and training views, and save a render and a depth map of each held-out view.
 
@@ -101,6 +144,7 @@ def evaluate_run(
         lpips: Network for LPIPS, or None.
         max_instances: As in RasterizeOptions.
         names: Names of image files by view, as `image_names` gives them for the whole scene; None for those of these views.
+        tell: Takes a line on each view before it is rendered.
 
     Returns:
         Means over held-out and over training views, a row per held-out view, scores of baselines, and what each score is.
@@ -124,7 +168,7 @@ def evaluate_run(
 
     tasks, jobs = [(finish, v) for v in test or train] + [(compare, v) for v in train if test], []
     with ThreadPoolExecutor(RENDER_WORKERS if lpips is None else 1) as render_workers:  # LPIPS takes much memory a view
-        for work, view in tasks:
+        for work, view in counted(tasks, tell, "scoring", "views"):
             jobs.append(render_workers.submit(work, view, *render_view(gaussians, view, options)))
             if len(jobs) > RENDER_WORKERS:
                 jobs[-RENDER_WORKERS].result()  # not all images at once
@@ -138,28 +182,31 @@ def evaluate_run(
     }  # fmt: skip
 
 
-def _images(views: list[View], gaussians: Gaussians, options: RasterizeOptions, rows: dict[str, Any]) -> list[ViewImages]:
+def _images(
+    views: list[View], gaussians: Gaussians, options: RasterizeOptions, rows: dict[str, Any], tell: Callable[[str], object]
+) -> list[ViewImages]:
     """Render up to `SHOWN_VIEWS` of the views, evenly spaced, and encode what the page shows of them."""
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(SHOWN_VIEWS, len(views))).round().astype(int))]
     result = []
     with ThreadPoolExecutor(RENDER_WORKERS) as render_workers:
-        for view in chosen:
+        for view in counted(chosen, tell, "making the report", "views"):
             image, depth, alpha = render_view(gaussians, view, options)
             row = rows.get(view.name)
             region = f", over {row['region']}" if row and row["region"] != "all" else ""
             caption = f"PSNR {row['psnr']:.2f} dB{region}, SSIM {row['ssim']:.3f}" if row else "training view"
             parts = (image, view.image, error_map(image, view.image), depth_map(depth, alpha))
-            result.append((view.name, caption, render_workers.map(png, parts)))
+            result.append((view.name, caption, render_workers.map(webp, parts)))
     return [ViewImages(name, caption, *parts) for name, caption, parts in result]
 
 
-def _overview(gaussians: Gaussians, train: list[View], test: list[View]) -> tuple[bytes | None, str]:
-    """Return the PNG of the 3D overview, or None and the reason."""
-    means = gaussians.means.cpu().numpy()
-    colors = np.clip(C0 * gaussians.sh[:, 0].cpu().numpy() + 0.5, 0, 1)
+def overview_of(gaussians: Gaussians, train: list[View], test: list[View]) -> Callable[[], Overview]:
+    """Return a function that draws the 3D overview, in a process of its own: it may be called from another thread."""
+    means = gaussians.means.detach().cpu().numpy()
+    colors = np.clip(C0 * gaussians.sh[:, 0].detach().cpu().numpy() + 0.5, 0, 1)
     sample = np.random.default_rng(0).permutation(len(means))[:OVERVIEW_POINTS]
-    cameras = ([v.camera for v in train], [v.camera for v in test])
-    return render_overview(*cameras, means[sample].astype(np.float64), colors[sample])
+    points, cameras = means[sample].astype(np.float64), ([v.camera for v in train], [v.camera for v in test])
+    up = up_of(cameras[0], points)
+    return lambda: render_overview(*cameras, points, colors[sample], up)
 
 
 def _figures(metrics: dict[str, Any]) -> list[tuple[str, str]]:
@@ -176,9 +223,8 @@ def _figures(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     return [
         *held_out,
         ("training PSNR", f"{metrics['train']['psnr']:.2f} dB"), ("Gaussians", f"{metrics['gaussians']:,}"),
-        ("mean SH degree", f"{metrics['complexity']['mean_degree']:.2f}"),
         ("model", format_bytes(metrics["complexity"]["bytes"])),
-        ("steps", f"{metrics['steps']:,}"), ("time", f"{metrics['seconds']['total']:.0f} s"),
+        ("steps", f"{metrics['steps']:,}"), ("time", duration(metrics["seconds"]["total"])),
     ]  # fmt: skip
 
 
@@ -196,8 +242,11 @@ def write_report(
     gaussians: Gaussians,
     metrics: dict[str, Any],
     record: dict[str, Any],
+    *,
     sampling: SamplingReport | None,
-) -> str:
+    overview: Overview,
+    tell: Callable[[str], object] = lambda line: None,
+) -> None:
     """Write report.html for a run whose scores are known.
 
     Args:
@@ -208,12 +257,11 @@ def write_report(
         metrics: Contents of metrics.json.
         record: Contents of config.json.
         sampling: The part on sampling events, or None.
-
-    Returns:
-        The reason why the page has no 3D overview; empty where it has one.
+        overview: What the function of `overview_of` returned.
+        tell: Takes a line on each view before it is rendered.
     """
     train, test = [scene.view(n) for n in split.train], [scene.view(n) for n in split.test]
-    overview, why = _overview(gaussians, train, test)
+    image, why = overview
     notes = [*record["notes"], *([why] if why else [])]
     events = read_events(out / "metrics.jsonl")
     steps = [e["step"] for e in events]
@@ -227,7 +275,7 @@ def write_report(
         for r in metrics["views"]
     ]
     options = options_for(record["config"]["rule"], tuple(record["background"]), gaussians)
-    images = _images(test or train, gaussians, options, {r["name"]: r for r in metrics["views"]})
+    images = _images(test or train, gaussians, options, {r["name"]: r for r in metrics["views"]}, tell)
     covered = None
     if "coverage" in metrics:
         names = image_names(v.name for v in scene.views)
@@ -239,7 +287,7 @@ def write_report(
         subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
         f"{camera.width} x {camera.height} px, {metrics['device']}",
         figures=_figures(metrics), notes=notes, table=table, views=images, curves=curves, sampling=sampling,
-        overview=overview, details={k: v for k, v in record.items() if k != "cameras"}, protocol=_protocol(metrics),
+        overview=None if image is None else webp(image), held_out=bool(test),
+        details={k: v for k, v in record.items() if k != "cameras"}, protocol=_protocol(metrics),
         coverage=covered,
     )  # fmt: skip
-    return why

@@ -200,3 +200,15 @@ def rig_of(cameras: list[Camera], depth: float) -> Rig:
         kind, focus, up, first, _span(azimuths), float(np.median(distances)), float(elevations.mean()),
         float(elevations.std()), turned,
     )  # fmt: skip
+
+
+def up_of(cameras: list[Camera], points: np.ndarray) -> np.ndarray:
+    """Return the upward direction of a scene, as films have it: of length 1, shape [3].
+
+    Args:
+        cameras: Training cameras, at least one.
+        points: Points that they show, such as the means of Gaussians [u], shape [N, 3].
+    """
+    depths = np.concatenate([matmul(points - c.center, c.viewmat[2, :3]) for c in cameras[:: max(1, len(cameras) // 5)]])
+    ahead = depths[depths > 0]
+    return rig_of(cameras, float(np.median(ahead)) if len(ahead) else 1.0).up

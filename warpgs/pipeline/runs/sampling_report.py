@@ -19,13 +19,15 @@ from warpgs.pipeline.train.strategies.sampler import SUPPORT
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.report.contact_sheet import Tile, contact_sheet
-from warpgs.report.images import png
+from warpgs.report.images import png, webp
 from warpgs.report.page import SamplingReport
 
 FOLDER = "sampling"
 """Subfolder of a run with the images, ``STEP.png``."""
 SHOWN = 3
 """Number of views in an image."""
+SHEET_WIDTH = 1600
+"""Largest width of an image on the report page [px], where it is shown as wide."""
 OPEN, CLOSED = (0.97, 0.97, 0.95), (0.17, 0.19, 0.22)
 """Colours of the gate."""
 FADED = 0.45
@@ -200,5 +202,6 @@ def sampling_report_of(fit: Trainer, out: Path) -> SamplingReport | None:
         ["sampling events", "Gaussians added", "evicted", "coarse at the end", "fine at the end"],
         [f"{n:,}" for n in (events["count"], events["added"], events["evicted"], layers["coarse"], layers["fine"])],
     ]
-    images = [(f"sampling after step {int(p.stem):,}", p.read_bytes()) for p in sorted((out / FOLDER).glob("*.png"))]
+    files = sorted((out / FOLDER).glob("*.png"))
+    images = [(f"sampling after step {int(p.stem):,}", webp(p.read_bytes(), SHEET_WIDTH, 70)) for p in files]
     return SamplingReport(words, images, table)

@@ -8,7 +8,7 @@ while the Gaussians turn brighter, and no training image would tell.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -16,6 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from warpgs.errors import UsageError
 from warpgs.pipeline.train.loss import LossTerm, Target, register
+from warpgs.pipeline.train.views import TrainingView
 from warpgs.scene import Gaussians, Render, View
 
 EXPOSURE = "exposure_affine"
@@ -81,7 +82,24 @@ def exposed(rgb: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
     return found
 
 
-@register("exposure")
+def exposed_views(views: list[TrainingView]) -> list[TrainingView]:
+    """Return the views with an exposure each, none at first, which `show_exposures` overwrites."""
+    return [replace(v, exposure=torch.zeros(CHANNELS * (CHANNELS + 1), device=v.image.device)) for v in views]
+
+
+def show_exposures(views: list[TrainingView], rows: torch.Tensor) -> None:
+    """Write the exposures as they are now, from the parameters of all views [V, 12], into views of `exposed_views`."""
+    for view, row in zip(views, exposure_of(rows, rows).detach(), strict=True):
+        assert view.exposure is not None
+        view.exposure.copy_(row)
+
+
+def seen_in(view: TrainingView, rgb: torch.Tensor) -> torch.Tensor:
+    """Return the colours of a render [H, W, 3] as a training view shows them, under its exposure if it has one."""
+    return rgb if view.exposure is None else exposed(rgb, view.exposure)
+
+
+@register("exposure_penalty")
 @dataclass(frozen=True)
 class ExposurePenalty(LossTerm):
     """The weighted sum of the squares of a view's exposure, which holds it to the identity."""
@@ -91,7 +109,7 @@ class ExposurePenalty(LossTerm):
 
     def __post_init__(self) -> None:
         if not 0 <= self.weight <= 1000:
-            raise UsageError(f"exposure: weight {self.weight} must lie between 0 and 1000")
+            raise UsageError(f"exposure-penalty: weight {self.weight} must lie between 0 and 1000")
 
     def __call__(self, render: Render, target: Target, gaussians: Gaussians) -> torch.Tensor:
         """Compute ``weight`` times the sum of squares of [A - 1 | b], shape []."""

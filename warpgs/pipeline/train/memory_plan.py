@@ -20,12 +20,17 @@ from warpgs.kernels.tiles import LIST_BYTES, MAX_INSTANCES, grid
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.runtime.byte_units import format_bytes
+from warpgs.runtime.terminal import Detail
 from warpgs.scene import Camera, Gaussians
 
 FLOAT = 4
 """Bytes of a float32 or int32."""
+CAMERA = 16 + 9
+"""Numbers of the gradient of view matrix and intrinsics, which each Gaussian has until they are summed."""
 SAMPLED = 8
 """Largest number of views that a sampling event samples in (`importance_sampling.MAX_VIEWS`)."""
+SUMMED = 2
+"""Statistics of each Gaussian that are summed with the gradients of several views: sum of its gradients, number of renders."""
 TILE = 16
 """Side of a tile in a fit [px]."""
 
@@ -70,8 +75,14 @@ class Layout:
     """CUDA graphs that exist at a time, one for each size of view; 0 where steps are taken one by one."""
     cutout: bool = False
     """True where views know their opacity."""
+    sums: int = 0
+    """Sums of gradients and statistics that a step of several views keeps (`warpgs.pipeline.train.slots`)."""
     trimmed: bool = False
     """True where the strategy trims the model: with lower degrees, merged and tried, it then stands there three times more."""
+    refined: bool = False
+    """True where poses are refined: each Gaussian has a gradient of the camera until these are summed."""
+    exposed: bool = False
+    """True where views have exposures: the render stands there with and without."""
 
     @property
     def row(self) -> int:
@@ -79,8 +90,9 @@ class Layout:
         return FLOAT * (3 + 4 + 3 + 1 + 3 * self.coefficients)
 
     def held(self, count: int) -> int:
-        """Return the bytes that last from step to step: parameters, two Adam moments, columns, and views."""
-        return (3 * self.row + self.column_bytes) * count + self.view_bytes
+        """Return the bytes that last from step to step: parameters, two Adam moments, columns, sums over slots, and views."""
+        sums = self.sums * (self.row + SUMMED * FLOAT)
+        return (3 * self.row + self.column_bytes + sums) * count + self.view_bytes
 
     def moments(self, count: int, instances: int, chunked: bool) -> dict[str, int]:
         """Return the bytes on top of `held` at each moment of a step that may be its heaviest.
@@ -101,6 +113,7 @@ class Layout:
         # three partials for each colour and the gradient; masked copies; the two maps that are correlated, with gradients
         # the difference of opacities and its gradient
         loss = FLOAT * pixels * ((19 if self.masked else 12) + 4 * self.depth_supervised + 3 * self.cutout)
+        loss += FLOAT * pixels * 3 * self.exposed
         if not self.cuda:
             loss += 5 * FLOAT * (3 * self.width + 30) * -(-self.height // 8)
         # an event keeps image, scores and gate of each view until its end
@@ -128,7 +141,7 @@ class Layout:
 
     def _projection(self, count: int) -> int:
         """Return the bytes of projected Gaussians, of their gradient and its copy for statistics, and of other gradients."""
-        return (FLOAT * (3 * PROJECTED_SIZE + 1) + self.row) * count
+        return (FLOAT * (3 * PROJECTED_SIZE + 1 + CAMERA * self.refined) + self.row) * count
 
     def event(self, before: int, after: int) -> int:
         """Return the bytes on top of ``held(after)`` while Gaussians are added: new rows, and one tensor before and after."""
@@ -215,7 +228,8 @@ class MemoryPlan:
                 text += (
                     f"; the {format_bytes(self.available)} that are free are reached at about {reached:,}, --memory-limit helps"
                 )
-            return text
+                return text
+            return text if self.chunked else Detail(text)
         text += f"; limit {format_bytes(self.limit)}"
         if self.lowered_from is not None:
             text += f", so there will be at most {self.cap:,} Gaussians, not {self.lowered_from:,}"
@@ -233,6 +247,9 @@ def layout_of(
     captured: bool = False,
     depth_supervised: bool = False,
     trimmed: bool = False,
+    refined: bool = False,
+    exposed: bool = False,
+    sums: int = 0,
 ) -> Layout:
     """Return the layout of steps of a fit.
 
@@ -244,6 +261,9 @@ def layout_of(
         captured: True to capture steps as CUDA graphs where the device can.
         depth_supervised: True where the loss has its depth term.
         trimmed: True where the strategy trims the model.
+        refined: True where poses are refined.
+        exposed: True where views have exposures.
+        sums: Sums of gradients that a step of several views keeps.
     """
     largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
     cuda = table.device.type == "cuda"
@@ -251,7 +271,7 @@ def layout_of(
         table.gaussians.sh.shape[1], largest.width, largest.height, view_bytes([*views, *kept]),
         sum(c.element_size() for c in table.columns.values()), len(views), any(v.mask is not None for v in views),
         scored, depth_supervised, cuda, len({v.kind for v in views}) if cuda and captured else 0,
-        any(v.alpha is not None for v in views), trimmed,
+        any(v.alpha is not None for v in views), sums, trimmed, refined, exposed,
     )  # fmt: skip
 
 

@@ -45,11 +45,13 @@ class OptimizerConfig:
     """Learning rate of the constant colour coefficient."""
     sh_rest_factor: float = 0.05
     """Fraction of that for the other coefficients."""
-    pose_rotation_lr: float = 5e-4
-    """Learning rate of the training cameras' rotations [rad] at the start, where poses are refined."""
-    pose_translation_lr: float = 5e-4
+    pose_start: float = 0.2
+    """Fraction of the steps before poses are refined, in [0, 1): the first Gaussians tell nothing of them."""
+    pose_rotation_lr: float = 2e-4
+    """Learning rate of the training cameras' rotations [rad] from then on, where poses are refined."""
+    pose_translation_lr: float = 2e-4
     """The same of their translations, times the scene's extent."""
-    pose_decay: float = 0.01
+    pose_decay: float = 0.1
     """Fraction of both that is left at the last step; log-linear between."""
     exposure_lr: float = 5e-3
     """Learning rate of the training views' exposures at the start, where these are learned."""
@@ -58,8 +60,10 @@ class OptimizerConfig:
 
     def __post_init__(self):
         for name, value in vars(self).items():
-            if value is not None and not 0 < value <= MAX_LR:
+            if name != "pose_start" and value is not None and not 0 < value <= MAX_LR:
                 raise UsageError(f"optimizer {name} must be positive and at most {MAX_LR:g}, not {value}")
+        if not 0 <= self.pose_start < 1:
+            raise UsageError(f"optimizer pose_start must be at least 0 and less than 1, not {self.pose_start}")
 
     def lrs(self, progress: float, extent: float, stable_start: float = 0.0) -> dict[str, float]:
         """Return the learning rate of each parameter.
@@ -81,7 +85,8 @@ class OptimizerConfig:
 
     def pose_lrs(self, progress: float, extent: float) -> tuple[float, float]:
         """Return the learning rates of rotations [rad] and translations [u] of cameras; arguments are those of `lrs`."""
-        left = log_linear(1.0, self.pose_decay, progress)
+        begun = (progress - self.pose_start) / (1 - self.pose_start)
+        left = log_linear(1.0, self.pose_decay, begun) if begun >= 0 else 0.0
         return self.pose_rotation_lr * left, self.pose_translation_lr * extent * left
 
     def exposure_lr_at(self, progress: float) -> float:

@@ -22,6 +22,7 @@ from warpgs.pipeline.train.strategies.importance_sampling import scored
 from warpgs.pipeline.train.views import TrainingView, with_alpha
 from warpgs.priors.cache import cache_folder
 from warpgs.priors.view_prior import view_priors
+from warpgs.runtime.terminal import Detail
 from warpgs.scene import PointCloud, Prior, View
 
 
@@ -72,12 +73,15 @@ def prepare(
     notes = []
     if priors is None and needs_priors(config):
         regions, cache = [fitted_region(v)[0] for v in train], cache_folder()
-        progress("finding what stands out in the views")
         # semantics come first: they are found while the device is made ready
-        priors, notes = view_priors(train, config.priors, depths=lambda: start().depths, regions=regions, cache=cache)
+        priors, notes = view_priors(
+            train, config.priors, depths=lambda: start().depths, regions=regions, cache=cache, tell=progress
+        )
     found = start()
     ready()
-    return Preparation(found, priors, [*(line.strip() for line in f"start: {found.how}".splitlines()), *notes])
+    lines = f"start: {found.how}".splitlines()
+    # lines on single views are indented
+    return Preparation(found, priors, [*(Detail(n.strip()) if n.startswith(" ") else n for n in lines), *notes])
 
 
 def needs_priors(config: FitConfig) -> bool:
@@ -132,5 +136,5 @@ def prepared_views(
     if config.loss.depth_weight > 0:
         known = sum(bool(p.disparity.any()) for p in priors)
         more = "" if known else "; --depth-model, or a start by --init.source sweep or flow, makes priors"
-        made.notes.append(f"depth term: in {known} of {len(views)} views, those whose prior knows a depth{more}")
+        made.notes.append(Detail(f"depth term: in {known} of {len(views)} views, those whose prior knows a depth{more}"))
     return found, disparities

@@ -36,6 +36,8 @@ class TrainingView:
     """Maps that loss terms asked for, by name, each of shape [H, W] or [H, W, C]."""
     alpha: torch.Tensor | None = None
     """Opacity of what was photographed, in [0, 1], shape [H, W]; None where no training view has one (`with_alpha`)."""
+    exposure: torch.Tensor | None = None
+    """Exposure as it is now, rows of [A - 1 | b], shape [12], overwritten in place; None where none are learned."""
 
     @staticmethod
     def of(view: View, device: torch.device) -> TrainingView:
@@ -93,7 +95,7 @@ def half_size(view: TrainingView) -> TrainingView:
 
     mask = None if view.mask is None else (mean(view.mask[None])[0] > 1 - 1e-4).to(view.mask.dtype)
     maps, alpha = {n: smaller(t) for n, t in view.maps.items()}, None if view.alpha is None else smaller(view.alpha)
-    return TrainingView(camera, smaller(view.image), mask, maps=maps, alpha=alpha)
+    return TrainingView(camera, smaller(view.image), mask, maps=maps, alpha=alpha, exposure=view.exposure)
 
 
 Rows = torch.Tensor | tuple[torch.Tensor, ...]

@@ -31,11 +31,13 @@ from warpgs.pipeline.train.strategies.holdout_blocks import (
     gain,
     hide,
     only,
+    rendered,
     sample_blocks,
 )
 from warpgs.pipeline.train.strategies.importance_sampling import EVENT, MAX_VIEWS, ImportanceSampling
 from warpgs.pipeline.train.views import TrainingView
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.rasterize import RasterizeOptions
+from warpgs.runtime.terminal import Detail
 from warpgs.scene import Gaussians
 
 RECOVERED_AGAIN = 0.5
@@ -119,12 +121,11 @@ class Holdout(ImportanceSampling):
         if self.measuring:
             t.set_views(shown)
             pixels = sum(len(b) * b.side**2 for b in self.blocks) / sum(v.camera.width * v.camera.height for v in t.views)
-            t.notes.append(
-                f"holdout: {held} blocks, {pixels:.1%} of the pixels, are held out until growth ends, by step {ends}"
-            )
+            words = f"holdout: {held} blocks, {pixels:.1%} of the pixels, are held out until growth ends, by step {ends}"
+            t.notes.append(Detail(words))
         else:
             few = f"the images hold only {held} blocks" if held < MIN_BLOCKS else "growth lasts to the end of the fit"
-            t.notes.append(f"holdout: nothing is held out, since {few}; the fit is as without this strategy")
+            t.notes.append(Detail(f"holdout: nothing is held out, since {few}; the fit is as without this strategy"))
 
     def hold_out(self, views: list[TrainingView]) -> tuple[list[Blocks], list[TrainingView]]:
         """Return what is held out of each view until growth ends, and the views that are trained on until then."""
@@ -208,9 +209,8 @@ class Holdout(ImportanceSampling):
 
     def _options(self) -> RasterizeOptions:
         t = self.trainer
-        degree = self.sh_degree(t.step)
         return RasterizeOptions(
-            rule=t.config.rule, sh_degree=degree, background=t.background, max_instances=t.max_instances
+            rule=t.config.rule, sh_degree=self.sh_degree(t.step), background=t.background, max_instances=t.max_instances
         )  # fmt: skip
 
     def _errors(self, gaussians: Gaussians) -> torch.Tensor:
@@ -291,16 +291,14 @@ class Holdout(ImportanceSampling):
         self.forget()
         t.set_views(self.whole)
         self.whole = t.views
-        t.messages.append(
-            f"holdout: growth ended at step {step} with {len(t.table):,} Gaussians, because {self.why}; all pixels are trained "
-            "on from here"
-        )
+        words = f"holdout: growth ended at step {step} with {len(t.table):,} Gaussians, because {self.why}"
+        t.messages.append(Detail(f"{words}; all pixels are trained on from here"))
 
     @torch.no_grad()
     def view_psnr(self, gaussians: Gaussians) -> float:
         """Return the mean over the training views of the PSNR over the pixels that count, the error floor included [dB]."""
         options = self._options()
-        errors = [masked_mse(rasterize(gaussians, v.camera, options).rgb, v.image, v.mask).double() for v in self.whole]
+        errors = [masked_mse(rendered(gaussians, v, options), v.image, v.mask).double() for v in self.whole]
         return float((-10 * torch.log10(torch.stack(errors) + FLOOR)).mean())
 
     def psnr_budget(self, psnr: float, step: int) -> float:
@@ -336,10 +334,8 @@ class Holdout(ImportanceSampling):
         self._observe()
         after = self.view_psnr(t.gaussians)
         self.trims.append({"step": step, "before": before, "after": len(made.degrees), "psnr": [whole, after]})
-        t.messages.append(
-            f"holdout: trimmed at step {step} from {before:,} to {len(made.degrees):,} Gaussians for {whole - after:.3f} dB on "
-            "the training views"
-        )
+        words = f"holdout: trimmed at step {step} from {before:,} to {len(made.degrees):,} Gaussians"
+        t.messages.append(Detail(f"{words} for {whole - after:.3f} dB on the training views"))
 
     def _catch_up(self, step: int) -> Iterator[DensityUpdate]:
         """Sample as many fine Gaussians per pixel in the blocks, where none were sampled so far, as there are elsewhere."""

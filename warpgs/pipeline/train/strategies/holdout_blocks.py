@@ -12,6 +12,7 @@ import torch
 
 from warpgs.errors import UsageError
 from warpgs.pipeline.metrics.psnr import psnr_of
+from warpgs.pipeline.train.exposure import seen_in
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Gaussians
@@ -116,6 +117,11 @@ def sample_blocks(views: list[TrainingView], fraction: float, seed: int) -> list
     return found
 
 
+def rendered(gaussians: Gaussians, view: TrainingView, options: RasterizeOptions) -> torch.Tensor:
+    """Return the colours of a model as a training view shows them, under its exposure if it has one, shape [H, W, 3]."""
+    return seen_in(view, rasterize(gaussians, view.camera, options).rgb)
+
+
 def hide(view: TrainingView, blocks: Blocks) -> TrainingView:
     """Return the view with a mask that leaves out the blocks."""
     mask = torch.ones_like(view.image[..., 0]) if view.mask is None else view.mask.clone()
@@ -146,7 +152,7 @@ def block_errors(
     for view, held in zip(views, blocks, strict=True):
         if len(held) == 0:
             continue
-        difference = (rasterize(gaussians, view.camera, options).rgb.clamp(0, 1) - view.image).square().mean(2)
+        difference = (rendered(gaussians, view, options).clamp(0, 1) - view.image).square().mean(2)
         where = held.pixels(difference.device)
         weights = torch.ones_like(difference) if view.mask is None else view.mask
         errors.append(((difference * weights)[where].sum((1, 2)) / weights[where].sum((1, 2))).double().cpu())

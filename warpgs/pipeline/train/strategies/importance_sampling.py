@@ -15,6 +15,7 @@ import torch
 from warpgs import geometry, schema
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.table import Column, DensityUpdate
+from warpgs.pipeline.train.exposure import seen_in
 from warpgs.pipeline.train.strategies import importance as scoring
 from warpgs.pipeline.train.strategies.base import register
 from warpgs.pipeline.train.strategies.clone_split import CloneSplit
@@ -164,7 +165,7 @@ def sample_view(
     valid = valid_pixels(alpha, depth, view.countable, c)
     known = view.semantic is not None
     semantic = view.semantic if known else torch.zeros_like(view.geometry)
-    scores = (scoring.render_score(render.rgb, view.image, valid), semantic, view.geometry)
+    scores = (scoring.render_score(seen_in(view, render.rgb), view.image, valid), semantic, view.geometry)
     score = scoring.importance(scores, config.weights(known))
     wanted = max(1, round(c.fraction * valid.numel()))
     gate, quantile = geometry_gate(view.geometry, valid, c.gate_quantile if config.ra else 0.0, wanted)
@@ -306,9 +307,9 @@ class ImportanceSampling(CloneSplit):
             held = self.is_protected(settings[1]) & going
             logits.copy_(torch.where(held, logits.clamp_min(self.method.protect.logit), logits))
 
-    def after_backward(self, phase, v_projected, visible, size, going):
-        """Gather gradients as `CloneSplit` does, whose phase is the first of the two; ``v_projected`` has shape [1, N, 12]."""
-        super().after_backward(phase[0], v_projected, visible, size, going)
+    def statistics(self, phase, v_projected, visible, size):
+        """Return those of `CloneSplit`, whose phase is the first of the two; ``v_projected`` has shape [1, N, 12]."""
+        return super().statistics(phase[0], v_projected, visible, size)
 
     def samples_after(self, step: int) -> bool:
         """Return whether fine Gaussians are sampled after a step."""

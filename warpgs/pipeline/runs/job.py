@@ -1,0 +1,75 @@
+"""One fit in progress: its inputs, what is known of it so far, and what it tells the user."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+
+from warpgs.io.splits import Split
+from warpgs.pipeline.metrics.lpips import Lpips
+from warpgs.pipeline.runs.model_file import FittedModel
+from warpgs.pipeline.runs.request import SceneRequest
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loop import train_views
+from warpgs.pipeline.train.step_report import StepReport
+from warpgs.priors.photo_checks import PhotoCheck
+from warpgs.runtime.ranks import Ranks
+from warpgs.runtime.terminal import Detail, say
+from warpgs.scene import Scene, View
+
+
+@dataclass
+class FitJob:
+    """One fit in progress: its inputs, and what is known of it so far."""
+
+    scene: Scene
+    request: SceneRequest
+    split: Split
+    config: FitConfig
+    device: torch.device
+    where: str
+    out: Path | None
+    lpips: Lpips | None
+    notes: list[str]
+    verbose: bool
+    on_step: Callable[[StepReport], object] | None
+    began: float
+    progress: Callable[[str], object]
+    on_model: Callable[[FittedModel], object] | None
+    ranks: Ranks
+    compiled: list[float]
+    photographs: list[PhotoCheck] = field(default_factory=list)
+
+    @property
+    def train(self) -> list[View]:
+        """Views to fit."""
+        return train_views(self.scene, self.split.train)
+
+    @property
+    def test(self) -> list[View]:
+        """Views held out."""
+        return train_views(self.scene, self.split.test)
+
+    def say(self, line: str) -> None:
+        """Print a line for the user, unless the fit is to be silent."""
+        if self.verbose:
+            say(line)
+
+    def note(self, line: str) -> None:
+        """Keep a line for the report, and print it where a user may act on it."""
+        self.notes.append(line)
+        if not isinstance(line, Detail):
+            self.say(f"  {line}")
+
+    def announce(self, notes: list[str]) -> None:
+        """Print what is fitted, and every choice made for the user so far, ``notes`` last."""
+        before, self.notes = self.notes, []
+        camera = self.train[0].camera
+        size = f"{camera.width} x {camera.height} px"
+        counts = f"{len(self.train)} views to fit, {len(self.test)} held out"
+        self.say(f"{self.scene.path}: {self.scene.format}, {counts}, {size}, {self.where}")
+        for note in [*before, *notes]:
+            self.note(note)
