@@ -27,6 +27,7 @@ from pathlib import Path
 import torch
 
 from bench import result_file
+from bench.machine import describe
 
 ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|\x1b[()][0-9A-Za-z]|[\r\b]")
 COLUMNS, ROWS = 100, 30
@@ -134,7 +135,8 @@ def main() -> None:
             load = os.getloadavg()[0]
             found = watch([sys.executable, "-P", "-m", "warpgs", *words], folder, own)
             line = [Path(w).name if Path(w).is_absolute() else w for w in words]
-            rows.append({"name": name, "arguments": line, "load": round(load, 1), **found})
+            commit = describe(torch.device("cpu"))["commit"]  # of this row: others may stay from an earlier run
+            rows.append({"name": name, "arguments": line, "load": round(load, 1), **found, "commit": commit})
             print(
                 f"{name}: first text after {found['first_text_s']} s, longest silence {found['longest_silence_s']} s of "
                 f"{found['seconds']} s, exit code {found['exit_code']}, after: {found['after_text']}", flush=True

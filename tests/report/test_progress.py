@@ -114,6 +114,8 @@ def test_in_a_terminal_a_stage_has_one_line_with_a_bar(terminal):
         for view in counted(range(3), stages, "scoring", "views"):
             assert view in range(3)
         say("a note")
+        stages("scoring: 3 of 3 views")
+        assert not module._STATUS.display.finished  # spinner and time go on until another stage begins
         assert Stages().live  # what stands before stdout now is still a terminal
         stages("reading fern: image 12")
     text = out.getvalue()

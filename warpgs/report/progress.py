@@ -50,6 +50,8 @@ class _StatusLine:
         stage, detail = (stage, detail) if stage else (detail, "")
         counted = COUNTED.search(detail)
         done, total = (float(n.replace(",", "")) for n in counted.groups()) if counted else (0.0, None)
+        if total is not None:
+            done = min(done, 0.999 * total)  # the line of a finished task stands still, and this stage may go on
         with self.lock:
             if self.display is None:
                 self.display = self._started()
