@@ -130,6 +130,16 @@ def test_silence_of_another_machine_is_a_loss_after_a_while(monkeypatch, capsys)
     assert not first.is_lost(2)
 
 
+def test_a_machine_has_a_name_on_every_system(monkeypatch):
+    """Where there is no /proc it is that of the computer."""
+
+    def none(*_):
+        raise FileNotFoundError
+
+    monkeypatch.setattr(rank_watch.Path, "read_text", none)
+    assert rank_watch.machine() == rank_watch.platform.node()
+
+
 def test_the_end_of_a_process_is_seen():
     """This one is there, and one that has ended is gone, also while its parent has not asked."""
     ended = subprocess.Popen([sys.executable, "-c", ""], stdout=subprocess.PIPE)
