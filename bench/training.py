@@ -9,17 +9,18 @@ from dataclasses import dataclass
 import torch
 
 from warpgs.pipeline.model.parameter_bounds import model_bytes as bytes_of
-from warpgs.pipeline.model.table import Table
+from warpgs.pipeline.model.table import DensityUpdate, Table
 from warpgs.pipeline.train.complexity import complexity_figures
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loop import run
 from warpgs.pipeline.train.loss import LossConfig, built_in_terms
 from warpgs.pipeline.train.schedule import OptimizerConfig
-from warpgs.pipeline.train.step import MAX_BATCH, Learned, StepBuffers, StepGraphs, StepPlan, eager_renderer, step
+from warpgs.pipeline.train.step import MAX_STEPS, Learned, StepBuffers, StepGraphs, StepPlan, eager_renderer, step
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import ViewStack
 from warpgs.pipeline.train.warmup import warm_up
+from warpgs.runtime.ranks import ALONE
 from warpgs.scene import Camera, Gaussians, PointCloud, View
 
 BLACK = (0.0, 0.0, 0.0)
@@ -28,10 +29,24 @@ KIND = "image"
 
 
 def make_trainer(
-    views: list[View], points: PointCloud | None, config: FitConfig, device: torch.device, background=BLACK
+    views: list[View], points: PointCloud | None, config: FitConfig, device: torch.device, background=BLACK, ranks=ALONE
 ) -> Trainer:
     """Return a trainer at step 0."""
-    return Trainer(views, points, config, device, background)
+    return Trainer(views, points, config, device, background, ranks=ranks)
+
+
+def set_gaussians(trainer: Trainer, gaussians: Gaussians) -> None:
+    """Replace the Gaussians of a trainer, which then begin without moments."""
+    new = {n: t.detach().to(trainer.device) for n, t in gaussians.tensors().items()}
+    nobody = torch.empty(0, dtype=torch.int64, device=trainer.device)
+    parents = torch.full((len(gaussians),), -1, dtype=torch.int64, device=trainer.device)
+    trainer.table.apply(DensityUpdate(nobody, new, parents))
+    trainer.set_views(trainer.views)
+
+
+def state_tensors(trainer: Trainer) -> list[torch.Tensor]:
+    """Return parameters, moments and columns of the Gaussians, in an order that stays."""
+    return [t for _, t in sorted(trainer.table.state().items())]
 
 
 def compile_kernels(config: FitConfig, device: torch.device) -> None:
@@ -154,7 +169,7 @@ class Steps:
         self.views = ViewStack(camera.viewmat, camera.K, target[None], None, {}, numbers)
         self.plan = StepPlan(gaussians.sh_degree, False, tuple(built_in_terms(LossConfig())), None)
         self.graphs = StepGraphs(self.learned, self.buffers, rule, self.background) if device.type == "cuda" else None
-        self._load(range(1, (MAX_BATCH if device.type == "cuda" else 1) + 1))
+        self._load(range(1, (MAX_STEPS if device.type == "cuda" else 1) + 1))
 
     def _load(self, steps: range) -> None:
         config = OptimizerConfig()
@@ -185,7 +200,7 @@ class Steps:
         """
         losses: list[float] = []
         while len(losses) < steps:
-            count = min(MAX_BATCH, steps - len(losses))
+            count = min(MAX_STEPS, steps - len(losses))
             graph = self._graph()
             self._load(range(len(losses) + 1, len(losses) + count + 1))
             for _ in range(count):

@@ -46,15 +46,15 @@ class Sprout(warpgs.Strategy):
         """Return the one number that is kept of each Gaussian: its gradients, summed since the last change."""
         return {"pull": Column(0.0, inherited=False)}
 
-    def after_backward(
-        self, phase: Hashable, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int], going: torch.Tensor
-    ) -> None:
-        """Add the gradient norms of the projected means, ``v_projected`` [1, N, 12], to their sums.
+    def statistics(
+        self, phase: Hashable, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int]
+    ) -> Mapping[str, torch.Tensor]:
+        """Return the gradient norms of the projected means, ``v_projected`` [1, N, 12], which are added to their sums.
 
         This is part of a step, which on CUDA is recorded as a graph: it works on tensors alone.
         """
         norms = v_projected[0, :, :2].norm(dim=1)
-        self.trainer.table.columns["pull"] += torch.where(visible[0], norms, 0) * going
+        return {"pull": torch.where(visible[0], norms, 0)}
 
     def due(self, step: int) -> bool:
         """Return whether the set changes after a step; the last fifth of the fit is left alone."""

@@ -10,7 +10,7 @@ import torch
 
 import warpgs
 from bench import __main__ as bench_main
-from bench import accuracy, many, needles, result_file, splat_transform, step, training
+from bench import accuracy, many, needles, ranks, result_file, splat_transform, step, training
 from bench.inputs import camera as bench_camera
 from bench.inputs import gaussians, image
 from bench.naive import rasterize
@@ -135,3 +135,14 @@ def test_naive_kernels_equal_the_real_ones(device):
     # an alpha within a rounding of the cut may be drawn by one and not by the other
     for found, wanted in [(theirs.detach(), ours.detach()), *pairs]:
         assert float((found - wanted).norm()) <= 1e-4 * float(wanted.norm())
+
+
+def test_steps_of_several_views_are_measured(tmp_path, device):
+    """A row for one process; with one for two of another model, the result says so."""
+    out, path = tmp_path / "ranks.json", points(tmp_path)
+    words = ["garden", path, "--tiles", "1", "--width", "64", "--height", "48", "--batch", "3", "--steps", "3"]
+    assert ranks.main([*words, "--device", device.type, "--out", str(out)]) == 0
+    row = result_file.read(out)["rows"][0]
+    assert row["gaussians"] == 400 and row["step_ms"] > 0 and row["same_model"] and row["efficiency"] == 1
+    rows = ranks.keep(out, device, row | {"ranks": 2, "step_ms": row["step_ms"] / 2, "sha256": "another"})
+    assert [r["efficiency"] for r in rows] == [1, 1] and not any(r["same_model"] for r in rows)

@@ -33,6 +33,7 @@ PROGRAMS = ("warpgs ", "pip ", "ssh ", "make ", "python ", "git ")
 LEFT_OUT = (
     (r"ssh ", "another machine"),
     (r"warpgs .*--device cuda\b", "GPU"),
+    (r"torchrun ", "several GPUs"),
     (r"make (demo|test|install)\b", "the workflow test runs it"),
     (r"(python3 -m venv|source .*activate|pip install (\.|torch)|git clone)", "installing, which --install runs"),
 )
@@ -52,7 +53,8 @@ open("keyframes.json", "w").write(json.dumps(keys))
 END
 """
 LIMITS = {
-    "demo": {"--width": "96", "--height": "72"}, "fit": {"--steps": "40"}, "render": {"--frames": "4"},
+    "demo": {"--width": "96", "--height": "72"}, "fit": {"--steps": "40"}, "farm": {"--steps": "40"},
+    "render": {"--frames": "4"},
     "compare": {"--steps": "20", "--seeds": "1", "--downscale": "1"}, "view": {"--port": "0"},
     "ablate": {"--steps": "20", "--seeds": "1", "--downscale": "1"},
 }  # fmt: skip

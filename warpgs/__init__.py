@@ -60,8 +60,8 @@ if TYPE_CHECKING:
     from warpgs.pipeline.runs.paths import render_path
     from warpgs.pipeline.train.config import PRESETS, FitConfig
     from warpgs.pipeline.train.loss import LossTerm
+    from warpgs.pipeline.train.step_report import StepReport
     from warpgs.pipeline.train.strategies.base import Strategy
-    from warpgs.pipeline.train.trainer import StepReport
     from warpgs.render.graphed import clear_graph_cache
     from warpgs.render.rasterize import RasterizeOptions, rasterize
     from warpgs.render.rule_costs import select_rule
@@ -81,7 +81,7 @@ _HOMES = {
         "warpgs.pipeline.train.config": ("FitConfig", "PRESETS"),
         "warpgs.pipeline.train.loss": ("LossTerm",),
         "warpgs.pipeline.train.strategies.base": ("Strategy",),
-        "warpgs.pipeline.train.trainer": ("StepReport",),
+        "warpgs.pipeline.train.step_report": ("StepReport",),
         "warpgs.render.graphed": ("clear_graph_cache",),
         "warpgs.render.rasterize": ("RasterizeOptions", "rasterize"),
         "warpgs.render.rule_costs": ("select_rule",),

@@ -28,6 +28,8 @@ class NotFiniteError(WarpgsError):
 
     view: int | None = None
     """Number of the training view whose loss it was; None where it was another number."""
+    slot: int = 0
+    """Number of that view among those of the step."""
 
 
 class ResourceError(WarpgsError):

@@ -24,6 +24,7 @@ from warpgs.pipeline.farm.record import CHECKED, LOG, PLY, RECORD, THUMBNAIL, fi
 from warpgs.pipeline.farm.work import run_job
 from warpgs.pipeline.runs.fit import fit_request
 from warpgs.pipeline.train.config import PRESETS
+from warpgs.pipeline.train.loss import LOSS_TERMS
 from warpgs.runtime.folder_lock import hold_folder
 
 
@@ -76,26 +77,49 @@ def digests(statuses):
     return {s.job.name: s.record.files.get(PLY) for s in statuses}
 
 
-def test_processes_give_the_bytes_of_single_fits_and_one_that_is_killed_is_replaced(scenes, single, tmp_path):
-    """The process of the first job is killed once it has a checkpoint: its second attempt goes on from there."""
+TERM = """
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from warpgs.pipeline.train.loss import LossTerm
+
+@dataclass(frozen=True)
+class Blocks(LossTerm):
+    folder: str = ""
+
+    def active(self, step, steps):
+        mark = Path(self.folder, "mark")
+        if step == 5 and not mark.exists():
+            mark.touch()
+            Path(self.folder, "pipe").open()  # nobody ever writes there
+        return False
+"""
+"""A loss term of no effect that stops the first fit that has it before its fifth step."""
+
+
+def test_processes_give_the_bytes_of_single_fits_and_one_that_is_killed_is_replaced(scenes, single, tmp_path, monkeypatch):
+    """The process of the first job is killed in the middle of its fit; code of the user's own is loaded there, too."""
+    monkeypatch.setattr(LOSS_TERMS, "_classes", dict(LOSS_TERMS._classes))
+    (tmp_path / "term.py").write_text(TERM)
+    os.mkfifo(tmp_path / "pipe")
+    term = LOSS_TERMS.load(f"{tmp_path / 'term.py'}:Blocks")
     engine, killed = LocalEngine(local_slots("cpu", 1, 1)), []
-    jobs = jobs_of(scenes, tmp_path / "out", steps=6)
-    pipe = jobs[0].request.out / "metrics.jsonl"
+    jobs = jobs_of(scenes, tmp_path / "out", loss_terms=(term(str(tmp_path)),))
 
     def show(statuses):
-        if statuses[0].step and not killed:
-            killed.append(pipe.is_file())
+        if (tmp_path / "mark").exists() and not killed:
+            killed.append(statuses[0].step)
             os.kill(engine.workers()["s0"], signal.SIGKILL)
 
     try:
-        statuses = run_farm(jobs, engine, show)
+        statuses = run_farm(jobs, engine, show, poll=0.1)
     finally:
         engine.close()
-    assert killed == [True] and [s.attempts for s in statuses] == [2, 1]
+    assert killed and [s.attempts for s in statuses] == [2, 1]
     assert [s.state for s in statuses] == ["done", "done"] and "killed by signal 9" in statuses[0].notes[0]
-    assert digests(statuses) == single
-    assert statuses[0].record.how in ("continued", "redone", "fitted") and (tmp_path / "out" / "s1" / THUMBNAIL).is_file()
+    assert digests(statuses) == single and statuses[0].record.how == "continued"
     assert "held-out PSNR" in (tmp_path / "out" / "s1" / LOG).read_text("utf-8")
+    assert (tmp_path / "out" / "s1" / THUMBNAIL).is_file()
 
 
 def test_a_rerun_skips_what_is_finished_and_valid(scenes, single, results):

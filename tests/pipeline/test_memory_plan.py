@@ -73,6 +73,16 @@ def test_plan_covers_a_step_and_not_much_more(views, count):
     assert fit.memory.planned >= 0.95 * planned and found <= planned <= 1.25 * found + 20_000
 
 
+@pytest.mark.parametrize("batch", [3, 8])
+def test_plan_covers_the_sums_of_several_views(batch):
+    """Their gradients and statistics, of many Gaussians on few pixels."""
+    fit = Trainer(photos(2), seeds(5000), dataclasses.replace(STEADY, batch=batch), CPU)
+    fit.advance()
+    found = measured(fit, 2)
+    planned = fit.layout.step(5000, instances(fit))
+    assert fit.layout.sums == {3: 1, 8: 3}[batch] and found <= planned <= 1.1 * found
+
+
 @pytest.mark.parametrize("views", [photos(2, 400, 300), masked(photos(2, 400, 300))], ids=["all", "masked"])
 def test_plan_covers_the_depth_term(views):
     """A disparity a pixel that stays, and what a correlation and its gradient take."""

@@ -72,6 +72,17 @@ def test_recorded_method_equals_single_steps():
     assert all(torch.equal(a[k], b[k]) for k in a) and [r.count for r in said] == [r.count for r in reports]
 
 
+@pytest.mark.parametrize("views", [photos(4), sizes(), cut_out()], ids=["one size", "two sizes and a mask", "cut out"])
+def test_recorded_batches_equal_single_ones(views):
+    """Of three views each, whose graphs follow one another in a step: the same bits, through densification and resets."""
+    config = dataclasses.replace(BUSY, batch=3, dropout=0.2, steps=40)
+    single, said = fitted(views, recorded=False, config=config)
+    recorded, reports = fitted(views, recorded=True, config=config)
+    a, b = single.state()[0], recorded.state()[0]
+    assert len(single.gaussians) != 61 and recorded.layout.graphs > 0
+    assert all(torch.equal(a[k], b[k]) for k in a) and [r.count for r in said] == [r.count for r in reports]
+
+
 def test_recordings_do_not_pile_up(monkeypatch):
     """Memory of recordings that are no longer used goes back: a long fit holds no more than a short one of its size."""
     torch.cuda.empty_cache()

@@ -98,6 +98,6 @@ def test_what_was_chosen_is_said_and_stored(scene, tmp_path, capsys):
     printed = capsys.readouterr().out
     config, metrics = json.loads((out / "config.json").read_text()), json.loads((out / "metrics.json").read_text())
     assert config["config"]["rule"] == metrics["rule"]["rule"] == RULE_COSTS[0].rule
-    assert f"chose rule {RULE_COSTS[0].rule}" in printed and metrics["rule"]["summary"] in printed
+    assert f"chose rule {RULE_COSTS[0].rule}" in printed
     assert metrics["rule"]["summary"] in (out / "report.html").read_text("utf-8")
     assert re.search(r"a view took [\d.]+ ms instead of", metrics["rule"]["summary"])

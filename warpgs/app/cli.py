@@ -11,6 +11,7 @@ from warpgs.errors import UsageError, WarpgsError
 from warpgs.report.progress import waiting
 from warpgs.runtime.device_memory import is_out_of_memory
 from warpgs.runtime.imports import fast_imports
+from warpgs.runtime.ranks import last_words
 from warpgs.runtime.stop_signals import ignored_signals, interrupting_signals
 from warpgs.runtime.terminal import accept_all_letters, say
 
@@ -92,13 +93,11 @@ def _run(arguments: list[str]) -> int:
             code: int = command.run(arguments[1:], COMMANDS[name])
         return code
     except WarpgsError as e:
-        say(f"warpgs: {e}", error=True)
-        return e.exit_code
+        return last_words(f"warpgs: {e}", e.exit_code)
     except KeyboardInterrupt:
         with ignored_signals():
             hint = "; --resume continues from the last checkpoint" if name == "fit" else ""
-            say(f"warpgs: interrupted{hint}", error=True)
-        return 130
+            return last_words(f"warpgs: interrupted{hint}", 130)
     except BrokenPipeError:  # the reader, `head` for one, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0

@@ -1,16 +1,16 @@
 """The last words of a command that failed, and its exit code."""
 
 from warpgs import __version__
-from warpgs.errors import ResourceError, UsageError
+from warpgs.errors import ResourceError, UsageError, WarpgsError
 from warpgs.plugins import own_frame
 from warpgs.runtime.device_memory import no_memory_message
+from warpgs.runtime.ranks import last_words
 from warpgs.runtime.terminal import say
 
 
 def report_no_memory(error: Exception) -> int:
     """Print that no memory is left, in words that say what to do; return the exit code."""
-    say(f"warpgs: {no_memory_message(error)}", error=True)
-    return ResourceError.exit_code
+    return last_words(f"warpgs: {no_memory_message(error)}", ResourceError.exit_code)
 
 
 def report_defect(error: Exception, arguments: list[str]) -> int:
@@ -31,11 +31,10 @@ def report_defect(error: Exception, arguments: list[str]) -> int:
         where = "above"
     own = own_frame(error)
     if own:
-        say(f"warpgs: {type(error).__name__}: {error} (in your own code, {own}; the details are {where})", error=True)
-        return UsageError.exit_code
-    say(
+        line = f"warpgs: {type(error).__name__}: {error} (in your own code, {own}; the details are {where})"
+        return last_words(line, UsageError.exit_code)
+    line = (
         f"warpgs: internal error, {type(error).__name__}: {error}. This is a defect of warpgs; the details are {where}, "
-        "please report them",
-        error=True,
+        "please report them"
     )
-    return 5
+    return last_words(line, WarpgsError.exit_code)

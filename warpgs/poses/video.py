@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy as np
 from warpgs.errors import DataError
 from warpgs.files import write_bytes
 from warpgs.io.decoding import MAX_PIXELS
+from warpgs.runtime.native_output import hidden_stderr
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 """Endings of video files."""
@@ -28,15 +28,10 @@ def is_video(path: Path) -> bool:
 
 def _frames(path: Path) -> Iterator[np.ndarray]:
     """Yield the frames of a video, uint8 BGR [H, W, 3], upright."""
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # it writes about broken files past everything
     import cv2
 
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # of a broken file it says the same, in its own words
-    try:
+    with hidden_stderr():  # of a broken file OpenCV and FFmpeg say the same, in their own words
         capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    finally:
-        cv2.utils.logging.setLogLevel(level)
     try:
         if not capture.isOpened():
             raise DataError(

@@ -28,6 +28,15 @@ def printable(text: object) -> str:
     )
 
 
+_quiet = False
+
+
+def be_quiet() -> None:
+    """Print no more lines but errors, since another process prints the same."""
+    global _quiet
+    _quiet = True
+
+
 def say(line: object = "", *, error: bool = False) -> None:
     """Print one line at once: `printable`, and with codes for the letters that the terminal does not have.
 
@@ -38,6 +47,8 @@ def say(line: object = "", *, error: bool = False) -> None:
     Raises:
         BrokenPipeError: Nobody reads any more.
     """
+    if _quiet and not error:
+        return
     stream = sys.stderr if error else sys.stdout
     encoding = getattr(stream, "encoding", None) or "utf-8"
     print(printable(line).encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)

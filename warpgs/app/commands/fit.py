@@ -25,7 +25,8 @@ from warpgs.render.rule_costs import select_rule
 from warpgs.runtime.byte_units import parse_bytes
 from warpgs.runtime.imports import fast_imports
 from warpgs.runtime.interop import set_threads
-from warpgs.runtime.terminal import say
+from warpgs.runtime.ranks import join, place
+from warpgs.runtime.terminal import be_quiet, say
 
 
 def _request_type() -> type:
@@ -240,14 +241,17 @@ def request_of(arguments: list[str], about: str) -> FitRequest:
 
 def run(arguments: list[str], about: str) -> int:
     """Run the command; ``about`` heads its help."""
+    if place()[0] > 0:
+        be_quiet()
     request = request_of(arguments, about)
     with fast_imports():
         from warpgs.pipeline.runs.fit import fit_request
-    if request.view_port is None:
-        fit_request(request)
+    ranks = join(request.device)
+    if request.view_port is None or not ranks.first:
+        fit_request(request, ranks=ranks)
         return 0
     from warpgs.viewer.watch import live_view
 
     with live_view(request.out, request.view_port) as live:
-        fit_request(request, on_model=live.look)
+        fit_request(request, on_model=live.look, ranks=ranks)
     return 0

@@ -18,7 +18,7 @@ from warpgs.pipeline.runs.folder import CONFIG, read_record
 from warpgs.pipeline.runs.request import FitRequest
 from warpgs.pipeline.runs.schemas import METRICS
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.trainer import StepReport
+from warpgs.pipeline.train.step_report import StepReport
 from warpgs.runtime.folder_lock import hold_folder
 
 

@@ -35,7 +35,7 @@ from warpgs.pipeline.runs.with_poses import with_poses
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loop import train_views
-from warpgs.pipeline.train.trainer import StepReport
+from warpgs.pipeline.train.step_report import StepReport
 from warpgs.runtime.device_memory import is_out_of_memory, no_memory_message
 from warpgs.runtime.interop import set_threads
 from warpgs.runtime.native_output import output_to

@@ -53,7 +53,7 @@ def _work(values: dict[str, object], answer: Callable[..., None]) -> str:
             pass
         return "done"
     from warpgs.pipeline.farm.work import run_job
-    from warpgs.pipeline.train.trainer import StepReport
+    from warpgs.pipeline.train.step_report import StepReport
 
     told = 0.0
 

@@ -6,6 +6,7 @@ parameters of each view.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -13,7 +14,7 @@ import torch
 
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import logit
-from warpgs.kernels.adam import adam_scheduled, scheduled_lrs
+from warpgs.kernels.adam import BETAS, adam_scheduled, scheduled_lrs
 from warpgs.kernels.knn import morton_codes
 from warpgs.scene import Gaussians
 
@@ -53,6 +54,10 @@ class DensityUpdate:
 class Table:
     """Parameters with Adam moments and columns, kept row by row in step."""
 
+    batch: int = 1
+    """Number of views that gradients are the mean of. With B, learning rates are those of one view times the square root of B,
+    and the decay rates of the moments their B-th power (Zhao et al. 2024, Grendel-GS, arXiv 2406.18533)."""
+
     def __init__(self, params: Mapping[str, torch.Tensor], columns: Mapping[str, Column], device: torch.device, count: int):
         """Begin with zero moments and filled columns.
 
@@ -84,17 +89,23 @@ class Table:
         """The current parameters as Gaussians; they require gradients."""
         return Gaussians(**self.params)
 
+    @property
+    def betas(self) -> tuple[float, float]:
+        """Decay rates of the two moments for a batch of views."""
+        return BETAS[0] ** self.batch, BETAS[1] ** self.batch
+
     def lr_row(self, lrs: Mapping[str, float], step: int, head_lrs: Mapping[str, float]) -> list[float]:
         """Return the numbers that `adam_step` reads at a step, 3 for each parameter, in order.
 
         Args:
-            lrs: Learning rate of each parameter.
+            lrs: Learning rate of each parameter, for one view a step.
             step: Number of the step, from 1.
             head_lrs: Learning rate of the first 3 numbers of each row, for parameters where it differs.
         """
-        row = []
+        row, factor = [], math.sqrt(self.batch)
         for name in self.params:
-            row += scheduled_lrs(lrs[name], step, head_lr=head_lrs.get(name))
+            head = factor * head_lrs[name] if name in head_lrs else None
+            row += scheduled_lrs(factor * lrs[name], step, self.betas, head)
         return row
 
     @torch.no_grad()
@@ -113,7 +124,7 @@ class Table:
         before = None if factors is None else self.params["means"].detach().clone()
         for i, (name, gradient) in enumerate(gradients.items()):
             state = (self.params[name].detach(), gradient, self.exp_avg[name], self.exp_avg_sq[name])
-            adam_scheduled(*state, lrs[3 * i : 3 * i + 3], skip, head=3 if name == "sh" else 0)
+            adam_scheduled(*state, lrs[3 * i : 3 * i + 3], skip, head=3 if name == "sh" else 0, betas=self.betas)
         if factors is not None:
             means = self.params["means"].detach()
             means.copy_(torch.where(factors[:, None] == 1, means, before + factors[:, None] * (means - before)))

@@ -29,20 +29,21 @@ Bundle = tuple[dict[str, torch.Tensor], dict[str, Any]]
 """Tensors and plain values of such a step."""
 
 
-def failed_step(trainer: Trainer, view: int, name: str) -> Bundle:
+def failed_step(trainer: Trainer, view: int, name: str, slot: int = 0) -> Bundle:
     """Return what the next step of a fit computes its loss from.
 
     Args:
         trainer: The fit, in the state before the step.
         view: Number of the step's view.
         name: Its name.
+        slot: Its number among the views of the step.
     """
     trainer.show_learned()
     number, shown = trainer.step + 1, trainer.views[view]
     plan = trainer.plan_of(number)
     if plan.half_size:
         shown = half_size(shown)
-    camera, settings = shown.camera, list(trainer.settings(number))
+    camera, settings = shown.camera, list(trainer.settings(number, slot))
     image, background = shown.image, trainer.background
     if shown.alpha is not None:  # over the colour that the step had behind it
         shift = torch.tensor(settings[3:], dtype=torch.float32, device=image.device)

@@ -35,6 +35,7 @@ from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device
 from warpgs.pipeline.runs.results import evaluate_run, overview_of, protocol_of, result_lines, write_report
 from warpgs.pipeline.runs.rule_report import rule_report_of
 from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, sampling_report_of
+from warpgs.pipeline.runs.shared import check_shared, shared_notes
 from warpgs.pipeline.runs.with_poses import with_poses
 from warpgs.pipeline.train.background import choose_background, over_background
 from warpgs.pipeline.train.by_views import settings_by_views
@@ -42,13 +43,15 @@ from warpgs.pipeline.train.complexity import complexity_figures, complexity_summ
 from warpgs.pipeline.train.config import FitConfig, preset_config
 from warpgs.pipeline.train.exposure import EXPOSURE
 from warpgs.pipeline.train.loop import run
+from warpgs.pipeline.train.step_report import StepReport
 from warpgs.pipeline.train.time_budget import within_budget
-from warpgs.pipeline.train.trainer import StepReport, Trainer
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.warmup import background_warmup
 from warpgs.priors.photo_checks import check_photos, photo_notes
 from warpgs.report.events import EventLog
 from warpgs.report.progress import Progress, Stages
 from warpgs.runtime.load_module import told_of_compiling
+from warpgs.runtime.ranks import ALONE, Ranks
 from warpgs.runtime.stop_signals import noted_signals
 from warpgs.runtime.terminal import Detail, counted
 from warpgs.scene import Camera, Gaussians, Normalization, Scene
@@ -88,6 +91,7 @@ def fit(
     notes: tuple[str, ...] = (),
     verbose: bool = True,
     on_model: Callable[[FittedModel], object] | None = None,
+    ranks: Ranks = ALONE,
 ) -> FitResult:
     """Fit Gaussians to a scene: the same code as `warpgs fit`.
 
@@ -106,6 +110,8 @@ def fit(
         notes: Choices made before, to be printed and recorded with the fit's own.
         verbose: Whether to print.
         on_model: Called after every step with the model as it is, for those who look on: the next step overwrites its tensors.
+        ranks: Processes that fit together, from `warpgs.runtime.ranks.join`, all with the same arguments. The first alone
+            prints, writes and scores; the others return a result without metrics.
 
     Raises:
         UsageError: Settings, a preset or a split cannot be, ``out`` holds something already, or ``resume`` comes without it.
@@ -114,10 +120,12 @@ def fit(
     out = None if out is None else Path(out)
     if resume and out is None:
         raise UsageError("resume needs the run folder that it continues: give out")
+    config = preset_config(config)
+    check_shared(scene, config, ranks, time_budget, resume)
+    verbose, own = verbose and ranks.first, out if ranks.first else None
     stages = Stages() if verbose else Stages(lambda line: None)
-    folder: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
-    if out is not None:
-        folder = run_folder(out, resume)
+    nothing: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
+    folder = nothing if own is None else run_folder(own, resume)
     with folder as held, stages as progress, told_of_compiling(lambda name: progress(COMPILING)) as compiled:
         if out is not None and resume:
             read_record(out)  # a run of another version is refused before anything takes time
@@ -127,8 +135,8 @@ def fit(
         request, read, parts, found = _scene_of(scene, split, out, progress)
         notes = (*notes, *held, *found, *([] if out is None else renaming_notes(image_names(v.name for v in read.views))))
         job = FitJob(
-            read, request, parts, preset_config(config), *where, out, lpips, [*notes], verbose, on_step, began,
-            progress, on_model, compiled,
+            read, request, parts, config, *where, own, lpips, [*notes], verbose, on_step, began, progress, on_model, ranks,
+            compiled,
         )  # fmt: skip
         if time_budget is not None:
             job.config, note = within_budget(job.config, time_budget, job.train, job.device)
@@ -137,7 +145,9 @@ def fit(
         job.config, chosen = settings_by_views(job.config, job.train, job.device.type)
         job.notes += chosen
         trainer, state, record = _prepare(job, out if resume else None)
-        return _finish(job, trainer, state, record, resume)
+        result = _finish(job, trainer, state, record, resume)
+    ranks.leave()
+    return result
 
 
 def _set_background(job: FitJob) -> None:
@@ -147,12 +157,12 @@ def _set_background(job: FitJob) -> None:
     job.notes += [note] if note else []
 
 
-def fit_request(request: FitRequest, **watchers: Any) -> FitResult:
-    """Run `fit` as the command line, a study or a farm asks for it; ``watchers`` are its on_model and on_step."""
+def fit_request(request: FitRequest, **others: Any) -> FitResult:
+    """Run `fit` as the command line, a study or a farm asks for it; ``others`` are its on_model, on_step and ranks."""
     r = request
     return fit(
         r.scene, r.config, out=r.out, device=r.device, resume=r.resume, lpips_weights=r.lpips_weights,
-        time_budget=r.time_budget, notes=r.notes, **watchers,
+        time_budget=r.time_budget, notes=r.notes, **others,
     )  # fmt: skip
 
 
@@ -184,7 +194,8 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, State | None, 
     c = job.config
     with background_warmup(c, job.device) as ready:
         job.photographs = check_photos([*job.train, *job.test], job.progress)
-        trainer = Trainer(job.train, job.scene.points, c, job.device, job.scene.background, ready=ready, progress=job.progress)
+        of = job.train, job.scene.points, c, job.device, job.scene.background
+        trainer = Trainer(*of, ready=ready, progress=job.progress, ranks=job.ranks)
     if job.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(job.device)  # the steps' need is told, not the start's or an earlier fit's
     return trainer, state, record
@@ -200,13 +211,17 @@ def _finish(job: FitJob, trainer: Trainer, state: State | None, record: dict[str
         except DataError as e:
             raise DataError(f"{job.out}/{TENSORS}: {e}") from e
         job.notes.append(f"continued from step {trainer.step}")
-    job.announce([*photo_notes(job.photographs), *trainer.notes, trainer.memory.summary()])
+    shared = shared_notes(job.config, job.ranks)
+    job.announce([*photo_notes(job.photographs), *trainer.notes, *shared, trainer.memory.summary()])
     setup = time.perf_counter() - job.began
     nothing = contextlib.nullcontext(lambda: None)
     with nothing if job.out is None else images_kept(trainer, list(job.split.train), job.out) as images_written:
         _train(job, trainer, images_written)
     _tell(job, trainer)  # of images that were written last
     training = time.perf_counter() - job.began - setup
+    job.ranks.part()
+    if not job.ranks.first:
+        return FitResult(*_model_fields(job, trainer), job.config, {}, tuple(job.notes), None)
     poses = _refined(job, trainer)
     if job.out is not None:
         write_ply(job.out / "point_cloud.ply", drop_unused_sh(trainer.gaussians), job.scene.normalization)
@@ -278,7 +293,8 @@ def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float]) -> dict[str
     compiling = {"compiling": sum(job.compiled)} if job.compiled else {}
     return metrics | {
         "protocol": protocol_of(scene, job.request.split, job.request.downscale or 1, train, test),
-        "steps": trainer.step, "gaussians": len(gaussians), "preset": c.preset, "seed": c.seed,
+        "steps": trainer.step, "batch": c.batch, "ranks": job.ranks.count,
+        "gaussians": len(gaussians), "preset": c.preset, "seed": c.seed,
         "config_hash": c.fingerprint(), "fingerprint": scene.fingerprint, "device": job.where.removeprefix("on "),
         "seconds": {**seconds, **compiling, "total": time.perf_counter() - job.began}, **peak,
         "memory": trainer.memory.to_json(), "rule": rule, "shape": shape,
@@ -331,9 +347,11 @@ def _train(job: FitJob, trainer: Trainer, images_written: Callable[[], None]) ->
                 run(trainer, on_step, save, stopped, restore)
         except NotFiniteError as e:
             if out is None or e.view is None:
+                if e.view is not None:
+                    job.ranks.leave()  # all have this loss, and the first says so
                 raise
             name = job.split.train[e.view]
-            save_failed_step(out / FAILED, failed_step(trainer, e.view, name))
+            save_failed_step(out / FAILED, failed_step(trainer, e.view, name, e.slot))
             save(trainer)
             raise NotFiniteError(
                 f"{e}, on {name}. The state before is saved, and so is what that step computed with: `warpgs doctor --repeat "

@@ -14,8 +14,9 @@ from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.pipeline.runs.request import SceneRequest
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loop import train_views
-from warpgs.pipeline.train.trainer import StepReport
+from warpgs.pipeline.train.step_report import StepReport
 from warpgs.priors.photo_checks import PhotoCheck
+from warpgs.runtime.ranks import Ranks
 from warpgs.runtime.terminal import Detail, say
 from warpgs.scene import Scene, View
 
@@ -38,6 +39,7 @@ class FitJob:
     began: float
     progress: Callable[[str], object]
     on_model: Callable[[FittedModel], object] | None
+    ranks: Ranks
     compiled: list[float]
     photographs: list[PhotoCheck] = field(default_factory=list)
 

@@ -110,7 +110,7 @@ METRICS = fields(
         }),
     },
     {
-        "gaussians": whole(0), "seconds": fields({"total": number(0)}), "shape": _SHAPE,
+        "gaussians": whole(0), "batch": whole(1), "ranks": whole(1), "seconds": fields({"total": number(0)}), "shape": _SHAPE,
         "photographs": items(_PHOTOGRAPH),
         "poses": fields({
             "views": items(fields({"name": _view_name, "degrees": number(0), "units": number(0)})), "summary": text,

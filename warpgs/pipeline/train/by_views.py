@@ -70,13 +70,14 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     steps = config.steps
     if steps is None:
         steps = steps_by_views(views)
+        each = f" of {config.batch} views" if config.batch > 1 else ""
         notes.append(
-            f"by the number of views, {views}: at most {steps:,} steps, colours of degree {init.max_sh_degree}, learning rates "
-            f"of scales {optimizer.scales_lr:g} and opacities {optimizer.opacities_lr:g}, half size in the first {half:.0%} of "
-            "the steps"
+            f"by the number of views, {views}: at most {steps:,} steps{each}, colours of degree {init.max_sh_degree}, learning "
+            f"rates of scales {optimizer.scales_lr:g} and opacities {optimizer.opacities_lr:g}, half size in the first "
+            f"{half:.0%} of the steps"
         )
         pixels = max(v.camera.width * v.camera.height for v in train)
-        seconds = pixels_of_steps(steps, half, pixels) / CPU_PIXELS
+        seconds = pixels_of_steps(config.batch * steps, half, pixels) / CPU_PIXELS
         if device == "cpu" and config.cpu_limit and seconds > cpu_seconds(views):
             most, wanted = cpu_seconds(views), steps
             steps = max(1, int(steps * most / seconds))

@@ -31,7 +31,10 @@ class FitConfig:
     preset: str = "3dgs"
     """Named set of settings that the others start from: default, quick, 3dgs, mcmc or paper-literal."""
     steps: int | None = 7000
-    """Number of optimisation steps, one view each; strategy holdout may end earlier. None: by the number of views."""
+    """Number of optimisation steps; strategy holdout may end earlier. None: by the number of views."""
+    batch: int = 1
+    """Views that each step renders; its gradient is their mean. Learning rates are those of one view times the square root of
+    this (docs/many-gpus.md). Several GPUs share the views of a step."""
     cpu_limit: bool = True
     """Take no more steps on a CPU than two cores do in 1 to 20 minutes, where the steps follow from the number of views."""
     seed: int = 0
@@ -98,7 +101,7 @@ class FitConfig:
     """Networks that priors of the views come from."""
 
     def __post_init__(self) -> None:
-        for name in ("steps", "sh_every", "checkpoint_every", "dropout_views", "max_gaussians"):
+        for name in ("steps", "batch", "sh_every", "checkpoint_every", "dropout_views", "max_gaussians"):
             if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise UsageError(f"{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
         if not 0 <= self.seed < 2**31:

@@ -6,7 +6,8 @@ import time
 from collections.abc import Callable
 
 from warpgs.errors import OutOfMemoryError, ResourceError
-from warpgs.pipeline.train.trainer import StepReport, Trainer
+from warpgs.pipeline.train.step_report import StepReport
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.scene import Scene, View
 
 
@@ -25,7 +26,7 @@ def run(
     """Take all remaining steps, reporting each and saving now and then and at the end.
 
     A step that runs out of memory is tried once more with less (`Trainer.spare_memory`), from the last saved state where the
-    set of Gaussians was being changed.
+    set of Gaussians was being changed; not so in one of several processes, which would be alone in that step.
 
     Args:
         trainer: The fit.
@@ -48,7 +49,7 @@ def run(
             failure = e.with_traceback(None)  # whose frames hold tensors
             failure.__cause__ = failure.__context__ = None
         if failure is not None:
-            again, ran_out = trainer.step > ran_out, trainer.step
+            again, ran_out = trainer.step > ran_out and trainer.ranks.count == 1, trainer.step
             try:
                 if not again or not (failure.intact or restore(trainer)):
                     raise failure
@@ -60,10 +61,11 @@ def run(
             continue
         for report in reports:
             on_step(report)
-        stop = stopped()
+        stop = trainer.agreed(stopped())
         due = trainer.step % every == 0 and time.monotonic() - saved >= trainer.config.checkpoint_seconds
         if stop or due or trainer.step == trainer.steps:
             save(trainer)
             saved = time.monotonic()
         if stop:
+            trainer.ranks.leave()
             raise KeyboardInterrupt

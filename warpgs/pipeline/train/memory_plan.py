@@ -29,6 +29,8 @@ CAMERA = 16 + 9
 """Numbers of the gradient of view matrix and intrinsics, which each Gaussian has until they are summed."""
 SAMPLED = 8
 """Largest number of views that a sampling event samples in (`importance_sampling.MAX_VIEWS`)."""
+SUMMED = 2
+"""Statistics of each Gaussian that are summed with the gradients of several views: sum of its gradients, number of renders."""
 TILE = 16
 """Side of a tile in a fit [px]."""
 
@@ -73,9 +75,10 @@ class Layout:
     """CUDA graphs that exist at a time, one for each size of view; 0 where steps are taken one by one."""
     cutout: bool = False
     """True where views know their opacity."""
+    sums: int = 0
+    """Sums of gradients and statistics that a step of several views keeps (`warpgs.pipeline.train.slots`)."""
     trimmed: bool = False
     """True where the strategy trims the model: with lower degrees, merged and tried, it then stands there three times more."""
-
     refined: bool = False
     """True where poses are refined: each Gaussian has a gradient of the camera until these are summed."""
     exposed: bool = False
@@ -87,8 +90,9 @@ class Layout:
         return FLOAT * (3 + 4 + 3 + 1 + 3 * self.coefficients)
 
     def held(self, count: int) -> int:
-        """Return the bytes that last from step to step: parameters, two Adam moments, columns, and views."""
-        return (3 * self.row + self.column_bytes) * count + self.view_bytes
+        """Return the bytes that last from step to step: parameters, two Adam moments, columns, sums over slots, and views."""
+        sums = self.sums * (self.row + SUMMED * FLOAT)
+        return (3 * self.row + self.column_bytes + sums) * count + self.view_bytes
 
     def moments(self, count: int, instances: int, chunked: bool) -> dict[str, int]:
         """Return the bytes on top of `held` at each moment of a step that may be its heaviest.
@@ -245,6 +249,7 @@ def layout_of(
     trimmed: bool = False,
     refined: bool = False,
     exposed: bool = False,
+    sums: int = 0,
 ) -> Layout:
     """Return the layout of steps of a fit.
 
@@ -258,6 +263,7 @@ def layout_of(
         trimmed: True where the strategy trims the model.
         refined: True where poses are refined.
         exposed: True where views have exposures.
+        sums: Sums of gradients that a step of several views keeps.
     """
     largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
     cuda = table.device.type == "cuda"
@@ -265,7 +271,7 @@ def layout_of(
         table.gaussians.sh.shape[1], largest.width, largest.height, view_bytes([*views, *kept]),
         sum(c.element_size() for c in table.columns.values()), len(views), any(v.mask is not None for v in views),
         scored, depth_supervised, cuda, len({v.kind for v in views}) if cuda and captured else 0,
-        any(v.alpha is not None for v in views), trimmed, refined, exposed,
+        any(v.alpha is not None for v in views), sums, trimmed, refined, exposed,
     )  # fmt: skip
 
 

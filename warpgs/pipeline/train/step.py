@@ -33,7 +33,7 @@ from warpgs.runtime.cuda_graph import CapturedGraph, GraphMemory
 from warpgs.runtime.device_memory import available_bytes
 from warpgs.scene import Camera, Gaussians, Render
 
-MAX_BATCH = 100
+MAX_STEPS = 100
 """Largest number of steps after which results are read back from the device."""
 CAPACITY_FACTOR = 1.3
 """Capacity of a captured step for instances, as a multiple of the most that any view has when it is captured."""
@@ -58,12 +58,13 @@ class StepPlan:
 
 
 class StepBuffers:
-    """Tensors that a batch of steps reads and writes on the device: views, learning rates, losses, and the stop flag."""
+    """Tensors that a series of steps reads and writes on the device: views, learning rates, losses, and the stop flag."""
 
-    def __init__(self, device: torch.device, lrs: int):
-        """Allocate for `MAX_BATCH` steps on CUDA, elsewhere for the one of a batch, with ``lrs`` learning rates each."""
+    def __init__(self, device: torch.device, lrs: int, rows: int | None = None):
+        """Allocate for ``rows`` steps of ``lrs`` learning rates each; None for `MAX_STEPS` on CUDA and one elsewhere."""
         self.device = device
-        rows = MAX_BATCH if device.type == "cuda" else 1
+        if rows is None:
+            rows = MAX_STEPS if device.type == "cuda" else 1
         self.view_rows = torch.zeros(rows, dtype=torch.int64, device=device)
         """Row of each step's view in its stack."""
         self.lr_rows = torch.ones(rows, lrs, device=device)
@@ -72,7 +73,7 @@ class StepBuffers:
         """Dropout probability, number, and learning rate of the means [u] of each step; and the colour behind its view, less
         the scene's."""
         self.counter = torch.zeros(1, dtype=torch.int64, device=device)
-        """Number of the current step in its batch. It stays once a step stops, and so do all Gaussians."""
+        """Number of the current step in its series. It stays once a step stops, and so do all Gaussians."""
         self.stop = torch.zeros(1, dtype=torch.int32, device=device)
         """0 while steps go on, else the reason why they stopped."""
         self.history = torch.zeros(rows, 2, device=device)
@@ -81,7 +82,7 @@ class StepBuffers:
         """Gradient of the loss."""
 
     def load(self, rows: list[int], lrs: list[list[float]], settings: list[tuple[float, ...]]) -> None:
-        """Upload view rows, learning rates and settings (6 each) of the next steps, at most `MAX_BATCH`."""
+        """Upload view rows, learning rates and settings (6 each) of the next steps, at most `MAX_STEPS`."""
         self.counter.zero_()
         self.stop.zero_()
         self.view_rows[: len(rows)] = torch.tensor(rows).to(self.device)
@@ -173,6 +174,22 @@ class Learned:
         return replace(views, viewmats=moved(views.viewmats, views.numbers, *rows)) if rows else views
 
 
+@dataclass(frozen=True)
+class ViewGradients:
+    """Contribution of one view to a step."""
+
+    gradients: list[torch.Tensor]
+    """Gradients of the loss by the parameters of the Gaussians, then by those of the views, in the order of the tables."""
+    statistics: Mapping[str, torch.Tensor]
+    """Result of `Strategy.statistics`."""
+    lrs: torch.Tensor
+    """Learning rates of the step, shape [R]."""
+    settings: torch.Tensor
+    """Settings of the step, shape [6]."""
+    going: torch.Tensor
+    """True where nothing stops the step, bool, shape [1]."""
+
+
 def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer) -> None:
     """Take one training step: render the next view, compute the loss, update all parameters.
 
@@ -181,9 +198,18 @@ def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPla
     Args:
         learned: Tables and strategy that the step changes.
         views: Views of one kind.
-        buffers: Settings of the batch, and its results.
+        buffers: Settings of the steps, and their results.
         plan: Choices that the step is made of.
         render: Renderer.
+    """
+    found = view_gradients(learned, views, buffers, plan, render)
+    update(learned, plan, found, buffers.stop)
+
+
+def view_gradients(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer) -> ViewGradients:
+    """Render the next view and return what it contributes; its loss, and what stops the step, stand in ``buffers``.
+
+    Arguments are those of `step`.
     """
     table, strategy = learned.table, learned.strategy
     lrs, settings, viewmat, K, image = buffers.begin(views)
@@ -207,17 +233,28 @@ def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPla
         rendered = replace(rendered, rgb=exposed(rendered.rgb, own[EXPOSURE]))
     loss = total_loss(plan, rendered, target, table.gaussians, strategy)
 
-    projected, split = rendered.projected, 3 * len(table.params)
+    projected = rendered.projected
     params = [*table.params.values(), *learned.views.params.values()]
     *gradients, v_projected = torch.autograd.grad(loss, [*params, projected], buffers.one, materialize_grads=True)
     with torch.no_grad():
         going = end_step(loss, masked_mse(rendered.rgb, image, mask), buffers.counter, buffers.stop, buffers.history)
-        table.adam_step(dict(zip(table.params, gradients)), lrs[:split], buffers.stop, strategy.lr_factors(plan.phase))
-        learned.views.adam_step(dict(zip(learned.views.params, gradients[len(table.params) :])), lrs[split:], buffers.stop)
-        strategy.after_step(plan.phase, settings[:3], going)
-        plan.limits.apply(table.params, learned.centers, going)
         size = (views.size["width"], views.size["height"])
-        strategy.after_backward(plan.phase, v_projected, rendered.visible, size, going)
+        statistics = strategy.statistics(plan.phase, v_projected, rendered.visible & going, size)
+    return ViewGradients(gradients, statistics, lrs, settings, going)
+
+
+@torch.no_grad()
+def update(learned: Learned, plan: StepPlan, found: ViewGradients, stop: torch.Tensor) -> None:
+    """Update all parameters and columns; nothing changes where ``stop`` [1] is not 0, int32."""
+    table, strategy = learned.table, learned.strategy
+    count, split = len(table.params), 3 * len(table.params)
+    own, of_views = found.gradients[:count], found.gradients[count:]
+    table.adam_step(dict(zip(table.params, own)), found.lrs[:split], stop, strategy.lr_factors(plan.phase))
+    learned.views.adam_step(dict(zip(learned.views.params, of_views)), found.lrs[split:], stop)
+    strategy.after_step(plan.phase, found.settings[:3], found.going)
+    plan.limits.apply(table.params, learned.centers, found.going)
+    for name, value in found.statistics.items():
+        table.columns[name] += value
 
 
 def total_loss(plan: StepPlan, rendered: Render, target: Target, gaussians: Gaussians, strategy: Strategy) -> torch.Tensor:
@@ -237,7 +274,10 @@ class OverLimitError(ResourceError):
 class StepGraphs:
     """Captured steps, one for each plan and kind of view; made when they are first asked for."""
 
-    def __init__(self, learned: Learned, buffers: StepBuffers, rule: str, background: torch.Tensor):
+    def __init__(
+        self, learned: Learned, buffers: StepBuffers, rule: str, background: torch.Tensor,
+        work: Callable[[Learned, ViewStack, StepBuffers, StepPlan, Renderer], object] = step,
+    ):  # fmt: skip
         """Capture nothing yet.
 
         Args:
@@ -245,7 +285,9 @@ class StepGraphs:
             buffers: Settings and results of steps.
             rule: Cut-offs of the rasterizer.
             background: Colour behind the scene, shape [3].
+            work: Function that is captured.
         """
+        self.work = work
         self.learned, self.buffers, self.rule, self.background = learned, buffers, rule, background
         device = buffers.device
         self.stream = torch.cuda.Stream(device)
@@ -285,12 +327,12 @@ class StepGraphs:
                 )
             self.memory.give_back(0 if max_instances is not None else DEAD_BYTES)
             render = captured_renderer(self.rule, self.background, capacity, self.buffers.stop)
-            work = functools.partial(step, self.learned, views, self.buffers, plan, render)
-            self._graphs[kind, plan] = self._capture(work)
+            work = functools.partial(self.work, self.learned, views, self.buffers, plan, render)
+            self._graphs[kind, plan] = self.capture(work)
         return [self._graphs[kind, plan] for kind in kinds]
 
-    def _capture(self, work: Callable[[], None]) -> CapturedGraph:
-        """Return the graph of a step."""
+    def capture(self, work: Callable[[], object]) -> CapturedGraph:
+        """Return the graph of a function that changes nothing where the stop flag is set."""
         buffers = self.buffers
         here, loaded = torch.cuda.current_stream(buffers.device), buffers.view_rows.clone()
         self.stream.wait_stream(here)

@@ -74,7 +74,7 @@ def within_budget(config: FitConfig, seconds: float, views: list[View], device: 
     check_budget(seconds)
     largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
     probe = probe_seconds(largest.width, largest.height, device)
-    setup, step = probe * SETUP * len(views), probe * STEP
+    setup, step = probe * SETUP * len(views), probe * STEP * config.batch
     steps = min(int((seconds - setup) / step), MAX_STEPS)
     if steps < MIN_STEPS:
         raise UsageError(

@@ -1,11 +1,11 @@
-"""The training loop: from views and points to Gaussians, one view a step."""
+"""The training loop: from views and points to Gaussians, one view or several a step."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from warpgs.pipeline.metrics.psnr import psnr_of
 from warpgs.pipeline.model.init import initial_gaussians, scene_extent
 from warpgs.pipeline.model.scale_limits import camera_centers, scene_radius
 from warpgs.pipeline.model.table import Table
+from warpgs.pipeline.train.batch import BatchSteps
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.exposure import EXPOSURE, check_exposure, exposed_views, show_exposures
@@ -25,9 +26,10 @@ from warpgs.pipeline.train.memory_plan import Layout, layout_of, most_instances,
 from warpgs.pipeline.train.refine_poses import ROTATION, TRANSLATION, GivenPoses
 from warpgs.pipeline.train.schedule import plan_phases
 from warpgs.pipeline.train.setup import prepare, prepared_views, terms_of, view_parameters
+from warpgs.pipeline.train.slots import Tree, check_batch
 from warpgs.pipeline.train.step import (
     CAPACITY_FACTOR,
-    MAX_BATCH,
+    MAX_STEPS,
     Learned,
     OverLimitError,
     StepBuffers,
@@ -36,29 +38,15 @@ from warpgs.pipeline.train.step import (
     eager_renderer,
     step,
 )
+from warpgs.pipeline.train.step_report import StepReport
 from warpgs.pipeline.train.stored_state import check_state
 from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.views import Kind, TrainingView, half_size, stack_views
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.device_memory import available_bytes, is_out_of_memory, no_memory_message
+from warpgs.runtime.ranks import ALONE, Ranks
 from warpgs.runtime.terminal import Detail
 from warpgs.scene import Gaussians, PointCloud, Prior, View
-
-
-@dataclass(frozen=True)
-class StepReport:
-    """Figures of one step."""
-
-    step: int
-    """Steps done, from 1."""
-    loss: float
-    """Loss on the step's view."""
-    psnr: float
-    """PSNR on the step's view before the update [dB]."""
-    count: int
-    """Number of Gaussians after the step."""
-    seconds: float
-    """Wall time of the step [s]."""
 
 
 class Trainer:
@@ -71,6 +59,7 @@ class Trainer:
         self, train: list[View], points: PointCloud | None, config: FitConfig, device: torch.device,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0), priors: list[Prior] | None = None,
         ready: Callable[[], object] = lambda: None, *, progress: Callable[[str], object] = lambda line: None,
+        ranks: Ranks = ALONE,
     ):  # fmt: skip
         """Set up the first Gaussians.
 
@@ -83,6 +72,7 @@ class Trainer:
             priors: Prior of each view; None to compute them where sampling or a loss term needs them.
             ready: Called before the device is used.
             progress: Called with a line for the user on what is done before the first step.
+            ranks: Processes that share the views of a step; the fit is the same to the bit for any number of them.
 
         Raises:
             DataError: There is nothing to start from.
@@ -94,7 +84,8 @@ class Trainer:
         if config.exposure:
             check_exposure(train)
         config, chosen = settings_by_views(config, train, device.type)
-        self.config, self.device = config, device
+        check_batch(config.batch, config.steps, ranks)
+        self.config, self.device, self.ranks, self.batch = config, device, ranks, config.batch
         self.generator = torch.Generator().manual_seed(config.seed)
         made = prepare(train, points, config, np.random.default_rng(config.seed), device, priors, ready, progress)
         made.notes[:0] = chosen
@@ -116,8 +107,7 @@ class Trainer:
         """Dropout probability at the last step."""
         self.cutout = any(v.alpha is not None and not v.alpha_estimated for v in train)  # all have an opacity then
         self.terms = terms_of(config, self.cutout)
-        self.step = 0
-        """Steps taken."""
+        self.step = 0  # taken
         self.memory_limit, self.captured = config.memory_limit, config.cuda_graph
         """Bytes that steps may take, None for no limit; and whether they may be captured (`spare_memory`)."""
         self.order: list[int] = []
@@ -129,10 +119,13 @@ class Trainer:
         """Training poses as given, where they are refined."""
         first, self.view_lrs = view_parameters(self.terms, config, len(train), device)
         self.view_table = Table(first, {}, device, len(train))
+        self.table.batch = self.view_table.batch = self.batch
         self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(first)))
         dropout_seed, centers = config.seed if self.dropout > 0 else None, camera_centers(cameras, device)
         self.learned = Learned(self.table, self.view_table, self.strategy, dropout_seed, centers)
-        self.graphs = StepGraphs(self.learned, self.buffers, config.rule, self.background) if device.type == "cuda" else None
+        own = (self.learned, self.buffers, config.rule, self.background)
+        self.graphs = StepGraphs(*own) if device.type == "cuda" else None
+        self.batched = BatchSteps(*own, Tree(self.batch, ranks)) if self.batch > 1 else None
         self.layout: Layout
         self.max_instances: int | None = None
         views, self.disparities = prepared_views(train, made, config, self.terms, device)
@@ -199,7 +192,7 @@ class Trainer:
             raise self._no_memory(e) from e
 
     def _no_memory(self, error: Exception) -> OutOfMemoryError:
-        """Return the error for a step that found no memory; where none of its batch was taken, its views come again."""
+        """Return the error for a step that found no memory; where none of its series was taken, its views come again."""
         chosen, self.chosen = self.chosen, None
         intact = chosen is not None and int(self.buffers.counter) == 0
         if chosen is not None and intact:
@@ -212,7 +205,7 @@ class Trainer:
         Raises:
             ResourceError: Not even the smallest step fits.
         """
-        self._forget_graphs()
+        self.forget_graphs()
         if self.device.type == "cuda":
             torch.cuda.empty_cache()
         held = self.layout.held(len(self.table))
@@ -236,31 +229,34 @@ class Trainer:
         """Take steps as `advance` does."""
         begin, first = time.perf_counter(), self.step + 1
         plan, count = self.plan_of(first), 1
-        if self.layout.graphs:
+        if self.layout.graphs and self.batched is None:
             while (
-                count < min(limit, MAX_BATCH, self.steps - self.step)
+                count < min(limit, MAX_STEPS, self.steps - self.step)
                 and self.plan_of(first + count) == plan
                 and not self.strategy.due(first + count - 1)
             ):
                 count += 1
-        chosen = [self.next_view() for _ in range(count)]
+        chosen = [self.next_view() for _ in range(count * self.batch)]
         places = [self.places[i + plan.half_size * len(self.views)] for i in chosen]
         steps = range(first, first + count)
-        self.buffers.load([row for _, row in places], [self._lr_row(s) for s in steps], [self.settings(s) for s in steps])
+        self.buffers.load(
+            [row for _, row in places[:count]], [self._lr_row(s) for s in steps], [self.settings(s) for s in steps]
+        )
         self.chosen = chosen
         if not self._take(places, plan):
             self.order += reversed(chosen)
             return self._advance(1)
         self.chosen = None
         done, stop, history = self.buffers.result()
-        self.order += reversed(chosen[done:])  # views of steps that were not taken come again
+        self.order += reversed(chosen[done * self.batch :])  # views of steps that were not taken come again
         self.step += done
         if stop == NOT_FINITE:
             error = NotFiniteError(f"the loss became {history[done][0]} at step {self.step + 1}")
-            error.view = chosen[done]
+            error.slot = 0 if self.batched is None else self.batched.result()[0]
+            error.view = chosen[done + error.slot]
             raise error
         if stop:
-            self._forget_graphs()  # they are captured anew with more capacity
+            self.forget_graphs()  # they are captured anew with more capacity
         counts = [len(self.table)] * done
         if done == count:
             self._update()
@@ -273,22 +269,24 @@ class Trainer:
 
     def _take(self, places: list[tuple[Kind, int]], plan: StepPlan) -> bool:
         """Take steps with views at these places; return False, and take none, where graphs would need too much memory."""
-        if self.graphs is None or not self.layout.graphs:
-            render = eager_renderer(self.config.rule, self.background, self.max_instances)
-            for kind, _ in places:
-                step(self.learned, self.stacks[kind], self.buffers, plan, render)
-            return True
-        kinds = [kind for kind, _ in places]
+        kinds, captured = [kind for kind, _ in places], self.layout.graphs > 0
         try:
-            graphs = self.graphs.capture_all(kinds, self.stacks, plan, self.max_instances)
+            if self.batched is not None:
+                settings = [self.settings(self.step + 1, slot) for slot in range(self.batch)]
+                self.batched.take(places, settings, self.stacks, plan, self.max_instances, captured=captured)
+            elif captured and self.graphs is not None:
+                for graph in self.graphs.capture_all(kinds, self.stacks, plan, self.max_instances):
+                    graph.replay()
+            else:
+                render = eager_renderer(self.config.rule, self.background, self.max_instances)
+                for kind in kinds:
+                    step(self.learned, self.stacks[kind], self.buffers, plan, render)
         except OverLimitError as e:
-            self.graphs.clear()
+            self.forget_graphs()
             self.layout = dataclasses.replace(self.layout, graphs=0)
             self.count_changed()
             self.messages.append(f"memory: steps are taken one by one from here on, because {e}")
             return False
-        for graph in graphs:
-            graph.replay()
         return True
 
     def _lr_row(self, step: int) -> list[float]:
@@ -301,23 +299,34 @@ class Trainer:
             lrs[EXPOSURE] = optimizer.exposure_lr_at(self.progress(step))
         return row + self.view_table.lr_row(lrs, step, {})
 
+    def agreed(self, stopped: bool) -> bool:
+        """Return whether to end after the last step, as all processes do: one that was told to is heard in its next step."""
+        if self.batched is None or self.ranks.count == 1:
+            return stopped
+        self.batched.told_to_stop = stopped
+        return self.batched.result()[1]
+
     def lrs(self, step: int) -> dict[str, float]:
         """Return the learning rate of each parameter of the Gaussians at a step."""
         c, phases = self.config, self.phases
         stable_start = phases.stable_start / phases.planned if phases.stable_start < phases.planned else 0.0
         return c.optimizer.lrs(self.progress(step), self.extent, stable_start)
 
-    def settings(self, step: int) -> tuple[float, ...]:
-        """Return the six settings of a step, as `StepBuffers` takes them."""
+    def settings(self, step: int, slot: int | None = None) -> tuple[float, ...]:
+        """Return the six settings of a step, as `StepBuffers` takes them, or those of one of its slots.
+
+        A slot has the number of its view among all that the fit has rendered, from 1: its random numbers are its own.
+        """
+        number = step if slot is None else (step - 1) * self.batch + slot + 1
         shifted = self.cutout and self.config.loss.random_background
-        shift = random_shift(self.config.seed, step, self.scene_background) if shifted else (0.0, 0.0, 0.0)
-        return self.strategy.dropout(step), step, self.lrs(step)["means"], *shift
+        shift = random_shift(self.config.seed, number, self.scene_background) if shifted else (0.0, 0.0, 0.0)
+        return self.strategy.dropout(step), number, math.sqrt(self.batch) * self.lrs(step)["means"], *shift
 
     def _update(self) -> None:
         """Have the strategy change the set of Gaussians after the step that was just taken, where that is due."""
         if not self.strategy.due(self.step):
             return
-        self._forget_graphs()
+        self.forget_graphs()
         self.show_learned()
         for change in self.strategy.update(self.step):
             self.table.apply(change)
@@ -331,14 +340,16 @@ class Trainer:
         if self.config.exposure:
             show_exposures(self.views, self.view_table.params[EXPOSURE])
 
-    def _forget_graphs(self) -> None:
-        if self.graphs is not None:
-            self.graphs.clear()
+    def forget_graphs(self) -> None:
+        """Drop all CUDA graphs; they are captured anew."""
+        for graphs in (self.graphs, self.batched):
+            if graphs is not None:
+                graphs.clear()
 
     def set_views(self, views: list[TrainingView]) -> None:
         """Train on these views from here on, and plan the memory that steps need."""
         c = self.config
-        self._forget_graphs()
+        self.forget_graphs()
         shown = [*views, *(half_size(v) for v in views if self.half_resolution > 0)]
         shown, self.stacks, self.places = stack_views(shown, len(views))
         self.views = shown[: len(views)]
@@ -346,13 +357,13 @@ class Trainer:
             self.poses.restore(self.stacks.values())
         layout = layout_of(
             self.table, shown, kept=self.strategy.kept_views(), scored=self.strategy.samples(c), captured=self.captured,
-            depth_supervised=c.loss.depth_weight > 0, trimmed=self.strategy.shrinks(c),
-            refined=c.refine_poses, exposed=c.exposure,
+            depth_supervised=c.loss.depth_weight > 0, trimmed=self.strategy.shrinks(c), refined=c.refine_poses,
+            exposed=c.exposure, sums=0 if self.batched is None else self.batched.tree.buffers,
         )  # fmt: skip
-        cameras = [v.camera for v in shown]
+        most = most_instances(self.gaussians, [v.camera for v in shown], c.rule)
         self.memory, self.layout = plan(
-            layout, count=len(self.table), instances=most_instances(self.gaussians, cameras, c.rule), most=c.max_gaussians,
-            limit=self.memory_limit, available=available_bytes(self.device), capacity_factor=CAPACITY_FACTOR,
+            layout, count=len(self.table), instances=most, most=c.max_gaussians, limit=self.memory_limit,
+            available=available_bytes(self.device), capacity_factor=CAPACITY_FACTOR,
         )  # fmt: skip
         self.count_changed()
 
@@ -367,9 +378,8 @@ class Trainer:
         views = {f"views.{n}": t for n, t in self.view_table.state().items()}
         tensors = {**self.table.state(), **views, **tensors, "generator": self.generator.get_state()}
         plain = {
-            "step": self.step, "order": self.order, "extent": self.extent, "notes": self.notes,
-            "config": self.config.to_json(), "strategy": strategy,
-            "stable_start": self.phases.stable_start, "steps": self.steps,
+            "step": self.step, "order": self.order, "extent": self.extent, "notes": self.notes, "strategy": strategy,
+            "config": self.config.to_json(), "stable_start": self.phases.stable_start, "steps": self.steps,
         }  # fmt: skip
         return tensors, plain
 

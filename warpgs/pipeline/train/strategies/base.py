@@ -24,8 +24,8 @@ class Strategy:
     """Rules by which Gaussians are added, moved and removed.
 
     A strategy of your own is a class that derives from this one and overrides what it needs; nothing else has to change. The
-    trainer calls, for each step: `phase` on the host; then, as part of the step, `lr_factors`, `after_step` and
-    `after_backward`; then `due` and, where that is true, `update` on the host.
+    trainer calls, for each step: `phase` on the host; then, as part of the step, `statistics` for each of its views,
+    `lr_factors` and `after_step`; then `due` and, where that is true, `update` on the host.
 
     What is part of a step is captured once as a CUDA graph and replayed, so it must not read back from the device, must write
     its results into tensors that are there already, and may depend on the host only by `phase`.
@@ -112,18 +112,21 @@ class Strategy:
             going: Whether the step is taken, bool, shape [1]; where it is not, nothing may change.
         """
 
-    def after_backward(
-        self, phase: Hashable, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int], going: torch.Tensor
-    ) -> None:
-        """Gather statistics of the gradients of a step, within it.
+    def statistics(
+        self, phase: Hashable, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int]
+    ) -> Mapping[str, torch.Tensor]:
+        """Return what a view of a step adds to columns, by name of the column, shape [N] each.
+
+        It depends on this view alone, as a step may have several, in other processes too, and it must be 0 where ``visible`` is
+        False: gradients of a step that is not taken may be no numbers.
 
         Args:
             phase: Value of `phase` for the step.
             v_projected: Gradient of the projected Gaussians, shape [1, N, 12]; the first two are of the mean [1/px].
-            visible: Gaussians that touch a tile, bool, shape [1, N].
+            visible: Gaussians that touch a tile, bool, shape [1, N]; none where the step is not taken.
             size: Width and height of the view [px].
-            going: Whether the step is taken, bool, shape [1]; where it is not, nothing may change.
         """
+        return {}
 
     def due(self, step: int) -> bool:
         """Return whether `update` has anything to do after a step."""

@@ -174,19 +174,17 @@ class CloneSplit(Strategy):
         """Return whether gradients are gathered in a step."""
         return step <= self.densify_until
 
-    def after_backward(self, phase, v_projected, visible, size, going):
-        """Add the norm of each projected mean's gradient to its sum, and count the renders that see it.
+    def statistics(self, phase, v_projected, visible, size):
+        """Return the norm of each projected mean's gradient, and 1 for each that the view sees, shape [N] each.
 
-        The unit is half image widths and heights; ``v_projected`` has shape [1, N, 12], ``visible`` [1, N], ``going`` [1].
+        The unit is half image widths and heights; ``v_projected`` has shape [1, N, 12], ``visible`` [1, N].
         """
         if not phase:
-            return
+            return {}
         # a product with a tensor of the two sizes would copy them to the device, which a captured step must not
         norms = torch.hypot(v_projected[..., 0] * (0.5 * size[0]), v_projected[..., 1] * (0.5 * size[1]))
-        columns = self.trainer.table.columns
-        counted = visible & going  # not times going: 0 times NaN is NaN
-        columns["grad_sum"] += torch.where(counted, norms, 0).sum(0)
-        columns["seen_count"] += counted.sum(0)
+        # not times visible: 0 times NaN is NaN
+        return {"grad_sum": torch.where(visible, norms, 0).sum(0), "seen_count": visible.sum(0)}
 
     def _due(self, step: int) -> tuple[bool, bool]:
         return self.trainer.config.density.due(step, self.trainer.config.steps, self.densify_until)

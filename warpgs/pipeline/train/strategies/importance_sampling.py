@@ -307,9 +307,9 @@ class ImportanceSampling(CloneSplit):
             held = self.is_protected(settings[1]) & going
             logits.copy_(torch.where(held, logits.clamp_min(self.method.protect.logit), logits))
 
-    def after_backward(self, phase, v_projected, visible, size, going):
-        """Gather gradients as `CloneSplit` does, whose phase is the first of the two; ``v_projected`` has shape [1, N, 12]."""
-        super().after_backward(phase[0], v_projected, visible, size, going)
+    def statistics(self, phase, v_projected, visible, size):
+        """Return those of `CloneSplit`, whose phase is the first of the two; ``v_projected`` has shape [1, N, 12]."""
+        return super().statistics(phase[0], v_projected, visible, size)
 
     def samples_after(self, step: int) -> bool:
         """Return whether fine Gaussians are sampled after a step."""

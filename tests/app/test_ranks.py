@@ -1,0 +1,151 @@
+"""A fit of several processes: what they write, and what they say when one is lost."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tests.app import rank_that_dies
+from warpgs.app.cli import main
+from warpgs.errors import UsageError
+from warpgs.runtime import rank_watch, ranks
+from warpgs.synthetic.demo import write_demo
+
+LONGEST = 30
+"""Time in which all processes must end once one is lost [s]."""
+
+
+def started(count: int, *command: str) -> list[subprocess.Popen]:
+    """Processes with the variables that torchrun sets."""
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        port = str(s.getsockname()[1])
+    shared = os.environ | {"WORLD_SIZE": str(count), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "OMP_NUM_THREADS": "1"}
+    return [
+        subprocess.Popen(
+            [sys.executable, *command], env=shared | {"RANK": str(rank), "LOCAL_RANK": str(rank)}, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True,
+        )
+        for rank in range(count)
+    ]  # fmt: skip
+
+
+def ended(processes: list[subprocess.Popen]) -> list[tuple[int, str, str]]:
+    """Exit code, stdout and stderr of each."""
+    found = []
+    try:
+        for process in processes:
+            out, errors = process.communicate(timeout=300)
+            found.append((process.returncode, out, errors))
+    finally:
+        for process in processes:
+            process.kill()
+    return found
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no such signal")
+def test_any_number_of_processes_fits_the_same_model(tmp_path):
+    """Three, of which one is killed; two that go on; and one alone, uninterrupted: the same PLY and the same state."""
+    write_demo(tmp_path / "scene", views=8, width=48, height=36)
+    flags = [
+        str(tmp_path / "scene"), "--device", "cpu", "--preset", "3dgs", "--steps", "8", "--batch", "5", "--dropout", "0.3",
+        "--init.source", "random", "--init.random-count", "60", "--density.start", "1", "--density.every", "3",
+        "--density.gradient", "1e-6", "--checkpoint-every", "2", "--checkpoint-seconds", "0",
+    ]  # fmt: skip
+    shared = ["--out", str(tmp_path / "shared")]
+    lost = started(3, rank_that_dies.__file__, "2", "5", *flags, *shared)
+    lost[2].wait(300)
+    killed = time.monotonic()
+    found = ended(lost)
+    assert time.monotonic() - killed < LONGEST and [code for code, _, _ in found] == [4, 4, -signal.SIGKILL]
+    lines = [line for _, _, errors in found for line in errors.splitlines() if line.startswith("warpgs")]
+    assert lines == [
+        "warpgs: rank 2 of 3 is gone, and this fit ends with it; --resume continues from the last checkpoint, with any number "
+        "of ranks"
+    ]
+
+    (code, out, _), (other, silent, _) = ended(started(2, "-m", "warpgs", "fit", *flags, *shared, "--resume"))
+    assert (code, other, silent) == (0, 0, "") and "continued from step 4" in out and "ranks: 2 processes by gloo" in out
+    assert main(["fit", *flags, "--out", str(tmp_path / "alone")]) == 0
+    for name in ("point_cloud.ply", "checkpoint.safetensors"):
+        assert len({(tmp_path / run / name).read_bytes() for run in ("shared", "alone")}) == 1, name
+    for run, count in (("shared", 2), ("alone", 1)):
+        assert f'"ranks": {count}' in (tmp_path / run / "metrics.json").read_text()
+
+
+@pytest.mark.parametrize(("name", "value"), [("RANK", "2"), ("RANK", "-1"), ("WORLD_SIZE", "two"), ("MASTER_PORT", "")])
+def test_variables_that_are_no_numbers_are_named(monkeypatch, name, value):
+    """One of torchrun's variables is something else: a sentence, before anything else happens."""
+    for key, usual in (("RANK", "0"), ("WORLD_SIZE", "2"), ("LOCAL_RANK", "0"), ("MASTER_PORT", "29500")):
+        monkeypatch.setenv(key, usual)
+    monkeypatch.setenv(name, value)
+    with pytest.raises(UsageError, match=f"the environment variable {name} is"):
+        ranks.join("cpu")
+
+
+def test_a_process_alone_joins_nobody(monkeypatch):
+    """Without the variables, and where torchrun starts one process."""
+    monkeypatch.delenv("RANK", raising=False)
+    assert ranks.join("cpu") is ranks.ALONE and ranks.ALONE.first
+    for key, value in (("RANK", "0"), ("WORLD_SIZE", "1")):
+        monkeypatch.setenv(key, value)
+    assert ranks.join("cpu") is ranks.ALONE
+
+
+class Store(dict):
+    """A store as torch's is, in this process."""
+
+    def set(self, key, value):
+        self[key] = value.encode()
+
+    def check(self, keys):
+        return all(k in self for k in keys)
+
+    def add(self, key, number):
+        self[key] = self.get(key, 0) + number
+        return self[key]
+
+
+def test_silence_of_another_machine_is_a_loss_after_a_while(monkeypatch, capsys):
+    """Not at once, nor where the process has said goodbye; and of two that find it one alone says so."""
+    now = [100.0]
+    monkeypatch.setattr(rank_watch.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(rank_watch.time, "sleep", lambda seconds: None)
+    monkeypatch.setattr(rank_watch.threading.Thread, "start", lambda self: None)
+    store = Store()
+    first, second = (rank_watch.RankWatch(rank, 3, store, store) for rank in (0, 1))
+    assert not first.is_lost(2)  # it is still to come
+    store.set("beat/2", "7|1234|another machine")
+    for seconds, lost in ((0, False), (rank_watch.LOST_SECONDS - 1, False), (2, True)):
+        now[0] += seconds
+        assert first.is_lost(2) is lost
+    first.fail("warpgs: rank 2 is gone")
+    second.fail("warpgs: rank 2 is gone")
+    assert capsys.readouterr().err.splitlines() == ["warpgs: rank 2 is gone"]
+    store.set("left/2", "")
+    assert not first.is_lost(2)
+
+
+def test_a_machine_has_a_name_on_every_system(monkeypatch):
+    """Where there is no /proc it is that of the computer."""
+
+    def none(*_):
+        raise FileNotFoundError
+
+    monkeypatch.setattr(rank_watch.Path, "read_text", none)
+    assert rank_watch.machine() == rank_watch.platform.node()
+
+
+def test_the_end_of_a_process_is_seen():
+    """This one is there, and one that has ended is gone, also while its parent has not asked."""
+    ended = subprocess.Popen([sys.executable, "-c", ""], stdout=subprocess.PIPE)
+    ended.stdout.read()
+    until = time.monotonic() + 60
+    while not rank_watch.is_gone(ended.pid) and time.monotonic() < until:
+        time.sleep(0.01)
+    assert rank_watch.is_gone(ended.pid) and not rank_watch.is_gone(os.getpid())
+    ended.wait()

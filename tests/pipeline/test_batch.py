@@ -1,0 +1,102 @@
+"""Steps of several views."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from tests.pipeline.test_importance_sampling import CONFIG as METHOD
+from tests.scenes import photos, priors, seeds
+from warpgs.errors import NotFiniteError
+from warpgs.kernels.adam import scheduled_lrs
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.train.batch import BatchSteps
+from warpgs.pipeline.train.by_views import settings_by_views
+from warpgs.pipeline.train.config import PRESETS, FitConfig
+from warpgs.pipeline.train.slots import Tree
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.trainer import Trainer
+from warpgs.runtime.ranks import ALONE
+from warpgs.scene import View
+
+CPU = torch.device("cpu")
+PLAIN = FitConfig(steps=20, init=InitConfig(source="points"), density=DensityConfig(start=100))
+
+
+def advanced(fit: Trainer, until: int) -> Trainer:
+    while fit.step < until:
+        fit.advance(100)
+    return fit
+
+
+def same_bits(a: Trainer, b: Trainer) -> bool:
+    mine, theirs = a.state()[0], b.state()[0]
+    return all(torch.equal(mine[n], theirs[n]) for n in mine)
+
+
+def test_a_batch_of_one_view_is_a_step_of_one_view():
+    """Through dropout, sampling events, layers and protection: the same bits by way of the sums."""
+    views = photos(3)
+    one, batch = (Trainer(views, seeds(61), METHOD, CPU, priors=priors(views)) for _ in range(2))
+    batch.batched = BatchSteps(batch.learned, batch.buffers, METHOD.rule, batch.background, Tree(1, ALONE))
+    advanced(one, 24), advanced(batch, 24)
+    assert len(one.strategy.events) > 1 and same_bits(one, batch)
+
+
+def test_views_of_a_step_share_its_gradient_and_add_to_statistics():
+    """The same view four times: its gradient once, at a rate that is twice as high, and its statistics four times."""
+    one, four = (Trainer(photos(1), seeds(), dataclasses.replace(PLAIN, batch=b), CPU) for b in (1, 4))
+    before = one.gaussians.means.clone()
+    said = [fit.advance()[0] for fit in (one, four)]
+    assert said[0].loss == pytest.approx(said[1].loss, rel=1e-6) and said[0].psnr == pytest.approx(said[1].psnr, rel=1e-6)
+    ways = [fit.gaussians.means - before for fit in (one, four)]
+    assert ways[0].abs().max() > 0 and torch.allclose(2 * ways[0], ways[1], rtol=1e-3, atol=1e-7)
+    for name in ("grad_sum", "seen_count"):
+        assert torch.equal(4 * one.table.columns[name], four.table.columns[name])
+    for name, moment in one.table.exp_avg.items():
+        assert torch.allclose(moment / (1 - 0.9), four.table.exp_avg[name] / (1 - 0.9**4), rtol=1e-5)
+
+
+def test_rates_follow_the_square_root_of_the_batch():
+    """Learning rates times 2 for four views, with corrections for decay rates to the power of four."""
+    fit = Trainer(photos(2), seeds(), dataclasses.replace(PLAIN, batch=4), CPU)
+    row, lrs = fit._lr_row(3), fit.lrs(3)
+    assert row[:3] == scheduled_lrs(2 * lrs["means"], 3, (0.9**4, 0.999**4))
+    assert fit.settings(3)[1:3] == (3, 2 * lrs["means"])
+    assert [fit.settings(3, slot)[1] for slot in range(4)] == [9, 10, 11, 12]
+
+
+def test_a_fit_with_batches_continues_with_the_same_bits():
+    """From a state between two epochs, and through changes of the set."""
+    config = dataclasses.replace(
+        PLAIN, steps=12, batch=5, dropout=0.3, density=DensityConfig(start=2, every=3, gradient=1e-5, reset_every=6)
+    )
+    whole, first, second = (Trainer(photos(3), seeds(61), config, CPU) for _ in range(3))
+    second.load(*advanced(first, 7).state())
+    assert same_bits(advanced(whole, 12), advanced(second, 12)) and len(whole.table) > 61
+
+
+def test_a_loss_that_is_no_number_names_its_view_and_harms_nothing():
+    """A NaN in one photograph of three: the Gaussians are those before the step, and its views come again."""
+    views = photos(3)
+    bad = View("bad", views[1].camera, np.full_like(views[1].image, np.nan))
+    fit = Trainer([views[0], bad, views[2]], seeds(), dataclasses.replace(PLAIN, batch=3), CPU)
+    before = {n: t.clone() for n, t in fit.state()[0].items() if n != "generator"}
+    with pytest.raises(NotFiniteError, match="became nan at step 1") as found:
+        fit.advance()
+    order = list(reversed(fit.order))
+    assert found.value.view == 1 and order[found.value.slot] == 1 and sorted(order) == [0, 1, 2] and fit.step == 0
+    assert all(torch.equal(before[n], t) for n, t in fit.state()[0].items() if n in before)
+
+
+def test_a_batch_costs_memory_and_on_a_cpu_steps():
+    """The plan counts the sums; a time on a CPU is one of renders; and elsewhere steps are those of one view."""
+    views = [View(v.name, dataclasses.replace(v.camera, width=4000, height=3000), v.image) for v in photos(4)]
+    config = PRESETS["default"]
+    for device, fewer in (("cpu", 8), ("cuda", 1)):
+        one, eight = (settings_by_views(dataclasses.replace(config, batch=b), views, device)[0].steps for b in (1, 8))
+        assert eight == one // fewer > 0
+    views = photos(4)
+    one, eight = (Trainer(views, seeds(), dataclasses.replace(PLAIN, batch=b), CPU).layout for b in (1, 8))
+    assert eight.held(1000) - one.held(1000) == 3 * (one.row + 8) * 1000

@@ -1,0 +1,88 @@
+"""Sums over slots: one order for any number of processes."""
+
+import threading
+
+import pytest
+import torch
+
+from warpgs.errors import UsageError
+from warpgs.pipeline.train.slots import SlotSums, Tree, check_batch, own_slots
+from warpgs.runtime.ranks import ALONE, Ranks
+
+SHAPES = [(7, 3), (7,), (5,)]
+
+
+class Thread(Ranks):
+    """One of several threads that exchange as processes do."""
+
+    def __init__(self, rank: int, count: int, desk: list, barrier: threading.Barrier):
+        self.rank, self.count, self.desk, self.barrier = rank, count, desk, barrier
+
+    def _put(self, value):
+        self.desk[self.rank] = value
+        self.barrier.wait(30)
+        found = list(self.desk)
+        self.barrier.wait(30)
+        return found
+
+    def to_each(self, sent):
+        return torch.stack([other[self.rank].clone() for other in self._put(sent)])
+
+    def gather(self, own, found):
+        found.copy_(torch.cat(self._put(own)))
+
+
+def summed(slots: list[list[torch.Tensor]], ranks: Ranks) -> list[torch.Tensor]:
+    """The sums of the tensors of slots, as one process gets them."""
+    sums = SlotSums(Tree(len(slots), ranks), SHAPES, torch.device("cpu"))
+
+    def add(slot, parts, adds):
+        for part, value in zip(parts, slots[slot], strict=True):
+            part.add_(value) if adds else part.copy_(value)
+
+    return [part.clone() for part in sums.add_up(add)]
+
+
+def by_threads(slots: list[list[torch.Tensor]], count: int) -> list[list[torch.Tensor]]:
+    """What each of several processes gets."""
+    desk, barrier, found = [None] * count, threading.Barrier(count), [None] * count
+
+    def work(rank: int) -> None:
+        found[rank] = summed(slots, Thread(rank, count, desk, barrier))
+
+    threads = [threading.Thread(target=work, args=(rank,)) for rank in range(count)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    return found
+
+
+@pytest.mark.parametrize("batch", [2, 3, 5, 8, 13])
+def test_any_number_of_processes_gets_the_same_bits(batch):
+    """Also where slots are not spread evenly; and they are the sums, but for float32's rounding."""
+    random = torch.Generator().manual_seed(batch)
+    slots = [[torch.randn(s, generator=random) * 10.0 ** (k % 5) for s in SHAPES] for k in range(batch)]
+    alone = summed(slots, ALONE)
+    for part, *values in zip(alone, *slots, strict=True):
+        exact = torch.stack(values).double()
+        assert ((part - exact.sum(0)).abs() <= 2**-23 * batch.bit_length() * exact.abs().sum(0)).all()
+    for count in range(2, min(batch, 6) + 1):
+        for found in by_threads(slots, count):
+            assert all(torch.equal(a, b) for a, b in zip(alone, found, strict=True))
+
+
+@pytest.mark.parametrize(("batch", "ranks"), [(8, 1), (8, 3), (7, 4), (5, 5)])
+def test_every_slot_is_in_one_process_and_one_node(batch, ranks):
+    """The slots of the processes, and those of the nodes that they sum, are all slots from the first to the last."""
+    assert [s for r in range(ranks) for s in own_slots(batch, ranks, r)] == list(range(batch))
+    tree = Tree(batch, Thread(ranks - 1, ranks, [], threading.Barrier(1)))
+    assert [s for nodes in tree.nodes for first, end in nodes for s in range(first, end)] == list(range(batch))
+
+
+def test_a_process_without_a_view_is_refused():
+    """And so are fits whose renders cannot be numbered."""
+    with pytest.raises(UsageError, match="give --batch 4 or a multiple"):
+        check_batch(3, 10, Thread(0, 4, [], threading.Barrier(1)))
+    with pytest.raises(UsageError, match="renders; lower --steps or --batch"):
+        check_batch(1000, 20_000, ALONE)

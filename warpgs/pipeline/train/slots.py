@@ -1,0 +1,189 @@
+"""Sums over the views of a step, its slots, in one order for any number of processes.
+
+Numbers of float32 are added in a fixed binary tree over the slots 0 to B - 1: slots ``first`` to ``end`` are those up to the
+largest power of two below their number, plus the others. A process sums the largest subtrees of its own slots; from those of
+all processes each finishes the same tree, and has the same bits as one process alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from warpgs.errors import UsageError
+from warpgs.runtime.ranks import Ranks
+
+Node = tuple[int, int]
+"""Slots of a subtree: the first, and the one behind the last."""
+ALIGNMENT = 16
+"""Floats to whose multiples the parts of a sum begin: Adam reads four at a time."""
+
+
+MAX_RENDERS = 2**24
+"""Number of renders that a fit must stay below: it is a float32, from which each takes its random numbers."""
+
+
+def check_batch(batch: int, steps: int | None, ranks: Ranks) -> None:
+    """Check that every process has a view in each step, and that the views of all steps can be numbered.
+
+    Args:
+        batch: Views in a step.
+        steps: Steps of the fit; None where they are not known yet.
+        ranks: The processes.
+
+    Raises:
+        UsageError: There are fewer views than processes, or too many steps.
+    """
+    if batch < ranks.count:
+        raise UsageError(
+            f"{ranks.count} ranks share the views of a step, and --batch {batch} gives it {batch}: give --batch {ranks.count} "
+            "or a multiple of it, or start fewer ranks"
+        )
+    if batch > 1 and steps is not None and steps * batch >= MAX_RENDERS:
+        raise UsageError(f"{steps:,} steps of {batch} views are more than {MAX_RENDERS:,} renders; lower --steps or --batch")
+
+
+def children(node: Node) -> tuple[Node, Node]:
+    """Return the two halves of a node of at least two slots."""
+    first, end = node
+    middle = first + (1 << (end - first - 1).bit_length() - 1)
+    return (first, middle), (middle, end)
+
+
+def own_slots(batch: int, ranks: int, rank: int) -> range:
+    """Return the slots of one of several ranks: equally many each, or one more."""
+    return range(rank * batch // ranks, (rank + 1) * batch // ranks)
+
+
+def subtrees(slots: range, node: Node) -> list[Node]:
+    """Return the largest nodes below a node that hold none but these slots, from the first slot to the last."""
+    first, end = node
+    if slots.start <= first and end <= slots.stop:
+        return [node]
+    if end <= slots.start or slots.stop <= first:
+        return []
+    return [found for child in children(node) for found in subtrees(slots, child)]
+
+
+def depth(node: Node) -> int:
+    """Return how many sums stand side by side while the slots of a node are added one after the other."""
+    first, end = node
+    if end - first == 1:
+        return 1
+    left, right = children(node)
+    return max(depth(left), (1 + depth(right)) if right[1] - right[0] > 1 else 1)
+
+
+def finished(node: Node, known: Mapping[Node, torch.Tensor]) -> torch.Tensor:
+    """Return the sum of a node from those that are known, shape [...]; they are overwritten."""
+    if node in known:
+        return known[node]
+    left, right = (finished(child, known) for child in children(node))
+    return left.add_(right)
+
+
+@dataclass(frozen=True)
+class Tree:
+    """The tree over the slots of a step, and who adds what of it."""
+
+    batch: int
+    """Number of slots B."""
+    ranks: Ranks
+    """The processes."""
+
+    @property
+    def slots(self) -> range:
+        """Slots of this process."""
+        return own_slots(self.batch, self.ranks.count, self.ranks.rank)
+
+    @property
+    def nodes(self) -> list[list[Node]]:
+        """Subtrees that each process sums."""
+        count, whole = self.ranks.count, (0, self.batch)
+        return [subtrees(own_slots(self.batch, count, rank), whole) for rank in range(count)]
+
+    @property
+    def width(self) -> int:
+        """Most subtrees that a process sums."""
+        return max(map(len, self.nodes))
+
+    @property
+    def rows(self) -> int:
+        """Sums that a process keeps side by side: those that it adds up, one at least for each that is exchanged."""
+        own = self.nodes[self.ranks.rank]
+        return max(self.width, *(k + depth(node) for k, node in enumerate(own)))
+
+    @property
+    def buffers(self) -> int:
+        """Sums that a process keeps in all, with copies for the exchange."""
+        exchanged = 0 if self.ranks.count == 1 else self.width + (self.width if self.width > 1 else 0)
+        return self.rows + exchanged
+
+
+class SlotSums:
+    """Sums over slots of tensors of fixed shapes, side by side in one piece of memory for each sum."""
+
+    def __init__(self, tree: Tree, shapes: Sequence[tuple[int, ...]], device: torch.device):
+        """Allocate.
+
+        Args:
+            tree: The tree.
+            shapes: Shape of each tensor.
+            device: Where sums are kept.
+        """
+        self.tree, self.shapes, self.device = tree, [tuple(s) for s in shapes], device
+        sizes = [-(-torch.Size(s).numel() // ALIGNMENT) * ALIGNMENT for s in self.shapes]
+        self.starts = [sum(sizes[:i]) for i in range(len(sizes))]
+        """Where each tensor begins in a sum."""
+        unit = ALIGNMENT * tree.ranks.count
+        self.rows = torch.zeros(tree.rows, -(-sum(sizes) // unit) * unit, device=device)
+        """The sums, shape [R, L]."""
+
+    def fits(self, shapes: Sequence[tuple[int, ...]]) -> bool:
+        """Return whether tensors have the shapes that these sums are of."""
+        return self.shapes == [tuple(s) for s in shapes]
+
+    def parts(self, row: int = 0) -> list[torch.Tensor]:
+        """Return the tensors of a sum, parts of its memory, in their shapes [...]."""
+        sized = zip(self.starts, self.shapes, strict=True)
+        return [self.rows[row, start : start + torch.Size(s).numel()].view(s) for start, s in sized]
+
+    def add_up(self, slot: Callable[[int, list[torch.Tensor], bool], None]) -> list[torch.Tensor]:
+        """Add the slots of all processes; every process gets the same sums of the tensors, in their shapes [...].
+
+        Args:
+            slot: Function of a slot, the tensors of a sum, and whether it adds to them; else it overwrites them.
+
+        Raises:
+            ResourceError: Another process is gone.
+        """
+        own = self.tree.nodes[self.tree.ranks.rank]
+        for row, node in enumerate(own):
+            self._add_node(node, row, slot)
+        if self.tree.ranks.count > 1:
+            self._exchange()
+        return self.parts()
+
+    def _add_node(self, node: Node, row: int, slot: Callable[[int, list[torch.Tensor], bool], None]) -> None:
+        """Add the slots of a node into a row, with those behind it as scratch."""
+        if node[1] - node[0] == 1:
+            slot(node[0], self.parts(row), False)
+            return
+        left, right = children(node)
+        self._add_node(left, row, slot)
+        if right[1] - right[0] == 1:
+            slot(right[0], self.parts(row), True)
+        else:
+            self._add_node(right, row + 1, slot)
+            self.rows[row].add_(self.rows[row + 1])
+
+    def _exchange(self) -> None:
+        """Finish the tree: each process does a slice of the numbers with the sums of all, and gives it to all."""
+        tree, ranks = self.tree, self.tree.ranks
+        count, width = ranks.count, tree.width
+        sent = self.rows[:width].view(width, count, -1).transpose(0, 1).contiguous()
+        received = ranks.to_each(sent)
+        known = {node: received[r, k] for r, nodes in enumerate(tree.nodes) for k, node in enumerate(nodes)}
+        ranks.gather(finished((0, tree.batch), known), self.rows[0])

@@ -1,0 +1,152 @@
+"""Watch of each process of a fit over the others: whoever is lost ends all, with one sentence."""
+
+from __future__ import annotations
+
+import os
+import platform
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from warpgs.errors import ResourceError
+from warpgs.runtime.terminal import say
+
+if TYPE_CHECKING:
+    from torch.distributed import Store
+
+BEAT_SECONDS = 1.0
+"""Time between two signs of life [s]."""
+LOST_SECONDS = 20.0
+"""Time without a sign of life after which a process on another machine counts as lost [s]; on this one its end is seen."""
+
+
+def machine() -> str:
+    """Return a name of the machine and of its table of processes, in which process numbers mean something."""
+    try:
+        return f"{Path('/proc/sys/kernel/random/boot_id').read_text().strip()} {os.stat('/proc/self/ns/pid').st_ino}"
+    except OSError:  # a system other than Linux
+        return platform.node()
+
+
+def is_gone(process: int) -> bool:
+    """Return whether a process of this machine has ended."""
+    import psutil
+
+    try:
+        return psutil.Process(process).status() in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
+    except psutil.NoSuchProcess:
+        return True
+    except (psutil.Error, OSError):  # it is there, and not ours to look at
+        return False
+
+
+class RankWatch:
+    """Signs of life in a store, and a thread that reads those of the others.
+
+    A store's calls wait for each other, so that the thread has a connection of its own.
+    """
+
+    def __init__(self, rank: int, count: int, store: Store, own: Store):
+        """Give the first sign of life, and begin to watch.
+
+        Args:
+            rank: Number of this process.
+            count: Number of processes.
+            store: Store of the main thread.
+            own: Another connection to it.
+        """
+        self.rank, self.count, self.store = rank, count, store
+        self.here = machine()
+        self.leaving = threading.Event()
+        """Set once this process ends in good order."""
+        self._own = own
+        self._seen: dict[int, tuple[str, float]] = {}
+        self._beat(0)
+        threading.Thread(target=self._watch, name="ranks", daemon=True).start()
+
+    def _beat(self, number: int) -> None:
+        self._own.set(f"beat/{self.rank}", f"{number}|{os.getpid()}|{self.here}")
+
+    def meet(self, seconds: float) -> None:
+        """Wait until all processes have given a sign of life.
+
+        Raises:
+            ResourceError: One has not within the time [s].
+        """
+        until = time.monotonic() + seconds
+        while missing := [r for r in range(self.count) if not self.store.check([f"beat/{r}"])]:
+            if time.monotonic() > until:
+                raise ResourceError(
+                    f"{self.count - len(missing)} of {self.count} ranks came within {seconds:.0f} s, rank {missing[0]} did "
+                    "not: start all of them, with the same MASTER_ADDR and MASTER_PORT"
+                )
+            time.sleep(0.05)
+
+    def _watch(self) -> None:
+        """Give signs of life and look for those of the others, until this process ends."""
+        number = 0
+        while not self.leaving.wait(BEAT_SECONDS):
+            number += 1
+            try:
+                self._beat(number)
+                if self._own.check(["spoke"]):  # somebody else has said why all end
+                    os._exit(ResourceError.exit_code)
+                lost = next((r for r in range(self.count) if r != self.rank and self.is_lost(r)), None)
+            except RuntimeError:  # the store is gone, and with it the process that held it
+                lost = 0
+            if lost is not None and not self.leaving.is_set():
+                self.fail(
+                    f"warpgs: rank {lost} of {self.count} is gone, and this fit ends with it; --resume continues from the last "
+                    "checkpoint, with any number of ranks"
+                )
+                os._exit(ResourceError.exit_code)
+
+    def is_lost(self, rank: int) -> bool:
+        """Return whether a process has ended without a word, or has been silent for too long."""
+        if not self._own.check([f"beat/{rank}"]):
+            return False  # it is still to come
+        found, now = self._own.get(f"beat/{rank}").decode(), time.monotonic()
+        last, since = self._seen.get(rank, ("", now))
+        if found != last:
+            self._seen[rank] = (found, now)
+            since = now
+        _, process, there = found.split("|", 2)
+        gone = is_gone(int(process)) if there == self.here else now - since > LOST_SECONDS
+        return gone and not self._own.check([f"left/{rank}"])
+
+    def fail(self, line: str) -> None:
+        """Print why all end, unless another process has, or this one ends in good order behind the first."""
+        if self.leaving.is_set() and self.rank != 0:
+            return
+        self.leaving.set()
+        try:
+            first = self.store.add("spoke", 1) == 1
+        except RuntimeError:  # nobody else can be asked
+            first = True
+        if first:
+            say(line, error=True)
+        if self.rank == 0:
+            time.sleep(3 * BEAT_SECONDS)  # with this process the store may go, from which the others hear of it
+
+    def settle(self, seconds: float) -> None:
+        """Wait for the thread to end this process, which it does once it knows who is lost; at most so long [s]."""
+        time.sleep(seconds + 2 * BEAT_SECONDS)
+
+    def leave(self) -> None:
+        """Tell the others that this process ends in good order; all but the first wait for the first to do so."""
+        try:
+            self.store.set(f"left/{self.rank}", "")
+            if self.rank != 0:
+                while not self.store.check(["left/0"]):
+                    time.sleep(0.1)
+            self.leaving.set()
+            self.store.set(f"heard/{self.rank}", "")
+            until = time.monotonic() + 3 * BEAT_SECONDS  # with the first process the store may go
+            while self.rank == 0 and time.monotonic() < until and not self._all_heard():
+                time.sleep(0.05)
+        except RuntimeError:  # the store has ended with the process that held it
+            self.leaving.set()
+
+    def _all_heard(self) -> bool:
+        return bool(self.store.check([f"heard/{r}" for r in range(self.count)]))

@@ -1,0 +1,215 @@
+"""Processes that fit one scene together: who they are, what they exchange, and what ends them when one is lost.
+
+They are started by torchrun, or with the variables that it sets: RANK, WORLD_SIZE, LOCAL_RANK, MASTER_ADDR and MASTER_PORT.
+Numbers go by NCCL between GPUs and by gloo between CPUs. Neither tells in time that a process is gone (a kernel of NCCL waits
+for ever), so each watches the others by way of a store that all have a connection to.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+from datetime import timedelta
+from typing import TYPE_CHECKING
+
+from warpgs.errors import ResourceError, UsageError
+from warpgs.runtime.rank_watch import LOST_SECONDS, RankWatch
+from warpgs.runtime.terminal import say
+
+if TYPE_CHECKING:
+    import torch
+
+JOIN_SECONDS = 300.0
+"""Time in which all processes must have come [s]."""
+EXCHANGE_TIME = timedelta(days=1)
+"""Time that an exchange may take: the first rank may write a checkpoint meanwhile, and who is lost is noticed otherwise."""
+
+
+class Ranks:
+    """The processes of a fit; of this class itself where there is one alone."""
+
+    rank = 0
+    """Number of this process."""
+    count = 1
+    """Number of processes."""
+    backend = "none"
+    """Library that exchanges numbers: nccl, gloo, or none."""
+
+    @property
+    def first(self) -> bool:
+        """True for the process that prints and writes."""
+        return self.rank == 0
+
+    def to_each(self, sent: torch.Tensor) -> torch.Tensor:
+        """Return what every process has sent to this one, ``sent[r]`` being what goes to process r; shape [R, ...] both.
+
+        Raises:
+            ResourceError: A process is gone.
+        """
+        return sent
+
+    def gather(self, own: torch.Tensor, found: torch.Tensor) -> None:
+        """Put what each process has, [S], one behind the other into ``found`` [R * S].
+
+        Raises:
+            ResourceError: A process is gone.
+        """
+        found.copy_(own)
+
+    def part(self) -> None:
+        """End all exchange, once all processes have done the same steps."""
+
+    def leave(self) -> None:
+        """End in good order; all but the first wait for the first to do so."""
+
+
+ALONE = Ranks()
+"""One process alone."""
+_joined: Group | None = None
+
+
+class Group(Ranks):
+    """Several processes."""
+
+    def __init__(self, rank: int, count: int, backend: str, watch: RankWatch):
+        """Keep what `join` has set up."""
+        self.rank, self.count, self.backend, self.watch = rank, count, backend, watch
+
+    def to_each(self, sent):
+        """Return what every process has sent to this one; shape [R, ...] both."""
+        import torch
+        import torch.distributed as dist
+
+        received = torch.empty_like(sent)
+        with self._watched():
+            dist.all_to_all_single(received, sent)
+        return received
+
+    def gather(self, own, found):
+        """Put what each process has, [S], one behind the other into ``found`` [R * S]."""
+        import torch.distributed as dist
+
+        with self._watched():
+            # the second name is that of torch before 2.13
+            (getattr(dist, "all_gather_single", None) or dist.all_gather_into_tensor)(found, own)
+
+    @contextlib.contextmanager
+    def _watched(self) -> Iterator[None]:
+        """Turn the failure of an exchange into the end of this process by the watch, which knows who is gone."""
+        try:
+            yield
+        except RuntimeError as e:
+            self.watch.settle(LOST_SECONDS)
+            raise ResourceError(
+                f"rank {self.rank} of {self.count} cannot exchange numbers with the others ({str(e).splitlines()[0][:200]}); "
+                "--resume continues from the last checkpoint"
+            ) from e
+
+    def part(self):
+        """End all exchange."""
+        import torch.distributed as dist
+
+        if dist.is_initialized():
+            dist.destroy_process_group()
+
+    def leave(self):
+        """End in good order."""
+        self.watch.leave()
+
+
+def _number(name: str, least: int, most: int, default: str | None = None) -> int:
+    text = os.environ.get(name, default)
+    if text is None or not text.isdecimal() or not least <= int(text) <= most:
+        raise UsageError(
+            f"the environment variable {name} is {text!r}, and must be a whole number from {least} to {most}; start the fit "
+            "with `torchrun --nproc_per_node N -m warpgs fit ...`, or unset RANK and WORLD_SIZE"
+        )
+    return int(text)
+
+
+def place() -> tuple[int, int]:
+    """Return rank and number of the processes that this one was started as, 0 and 1 for one alone.
+
+    Raises:
+        UsageError: The variables are no such numbers.
+    """
+    if "RANK" not in os.environ or "WORLD_SIZE" not in os.environ:
+        return 0, 1
+    count = _number("WORLD_SIZE", 1, 2**16)
+    return _number("RANK", 0, count - 1), count
+
+
+def join(device: str) -> Ranks:
+    """Wait for the other processes that were started with this one; returns `ALONE` where there are none.
+
+    Args:
+        device: auto, cpu or cuda; with CUDA each process takes the GPU of its number on this machine.
+
+    Raises:
+        ResourceError: There are fewer GPUs than processes, the others do not come, or cannot be reached.
+        UsageError: The variables of the environment are not those of torchrun.
+    """
+    global _joined
+    rank, count = place()
+    if count == 1:
+        return ALONE
+    import torch
+    import torch.distributed as dist
+
+    local = _number("LOCAL_RANK", 0, count - 1, str(rank))
+    address, port = os.environ.get("MASTER_ADDR", "127.0.0.1"), _number("MASTER_PORT", 1, 65535)
+    agent = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"  # torchrun itself holds the store then
+    cuda = device != "cpu" and (device.startswith("cuda") or torch.cuda.is_available())
+
+    def connected(hosts: bool) -> dist.Store:
+        store = dist.TCPStore(
+            address, port, count, is_master=hosts, timeout=timedelta(seconds=JOIN_SECONDS), wait_for_workers=False
+        )
+        run = [os.environ.get(f"TORCHELASTIC_{name}", "0") for name in ("RUN_ID", "RESTART_COUNT")]
+        return dist.PrefixStore("/".join(["warpgs", *run]), store)
+
+    try:
+        store = connected(rank == 0 and not agent)
+        watch = RankWatch(rank, count, store, connected(False))
+    except RuntimeError as e:
+        raise ResourceError(
+            f"rank {rank} of {count} does not reach the others at {address}:{port} ({str(e).splitlines()[0][:200]})"
+        ) from e
+    backend = "nccl" if cuda else "gloo"
+    _joined = Group(rank, count, backend, watch)
+    if cuda:
+        if torch.cuda.device_count() <= local:
+            raise ResourceError(
+                f"rank {rank} needs GPU {local} of this machine, and torch sees {torch.cuda.device_count()}: NCCL takes one "
+                "GPU a process, so start as many as there are, or give --device cpu"
+            )
+        torch.cuda.set_device(local)
+    watch.meet(JOIN_SECONDS)
+    try:
+        dist.init_process_group(
+            backend, store=dist.PrefixStore("group", store), rank=rank, world_size=count, timeout=EXCHANGE_TIME
+        )
+    except RuntimeError as e:
+        raise ResourceError(f"{backend} cannot connect the {count} ranks ({str(e).splitlines()[0][:200]})") from e
+    return _joined
+
+
+def last_words(line: str, code: int) -> int:
+    """Print why this process ends, and return its exit code; of several the first to fail says it, and this one ends here."""
+    if _joined is None:
+        if place_or_first()[0] == 0:
+            say(line, error=True)
+        return code
+    _joined.watch.fail(line)
+    sys.stdout.flush()
+    os._exit(code)  # what is left of a broken group may wait for ever
+
+
+def place_or_first() -> tuple[int, int]:
+    """Return `place`, or that of the first process where the variables say nothing of use."""
+    try:
+        return place()
+    except UsageError:
+        return 0, 1
