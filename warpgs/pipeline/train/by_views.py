@@ -26,7 +26,7 @@ DEGREES = (5, 9, 12)
 cannot tell a colour that changes with direction from an error of the shape."""
 CPU_PIXELS = 1e6
 """Pixels that two cores of a processor of 2.5 GHz train a second: 190 ms a step at 504 x 378 px."""
-CPU_SECONDS = 40.0, 5.0, 1200.0
+CPU_SECONDS = 45.0, 4.0, 1200.0
 """Time that a fit on a CPU may take by default [s]: at least, for each view, and at most."""
 
 
