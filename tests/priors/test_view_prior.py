@@ -11,6 +11,7 @@ from tests.priors.test_depth import response, scaled, two_planes
 from tests.priors.test_semantics import shapes
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.priors.view_prior import PriorConfig, view_priors
+from warpgs.runtime.terminal import Detail
 from warpgs.scene import Camera, View
 
 PLAIN = {"segmentation_size": 32, "segmentation_mean": (0.0, 0.0, 0.0), "segmentation_std": (1.0, 1.0, 1.0)}
@@ -122,7 +123,7 @@ def test_a_region_beats_saliency():
     region[10:20, 20:40] = True
     (prior,), notes = view_priors([view(shapes()[0])], PriorConfig(), regions=[region])
     assert (prior.foreground == region).all() and (prior.confidence == 1).all()
-    assert any("a mask is surer than saliency" in n for n in notes)
+    assert any("a mask is surer than saliency" in n and isinstance(n, Detail) for n in notes)
 
 
 def test_classical_sources_say_so():

@@ -189,7 +189,8 @@ def _fall_back(found: list[tuple[SemanticMaps, str]], views: Sequence[View], reg
         result.append((maps, source))
     reason = "a mask is surer than saliency" if classical else "the network finds hardly any foreground"
     if replaced:
-        notes.append(f"semantics: {reason}, so the mask or black background stands for foreground in {_names(replaced)}")
+        words = f"semantics: {reason}, so the mask or black background stands for foreground in {_names(replaced)}"
+        notes.append(Detail(words) if classical else words)
     if empty:
         notes.append(f"semantics: hardly any foreground and no mask of an object in {_names(empty)}: they do not count there")
     return result

@@ -94,7 +94,7 @@ def choose_device(name: str | torch.device) -> tuple[torch.device, str]:
     else:
         device = torch.device("cuda" if name == "auto" and torch.cuda.is_available() else name.replace("auto", "cpu"))
     if device.type == "cpu":
-        return device, f"on the CPU, {torch.get_num_threads()} threads"
+        return device, f"on the CPU, {torch.get_num_threads()} thread{'s' if torch.get_num_threads() > 1 else ''}"
     if not torch.cuda.is_available():
         raise ResourceError("--device cuda: torch sees no CUDA device here; `warpgs doctor` says why. Use --device cpu")
     if device.index is None:
