@@ -27,7 +27,7 @@ until then a grey cover lies over the page."""
 
 
 def shot(page, folder) -> tuple[np.ndarray, str]:
-    """A picture of a page in [0, 1], [H, W, 3], and what the browser wrote; of a page that stays covered the last of several."""
+    """A picture of a page in [0, 1], [H, W, 3], and what the browser wrote; the last of several where it stays covered."""
     for _ in range(ATTEMPTS):
         image, console = taken(page, folder)
         if image[-1, -1].max() == 0 and image[SHOWN].std() > 0.05:
