@@ -235,9 +235,11 @@ class Holdout(ImportanceSampling):
             return  # the set has not changed since
         errors = self._errors(model)
         if self.before is not None:
+            fall = own = gain(self.before, errors)
             old = self.trainer.table.columns["growth_level"] < self.growing
-            hidden = self._errors(compress.rows_of(model, old)) if bool(old.any()) and not bool(old.all()) else errors
-            fall, own = gain(self.before, errors), gain(hidden, errors)
+            if c.stop_db == 0:  # else the fall alone decides; this renders every view once more
+                hidden = self._errors(compress.rows_of(model, old)) if bool(old.any()) and not bool(old.all()) else errors
+                own = gain(hidden, errors)
             least: Gain = min(fall, own, key=lambda g: g.mean)
             self.levels.append(Level(step, len(model), decibels(errors), fall.mean, own.mean, least.mean, least.noise))
             if c.stop_db == 0 and least.upper_bound_below(c.least_db, c.noise):

@@ -214,7 +214,7 @@ class Level:
     fall: float
     """Fall of the held-out error since the level before, by growth and training together [dB]."""
     own: float
-    """Loss when the Gaussians that came with the level are hidden [dB]."""
+    """Loss when the Gaussians that came with the level are hidden [dB]; ``fall`` where ``holdout.stop_db`` ends the fit."""
     gain: float
     """The smaller of the two, which are both upper bounds of the gain by growth [dB]."""
     noise: float
