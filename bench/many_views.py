@@ -1,7 +1,7 @@
 """A fit of many photographs: the demo with 300 views, its time, steps, PSNR and peak memory.
 
 usage: python -m bench.many_views [--views 300] [--width 320] [--height 240] [--split every:8] [--preset default] [--seeds 1]
-           [--device auto] --out FILE.json
+           [--device auto] [--work FOLDER] --out FILE.json
 Each fit has a process of its own, so that its peak memory is its own; reading the scene counts as part of it.
 """
 
@@ -65,13 +65,15 @@ def main(arguments: list[str] | None = None) -> int:
     p.add_argument("--split", default="every:8")
     p.add_argument("--preset", default="default")
     p.add_argument("--device", default="auto")
+    p.add_argument("--work", type=Path, help="folder that keeps the demo for the next call; a temporary one where not given")
     p.add_argument("--out", type=Path, required=True)
     a = p.parse_args(arguments)
     device, rows = choose_device(a.device)[0], []
     facts = {k: getattr(a, k) for k in ("views", "width", "height", "split", "preset")}
     with tempfile.TemporaryDirectory() as work:
-        folder = str(Path(work, "demo"))
-        write_demo(Path(folder), views=a.views, width=a.width, height=a.height)
+        folder = str((a.work or Path(work)) / f"demo{a.views}_{a.width}x{a.height}")
+        if not Path(folder).is_dir():
+            write_demo(Path(folder), views=a.views, width=a.width, height=a.height)
         first = functools.partial(compile_all, (a.preset,), str(device))
         for seed in range(a.seeds):
             # compiled in another process: its memory is not the fit's
