@@ -261,7 +261,7 @@ class Holdout(ImportanceSampling):
                 yield from self._close(step)
                 return
             if step == self.marks[-1]:
-                self.why = f"its time was up: level {len(self.levels)} still gained {least.mean:+.3f} dB"
+                self.why = f"its time was up, after {least.mean:+.3f} dB by level {len(self.levels)}"
                 yield from self._close(step)
                 return
         self.before = errors
