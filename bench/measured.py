@@ -69,13 +69,15 @@ def captures() -> str:
         body.append(cells)
     heads = [*(f"`{p}`" for p in PRESETS[:-1]), f"gsplat {result['versions']['gsplat']}"]
     words = table(["scene", "training views", *heads], body)
+    older = {r["preset"]: r["commit"] for r in result["rows"] if "commit" in r}
+    older = "".join(f" {preset}: commit {commit}." for preset, commit in older.items())
     return f"""## New views
 
 Held-out photographs: PSNR [dB], mean and standard deviation over {min(seeds - {0})} to {max(seeds)} seeds, / SSIM. 504 x 378 px
 (fox 270 x 480, temple 640 x 480 by its foreground). {_where(result)}. Settings were chosen on these scenes by leaving training
 views out, but those of the first points, which were compared on three views with their held-out ones ([decision
 007](decisions/007-coarse-start.md)). `gsplat` is that package's default strategy in 7000 steps, from the first points
-of `default`.
+of `default`.{older}
 
 {words}
 What `default` is and how it was chosen: [decision 013](decisions/013-any-capture.md). Synthetic scenes of smooth surfaces
