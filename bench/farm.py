@@ -19,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
@@ -137,7 +137,6 @@ def engines(scenes: int, steps: int, slots: int, work: Path) -> list[dict]:
         out.mkdir()
         row = timed(jobs_of(found, out, config), lambda: make_engine(request, "cpu", out), show)  # noqa: B023
         rows.append({"way": way, "slots": request.slots, **row, "same_bytes": digests(out, names) == wanted})
-        print(rows[-1], flush=True)
     row = shared(found, work / "scenes", work / "shared", steps)
     rows.append({"way": "two farms of 1 slot", "slots": 2, **row, "same_bytes": digests(work / "shared", names) == wanted})
     for row in rows:
@@ -170,15 +169,14 @@ def pack(scene: SceneRequest, config: FitConfig, out: Path, slots: list[Slot], f
     }  # fmt: skip
 
 
-def packing(a: argparse.Namespace, work: Path) -> list[dict]:
-    """Return a row for each number of slots on one GPU, then for each number of GPUs with the best one."""
+def packing(a: argparse.Namespace, work: Path) -> Iterator[dict]:
+    """Yield a row for each number of slots on one GPU, then for each number of GPUs with the best one."""
     if a.scene is None:
         write_demo(work / "demo", views=24, width=504, height=378)
         a.scene, a.split = work / "demo", "train=000.png,012.png,023.png;test=006.png,018.png"
     scene = SceneRequest(str(a.scene.resolve()), a.split, a.downscale)
     config = PRESETS["default"] if a.steps is None else dataclasses.replace(PRESETS["default"], steps=a.steps)
-    there, rows = torch.cuda.device_count(), []
-    best, alone = 0, {}
+    there, best, alone = torch.cuda.device_count(), 0, {}
 
     def measure(gpus: int, per_gpu: int) -> dict:
         threads = max(1, torch.get_num_threads() // (gpus * per_gpu))
@@ -187,18 +185,17 @@ def packing(a: argparse.Namespace, work: Path) -> list[dict]:
         out.mkdir()
         row = {"gpus": gpus, "per_gpu": per_gpu, "threads": threads, **pack(scene, config, out, slots, a.fits)}
         shutil.rmtree(out)
-        print(row, flush=True)
         return row
 
     for per_gpu in map(int, a.per_gpu.split(",")):
-        rows.append(measure(1, per_gpu))
-        if rows[-1]["fits_per_hour"] > alone.get("fits_per_hour", 0):
-            best, alone = per_gpu, rows[-1]
+        row = measure(1, per_gpu)
+        yield row
+        if row["fits_per_hour"] > alone.get("fits_per_hour", 0):
+            best, alone = per_gpu, row
     for gpus in map(int, a.gpus.split(",")):
         if 1 < gpus <= there:
             row = measure(gpus, best)
-            rows.append(row | {"efficiency": row["fits_per_hour"] / (gpus * alone["fits_per_hour"])})
-    return rows
+            yield row | {"efficiency": row["fits_per_hour"] / (gpus * alone["fits_per_hour"])}
 
 
 def main() -> None:
@@ -221,12 +218,15 @@ def main() -> None:
         work = (a.work or Path(temporary)).resolve()
         work.mkdir(parents=True, exist_ok=True)
         if a.what == "engines":
-            rows, device = engines(a.scenes, a.steps or 100, a.slots, work), torch.device("cpu")
+            found, device = engines(a.scenes, a.steps or 100, a.slots, work), torch.device("cpu")
         else:
-            rows, device = packing(a, work), torch.device("cuda")
-    print(*rows, sep="\n")
-    load = os.getloadavg()[0]
-    result_file.write(a.out, result_file.result(f"farms of small fits: {a.what}", device, rows, load_average=load))
+            found, device = packing(a, work), torch.device("cuda")
+        rows = []
+        for row in found:  # a row that took minutes is kept when a later one fails
+            rows.append(row)
+            print(row, flush=True)
+            load = os.getloadavg()[0]
+            result_file.write(a.out, result_file.result(f"farms of small fits: {a.what}", device, rows, load_average=load))
 
 
 if __name__ == "__main__":
