@@ -295,6 +295,13 @@ def test_defects_are_called_defects(tmp_path, capsys, monkeypatch):
     assert "Traceback" in next(tmp_path.glob("warpgs-error-*.txt")).read_text()
 
 
+def test_a_package_that_is_gone_is_named(capsys, monkeypatch):
+    """A package that warpgs was installed with and that is no longer there is no defect of warpgs."""
+    monkeypatch.setitem(sys.modules, "pyvista", None)
+    monkeypatch.setattr("warpgs.pipeline.runs.share.export", lambda *a: __import__("pyvista"))
+    assert "the Python package pyvista is missing" in failure(capsys, 2, "export", "run", "--to", "x.ply")
+
+
 def test_changed_data_are_noticed(scene, run, tmp_path, capsys):
     """eval refuses a scene whose photographs are no longer those of the fit."""
     import shutil

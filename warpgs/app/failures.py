@@ -13,11 +13,25 @@ def report_no_memory(error: Exception) -> int:
     return last_words(f"warpgs: {no_memory_message(error)}", ResourceError.exit_code)
 
 
+def missing_package(error: Exception) -> str:
+    """Return the package that an import of warpgs's own code did not find; empty where it is no such error."""
+    name = error.name or "" if isinstance(error, ModuleNotFoundError) and not own_frame(error) else ""
+    package = name.partition(".")[0]
+    return "" if package == "warpgs" else package
+
+
 def report_defect(error: Exception, arguments: list[str]) -> int:
-    """Keep the traceback for a bug report; the user sees one line. Returns the exit code."""
+    """Keep the traceback for a bug report; the user sees one line. Returns the exit code.
+
+    A package that was installed with warpgs and is gone is no defect: it is named instead.
+    """
     import tempfile
     import traceback
 
+    gone = missing_package(error)
+    if gone:
+        line = f"warpgs: the Python package {gone} is missing, which warpgs needs here; install warpgs again with pip"
+        return last_words(line, UsageError.exit_code)
     details = f"warpgs {__version__} {' '.join(arguments)}\n\n{''.join(traceback.format_exception(error))}"
     try:
         with tempfile.NamedTemporaryFile(
