@@ -18,8 +18,8 @@ import torch
 
 import warpgs
 from warpgs.files import write_bytes
-from warpgs.pipeline.runs.film_plan import FilmSettings, plan_film
-from warpgs.pipeline.runs.model_file import FittedModel
+from warpgs.pipeline.films.plan import FilmSettings, plan_film
+from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.render.rasterize import rasterize
 from warpgs.report.images import frame_sheet, png
 from warpgs.runtime.terminal import say

@@ -23,8 +23,8 @@ from warpgs.coordinates import convert_mesh
 from warpgs.geometry import back_project
 from warpgs.mesh.fuse import MeshOptions, fuse
 from warpgs.mesh.surface_views import surface_view
+from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.runs.folder import open_run
-from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.scene import Camera, Mesh
 from warpgs.synthetic import raycast
 from warpgs.synthetic.demo import still_life

@@ -53,11 +53,11 @@ if TYPE_CHECKING:
     from warpgs.export.ply import read_ply, write_ply
     from warpgs.io.load import load_scene
     from warpgs.io.readers import Reader
+    from warpgs.pipeline.films.film import render_path
     from warpgs.pipeline.metrics.evaluate import ViewMetrics, evaluate
+    from warpgs.pipeline.model.model_file import Model, load, save
     from warpgs.pipeline.runs.fit import FitResult, fit
     from warpgs.pipeline.runs.folder import StoredRun, open_run
-    from warpgs.pipeline.runs.model_file import Model, load, save
-    from warpgs.pipeline.runs.paths import render_path
     from warpgs.pipeline.train.config import PRESETS, FitConfig
     from warpgs.pipeline.train.loss import LossTerm
     from warpgs.pipeline.train.step_report import StepReport
@@ -76,8 +76,8 @@ _HOMES = {
         "warpgs.pipeline.metrics.evaluate": ("ViewMetrics", "evaluate"),
         "warpgs.pipeline.runs.fit": ("FitResult", "fit"),
         "warpgs.pipeline.runs.folder": ("StoredRun", "open_run"),
-        "warpgs.pipeline.runs.model_file": ("Model", "load", "save"),
-        "warpgs.pipeline.runs.paths": ("render_path",),
+        "warpgs.pipeline.model.model_file": ("Model", "load", "save"),
+        "warpgs.pipeline.films.film": ("render_path",),
         "warpgs.pipeline.train.config": ("FitConfig", "PRESETS"),
         "warpgs.pipeline.train.loss": ("LossTerm",),
         "warpgs.pipeline.train.strategies.base": ("Strategy",),

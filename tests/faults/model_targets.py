@@ -20,7 +20,8 @@ from warpgs.files import write_json
 from warpgs.io.load import load_scene
 from warpgs.io.splits import Split
 from warpgs.pipeline.metrics import lpips_weights
-from warpgs.pipeline.runs import checkpoint, folder, model_file
+from warpgs.pipeline.model import model_file
+from warpgs.pipeline.runs import checkpoint, folder
 from warpgs.pipeline.runs.request import SceneRequest
 from warpgs.pipeline.train.config import PRESETS
 from warpgs.priors import flow, onnx_file, preprocess

@@ -20,13 +20,13 @@ from tests.faults.tiny_runs import SAME_BYTES, digests, is_temporary
 from warpgs.errors import ResourceError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
+from warpgs.pipeline.films.film import render_path
+from warpgs.pipeline.model import model_file
 from warpgs.pipeline.model.compress import Pruned
-from warpgs.pipeline.runs import model_file
 from warpgs.pipeline.runs.checkpoint import save_checkpoint
 from warpgs.pipeline.runs.commands import evaluate
 from warpgs.pipeline.runs.failed_step import save_failed_step
 from warpgs.pipeline.runs.folder import StoredRun, open_run
-from warpgs.pipeline.runs.paths import render_path
 from warpgs.pipeline.runs.prune import _write
 from warpgs.pipeline.runs.share import export
 from warpgs.report.events import EventLog

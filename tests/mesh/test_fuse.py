@@ -12,8 +12,8 @@ from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
 from warpgs.mesh.fuse import MeshOptions, fuse, vertex_colors
 from warpgs.mesh.surface_views import sample_surface, surface_view
+from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.runs import mesh as run_mesh
-from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.scene import Normalization
 

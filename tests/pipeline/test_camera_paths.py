@@ -8,10 +8,10 @@ import pytest
 from tests.scenes import ring
 from warpgs.errors import UsageError
 from warpgs.geometry import look_at, project_points
-from warpgs.pipeline.runs.camera_paths import BY_KIND, camera_path, framed
-from warpgs.pipeline.runs.keyframes import Keyframe, through
-from warpgs.pipeline.runs.rig import rig_of, up_of
-from warpgs.pipeline.runs.view_tour import tour_of
+from warpgs.pipeline.films.camera_paths import BY_KIND, camera_path, framed
+from warpgs.pipeline.films.keyframes import Keyframe, through
+from warpgs.pipeline.films.rig import rig_of, up_of
+from warpgs.pipeline.films.view_tour import tour_of
 from warpgs.scene import Camera
 
 K = np.array([[50.0, 0, 20], [0, 55, 15], [0, 0, 1]])

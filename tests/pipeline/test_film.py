@@ -14,12 +14,12 @@ import warpgs
 from tests.scenes import ring, three_gaussians
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import look_at
-from warpgs.pipeline.runs.film_plan import FilmSettings, plan_film
-from warpgs.pipeline.runs.frame_check import FrameCheck
-from warpgs.pipeline.runs.keyframes import read_keyframes
-from warpgs.pipeline.runs.model_file import FittedModel
-from warpgs.pipeline.runs.paths import render_film
-from warpgs.pipeline.runs.rig import rig_of
+from warpgs.pipeline.films.film import render_film
+from warpgs.pipeline.films.frame_check import FrameCheck
+from warpgs.pipeline.films.keyframes import read_keyframes
+from warpgs.pipeline.films.plan import FilmSettings, plan_film
+from warpgs.pipeline.films.rig import rig_of
+from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.scene import Normalization
 
 UNITS = Normalization(np.array([1.0, 2.0, 3.0]), 0.5)

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from tests.scenes import photos, seeds
 from warpgs.pipeline.model.init import InitConfig, initial_gaussians
-from warpgs.pipeline.runs.image_names import image_names, renaming_notes
 from warpgs.pipeline.runs.results import evaluate_run
+from warpgs.report.image_names import image_names, renaming_notes
 
 
 def test_plain_names_stay_as_they_are():

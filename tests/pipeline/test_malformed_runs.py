@@ -11,11 +11,11 @@ from safetensors.torch import save
 
 from warpgs.app.cli import main
 from warpgs.errors import DataError
+from warpgs.pipeline.model.model_file import load as load_model
+from warpgs.pipeline.model.model_file import save as save_model
 from warpgs.pipeline.runs import checkpoint
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
 from warpgs.pipeline.runs.folder import open_run, read_record
-from warpgs.pipeline.runs.model_file import load as load_model
-from warpgs.pipeline.runs.model_file import save as save_model
 from warpgs.report.events import read_events
 from warpgs.synthetic.demo import write_demo
 

@@ -16,8 +16,8 @@ from warpgs.export.formats import write_gaussians
 from warpgs.files import make_folder
 from warpgs.geometry import look_at
 from warpgs.io.camera_files import read_cameras
+from warpgs.pipeline.films.plan import FilmSettings
 from warpgs.pipeline.runs.commands import render
-from warpgs.pipeline.runs.film_plan import FilmSettings
 from warpgs.pipeline.runs.model_and_cameras import open_file
 from warpgs.pipeline.runs.share import convert
 from warpgs.pipeline.runs.share_filters import Filters

@@ -9,11 +9,11 @@ import pytest
 
 from tests.io import scenes
 from warpgs.app.cli import main
+from warpgs.pipeline.films.film import render_path
 from warpgs.pipeline.metrics import evaluate
 from warpgs.pipeline.metrics.evaluate import score, summarize
 from warpgs.pipeline.runs import schemas
 from warpgs.pipeline.runs.folder import open_run
-from warpgs.pipeline.runs.paths import render_path
 from warpgs.pipeline.runs.results import score_line
 from warpgs.report.images import png, straight_alpha
 from warpgs.scene import Camera, View

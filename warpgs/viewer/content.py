@@ -13,10 +13,10 @@ import torch
 from warpgs.coordinates import convert_gaussians
 from warpgs.errors import DataError, WarpgsError
 from warpgs.export.formats import read_gaussians
+from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
 from warpgs.pipeline.runs.commands import scene_of
 from warpgs.pipeline.runs.folder import StoredRun, open_run
-from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.pipeline.train.strategies.importance_sampling import FINE
 from warpgs.scene import Normalization, View
 

@@ -14,8 +14,8 @@ import numpy as np
 from warpgs.coordinates import convert_camera, convert_gaussians
 from warpgs.errors import DataError
 from warpgs.files import write_text
+from warpgs.pipeline.films.rig import up_of
 from warpgs.pipeline.runs.folder import open_run
-from warpgs.pipeline.runs.rig import up_of
 from warpgs.pipeline.runs.share_filters import NO_FILTERS, Filters, file_gaussians, filtered, rotate_camera
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.folder_lock import hold_folder

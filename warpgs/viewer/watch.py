@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 from warpgs.errors import DataError, WarpgsError
 from warpgs.export.formats import FORMATS
+from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.runs.folder import CONFIG, read_record
-from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.pipeline.runs.request import choose_device
 from warpgs.report.progress import waiting
 from warpgs.runtime.terminal import say

@@ -52,8 +52,8 @@ def run(arguments: list[str], about: str) -> int:
     check_range("--fps", a.fps, 1, 1000)
     from math import radians
 
+    from warpgs.pipeline.films.plan import FilmSettings
     from warpgs.pipeline.runs.commands import render
-    from warpgs.pipeline.runs.film_plan import FilmSettings
 
     settings = FilmSettings(a.frames, a.seconds, a.fps, a.size, None if a.fov is None else radians(a.fov))
     if a.run.is_dir() and (a.cameras is not None or a.rule is not None):

@@ -20,6 +20,7 @@ from warpgs.pipeline.metrics.evaluate import options_for, render_view
 from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.metrics.moved import Rendered, moved_fractions, moved_notes
 from warpgs.pipeline.model.compress import drop_unused_sh
+from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.model.scale_limits import shape_figures, shape_summary
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.runs.coverage_report import coverage_of_run
@@ -27,9 +28,7 @@ from warpgs.pipeline.runs.exposures import exposure_figures
 from warpgs.pipeline.runs.failed_step import FILE as FAILED
 from warpgs.pipeline.runs.failed_step import failed_step, save_failed_step
 from warpgs.pipeline.runs.folder import CONFIG, check_checkpoint, check_same, read_record, record_of, run_folder
-from warpgs.pipeline.runs.image_names import image_names, renaming_notes
 from warpgs.pipeline.runs.job import FitJob
-from warpgs.pipeline.runs.model_file import FittedModel
 from warpgs.pipeline.runs.refined_poses import refined_scene
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device, choose_split, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, overview_of, protocol_of, result_lines, write_report
@@ -49,6 +48,7 @@ from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.warmup import background_warmup
 from warpgs.priors.photo_checks import check_photos, photo_notes
 from warpgs.report.events import EventLog
+from warpgs.report.image_names import image_names, renaming_notes
 from warpgs.report.progress import Progress, Stages
 from warpgs.runtime.load_module import told_of_compiling
 from warpgs.runtime.ranks import ALONE, Ranks

@@ -18,9 +18,9 @@ from warpgs import __version__, schema
 from warpgs.errors import DataError, UsageError
 from warpgs.files import is_empty, plain
 from warpgs.io.splits import Split
+from warpgs.pipeline.model.model_file import FittedModel, checked_gaussians
 from warpgs.pipeline.model.parameter_bounds import unpack
 from warpgs.pipeline.runs.checkpoint import FORMAT, TENSORS, load_checkpoint
-from warpgs.pipeline.runs.model_file import FittedModel, checked_gaussians
 from warpgs.pipeline.runs.refined_poses import refined_cameras
 from warpgs.pipeline.runs.request import SceneRequest, choose_device
 from warpgs.pipeline.runs.schemas import MODEL_STATE, check_record

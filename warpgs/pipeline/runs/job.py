@@ -10,7 +10,7 @@ import torch
 
 from warpgs.io.splits import Split
 from warpgs.pipeline.metrics.lpips import Lpips
-from warpgs.pipeline.runs.model_file import FittedModel
+from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.runs.request import SceneRequest
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loop import train_views

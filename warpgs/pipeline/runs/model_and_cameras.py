@@ -13,7 +13,7 @@ from warpgs.export.formats import format_of, read_gaussians
 from warpgs.io.camera_files import colmap_folder, read_cameras
 from warpgs.io.decoding import MAX_PIXELS
 from warpgs.io.load import load_scene
-from warpgs.pipeline.runs.model_file import FittedModel
+from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.runs.request import choose_device
 from warpgs.scene import Camera, Gaussians, Normalization
 

@@ -12,11 +12,11 @@ from warpgs.errors import DataError, UsageError
 from warpgs.files import write_bytes
 from warpgs.geometry import rotation_matrices
 from warpgs.kernels.sh import C0
+from warpgs.pipeline.films.plan import depth_and_coverage
+from warpgs.pipeline.films.rig import Rig, rig_of
 from warpgs.pipeline.model.coverage import coverage
 from warpgs.pipeline.runs.commands import scene_of
-from warpgs.pipeline.runs.film_plan import depth_and_coverage
 from warpgs.pipeline.runs.folder import StoredRun, open_run
-from warpgs.pipeline.runs.rig import Rig, rig_of
 from warpgs.report.scene_plot import ScenePlot, render_plot
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Camera

@@ -11,12 +11,12 @@ from warpgs.errors import UsageError
 from warpgs.files import write_bytes
 from warpgs.pipeline.metrics.region import counted_region
 from warpgs.pipeline.model.init import InitConfig, consistent_depths, seen_points
-from warpgs.pipeline.runs.image_names import image_names, renaming_notes
 from warpgs.pipeline.runs.request import SceneRequest, read_scene
 from warpgs.pipeline.train.strategies.importance import ImportanceConfig, geometry_score, semantic_score
 from warpgs.priors.cache import cache_folder
 from warpgs.priors.view_prior import PriorConfig, view_priors
 from warpgs.report.contact_sheet import Tile, contact_sheet
+from warpgs.report.image_names import image_names, renaming_notes
 from warpgs.report.images import png
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Prior, View

@@ -14,6 +14,7 @@ import numpy as np
 from warpgs.files import make_folder, write_bytes
 from warpgs.io.splits import Split
 from warpgs.kernels.sh import C0
+from warpgs.pipeline.films.rig import up_of
 from warpgs.pipeline.metrics.evaluate import (
     ALPHA_VARIANTS,
     ViewMetrics,
@@ -26,12 +27,11 @@ from warpgs.pipeline.metrics.evaluate import (
 )
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.runs.coverage_report import coverage_section
-from warpgs.pipeline.runs.image_names import image_names
 from warpgs.pipeline.runs.request import NO_SCORES
-from warpgs.pipeline.runs.rig import up_of
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.report.curve import curve
 from warpgs.report.events import read_events
+from warpgs.report.image_names import image_names
 from warpgs.report.images import depth_map, error_map, png, side_by_side, webp
 from warpgs.report.overview import render_overview
 from warpgs.report.page import SamplingReport, ViewImages, write_page

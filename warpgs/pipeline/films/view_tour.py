@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpgs.geometry import matmul
-from warpgs.pipeline.runs.keyframes import Keyframe
+from warpgs.pipeline.films.keyframes import Keyframe
 from warpgs.scene import Camera
 
 MAX_DETOUR = 1.5

@@ -9,7 +9,7 @@ import numpy as np
 
 from warpgs.errors import UsageError
 from warpgs.geometry import check_pinhole, look_at, matmul
-from warpgs.pipeline.runs.rig import MIN_SWING, Rig
+from warpgs.pipeline.films.rig import MIN_SWING, Rig
 from warpgs.scene import Camera
 
 BY_KIND = {"forward": "spiral", "ring": "turntable", "room": "turntable", "free": "interpolate"}

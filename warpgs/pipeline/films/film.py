@@ -13,11 +13,11 @@ import torch
 from warpgs.coordinates import convert_camera
 from warpgs.errors import UsageError
 from warpgs.files import make_folder, write_bytes
+from warpgs.pipeline.films.frame_check import FrameCheck
+from warpgs.pipeline.films.plan import FilmPlan, FilmSettings, plan_film
 from warpgs.pipeline.metrics.coverage_map import MIN_ALPHA, DepthView, coverage_map, depth_views
 from warpgs.pipeline.metrics.coverage_scores import classes_of
-from warpgs.pipeline.runs.film_plan import FilmPlan, FilmSettings, plan_film
-from warpgs.pipeline.runs.frame_check import FrameCheck
-from warpgs.pipeline.runs.model_file import FittedModel
+from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.report.coverage_image import coverage_image
 from warpgs.report.film import SUFFIXES, write_film

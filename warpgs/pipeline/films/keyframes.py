@@ -14,7 +14,7 @@ from warpgs import schema
 from warpgs.coordinates import convert_camera
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import matmul, nearest_rotation, quaternions, rotation_matrices
-from warpgs.pipeline.runs.camera_paths import framed
+from warpgs.pipeline.films.camera_paths import framed
 from warpgs.scene import Camera, Normalization
 
 MAX_KEYFRAMES = 10_000

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 from warpgs.errors import UsageError
-from warpgs.pipeline.runs.camera_paths import BY_KIND, LIMITS, camera_path, framed, upright
-from warpgs.pipeline.runs.image_names import image_names
-from warpgs.pipeline.runs.keyframes import read_keyframes, through
-from warpgs.pipeline.runs.model_file import FittedModel
-from warpgs.pipeline.runs.rig import Rig, rig_of
-from warpgs.pipeline.runs.view_tour import tour_of
+from warpgs.pipeline.films.camera_paths import BY_KIND, LIMITS, camera_path, framed, upright
+from warpgs.pipeline.films.keyframes import read_keyframes, through
+from warpgs.pipeline.films.rig import Rig, rig_of
+from warpgs.pipeline.films.view_tour import tour_of
+from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.report.image_names import image_names
 from warpgs.scene import Camera, Gaussians
 
 PATHS = ("auto", "views", "turntable", "spiral", "interpolate")

@@ -1,0 +1,1 @@
+"""Films: paths of cameras, what they show, and the files they become."""
