@@ -34,8 +34,8 @@ install: $(VENV)/installed
 demo: install
 	rm -rf $(OUT)
 	mkdir -p $(OUT)
-	$(BIN)/warpgs demo $(OUT)/scene | tee $(OUT)/next.txt
-	$(BIN)/warpgs fit $(OUT)/scene --split "$$($(BIN)/python -c 'from warpgs.synthetic.demo import split_spec; print(split_spec(24), end="")')" --out $(OUT)/run
+	$(BIN)/warpgs demo $(OUT)/scene
+	$(BIN)/warpgs fit $(OUT)/scene --split llff:6 --out $(OUT)/run
 	@echo "images: $(OUT)/run/renders    report: $(OUT)/run/report.html"
 
 # Everything that must pass before a change is offered. PYTEST are the words of one pytest run.

@@ -38,13 +38,14 @@ def run(arguments: list[str], about: str) -> int:
     if a.object:
         from warpgs.synthetic.cut_out import write_object
 
-        split = write_object(a.folder, form=a.format, **size, tell=waiting())
-        masks = " --masks cutout" if a.format == "colmap" else ""
+        write_object(a.folder, form=a.format, **size, tell=waiting())
+        flags = "--split llff:8" + (" --masks cutout" if a.format == "colmap" else "")
     else:
         from warpgs.synthetic.demo import write_demo
 
-        split, masks = write_demo(a.folder, **size, tell=waiting()), ""
+        write_demo(a.folder, **size, tell=waiting())
+        flags = "--split every:8"
     form = "transforms.json" if a.object and a.format == "transforms" else "COLMAP"
     say(f"{a.folder}: {a.views} views of {a.width} x {a.height} px as a {form} folder")
-    say(f"next: warpgs fit {a.folder} --split '{split}'{masks} --out run")
+    say(f"next: warpgs fit {a.folder} {flags} --out run")
     return 0
