@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from warpgs.files import write_text
@@ -47,9 +49,11 @@ def write_index(folder: Path, statuses: list[JobStatus], seconds: float) -> None
     cards = []
     for status in statuses:
         record, job = status.record, status.job
+        row = row_of(status)
+        shown = replace(row, message=row.message.replace(f"{Path(job.request.scene.path).parent}{os.sep}", ""))  # a page is sent
         thumbnail, report = job.folder / THUMBNAIL, job.request.out / "report.html"
         cards.append(JobCard(
-            row_of(status), record.ssim if record else None, record.ply_bytes if record else 0,
+            shown, record.ssim if record else None, record.ply_bytes if record else 0,
             thumbnail.relative_to(folder).as_posix() if thumbnail.is_file() else "",
             report.relative_to(folder).as_posix() if report.is_file() else "",
         ))  # fmt: skip
