@@ -52,6 +52,23 @@ def test_an_ignored_signal_stays_ignored(context, number):
     assert signal.getsignal(number) is signal.SIG_IGN
 
 
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_during_a_destructor_is_not_lost(number):
+    """Python throws away what a destructor raises: the first Ctrl-C would do nothing."""
+
+    class Thing:
+        def __del__(self):
+            signal.raise_signal(number)
+            raised.append("not in the destructor")
+
+    raised = []
+    with pytest.raises(KeyboardInterrupt), interrupting_signals():
+        Thing()
+        threading.Event().wait(60)  # ended by the signal that comes again
+        raised.append("not at all")
+    assert raised == []
+
+
 @pytest.mark.parametrize("context", CONTEXTS)
 def test_other_threads_leave_signals_alone(context):
     """Python lets the main thread alone set handlers."""

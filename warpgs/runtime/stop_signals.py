@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
 STOPPING = (signal.SIGINT, signal.SIGTERM)
+AGAIN = 0.05
+"""Time after which a signal that Python threw away is sent again [s]."""
 
 
 def _heeded() -> list[signal.Signals]:
@@ -32,15 +35,45 @@ def _handled(handler: Callable[..., Any] | signal.Handlers) -> Iterator[None]:
             signal.signal(number, old)
 
 
-def _interrupt(*_: object) -> None:
-    raise KeyboardInterrupt
+def _send(number: signal.Signals) -> None:
+    """Send a signal to the main thread, which it wakes where the system can do that."""
+    if sys.platform == "win32":
+        signal.raise_signal(number)
+    else:
+        main = threading.main_thread().ident
+        assert main is not None
+        signal.pthread_kill(main, number)
 
 
 @contextlib.contextmanager
 def interrupting_signals() -> Iterator[None]:
-    """Raise KeyboardInterrupt in the body when a signal comes."""
-    with _handled(_interrupt):
-        yield
+    """Raise KeyboardInterrupt in the body when a signal comes.
+
+    Python throws an exception away that is raised in a destructor, or in a callback of a weak reference; where the signal came
+    during one, it is sent again.
+    """
+    before = sys.unraisablehook
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def unraisable(thrown: sys.UnraisableHookArgs) -> None:
+        if thrown.exc_type is not KeyboardInterrupt:
+            before(thrown)
+        elif numbers:  # from a thread: here it would come in this very function
+            timers.append(threading.Timer(AGAIN, _send, numbers[:1]))
+            timers[-1].daemon = True
+            timers[-1].start()
+
+    numbers, timers = _heeded(), list[threading.Timer]()
+    sys.unraisablehook = unraisable
+    try:
+        with _handled(interrupt):
+            yield
+    finally:
+        for timer in timers:
+            timer.cancel()
+        sys.unraisablehook = before
 
 
 @contextlib.contextmanager

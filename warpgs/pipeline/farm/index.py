@@ -50,7 +50,9 @@ def write_index(folder: Path, statuses: list[JobStatus], seconds: float) -> None
     for status in statuses:
         record, job = status.record, status.job
         row = row_of(status)
-        shown = replace(row, message=row.message.replace(f"{Path(job.request.scene.path).parent}{os.sep}", ""))  # a page is sent
+        shown = replace(
+            row, message=row.message.replace(f"{Path(job.request.scene.path).parent}{os.sep}", "")
+        )  # a page is sent
         thumbnail, report = job.folder / THUMBNAIL, job.request.out / "report.html"
         cards.append(JobCard(
             shown, record.ssim if record else None, record.ply_bytes if record else 0,
