@@ -148,7 +148,7 @@ class Progress:
 
     def __init__(self, total: int, done: int = 0, *, live: bool | None = None):
         """Prepare for ``total`` steps of which ``done`` are done; ``live`` None shows the panel where stdout is a terminal."""
-        self.total, self.first, self.step = total, done, done
+        self.total, self.told, self.step = total, done, done
         self.live = is_live() if live is None else live
         self.loss = self.psnr = self.seconds = None
         self.count, self.began, self.printed = 0, time.perf_counter(), 0.0
@@ -176,7 +176,7 @@ class Progress:
         if self.display is not None:
             _PANELS.remove(self)
             self.display.__exit__(*error)
-        elif error[0] is None and self.step > self.first:
+        elif error[0] is None and self.step > self.told:
             say(self._line())
 
     def update(self, *, step: int, loss: float, psnr: float, count: int, seconds: float | None = None) -> None:
@@ -186,7 +186,7 @@ class Progress:
         self.seconds = self.seconds if seconds is None else _mean(self.seconds, seconds)
         now = time.perf_counter()
         if self.display is None and now - self.printed >= PLAIN_INTERVAL:
-            self.printed = now
+            self.printed, self.told = now, step
             say(self._line())
 
     def _values(self) -> list[tuple[str, str]]:
