@@ -7,6 +7,7 @@ import pytest
 
 from warpgs.errors import UsageError
 from warpgs.pipeline.runs import with_poses as module
+from warpgs.pipeline.runs.fit import fit
 from warpgs.pipeline.runs.folder import StoredRun, run_folder
 from warpgs.pipeline.runs.request import SceneRequest
 from warpgs.pipeline.runs.with_poses import with_poses
@@ -30,10 +31,11 @@ def test_poses_are_kept_in_the_run_folder(tmp_path, photographs, found, monkeypa
         assert posed.path == str(run / "scene") and any(n.startswith("poses found for 6 of 6") for n in notes)
     assert calls == [tmp_path / "in"] and "holds no cameras: finding poses" in said[0]
     (tmp_path / "in" / "0.png").write_bytes((tmp_path / "in" / "1.png").read_bytes())
-    with pytest.raises(UsageError, match="no longer holds the photographs"):
+    with pytest.raises(UsageError, match="does not hold the photographs"):
         with_poses(request, run, said.append)
-    with pytest.raises(UsageError, match="found poses and no run"), run_folder(run, False):
-        pass
+    for resume in (False, True):  # a fit that ended before its first step begins again either way
+        with run_folder(run, resume):
+            pass
 
 
 def test_other_requests_stay_as_they_are(tmp_path, photographs, found):
@@ -41,6 +43,14 @@ def test_other_requests_stay_as_they_are(tmp_path, photographs, found):
         assert with_poses(request, tmp_path, print) == (request, [])
     with pytest.raises(UsageError, match="kept in a run folder; give out"):
         with_poses(SceneRequest(str(photographs)), None, print)
+
+
+def test_a_split_that_is_not_understood_is_refused_before_poses_are_found(tmp_path, photographs, monkeypatch):
+    monkeypatch.setattr(module, "find_poses", lambda *_, **__: pytest.fail("poses are found"))
+    for spec in ("every8", "every:1", "tset=0.png"):
+        with pytest.raises(UsageError, match="split"):
+            fit(SceneRequest(str(photographs), spec), out=tmp_path / "run", device="cpu", verbose=False)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_run_that_was_moved_finds_its_scene(tmp_path, found):

@@ -94,10 +94,9 @@ def _run(arguments: list[str]) -> int:
         return code
     except WarpgsError as e:
         return last_words(f"warpgs: {e}", e.exit_code)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as e:
         with ignored_signals():
-            hint = "; --resume continues from the last checkpoint" if name == "fit" else ""
-            return last_words(f"warpgs: interrupted{hint}", 130)
+            return last_words("; ".join(["warpgs: interrupted", *map(str, e.args)]), 130)
     except BrokenPipeError:  # the reader, `head` for one, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0

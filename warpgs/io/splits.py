@@ -100,12 +100,34 @@ def _find(names: list[str], wanted: str, spec: str) -> str:
     raise DataError(f"split {spec}: there is no view {wanted!r}; the nearest names are {', '.join(near or names[:3])}")
 
 
-def _explicit(names: list[str], spec: str) -> Split:
-    parts: dict[str, tuple[str, ...]] = {}
+def check_spec(spec: str) -> None:
+    """Check that the specification of a split can be understood, before a scene is there.
+
+    Raises:
+        UsageError: It cannot, or leaves nothing to train.
+    """
+    if "=" in spec:
+        _named(spec)
+    elif spec == "every:1":
+        raise UsageError("split 'every:1' holds out every view and leaves none to train; use every:2 or more, or all")
+    elif spec != "all" and not re.fullmatch(r"(llff|mip360|dtu|blender|every):([1-9][0-9]{0,5})", spec):
+        raise UsageError(f"split {spec[:80]!r} is not understood; use {SPECS}")
+
+
+def _named(spec: str) -> dict[str, str]:
+    """Return the names that a specification lists for train and for test."""
+    parts: dict[str, str] = {}
     for part in filter(str.strip, spec.split(";")):
         key, sep, values = (x.strip() for x in part.partition("="))
         if key not in ("train", "test") or not sep or key in parts:
             raise UsageError(f"split {spec[:80]!r} is not understood; use {SPECS}")
+        parts[key] = values
+    return parts
+
+
+def _explicit(names: list[str], spec: str) -> Split:
+    parts: dict[str, tuple[str, ...]] = {}
+    for key, values in _named(spec).items():
         found = [_find(names, v.strip(), spec) for v in values.split(",") if v.strip()]
         twice = sorted(n for n, count in Counter(found).items() if count > 1)
         if twice:
@@ -127,18 +149,15 @@ def split_views(scene: Scene, spec: str) -> Split:
         DataError: The scene does not have what the split names, or training and test overlap.
         UsageError: The split is not understood.
     """
+    check_spec(spec)
     names = sorted(v.name for v in scene.views)
     if spec == "all":
         return Split(tuple(names), ())
     if "=" in spec:
         return _explicit(names, spec)
-    match = re.fullmatch(r"(llff|mip360|dtu|blender|every):([1-9][0-9]{0,5})", spec)
-    if match is None:
-        raise UsageError(f"split {spec[:80]!r} is not understood; use {SPECS}")
-    kind, count = match[1], int(match[2])
+    kind, number = spec.split(":")
+    count = int(number)
     if kind == "every":
-        if count == 1:
-            raise UsageError("split 'every:1' holds out every view and leaves none to train; use every:2 or more, or all")
         test = tuple(n for i, n in enumerate(names) if i % count == 0)
         return Split(tuple(n for i, n in enumerate(names) if i % count), test)
     return {"llff": _every_8th, "mip360": _every_8th, "dtu": _dtu, "blender": _blender}[kind](names, count, spec)

@@ -15,7 +15,7 @@ import torch
 from warpgs.errors import DataError, NotFiniteError, UsageError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
-from warpgs.io.splits import Split
+from warpgs.io.splits import Split, check_spec
 from warpgs.pipeline.metrics.evaluate import options_for, render_view
 from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.metrics.moved import Rendered, moved_fractions, moved_notes
@@ -121,12 +121,16 @@ def fit(
     if resume and out is None:
         raise UsageError("resume needs the run folder that it continues: give out")
     config = preset_config(config)
+    spec = scene.split if split is None and isinstance(scene, SceneRequest) else split
+    if spec is not None:
+        check_spec(spec)
     check_shared(scene, config, ranks, time_budget, resume)
     verbose, own = verbose and ranks.first, out if ranks.first else None
     stages = Stages() if verbose else Stages(lambda line: None)
     nothing: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
     folder = nothing if own is None else run_folder(own, resume)
     with folder as held, stages as progress, told_of_compiling(lambda name: progress(COMPILING)) as compiled:
+        resume = resume and out is not None and (out / CONFIG).is_file()  # else it holds found poses alone
         if out is not None and resume:
             read_record(out)  # a run of another version is refused before anything takes time
         where = choose_device(device)
@@ -160,10 +164,15 @@ def _set_background(job: FitJob) -> None:
 def fit_request(request: FitRequest, **others: Any) -> FitResult:
     """Run `fit` as the command line, a study or a farm asks for it; ``others`` are its on_model, on_step and ranks."""
     r = request
-    return fit(
-        r.scene, r.config, out=r.out, device=r.device, resume=r.resume, lpips_weights=r.lpips_weights,
-        time_budget=r.time_budget, notes=r.notes, **others,
-    )  # fmt: skip
+    try:
+        return fit(
+            r.scene, r.config, out=r.out, device=r.device, resume=r.resume, lpips_weights=r.lpips_weights,
+            time_budget=r.time_budget, notes=r.notes, **others,
+        )  # fmt: skip
+    except KeyboardInterrupt as e:
+        saved = r.out is not None and (r.out / TENSORS).is_file()
+        again = "--resume continues from the last checkpoint" if saved else "no step was saved: the same command begins again"
+        raise KeyboardInterrupt(again) from e
 
 
 def _scene_of(

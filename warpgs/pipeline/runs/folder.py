@@ -53,6 +53,8 @@ def versions() -> dict[str, str]:
 def run_folder(out: Path, resume: bool) -> Iterator[list[str]]:
     """Hold a run folder for a fit: a new or an empty one, or one with a run to continue; gives notes for the user.
 
+    One that holds found poses alone, as a fit leaves it that ended before its first step, is taken in both cases.
+
     Raises:
         ResourceError: Another process writes into the folder, or it cannot be written.
         UsageError: The folder holds something already, or no run to continue.
@@ -66,13 +68,11 @@ def run_folder(out: Path, resume: bool) -> Iterator[list[str]]:
 def _check_folder(out: Path, resume: bool) -> None:
     """Raise a UsageError for a folder that holds no run to continue, or that must be new and is not."""
     try:
+        if not (out / CONFIG).exists() and (out / POSED_SCENE / POSES).is_file():
+            return
         if resume and not (out / CONFIG).is_file():
             raise UsageError(f"--resume: {out} holds no {CONFIG}, so there is no run to continue; give a run's folder")
         if not resume and out.exists() and not (out.is_dir() and is_empty(out)):
-            if not (out / CONFIG).exists() and (out / POSED_SCENE / POSES).is_file():
-                raise UsageError(
-                    f"{out} holds found poses and no run; fit them with `warpgs fit {out / POSED_SCENE} --out RUN`"
-                )
             raise UsageError(f"{out} exists already; choose another --out, or continue that run with --resume")
     except OSError as e:
         raise UsageError(f"{out}: cannot be looked into ({e.strerror or e}); choose another --out") from e

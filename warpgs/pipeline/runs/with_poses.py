@@ -21,7 +21,7 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
 
     Args:
         request: The request; its path may be a folder of images or a video.
-        out: Run folder, whose folder `scene` keeps the poses; a continued run finds them there.
+        out: Run folder, whose folder `scene` keeps the poses; a run that is continued, or begun again, finds them there.
         progress: Called with lines for the user.
 
     Returns:
@@ -41,9 +41,7 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
     if (scene / JSON).is_file():
         record = read_record(scene)
         if record["source_sha256"] != source_digest(source):
-            raise UsageError(
-                f"--resume: {source} no longer holds the photographs of {scene}; restore them, or give a new --out"
-            )
+            raise UsageError(f"{source} does not hold the photographs of {scene}, whose poses it keeps; give another --out")
     else:
         progress(f"{source} holds no cameras: finding poses, which {scene} keeps")
         threads = torch.get_num_threads()
