@@ -23,6 +23,8 @@ OWN_NAMES = re.compile(r"\.warpgs-[0-9a-f]{16}\.tmp(\.(mp4|webm))?")
 WINDOWS = sys.platform == "win32"
 PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Waits before a replacement is tried again on Windows [s]: a virus scanner holds a new file open for about that long."""
+FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Errors of a disk, or of a user's part of one, that has no room left."""
 NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES)
 """Errors of file systems that cannot sync a folder; what they keep after a power failure is theirs to say."""
 
@@ -178,8 +180,8 @@ def make_folder(folder: Path) -> bool:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise ResourceError(
-            f"{folder}: cannot be written, as the folder cannot be made ({e.strerror or e}); free some disk space, or choose "
-            "another folder"
+            f"{folder}: cannot be written, as the folder cannot be made ({e.strerror or e}); "
+            f"{'free some disk space, or ' if e.errno in FULL else ''}choose another folder"
         ) from e
     return made
 

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from warpgs.app import cli, fit_help
+from warpgs.app import fit_help
 from warpgs.app.cli import COMMANDS, GROUPS, main
 from warpgs.app.commands.fit import request_of
 from warpgs.io.splits import SPECS
@@ -89,13 +89,3 @@ def test_choices_are_those_of_the_code():
 def test_examples_parse(line):
     program, command, *words = line.split()
     assert (program, command) == ("warpgs", "fit") and request_of(words, "").out.name == "run"
-
-
-@pytest.mark.parametrize(("name", "resumes"), [("fit", True), ("export", False), ("doctor", False)])
-def test_only_a_fit_is_told_to_resume(capsys, monkeypatch, name, resumes):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(cli.importlib, "import_module", interrupted)
-    assert main([name]) == 130
-    assert ("--resume" in capsys.readouterr().err) == resumes

@@ -143,6 +143,24 @@ def test_errors_name_the_cause(device):
         rasterize(gaussians, Camera(cam.viewmat, cam.K, 0, 12))
 
 
+def test_arguments_of_another_type_or_shape_are_named():
+    """Before any work, on the CPU and on CUDA alike: nothing of it is read from the device."""
+    gaussians, cam = cloud(3), camera(8, 8, dtype=torch.float32)
+    wrong = [
+        (TypeError, "gaussians must be of Gaussians, not Camera", (cam, gaussians)),
+        (TypeError, "options must be of RasterizeOptions, not str", (gaussians, cam, "fast")),
+        (TypeError, "means must be a tensor, not ndarray", (dataclasses.replace(gaussians, means=np.zeros((3, 3))), cam)),
+        (ValueError, r"camera.K must have shape \[3, 3\] or", (gaussians, dataclasses.replace(cam, K=torch.eye(4)))),
+        (ValueError, r"camera.viewmat .*not \[3, 4\]", (gaussians, dataclasses.replace(cam, viewmat=cam.viewmat[:3]))),
+        (TypeError, "camera.width must be a whole number of pixels, not 8.0", (gaussians, dataclasses.replace(cam, width=8.0))),
+        (ValueError, r"background .*not \[4\]", (gaussians, cam, RasterizeOptions(background=torch.zeros(4)))),
+        (ValueError, r"K is 1, 4, 9 or 16, not \[3, 5, 3\]", (dataclasses.replace(gaussians, sh=torch.zeros(3, 5, 3)), cam)),
+    ]
+    for kind, words, arguments in wrong:
+        with pytest.raises(kind, match=words):
+            rasterize(*arguments)
+
+
 def test_opacity_factors_multiply_opacities_and_hide():
     """Image and gradients are those of such opacities, also in chunks; 0 hides a Gaussian and leaves it no gradient."""
     gaussians, camera = three_gaussians(), ring(3)[0]

@@ -18,7 +18,7 @@ FLAGS = (
 
 PRESETS = {
     "default": "any capture; steps follow from the number of views",
-    "quick": "a first look: the same in 600 steps",
+    "quick": "a first look on a GPU: the same in 600 steps",
     "3dgs": "a baseline: Kerbl et al. 2023, 7000 steps",
     "mcmc": "a baseline: Kheradmand et al. 2024, 7000 steps",
     "paper-literal": "the paper to the letter, 30000 steps; slow",

@@ -79,7 +79,8 @@ def format_of(path: str | os.PathLike[str]) -> Format:
             return kind
     cameras = "; cameras are named cameras.json, transforms.json or sparse" if name.endswith(".json") else ""
     raise UsageError(
-        f"{path}: format {Path(path).suffix or '(none)'} is not supported; use one of {', '.join(FORMATS)}{cameras}"
+        f"{path}: format {Path(path).suffix or '(none)'} is not supported; use one of {', '.join(FORMATS)}{cameras}. "
+        "`warpgs export` makes a page, too (.html), and `warpgs mesh` a mesh (.ply, .glb)"
     )
 
 

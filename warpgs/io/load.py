@@ -106,6 +106,8 @@ def detect(root: Path) -> tuple[Reader, list[str]]:
         images = ". It holds images without cameras: `warpgs poses` finds those" if list_images(root) else ""
         if not images and (unread := unread_note(root)):
             raise DataError(f"{root}: {unread}")
+        if not images:
+            images = ". It holds no photograph either (JPEG, PNG, BMP, TIFF, WebP)"
         raise DataError(f"{root}: no scene format found. Looked for: {', '.join(r.description for r in readers)}{images}")
     taken, *others = complete
     notes = [f"{lack}; passed over, {taken.name} is complete" for lack in broken]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 
 from warpgs.constants import RULES, Rule
@@ -67,6 +68,10 @@ class RasterizeOptions:
         return plain and all(o is None for o in others)
 
 
+ARGUMENTS = (Gaussians, Camera, RasterizeOptions)
+"""Types of the arguments of `rasterize`."""
+
+
 def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
     """Return the rule that the options name.
 
@@ -82,6 +87,38 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
     if options.max_instances is not None and (options.capacity is not None or options.max_instances < 1):
         raise UsageError("max_instances must be at least 1 and does not go with a capacity")
     return rule
+
+
+def _check_arguments(gaussians: Gaussians, camera: Camera, options: RasterizeOptions) -> None:
+    """Check types, and the shapes of the camera and the background; those of the Gaussians are checked where they are used.
+
+    Nothing is read from the device: values are not checked, and a Gaussian that is not finite is culled.
+
+    Raises:
+        TypeError: An argument, or the size of the image, is of another type.
+        ValueError: A shape is another.
+    """
+    for name, given, kind in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
+        if not isinstance(given, kind):
+            order = "the order is rasterize(gaussians, camera, options)"
+            raise TypeError(f"{name} must be of {kind.__name__}, not {type(given).__name__}; {order}")
+    for name, tensor in gaussians.tensors().items():
+        if not isinstance(tensor, torch.Tensor):
+            raise TypeError(f"{name} must be a tensor, not {type(tensor).__name__}; torch.as_tensor makes one")
+    for name, rows in (("viewmat", 4), ("K", 3)):
+        shape = tuple(np.shape(getattr(camera, name)))
+        if len(shape) not in (2, 3) or shape[-2:] != (rows, rows):
+            raise ValueError(f"camera.{name} must have shape [{rows}, {rows}] or [C, {rows}, {rows}], not {list(shape)}")
+    for name in ("width", "height"):
+        size = getattr(camera, name)
+        if not isinstance(size, (int, np.integer)):
+            raise TypeError(f"camera.{name} must be a whole number of pixels, not {size!r}")
+    shape = (3,) if options.background is None else tuple(np.shape(options.background))
+    if len(shape) not in (1, 2) or shape[-1] != 3:
+        raise ValueError(f"background must have shape [3] or [C, 3], not {list(shape)}")
+    sh = gaussians.sh
+    if sh.ndim != 3 or sh.shape[1] != (gaussians.sh_degree + 1) ** 2:
+        raise ValueError(f"sh must have shape [N, K, 3], where K is 1, 4, 9 or 16, not {list(sh.shape)}")
 
 
 def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
@@ -132,11 +169,12 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
 
     Raises:
         ResourceError: The Gaussians touch more tiles than memory allows.
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: An argument is of another type; a scalar type is neither float32 nor float64, or they differ.
         UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, or options exclude each
             other.
         ValueError: A shape or device disagrees; the message names argument, wanted and found.
     """
+    _check_arguments(gaussians, camera, options)
     rule = _checked_rule(camera, options)
     means = gaussians.means
     viewmats, Ks = _as_batch(camera.viewmat, means, 4), _as_batch(camera.K, means, 3)

@@ -67,6 +67,8 @@ def _check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple
     if not plan.cameras:
         raise UsageError("there is no camera to render; give at least one")
     alone = out.suffix.lower() in SUFFIXES
+    if not alone and out.suffix and not out.is_dir():
+        raise UsageError(f"{out}: a film is one of {', '.join(SUFFIXES)}; for images give a folder, whose name has no suffix")
     one_size = len({(c.width, c.height) for _, c in plan.cameras}) == 1
     if (alone or sheet) and not one_size:
         raise UsageError(f"{out}: the views differ in size, and a film or a sheet has one; give a size for all, or a folder")

@@ -162,7 +162,11 @@ def _set_background(job: FitJob) -> None:
 
 
 def fit_request(request: FitRequest, **others: Any) -> FitResult:
-    """Run `fit` as the command line, a study or a farm asks for it; ``others`` are its on_model, on_step and ranks."""
+    """Run `fit` as the command line, a study or a farm asks for it; ``others`` are its on_model, on_step and ranks.
+
+    Raises:
+        KeyboardInterrupt: A signal ended it; the message says how to go on.
+    """
     r = request
     try:
         return fit(

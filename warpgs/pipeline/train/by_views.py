@@ -67,15 +67,18 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     half = config.half_resolution
     if half is None:
         half = float(f"{HALF_RESOLUTION * min(1.0, HALF_VIEWS / views):.2g}")
-    steps = config.steps
-    if steps is None:
-        steps = steps_by_views(views)
-        each = f" of {config.batch} views" if config.batch > 1 else ""
-        notes.append(
-            f"by the number of views, {views}: at most {steps:,} steps{each}, colours of degree {init.max_sh_degree}, learning "
-            f"rates of scales {optimizer.scales_lr:g} and opacities {optimizer.opacities_lr:g}, half size in the first "
-            f"{half:.0%} of the steps"
-        )
+    steps = steps_by_views(views) if config.steps is None else config.steps
+    each = f" of {config.batch} views" if config.batch > 1 else ""
+    chosen = {
+        f"at most {steps:,} steps{each}": config.steps, f"colours of degree {init.max_sh_degree}": config.init.max_sh_degree,
+        f"a learning rate of scales of {optimizer.scales_lr:g}": config.optimizer.scales_lr,
+        f"of opacities of {optimizer.opacities_lr:g}": config.optimizer.opacities_lr,
+        f"half size in the first {half:.0%} of the steps": config.half_resolution,
+    }  # fmt: skip
+    open_ = [words for words, given in chosen.items() if given is None]
+    if open_:
+        notes.append(f"by the number of views, {views}: {', '.join(open_)}")
+    if config.steps is None:
         pixels = max(v.camera.width * v.camera.height for v in train)
         seconds = pixels_of_steps(config.batch * steps, half, pixels) / CPU_PIXELS
         if device == "cpu" and config.cpu_limit and seconds > cpu_seconds(views):

@@ -196,7 +196,7 @@ DEFAULT_PRESET = "default"
 
 PRESET_NOTES: dict[str, str] = {
     "default": "any capture: steps, degree and rates follow from the number of views, and the fit ends when it gains no more",
-    "quick": "a first look: the same in 600 steps",
+    "quick": "a first look on a GPU: the same in 600 steps",
     "3dgs": "a baseline: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few",
     "mcmc": "a baseline: Kheradmand et al. 2024, which fills a given number of Gaussians, from the same points as 3dgs",
     "paper-literal": "the paper to the letter, with first proposals for what it leaves open; slow",
