@@ -202,7 +202,9 @@ def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys)
     assert "no such folder" in failure(capsys, 3, "fit", str(tmp_path / "nowhere"), "--out", str(tmp_path / "b"))
     assert "no view 'x.png'" in failure(capsys, 3, "fit", str(scene), "--out", str(tmp_path / "c"), "--split", "train=x.png")
     assert "not understood" in failure(capsys, 2, "fit", str(scene), "--out", str(tmp_path / "d"), "--split", "third:3")
-    assert "cannot be read" in failure(capsys, 3, "eval", str(tmp_path))
+    assert "holds no run" in failure(capsys, 3, "eval", str(tmp_path))
+    again = ["fit", str(scene), "--split", split_spec(9), "--out", str(run), "--resume", "--device", "cpu", "--downscale", "2"]
+    assert "differs from the run" in (said := failure(capsys, 2, *again)) and "(downscale was 1" in said
     assert "path 'zigzag'" in failure(capsys, 2, "render", str(run), "--path", "zigzag")
     assert "format .obj is not supported" in failure(capsys, 2, "export", str(run), "--to", str(tmp_path / "a.obj"))
     assert not any((tmp_path / name).exists() for name in ("new", "b", "c", "d"))

@@ -110,6 +110,8 @@ def read_record(folder: Path) -> dict[str, Any]:
     path = folder / CONFIG
     try:
         record = schema.read(path)
+    except FileNotFoundError as e:
+        raise DataError(f"{folder}: holds no run (there is no {CONFIG}); give a folder that `warpgs fit --out` filled") from e
     except (OSError, schema.SchemaError) as e:
         raise DataError(f"{path}: cannot be read ({e}); give a folder that `warpgs fit --out` filled") from e
     if not isinstance(record, dict) or "config" not in record:
@@ -147,9 +149,11 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
                 changed = [k for k in now if now[k] != then.get(k)]
                 key = f"{key} ({', '.join(changed)})"
             words = {"fingerprint": "the scene (images, cameras or points, as --downscale, --max-side and --reader give them)"}
+            options = [f"{k} was {stored['scene'].get(k)}" for k, v in record["scene"].items() if stored["scene"].get(k) != v]
+            was = f" ({', '.join(o for o in options if not o.startswith('path '))})" if key != "device" else ""
             raise UsageError(
-                f"--resume: {words.get(key, key)} differs from the run in {out}; give all flags that it was started "
-                "with, or a new --out"
+                f"--resume: {words.get(key, key)} differs from the run in {out}{was if len(was) > 3 else ''}; give all flags "
+                "that it was started with, or a new --out"
             )
 
 

@@ -283,7 +283,7 @@ def write_report(
     camera = train[0].camera
     write_page(
         out / "report.html",
-        title=Path(scene.path).resolve().name,
+        title=(out if Path(scene.path).parent == out else Path(scene.path)).resolve().name,  # not "scene" for found poses
         subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
         f"{camera.width} x {camera.height} px, {metrics['device']}",
         figures=_figures(metrics), notes=notes, table=table, views=images, curves=curves, sampling=sampling,

@@ -156,7 +156,8 @@ def run_study(request: StudyRequest) -> list[str]:
     with hold_folder(request.out) as notes:
         for note in notes:
             say(note)
-        say(f"{len(places)} scenes, {len(request.variants)} settings, {request.seeds} seeds, {where}")
+        counts = {"scene": len(places), "setting": len(request.variants), "seed": request.seeds}
+        say(", ".join([*(f"{n} {word}{'' if n == 1 else 's'}" for word, n in counts.items()), where]))
         try:
             runs = _run_all(request, places, device, lpips)
         except KeyboardInterrupt:
