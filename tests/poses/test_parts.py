@@ -9,6 +9,7 @@ import pytest
 from tests.poses.conftest import film, with_exif
 from warpgs.errors import DataError
 from warpgs.poses.advice import advice, reason
+from warpgs.poses.find import _check_found
 from warpgs.poses.mapping import FoundCamera, FoundView, Mapping
 from warpgs.poses.metadata import without_jpeg_metadata, without_png_metadata
 from warpgs.poses.pairs import choose_pairs, similarity
@@ -99,6 +100,14 @@ def mapping(**values) -> Mapping:
         "method": "incremental", "version": "4",
     }  # fmt: skip
     return Mapping(**(given | values))
+
+
+def test_too_few_that_fit_together_are_told_with_their_links():
+    """The pairs that do match, once each, and who matches nobody."""
+    photographs = [Photograph(f"{n}.png", Path(n), 320, 240, 1, "", None, "0") for n in "abcde"]
+    found = mapping(views={}, keypoints=(900,) * 5, matches={(0, 1): 525, (2, 3): 292})
+    with pytest.raises(DataError, match="e.png matches no other; c.png and d.png share 292 matches; a.png and b.png share 525"):
+        _check_found(Path("in"), found, photographs)
 
 
 def test_a_record_says_what_does_not_repeat_and_who_has_no_pose():

@@ -13,7 +13,7 @@ from warpgs.files import filling, is_empty, make_folder, write_bytes
 from warpgs.io.decoding import MAX_PIXELS, read_image_file
 from warpgs.io.readers import all_readers
 from warpgs.io.unread_formats import unread_note
-from warpgs.poses.advice import MIN_KEYPOINTS
+from warpgs.poses.advice import MIN_KEYPOINTS, partners
 from warpgs.poses.mapping import Mapping, camera_groups, check_installed, find_model
 from warpgs.poses.photographs import Photograph, find_photographs, image_root, prepare, write_copy
 from warpgs.poses.record import record_of, write_record
@@ -23,6 +23,8 @@ MIN_PHOTOGRAPHS = 3
 """Fewest photographs: of two, nothing checks the focal length and the depths that they give each other."""
 FRAMES = 60
 """Frames taken of a video where nobody says how many."""
+LINKS = 6
+"""Pairs of photographs whose matches are told of where no poses are found, those with the fewest first."""
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
 """Files of a COLMAP model; the first three make a scene."""
 
@@ -166,6 +168,21 @@ def _notes(photographs: list[Photograph]) -> list[str]:
     return notes
 
 
+def _links(found: Mapping, photographs: list[Photograph]) -> str:
+    """Return which pairs match best, and which photographs match none; those with the fewest matches first."""
+    pairs: dict[tuple[int, ...], int] = {}
+    for i in range(len(photographs)):
+        best = partners(found, i)[:1]
+        pairs[tuple(sorted((i, best[0][0]))) if best else (i,)] = best[0][1] if best else 0
+    order = sorted(pairs, key=lambda pair: (pairs[pair], pair))
+    words = []
+    for pair in order[:LINKS]:
+        names = " and ".join(photographs[i].name for i in pair)
+        words.append(f"{names} share {pairs[pair]} matches" if pairs[pair] else f"{names} matches no other")
+    more = len(order) - LINKS
+    return "; ".join([*words, *([f"{more} more pairs"] if more > 0 else [])])
+
+
 def _check_found(source: Path, found: Mapping, photographs: list[Photograph]) -> None:
     """Raise a DataError where too few photographs fit together, with the reason that most of them have."""
     if len(found.views) >= MIN_PHOTOGRAPHS:
@@ -182,8 +199,7 @@ def _check_found(source: Path, found: Mapping, photographs: list[Photograph]) ->
         why = f"no two of {count} show the same place. Take photographs that overlap by two thirds, in small steps"
     else:
         why = (
-            f"at most {len(found.views)} of {count} fit together (no pair has more than {largest} matches, from at most "
-            f"{max(found.keypoints):,} keypoints). Take photographs that overlap by two thirds, moving the camera, not only "
-            "turning it"
+            f"at most {len(found.views)} of {count} fit together, and {MIN_PHOTOGRAPHS} are needed. Take photographs that "
+            f"overlap by two thirds, moving the camera, not only turning it. By now {_links(found, photographs)}"
         )
     raise DataError(f"{source}: no poses: {why}")
