@@ -106,7 +106,9 @@ def test_too_few_that_fit_together_are_told_with_their_links():
     """The pairs that do match, once each, and who matches nobody."""
     photographs = [Photograph(f"{n}.png", Path(n), 320, 240, 1, "", None, "0") for n in "abcde"]
     found = mapping(views={}, keypoints=(900,) * 5, matches={(0, 1): 525, (2, 3): 292})
-    with pytest.raises(DataError, match="e.png matches no other; c.png and d.png share 292 matches; a.png and b.png share 525"):
+    with pytest.raises(
+        DataError, match=r"e\.png matches no other; c\.png and d\.png share 292 matches; a\.png and b\.png share 525"
+    ):
         _check_found(Path("in"), found, photographs)
 
 
