@@ -20,9 +20,9 @@ main{max-width:1080px;margin:0 auto;padding:48px 24px 80px}
 h1{font-size:34px;letter-spacing:-.02em;margin:0 0 4px;overflow-wrap:anywhere}
 h2{font-size:20px;margin:52px 0 14px;letter-spacing:-.01em}
 .sub,figcaption,.dim{color:var(--soft)}.sub{margin:0}
-.figures{display:grid;grid-template-columns:repeat(auto-fill,minmax(168px,1fr));gap:1px;background:var(--card);
+.figures{display:flex;flex-wrap:wrap;gap:1px;background:var(--card);
 border:1px solid var(--line);border-radius:10px;overflow:hidden;margin:28px 0 0}
-.figures div{box-shadow:0 0 0 1px var(--line);padding:16px 18px}
+.figures div{flex:1 1 150px;box-shadow:0 0 0 1px var(--line);padding:16px 18px}
 .figures b{display:block;white-space:nowrap;font-size:25px;font-weight:600;letter-spacing:-.02em;
 font-variant-numeric:tabular-nums}.figures span{color:var(--soft);font-size:13px}
 ul{padding-left:20px;margin:0}li{margin:3px 0}
@@ -50,7 +50,7 @@ pre{background:var(--card);border:1px solid var(--line);border-radius:8px;paddin
 font-size:13px;line-height:1.45}
 @media(max-width:700px){.row{grid-template-columns:1fr}.stack{grid-template-columns:1fr 1fr}}
 """
-OVERVIEW = "the Gaussians, training cameras teal, held-out cameras orange"
+OVERVIEW, HELD_OUT = "the Gaussians, training cameras teal", ", held-out cameras orange"
 SCRIPT = (
     "document.querySelectorAll('.slider input').forEach(i=>i.addEventListener('input',"
     "()=>i.parentElement.style.setProperty('--cut',i.value+'%')))"
@@ -204,7 +204,7 @@ def write_page(
         f'<h1>{html.escape(title)}</h1><p class="sub">{html.escape(subtitle)}</p>',
     ]
     if overview:
-        sections.append(f'<div class="first">{_figure(overview, OVERVIEW)}</div>')
+        sections.append(f'<div class="first">{_figure(overview, OVERVIEW + (HELD_OUT if held_out else ""))}</div>')
     sections.append(f'<div class="figures">{cells}</div>')
     choices = [n for n in notes if not isinstance(n, Detail)]
     if choices:
