@@ -93,8 +93,9 @@ def errors(of: dict[str, View], to: dict[str, View]) -> dict[str, float]:
 
 def refined(gaussians: warpgs.Gaussians, view: View, options: warpgs.RasterizeOptions) -> View:
     """Return a view whose camera was moved to where a model shows its image best; the model stays as it is."""
-    start, target = torch.as_tensor(view.camera.viewmat, dtype=torch.float32), torch.as_tensor(view.image)
-    twist = torch.zeros(6, requires_grad=True)
+    device = gaussians.means.device
+    start, target = (torch.as_tensor(a, dtype=torch.float32, device=device) for a in (view.camera.viewmat, view.image))
+    twist = torch.zeros(6, device=device, requires_grad=True)
     optimizer = torch.optim.Adam([twist], lr=2e-3)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.05 ** (1 / REFINE_STEPS))
     still = replace(gaussians, **{n: t.detach() for n, t in gaussians.tensors().items()})
@@ -104,7 +105,7 @@ def refined(gaussians: warpgs.Gaussians, view: View, options: warpgs.RasterizeOp
         (rgb - target).square().mean().backward()
         optimizer.step()
         schedule.step()
-    viewmat = _turned(start, twist).detach().numpy().astype(np.float64)
+    viewmat = _turned(start, twist).detach().cpu().numpy().astype(np.float64)
     return replace(view, camera=replace(view.camera, viewmat=viewmat))
 
 

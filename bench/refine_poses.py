@@ -7,9 +7,9 @@ Each training camera is turned about its centre by an angle and moved by a fract
 directions; the points of the scene stay. A model whose training cameras moved is turned and moved as a whole, too: "psnr" is of
 held-out cameras that the similarity of the true training cameras to the model's takes there, with noisy and refined poses
 alike; "psnr_as_reported" is what the fit itself reports, which knows the noisy cameras alone. Cameras side by side leave a
-bend of the whole scene nearly free, which a similarity does not follow; so "psnr_settled" is of held-out cameras that are
-then moved to where the finished model explains their photographs best, as is usual where poses are learned (Lin et al. 2021,
-BARF, arXiv 2104.06405, section 4), for all three alike. It tells how good the model is, wherever it lies.
+bend of the whole scene nearly free, which a similarity does not follow; so "psnr_cameras_refined" is of held-out cameras that
+are then moved to where the finished model explains their photographs best, as is usual where poses are learned (Lin et al.
+2021, BARF, arXiv 2104.06405, section 4), for all three alike. It tells how good the model is, wherever it lies.
 """
 
 import argparse
@@ -22,19 +22,17 @@ import torch
 
 import warpgs
 from bench import result_file
+from bench.found_poses import refined
 from warpgs.geometry import camera_extent, matmul
 from warpgs.io.splits import split_views
 from warpgs.pipeline.runs.refined_poses import similar_cameras
 from warpgs.pipeline.runs.request import choose_device
 from warpgs.pipeline.train.config import PRESETS
 from warpgs.pipeline.train.refine_poses import increments
-from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.runtime.terminal import say
-from warpgs.scene import Camera, Gaussians, Scene, View
+from warpgs.scene import Camera, Scene
 
 WHAT = "held-out PSNR with given, noisy and refined poses"
-SETTLING_STEPS, SETTLING_RATE = 200, 1e-3
-"""Steps in which a held-out camera moves to where the model explains it best, and their first rate [rad, extents]."""
 
 
 def noisy_scene(scene: Scene, names: tuple[str, ...], degrees: float, shift: float, seed: int) -> Scene:
@@ -63,35 +61,16 @@ def relative_errors(cameras: dict[str, Camera], truth: dict[str, Camera], names:
     return float(np.degrees(np.mean(angles)))
 
 
-def settled(gaussians: Gaussians, view: View, options: RasterizeOptions, extent: float) -> Camera:
-    """Return the camera of a view moved to where the render is nearest to the photograph (mean absolute error)."""
-    c, device = view.camera, gaussians.means.device
-    given, K = (torch.as_tensor(a, dtype=torch.float32, device=device) for a in (c.viewmat, c.K))
-    image = torch.as_tensor(view.image, dtype=torch.float32, device=device)
-    w, t = (torch.zeros(3, device=device, requires_grad=True) for _ in range(2))
-    optimizer = torch.optim.Adam([{"params": [w], "lr": SETTLING_RATE}, {"params": [t], "lr": SETTLING_RATE * extent}])
-    rates = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, SETTLING_STEPS)
-    for _ in range(SETTLING_STEPS):
-        optimizer.zero_grad()
-        render = rasterize(gaussians, Camera(increments(w, t) @ given, K, c.width, c.height), options)
-        (render.rgb - image).abs().mean().backward()
-        optimizer.step()
-        rates.step()
-    found = (increments(w, t) @ given).detach().double().cpu().numpy()
-    return dataclasses.replace(c, viewmat=found)
-
-
 def figures(fit: warpgs.FitResult, truth: Scene, train: tuple[str, ...], test: tuple[str, ...]) -> dict[str, Any]:
     """Return the scores of a fit, and how far its training cameras are from the true ones."""
     true, found = {v.name: v.camera for v in truth.views}, fit.scene_cameras
     cameras = similar_cameras(true, [true[n] for n in train], [found[n] for n in train], test)
     views = [dataclasses.replace(truth.view(n), camera=cameras[n]) for n in test]
     scores = warpgs.evaluate(fit.scene_gaussians, views, fit.options())
-    extent = camera_extent([true[n] for n in train])
-    views = [dataclasses.replace(v, camera=settled(fit.scene_gaussians, v, fit.options(), extent)) for v in views]
+    views = [refined(fit.scene_gaussians, v, fit.options()) for v in views]
     best = warpgs.evaluate(fit.scene_gaussians, views, fit.options())
     return {
-        "psnr": float(np.mean([m.psnr for m in scores])), "psnr_settled": float(np.mean([m.psnr for m in best])),
+        "psnr": float(np.mean([m.psnr for m in scores])), "psnr_cameras_refined": float(np.mean([m.psnr for m in best])),
         "psnr_as_reported": fit.metrics["test"]["psnr"],
         "train_psnr": fit.metrics["train"]["psnr"], "relative_degrees": relative_errors(found, true, train),
         "steps": fit.step, "seconds": fit.metrics["seconds"]["total"],
