@@ -86,7 +86,8 @@ def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bo
     make_folder(results)
     began = time.monotonic()
     shown = written = began - INDEX_INTERVAL
-    say(f"{len(jobs)} jobs, engine {engine.name}, {engine.slots} at a time; results: {results / INDEX}, {TABLE}")
+    count = f"{len(jobs)} job{'' if len(jobs) == 1 else 's'}"
+    say(f"{count}, engine {engine.name}, {engine.slots} at a time; results: {results / INDEX}, {TABLE}")
     try:
         with FarmTable(live=live) as table:
 
