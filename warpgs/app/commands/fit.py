@@ -28,6 +28,9 @@ from warpgs.runtime.interop import set_threads
 from warpgs.runtime.ranks import join, place
 from warpgs.runtime.terminal import be_quiet, say
 
+CONTINUING = {"--out": 1, "--resume": 0, "--device": 1, "--threads": 1, "--view": 0, "--view-port": 1}
+"""Flags that go with --resume where all else is as the run was started, and how many values each has."""
+
 
 def _request_type() -> type:
     """Return the dataclass of the flags that are no settings of a fit: its input, output and machine."""
@@ -53,7 +56,7 @@ def _request_type() -> type:
         threads: int = 0
         """CPU threads; 0 for as many as there are cores."""
         resume: bool = False
-        """Continue the run in --out from its last checkpoint."""
+        """Continue the run in --out from its last checkpoint; `warpgs fit --out RUN --resume` takes all else from the run."""
         strict: bool = False
         """A frame without an image file is an error."""
         allow_outside: bool = False
@@ -211,12 +214,53 @@ def _chosen(a: Any, arguments: list[str], config: FitConfig) -> tuple[FitConfig,
     return dataclasses.replace(config, rule=rule), (note,)
 
 
+def _names_a_run_alone(arguments: list[str]) -> bool:
+    """Return whether words ask to continue a run, and give nothing that it was started with."""
+    words = [w for a in arguments for w in a.split("=", 1)]
+    while words:
+        if words[0] not in CONTINUING:
+            return False
+        words = words[1 + CONTINUING[words[0]] :]
+    return "--resume" in arguments
+
+
+def _continued(arguments: list[str], about: str) -> FitRequest:
+    """Return the request that continues a run as it was started."""
+    from warpgs.pipeline.runs.folder import stored_request
+
+    @dataclass(frozen=True, kw_only=True)
+    class Continue:
+        out: Path
+        """Run folder."""
+        resume: bool = False
+        """Continue it."""
+        device: str | None = None
+        """That of the run where not given."""
+        threads: int = 0
+        """CPU threads; 0 for as many as there are cores."""
+        view: bool = False
+        """Show the model in a browser while it trains."""
+        view_port: int = 8080
+        """Port of --view; 0 for any free one."""
+
+    a = parse_flags(Continue, arguments, "warpgs fit", about)
+    check_range("--threads", a.threads, 0, MAX_THREADS)
+    check_range("--view-port", a.view_port, 0, 65535)
+    if a.threads:
+        set_threads(a.threads)
+    request = stored_request(a.out)
+    say(f"continued as it was started: preset {request.config.preset}, {request.config.steps:,} steps, {request.scene.path}")
+    return dataclasses.replace(request, device=a.device or request.device, view_port=a.view_port if a.view else None)
+
+
 def request_of(arguments: list[str], about: str) -> FitRequest:
     """Return the request that the words of a command line make.
 
     Raises:
         UsageError: A flag is wrong, or a plug-in cannot be loaded.
     """
+    if _names_a_run_alone(arguments):
+        return _continued(arguments, about)
     arguments = ["--help" if word == "--help-all" else word for word in arguments]  # tyro has one help, that of all flags
     base = _preset(arguments)
     terms = _terms(arguments, base)

@@ -22,7 +22,7 @@ from warpgs.pipeline.model.model_file import FittedModel, checked_gaussians
 from warpgs.pipeline.model.parameter_bounds import unpack
 from warpgs.pipeline.runs.checkpoint import FORMAT, TENSORS, load_checkpoint
 from warpgs.pipeline.runs.refined_poses import refined_cameras
-from warpgs.pipeline.runs.request import SceneRequest, choose_device
+from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device
 from warpgs.pipeline.runs.schemas import MODEL_STATE, check_record
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.refine_poses import ROTATION
@@ -208,20 +208,38 @@ class StoredRun(FittedModel):
             DataError: The scene was passed from Python and lies in no folder.
             UsageError: The scene was read with another reader from outside warpgs.
         """
-        if self.record["scene"]["path"] is None:
-            raise DataError(
-                f"{self.folder}: its scene was passed from Python, so there is no folder to read it from; score the model "
-                "there with warpgs.evaluate"
-            )
-        request = SceneRequest(**self.record["scene"])
-        if not Path(request.path).exists() and (self.folder / POSED_SCENE / POSES).is_file():
-            request = replace(request, path=str(self.folder / POSED_SCENE))  # the run folder was moved, and its scene with it
-        if request.reader is not None and ":" in request.reader and reader != request.reader:
-            raise UsageError(
-                f"{self.folder}: its scene was read with {request.reader}, code from outside warpgs. A run folder never "
-                f"decides which code is loaded: name it again with --reader {request.reader}"
-            )
-        return request
+        return _stored_scene(self.folder, self.record, reader)
+
+
+def _stored_scene(folder: Path, record: dict[str, Any], reader: str | None) -> SceneRequest:
+    """Return the scene of a run's record, as `StoredRun.scene_request` does."""
+    if record["scene"]["path"] is None:
+        raise DataError(
+            f"{folder}: its scene was passed from Python, so there is no folder to read it from; score the model there with "
+            "warpgs.evaluate"
+        )
+    request = SceneRequest(**record["scene"])
+    if not Path(request.path).exists() and (folder / POSED_SCENE / POSES).is_file():
+        request = replace(request, path=str(folder / POSED_SCENE))  # the run folder was moved, and its scene with it
+    if request.reader is not None and ":" in request.reader and reader != request.reader:
+        raise UsageError(
+            f"{folder}: its scene was read with {request.reader}, code from outside warpgs. A run folder never decides which "
+            f"code is loaded: name it again with --reader {request.reader}"
+        )
+    return request
+
+
+def stored_request(folder: Path) -> FitRequest:
+    """Return the request that continues a run, with everything as the run was started.
+
+    Raises:
+        DataError: The folder is no run, or its scene was passed from Python.
+        UsageError: The run used code from outside warpgs, which must be named again.
+    """
+    record = read_record(folder)
+    scene = _stored_scene(folder, record, None)
+    _check_named_again({}, record["config"], folder)
+    return FitRequest(scene, folder, FitConfig.from_json(record["config"]), record["device"], resume=True)
 
 
 def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredRun:
