@@ -10,6 +10,7 @@ import os
 import platform
 import shlex
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -21,6 +22,8 @@ from warpgs.files import LOCK, make_folder, remove_leftovers
 
 NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
 """Errors of file systems without locks."""
+SIGNED_WITHIN = 50
+"""Times that the signature of who holds a lock is looked for, a hundredth of a second apart."""
 MOST_LETTERS = 200
 """Length at which a command is cut short in a message."""
 
@@ -128,11 +131,21 @@ def _sign(file: BinaryIO) -> None:
 
 
 def _holder(file: BinaryIO) -> str:
-    """Return in words who holds a lock file."""
+    """Return in words who holds a lock file, which may have been locked just now: its signature is waited for a little."""
+    for _ in range(SIGNED_WITHIN):
+        words = _signed(file)
+        if words is not None:
+            return words
+        time.sleep(0.01)
+    return "another process"
+
+
+def _signed(file: BinaryIO) -> str | None:
+    """Return who signed a lock file; None where nobody did, or not to the end."""
     try:
         file.seek(1)
         found = json.loads(file.read())
         command = found["command"] if len(found["command"]) <= MOST_LETTERS else f"{found['command'][:MOST_LETTERS]}..."
         return f"process {found['process']} on {found['host']}, since {found['since']}, `{command}`,"
-    except (OSError, ValueError, KeyError, TypeError):  # it has just been locked, and not been signed yet
-        return "another process"
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
