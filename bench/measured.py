@@ -55,6 +55,10 @@ def _mean(values: list[float], digits: int = 2) -> str:
     return f"{statistics.mean(values):.{digits}f}{spread}"
 
 
+def _range(counts: set[int]) -> str:
+    return " to ".join(map(str, sorted({min(counts), max(counts)})))
+
+
 def captures() -> str:
     """Return the table of held-out scores by scene, number of training views and preset; empty cells were not measured."""
     result = _only("presets", "h200")
@@ -73,7 +77,7 @@ def captures() -> str:
     older = "".join(f" {preset}: commit {commit}." for preset, commit in older.items())
     return f"""## New views
 
-Held-out photographs: PSNR [dB], mean and standard deviation over {min(seeds - {0})} to {max(seeds)} seeds, / SSIM. 504 x 378 px
+Held-out photographs: PSNR [dB], mean and standard deviation over {_range(seeds - {0})} seeds, / SSIM. 504 x 378 px
 (fox 270 x 480, temple 640 x 480 by its foreground). {_where(result)}. Settings were chosen on these scenes by leaving training
 views out, but those of the first points, which were compared on three views with their held-out ones ([decision
 007](decisions/007-coarse-start.md)). `gsplat` is that package's default strategy in 7000 steps, from the first points
