@@ -24,7 +24,7 @@ from warpgs.pipeline.metrics.lpips_weights import NETS, convert_lpips
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.checkpoint import TENSORS
 from warpgs.pipeline.runs.fit import fit_request
-from warpgs.pipeline.runs.request import FitRequest, SceneRequest, read_scene
+from warpgs.pipeline.runs.request import CPU_MAX_SIDE, FitRequest, SceneRequest, read_scene
 from warpgs.pipeline.study.compare import ABLATION_ROWS, _places, ablation_variants, preset_variants, run_study
 from warpgs.pipeline.study.statistics import paired_difference
 from warpgs.pipeline.study.study import FILES, SWITCHES, StudyRequest, run_folder
@@ -56,9 +56,9 @@ def test_a_study_without_a_split_holds_a_view_out_and_its_fits_do_the_same(scene
     """A fit of its own would train on every view."""
     wanted = dataclasses.replace(scene, split=None)
     request = StudyRequest((wanted,), {"a": A, "b": B}, 1, tmp_path / "out", "cpu")
-    (place,) = _places(request)
+    (place,) = _places(request, "cpu")
     assert place.split.test == ("004.png",) and "no --split given: 004.png is held out" in capsys.readouterr().out
-    assert read_scene(place.request)[1] == place.split
+    assert read_scene(place.request)[1] == place.split and place.request.max_side == CPU_MAX_SIDE
 
 
 def metrics_of(request, variant, seed):

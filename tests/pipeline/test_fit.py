@@ -61,14 +61,14 @@ def test_command_and_function_are_one_fit(folder, fitted):
 def test_every_photograph_trains_by_default_and_a_run_remembers_its_scale(folder, tmp_path, capsys, monkeypatch):
     """No score is made up, which the report says; a later default leaves the run as it is."""
     few, out = dataclasses.replace(CONFIG, steps=2), tmp_path / "run"
-    monkeypatch.setattr("warpgs.io.readers.DEFAULT_MAX_SIDE", 20)
+    monkeypatch.setattr("warpgs.pipeline.runs.request.CPU_MAX_SIDE", 20)
     result = warpgs.fit(folder / "scene", few, out=out, device="cpu")
     assert len(result.train) == 8 and result.test == () and not result.metrics["test"]
     assert capsys.readouterr().out.splitlines().count(NO_SCORES) == 1
     assert NO_SCORES in result.notes and NO_SCORES in (out / "report.html").read_text()
     protocol = result.metrics["protocol"]
     assert (protocol["split"], protocol["resolution"]) == ("all (no --split given)", ["20 x 16"])
-    monkeypatch.setattr("warpgs.io.readers.DEFAULT_MAX_SIDE", 30)
+    monkeypatch.setattr("warpgs.pipeline.runs.request.CPU_MAX_SIDE", 30)
     record = json.loads((out / "config.json").read_text())["scene"]
     assert (record["downscale"], record["max_side"]) == (1, 20)
     assert main(["eval", str(out), "--device", "cpu"]) == 0 and "no view is held out" in capsys.readouterr().out

@@ -36,7 +36,7 @@ def advanced(config: FitConfig, steps: int) -> Trainer:
     return fit
 
 
-def finished(views: list[View], points: PointCloud | None = None, steps: int = PRESETS["quick"].steps, **holdout) -> Trainer:
+def finished(views: list[View], points: PointCloud | None = None, steps: int = 600, **holdout) -> Trainer:
     """A fit as its sizes below were measured, whose settings do not follow from the number of views."""
     quick = PRESETS["quick"]
     lrs = dataclasses.replace(quick.optimizer, scales_lr=0.1, opacities_lr=0.05)
@@ -211,9 +211,7 @@ def _turned():
     return turn
 
 
-@pytest.mark.parametrize(
-    ("width", "steps", "psnr"), [(32, 200, 30), pytest.param(64, PRESETS["quick"].steps, 39, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("width", "steps", "psnr"), [(32, 200, 30), pytest.param(64, 600, 39, marks=pytest.mark.slow)])
 def test_a_wall_of_one_colour_needs_next_to_nothing(width, steps, psnr):
     """With default flags a handful of Gaussians of degree 0 for a card of one colour that fills the views, seen as it is."""
     fit = finished(textured_planes.photos(textured_planes.plain, half=(9, 9), width=width, height=3 * width // 4), steps=steps)

@@ -14,8 +14,9 @@ from warpgs.app.cli import main
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.pipeline.train import time_budget
+from warpgs.pipeline.train.by_views import steps_by_views
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.time_budget import MAX_STEPS, MIN_STEPS, within_budget
+from warpgs.pipeline.train.time_budget import MIN_STEPS, within_budget
 from warpgs.render.rule_costs import RULE_COSTS
 from warpgs.synthetic.demo import split_spec, write_demo
 
@@ -62,7 +63,9 @@ def test_more_time_more_steps(monkeypatch):
         chosen, why = within_budget(config, seconds, views, CPU)
         assert setup + chosen.steps * step <= seconds < setup + (chosen.steps + 1) * step + 1e-9
         assert f"--steps {chosen.steps}" in why and dataclasses.replace(chosen, steps=config.steps) == config
-    assert within_budget(config, 1e9, views, CPU)[0].steps == MAX_STEPS
+    for count in (3, 20):
+        most, why = within_budget(config, 1e9, photos(count), CPU)
+        assert most.steps == steps_by_views(count) and why.count(f"{count} views need no more") == 1
     with pytest.raises(UsageError, match=f"too short: {MIN_STEPS} steps"):
         within_budget(config, setup + (MIN_STEPS - 1) * step, views, CPU)
 

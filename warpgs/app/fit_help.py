@@ -7,7 +7,7 @@ FLAGS = (
     ("--steps", "N", "", "steps, one view each; without it the preset decides"),
     ("--device", "NAME", "auto", "auto, cpu or cuda"),
     ("--downscale", "F", "", "divide both sides of the images by F"),
-    ("--max-side", "N", "", "longest side [px]; 1600 without --downscale, 0 no limit"),
+    ("--max-side", "N", "", "longest side [px]; 1600, on a CPU 800; 0 no limit"),
     ("--seed", "N", "0", "seed of every random choice"),
     ("--background", "COLOR", "auto", "auto, mean, scene, black, white, #rrggbb or r,g,b"),
     ("--masks", "HOW", "ignore", "masked out: ignore it, or cutout: transparent"),
@@ -18,7 +18,7 @@ FLAGS = (
 
 PRESETS = {
     "default": "any capture; steps follow from the number of views",
-    "quick": "a first look on a GPU: the same in 600 steps",
+    "quick": "a first look: the same in at most 600 steps",
     "3dgs": "a baseline: Kerbl et al. 2023, 7000 steps",
     "mcmc": "a baseline: Kheradmand et al. 2024, 7000 steps",
     "paper-literal": "the paper to the letter, 30000 steps; slow",

@@ -48,7 +48,7 @@ def _request_type() -> type:
         downscale: int | None = None
         """Factor by which both image sides shrink; with it, images keep what it leaves of them."""
         max_side: int | None = None
-        """Longest side that an image keeps [px], 0 for no limit; 1600 where neither this nor --downscale is given."""
+        """Longest side that an image keeps [px], 0 for no limit; without this and --downscale 1600, or 800 on a CPU."""
         reader: str | None = None
         """Name of the scene's format, or a reader of your own: module:Class or path/to/file.py:Class."""
         device: str = "auto"

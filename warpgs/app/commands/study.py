@@ -25,7 +25,7 @@ def study_flags() -> type:
         downscale: int | None = None
         """Factor by which both image sides shrink; with it, images keep what it leaves of them."""
         max_side: int | None = None
-        """Longest side that an image keeps [px], 0 for no limit; 1600 where neither this nor --downscale is given."""
+        """Longest side that an image keeps [px], 0 for no limit; without this and --downscale 1600, or 800 on a CPU."""
         allow_outside: bool = False
         """Let names and links of the scenes lead to images and masks outside their folders."""
         max_pixels: int = MAX_PIXELS

@@ -127,7 +127,7 @@ def _ensure(job: FarmJob, on_step: Callable[[StepReport], object] | None) -> Out
 def _wanted(request: FitRequest, device: str) -> tuple[str, Split | None, FitConfig]:
     """Return the fingerprint of a scene as it is now, its split, and the settings with those chosen that are left open."""
     try:
-        found, _ = with_poses(request.scene, request.out, say)
+        found, _ = with_poses(request.scene.with_scale(device), request.out, say)
     except UsageError as e:  # other photographs than those whose poses are there
         return str(e), None, request.config
     scene, split, _ = read_scene(found)

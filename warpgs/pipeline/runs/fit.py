@@ -136,7 +136,7 @@ def fit(
         where = choose_device(device)
         began = time.perf_counter()
         lpips = None if lpips_weights is None else load_lpips(Path(lpips_weights), where[0])
-        request, read, parts, found = _scene_of(scene, split, out, progress)
+        request, read, parts, found = _scene_of(scene, split, out, where[0].type, progress)
         notes = (*notes, *held, *found, *([] if out is None else renaming_notes(image_names(v.name for v in read.views))))
         job = FitJob(
             read, request, parts, config, *where, own, lpips, [*notes], verbose, on_step, began, progress, on_model, ranks,
@@ -180,13 +180,17 @@ def fit_request(request: FitRequest, **others: Any) -> FitResult:
 
 
 def _scene_of(
-    scene: Scene | SceneRequest | str | Path, spec: str | None, out: Path | None, progress: Callable[[str], object]
+    scene: Scene | SceneRequest | str | Path,
+    spec: str | None,
+    out: Path | None,
+    device: str,
+    progress: Callable[[str], object],
 ) -> tuple[SceneRequest, Scene, Split, list[str]]:
     """Read and split a scene that is given in one of four ways; its notes come last."""
     if isinstance(scene, Scene):
         split, notes = choose_split(scene, spec)
-        return SceneRequest("", spec, 1).with_scale(), scene, split, [*scene.notes, *notes]
-    request = (scene if isinstance(scene, SceneRequest) else SceneRequest(str(scene))).with_scale()
+        return SceneRequest("", spec, 1).with_scale(device), scene, split, [*scene.notes, *notes]
+    request = (scene if isinstance(scene, SceneRequest) else SceneRequest(str(scene))).with_scale(device)
     if spec is not None:
         request = replace(request, split=spec)
     request, found = with_poses(request, out, progress)

@@ -89,7 +89,7 @@ def record_of(
     """Return the contents of config.json: format, scene, views, settings, device, versions and cameras."""
     return {
         "format": FORMAT,
-        "scene": {**asdict(request.with_scale()), "path": str(Path(request.path).resolve()) if request.path else None},
+        "scene": {**asdict(request), "path": str(Path(request.path).resolve()) if request.path else None},
         "scene_format": scene.format, "fingerprint": scene.fingerprint,
         "train": split.train, "test": split.test, "notes": notes,
         "normalization": {"offset": scene.normalization.offset.tolist(), "scale": scene.normalization.scale},

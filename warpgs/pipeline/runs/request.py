@@ -17,6 +17,9 @@ from warpgs.io.splits import Split, coincident_views, split_views
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.scene import Scene
 
+CPU_MAX_SIDE = 800
+"""Longest side of an image [px] that a fit on a CPU keeps where the user names neither a factor nor a side: four times as
+many steps fit into its time, and renders of the full size come nearer to new photographs (measured in docs/your-photos.md)."""
 NO_SCORES = "scores: none, every photograph was trained on; --split every:8 holds some out"
 """Sentence on a fit without held-out views, with the way to scores."""
 
@@ -48,11 +51,13 @@ class SceneRequest:
     max_pixels: int = MAX_PIXELS
     """Largest number of pixels that an image or a mask may have as stored."""
     max_side: int | None = None
-    """Longest side that an image keeps [px], 0 for no limit; None for 1600 where ``downscale`` is None too, else for 0."""
+    """Longest side that an image keeps [px], 0 for no limit; None for 0 where ``downscale`` is given, else for 1600, or 800
+    in a fit on a CPU."""
 
-    def with_scale(self) -> SceneRequest:
-        """Return this request with its size of images in numbers, as a run remembers it."""
-        downscale, max_side = image_scale(self.downscale, self.max_side)
+    def with_scale(self, device: str) -> SceneRequest:
+        """Return this request with its size of images in numbers, as a run on ``device``, cpu or cuda, remembers it."""
+        side = CPU_MAX_SIDE if device == "cpu" and self.max_side is None and self.downscale is None else self.max_side
+        downscale, max_side = image_scale(self.downscale, side)
         return replace(self, downscale=downscale, max_side=max_side)
 
 

@@ -61,10 +61,11 @@ def ablation_variants(base: FitConfig) -> tuple[dict[str, FitConfig], dict[str, 
     return variants, marks
 
 
-def _places(request: StudyRequest) -> list[Place]:
+def _places(request: StudyRequest, device: str) -> list[Place]:
     """Read the scenes of a study; DataError where one holds out no view."""
     places = []
-    for wanted in request.scenes:
+    for asked in request.scenes:
+        wanted = asked.with_scale(device)
         scene, split, _ = read_scene(wanted)
         if wanted.split is None:
             spec, note = held_out_split(scene)
@@ -152,7 +153,7 @@ def run_study(request: StudyRequest) -> list[str]:
     """
     device, where = choose_device(request.device)
     lpips = {} if request.lpips_weights is None else load_lpips(request.lpips_weights, device).variants()
-    places = _places(request)
+    places = _places(request, device.type)
     with hold_folder(request.out) as notes:
         for note in notes:
             say(note)

@@ -176,7 +176,7 @@ _DEFAULT = FitConfig(
 
 PRESETS: dict[str, FitConfig] = {
     "default": _DEFAULT,
-    "quick": dataclasses.replace(_DEFAULT, preset="quick", steps=600),
+    "quick": dataclasses.replace(_DEFAULT, preset="quick"),
     "3dgs": FitConfig(limits=LimitConfig(max_size=0, max_ratio=0, max_reach=0)),
     "mcmc": FitConfig(
         preset="mcmc", strategy="mcmc", init=InitConfig(opacity=0.5, scale_factor=0.1),
@@ -196,7 +196,7 @@ DEFAULT_PRESET = "default"
 
 PRESET_NOTES: dict[str, str] = {
     "default": "any capture: steps, degree and rates follow from the number of views, and the fit ends when it gains no more",
-    "quick": "a first look on a GPU: the same in 600 steps",
+    "quick": "a first look: the same in at most 600 steps",
     "3dgs": "a baseline: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few",
     "mcmc": "a baseline: Kheradmand et al. 2024, which fills a given number of Gaussians, from the same points as 3dgs",
     "paper-literal": "the paper to the letter, with first proposals for what it leaves open; slow",

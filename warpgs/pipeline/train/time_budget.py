@@ -9,6 +9,7 @@ import time
 import torch
 
 from warpgs.errors import UsageError
+from warpgs.pipeline.train.by_views import steps_by_views
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LossConfig, photometric_loss
 from warpgs.render.rasterize import rasterize
@@ -22,8 +23,8 @@ STEP, SETUP = 1.6, 11.0
 """Mean time of a step of a fit, and time before the first step for each training view, in probes (`probe_seconds`). Measured on
 a CPU on fern with preset `quick`: 1.54 and 11.2 at 126 x 94 px, 1.56 and 10.8 at 168 x 126 px (docs/trade.md). On CUDA, where
 steps are captured and probes are not, a step takes less, so that the prediction is an upper limit."""
-MIN_STEPS, MAX_STEPS = 100, 3000
-"""Range of the steps chosen: with fewer nothing is seen, with more held-out views gain nothing (docs/results.md)."""
+MIN_STEPS = 100
+"""Fewest steps chosen: with fewer nothing is seen. The most are those of a fit without a budget (`steps_by_views`)."""
 
 
 def probe_seconds(width: int, height: int, device: torch.device) -> float:
@@ -75,7 +76,8 @@ def within_budget(config: FitConfig, seconds: float, views: list[View], device: 
     largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
     probe = probe_seconds(largest.width, largest.height, device)
     setup, step = probe * SETUP * len(views), probe * STEP * config.batch
-    steps = min(int((seconds - setup) / step), MAX_STEPS)
+    most = steps_by_views(len(views))
+    steps = min(int((seconds - setup) / step), most)
     if steps < MIN_STEPS:
         raise UsageError(
             f"time-budget {seconds:g} s is too short: {MIN_STEPS} steps would take {setup + MIN_STEPS * step:.0f} s here, "
@@ -85,7 +87,7 @@ def within_budget(config: FitConfig, seconds: float, views: list[View], device: 
     return dataclasses.replace(config, steps=steps), (
         f"time-budget {seconds:g} s: chose --steps {steps} of preset {config.preset}, predicted to take {needed:.0f} s "
         f"here, where a render with gradients takes {1000 * probe:.0f} ms"
-        + (f"; more than {MAX_STEPS} steps gain nothing" if steps == MAX_STEPS else "")
+        + (f"; {len(views)} views need no more" if steps == most else "")
         + "; scores and report come on top"
     )
 
