@@ -182,7 +182,7 @@ def test_a_failed_run_is_left_out_of_its_pairs_and_named(finished, tmp_path, mon
     request = copy_of(finished, tmp_path)
     shutil.rmtree(run_folder(request, "still", "b b", 1))
 
-    def fail(*_):
+    def fail(*_, **__):
         raise DataError("no luck")
 
     monkeypatch.setattr("warpgs.pipeline.farm.ensure_run.fit_request", fail)
@@ -287,7 +287,7 @@ def test_command_ablates(scene, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "cache"))
     asked = []
 
-    def noted(request):
+    def noted(request, **others):
         asked.append((request.config.seed, request.config.method))
         return fit_request(request)
 
@@ -330,6 +330,12 @@ def test_command_compares_presets(scene, tmp_path, capsys, monkeypatch):
     flags = ["--presets", "a,b", "--seeds", "1", "--steps", "2", "--device", "cpu", "--out", str(tmp_path / "out")]
     assert main(["compare", scene.path, "--split", scene.split, *flags]) == 0
     out = capsys.readouterr().out
-    assert "[2/2] still, b, seed 0" in out and "one seed" in out and "table.tex" in out
+    lines = out.splitlines()
+    first, second = (
+        next(i for i, line in enumerate(lines) if line.startswith(f"[{k}/2] still, {n}, seed 0"))
+        for k, n in ((1, "a"), (2, "b"))
+    )
+    assert sum("2 steps" in line for line in lines[first:second]) == 1 and lines[second - 1].startswith("  PSNR ")
+    assert "next:" not in out and "one seed" in out and "table.tex" in out and "1 seed:" in out
     assert main(["compare", scene.path, "--out", str(tmp_path / "y"), "--presets", "a,zzz"]) == 2
     assert "preset 'zzz'" in capsys.readouterr().err

@@ -164,7 +164,7 @@ def classical_maps(images: Sequence[np.ndarray], tell: Callable[[str], object] =
     """
     with single_threaded_opencv(), ThreadPoolExecutor(os.cpu_count() or 1, initializer=without_ipp) as pool:
         made = [pool.submit(classical_semantics, image) for image in images]
-        return [m.result() for m in counted(made, tell, "finding what stands out", "views")]
+        return [m.result() for m in counted(made, tell, "finding salient regions", "views")]
 
 
 def knows_foreground(maps: SemanticMaps) -> bool:

@@ -238,7 +238,7 @@ def view_priors(
         maps = _segmentation_network(views, config, threads, store, notes)
     else:
         maps = _classical(views, notes, tell)
-    found = [maps(i) for i in counted(range(len(views)), tell, "finding what stands out", "views")]
+    found = [maps(i) for i in counted(range(len(views)), tell, "finding salient regions", "views")]
     found = _fall_back(found, views, regions or [None] * len(views), config.segmentation_model is None, notes)
     if disparity is None:
         disparity = _depth_views(views, depths(), notes)

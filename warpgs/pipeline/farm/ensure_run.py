@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ from warpgs.pipeline.runs.folder import CONFIG, read_record
 from warpgs.pipeline.runs.request import FitRequest
 from warpgs.pipeline.runs.schemas import METRICS
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.step_report import StepReport
 from warpgs.runtime.folder_lock import hold_folder
 
 
@@ -94,7 +92,7 @@ def ensure_run(
     device: str,
     variants: dict[str, str],
     resolved: FitConfig | None = None,
-    on_step: Callable[[StepReport], object] | None = None,
+    **others: Any,
 ) -> Outcome:
     """Ensure that a run folder holds the finished run that is asked for.
 
@@ -108,7 +106,7 @@ def ensure_run(
         device: cpu or cuda.
         variants: Names of the LPIPS scores that must be there, with their definitions; empty for none.
         resolved: The settings of ``request`` with those chosen that it leaves open; None where it leaves none open.
-        on_step: As in `fit`.
+        others: As `fit` takes them: on_step, verbose.
 
     Returns:
         The outcome. It holds the error of this one run, if any, so that the others can go on.
@@ -116,7 +114,7 @@ def ensure_run(
     try:
         record, why = _stored(request.out)
         gap = "" if record is None else _difference(record, resolved or request.config, fingerprint, split, device)
-        return _outcome(request, record, gap, why, variants, {} if on_step is None else {"on_step": on_step})
+        return _outcome(request, record, gap, why, variants, others)
     except WarpgsError as e:
         return Outcome("failed", None, f"failed: {e}", e)
 
@@ -130,7 +128,7 @@ def _stored(folder: Path) -> tuple[dict[str, Any] | None, str]:
 
 
 def _outcome(
-    request: FitRequest, record: dict[str, Any] | None, gap: str, why: str, variants: dict[str, str], watchers: dict[str, Any]
+    request: FitRequest, record: dict[str, Any] | None, gap: str, why: str, variants: dict[str, str], others: dict[str, Any]
 ) -> Outcome:
     """Return the outcome of `ensure_run`, or raise what keeps it from beginning."""
     folder, note, state, resume = request.out, "", "fitted", False
@@ -152,7 +150,7 @@ def _outcome(
         state = "redone"
 
     def fit(go_on: bool) -> dict[str, Any]:
-        return fit_request(replace(request, resume=go_on), **watchers).metrics
+        return fit_request(replace(request, resume=go_on), **others).metrics
 
     try:
         try:

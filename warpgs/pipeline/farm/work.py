@@ -121,7 +121,7 @@ def _ensure(job: FarmJob, on_step: Callable[[StepReport], object] | None) -> Out
     fingerprint, split, resolved = "", None, request.config
     if (request.out / CONFIG).is_file():
         fingerprint, split, resolved = _wanted(request, device.type)
-    return ensure_run(request, fingerprint, split, device.type, lpips, resolved, on_step)
+    return ensure_run(request, fingerprint, split, device.type, lpips, resolved, on_step=on_step)
 
 
 def _wanted(request: FitRequest, device: str) -> tuple[str, Split | None, FitConfig]:

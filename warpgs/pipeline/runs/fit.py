@@ -8,7 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -89,7 +89,7 @@ def fit(
     lpips_weights: str | Path | None = None,
     time_budget: float | None = None,
     notes: tuple[str, ...] = (),
-    verbose: bool = True,
+    verbose: bool | Literal["progress"] = True,
     on_model: Callable[[FittedModel], object] | None = None,
     ranks: Ranks = ALONE,
 ) -> FitResult:
@@ -108,7 +108,7 @@ def fit(
         lpips_weights: File of `warpgs convert-lpips`; None to leave LPIPS out.
         time_budget: Time that the fit may take [s], by which its steps are chosen; None for those of ``config``.
         notes: Choices made before, to be printed and recorded with the fit's own.
-        verbose: Whether to print.
+        verbose: True to print, False to print nothing, "progress" to print what is being done and no choice or result.
         on_model: Called after every step with the model as it is, for those who look on: the next step overwrites its tensors.
         ranks: Processes that fit together, from `warpgs.runtime.ranks.join`, all with the same arguments. The first alone
             prints, writes and scores; the others return a result without metrics.
@@ -125,7 +125,7 @@ def fit(
     if spec is not None:
         check_spec(spec)
     check_shared(scene, config, ranks, time_budget, resume)
-    verbose, own = verbose and ranks.first, out if ranks.first else None
+    verbose, own = ranks.first and verbose, out if ranks.first else None
     stages = Stages() if verbose else Stages(lambda line: None)
     nothing: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
     folder = nothing if own is None else run_folder(own, resume)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import torch
 
@@ -34,7 +35,7 @@ class FitJob:
     out: Path | None
     lpips: Lpips | None
     notes: list[str]
-    verbose: bool
+    verbose: bool | Literal["progress"]
     on_step: Callable[[StepReport], object] | None
     began: float
     progress: Callable[[str], object]
@@ -54,8 +55,8 @@ class FitJob:
         return train_views(self.scene, self.split.test)
 
     def say(self, line: str) -> None:
-        """Print a line for the user, unless the fit is to be silent."""
-        if self.verbose:
+        """Print a line for the user, unless the fit is to be silent, or to tell of its progress alone."""
+        if self.verbose is True:
             say(line)
 
     def note(self, line: str) -> None:

@@ -75,6 +75,12 @@ def score_line(scores: dict[str, float]) -> str:
     return f"PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f}{''.join(opacity)}{lpips}"
 
 
+def summary_line(metrics: dict[str, Any]) -> str:
+    """Return scores, size and time of a run, from metrics.json, as one line for people."""
+    size = f"{metrics['gaussians']:,} Gaussians, {metrics['steps']:,} steps"
+    return f"{score_line(metrics['test'])}; {size}, {duration(metrics['seconds']['total'])}"
+
+
 def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
     """Return the end of a fit for people: scores, size, time, where the report is, and what to do next.
 

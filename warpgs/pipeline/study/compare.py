@@ -15,6 +15,7 @@ from warpgs.pipeline.farm.record import JobRecord
 from warpgs.pipeline.farm.run import make_engine, run_and_show
 from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.runs.request import FitRequest, choose_device, read_scene
+from warpgs.pipeline.runs.results import summary_line
 from warpgs.pipeline.study.study import FILES, SWITCHES, Place, Runs, StudyRequest, run_folder, scene_name, write_study
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import PRESETS, FitConfig
@@ -129,11 +130,13 @@ def _run_all(request: StudyRequest, places: list[Place], device: torch.device, l
             runs[key] = Outcome("failed", None, f"failed: {record.message}")
             continue
         resolved, _ = settings_by_views(fit.config, place.train, device.type)
-        outcome = ensure_run(fit, place.fingerprint, place.split, device.type, lpips, resolved)
+        outcome = ensure_run(fit, place.fingerprint, place.split, device.type, lpips, resolved, verbose="progress")
         if record is not None and outcome.state == "kept":
             outcome = dataclasses.replace(outcome, state=record.how, note=record.message)
         if record is None and outcome.state != "fitted":
             say(f"  {outcome.state}{': ' if outcome.note else ''}{outcome.note}")
+        if record is None and outcome.metrics is not None:
+            say(f"  {summary_line(outcome.metrics)}")
         runs[key] = outcome
         gc.collect()  # a fit and its recorded steps refer to each other: without this their device memory piles up
     return runs
