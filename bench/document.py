@@ -5,6 +5,9 @@ usage: python -m bench.document
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Callable
+
 from bench import result_file
 from bench.harness import DISTURBED, OURS
 from bench.plot import Line, Panel, chart
@@ -34,7 +37,7 @@ during which other programs kept more than 0.2 cores busy, also on a second try.
 
 The scene is a random cloud whose Gaussians shrink as their number grows, rendered under rule `exact`. One size varies at a time
 around 100,000 Gaussians, 504 x 378 px, degree 3, one camera; a few points let Gaussians and image grow together. The tables
-have that point and those; the charts, and the results, have all.
+have that point and those (an op that depends on one of the two sizes takes that one); the charts, and the results, have all.
 
 Other programs: `torch conv2d` is SSIM as most trainers write it, `torch dense` a rasterizer without tiles in plain torch, up
 to 1,000 Gaussians, `naive` a kernel with one thread per pixel, `numpy` the paths of a sweep, a line at a time in numpy,
@@ -66,12 +69,6 @@ def _sizes(row: dict, names: list[str]) -> list[str]:
     return cells
 
 
-def _columns(rows: list[dict]) -> list[str]:
-    return [
-        n for n in ("N", "image", "degree", "cameras", "threads") if any((n if n != "image" else "width") in r for r in rows)
-    ]
-
-
 def _key(row: dict) -> tuple:
     return tuple(row.get(s, 0) for s in SIZES)
 
@@ -82,45 +79,32 @@ def _timing(row: dict | None) -> str:
     return figure(row["median_ms"]) + ("*" if row.get("others_cores", 0.0) > DISTURBED else "")
 
 
-def _name(program: str, direction: str) -> str:
-    return direction if program == OURS else f"{program}, {direction}"
-
-
 def _plain(row: dict) -> bool:
     """Return whether a row has the base's degree, one camera, and no number of threads of its own."""
     return row.get("degree", BASE.degree) == BASE.degree and row.get("cameras", 1) == 1 and "threads" not in row
 
 
-def _shown(rows: list[dict]) -> list[dict]:
-    """Return the rows at the base point and along the diagonal; all of an op that was measured at neither."""
-    points = {(BASE.count, BASE.width), *((count, width) for count, width, _ in DIAGONAL[2:])}
-
-    def wanted(r: dict) -> bool:
-        n, width = r.get("N"), r.get("width")
-        return any((n is None or n == count) and (width is None or width == side) for count, side in points)
-
-    return [r for r in rows if _plain(r) and wanted(r)] or rows
+def _size_table(rows: list[dict], cell: Callable[[dict], str]) -> str:
+    """Return a table of all tasks by the base point and those along the diagonal; an op takes of a point what it depends on."""
+    points = sorted({(BASE.count, BASE.width, BASE.height), *DIAGONAL[2:]})
+    body = []
+    for op, program, direction in tasks(rows):
+        own = [r for r in rows if (r["op"], r["program"], r["direction"]) == (op, program, direction) and _plain(r)]
+        found = [next((r for r in own if r.get("N", n) == n and r.get("width", w) == w), None) for n, w, _ in points]
+        if any(found):
+            body.append([op, direction, program, *("" if r is None else cell(r) for r in found)])
+    head = ["op", "direction", "program", *(f"{n:,}, {w} x {h}" for n, w, h in points)]
+    used = [k for k, name in enumerate(head) if name in WORDS or any(row[k] for row in body)]
+    return table([head[k] for k in used], [[row[k] for k in used] for row in body])
 
 
 def op_tables(rows: list[dict]) -> str:
-    """Per op a table of sizes by programs and directions; on CUDA a second one with GPU time and memory."""
-    parts = []
-    for op in dict.fromkeys(r["op"] for r in rows):
-        own = _shown([r for r in rows if r["op"] == op])
-        by_task = {(r["program"], r["direction"], _key(r)): r for r in own}
-        sizes, columns = {_key(r): r for r in sorted(own, key=_key)}, [c for c in _columns(own) if c in ("N", "image")]
-        done = [(program, direction) for _, program, direction in tasks(own)]
-        head = [*columns, *(_name(*t) for t in done)]
-        body = [[*_sizes(r, columns), *(_timing(by_task.get((*t, key))) for t in done)] for key, r in sizes.items()]
-        parts.append(f"#### {op}\n\n{table(head, body)}")
-        if any("peak_bytes" in r for r in own):
-            body = [[*_sizes(r, columns), *(_device(by_task.get((*t, key))) for t in done)] for key, r in sizes.items()]
-            parts.append(f"{op}: GPU time [ms] / peak memory above the inputs [MiB]\n\n{table(head, body)}")
-    return "\n".join(parts)
-
-
-def _device(row: dict | None) -> str:
-    return "" if row is None else f"{figure(row['gpu_ms'])} / {figure(row['peak_bytes'] / 2**20)}"
+    """Return the table of times; on CUDA, a second one of memory."""
+    text = _size_table(rows, _timing)
+    if any("peak_bytes" in r for r in rows):
+        memory = _size_table(rows, lambda r: figure(r["peak_bytes"] / 2**20))
+        text += f"\nPeak device memory above the inputs [MiB]:\n\n{memory}"
+    return text
 
 
 def peer_table(rows: list[dict]) -> str:
@@ -166,16 +150,10 @@ def exponent_table(rows: list[dict]) -> str:
     return table(["op", "program", "direction", "over N", "up to N", "over pixels", "up to pixels"], body)
 
 
-def skipped_list(skipped: list[dict]) -> str:
-    """Return a list of the tasks not measured: how many sizes of each, and the reason at the first."""
-    groups: dict[tuple[str, str, str], list[str]] = {}
-    for r in skipped:
-        groups.setdefault((r["op"], r["program"], r["direction"]), []).append(r["reason"])
-    lines = [
-        f"- {op}, {program}, {direction}: {len(why)} size{'s' if len(why) > 1 else ''}, the first because: {why[0]}"
-        for (op, program, direction), why in groups.items()
-    ]
-    return "\n".join(lines) + "\n"
+def skipped_words(skipped: list[dict]) -> str:
+    """Return the tasks that were not measured at some sizes, with their number."""
+    counts = Counter((r["op"], r["program"], r["direction"]) for r in skipped)
+    return ", ".join(f"{' '.join(task)} {count}" for task, count in counts.items())
 
 
 def _lines(series: list[Series], name) -> tuple[Line, ...]:
@@ -235,7 +213,7 @@ def machine_text(stem: str, result: dict, plots: list[str]) -> str:
         + (f" {result['note'].rstrip('.')}." if result.get("note") else "")
         + f" Results: `bench/results/ops_{stem}.json`.\n",
         *(f"![{name} of {stem}](plots/{stem}_{name}.svg)\n" for name in plots),
-        "### Ops\n",
+        "### Times by number of Gaussians and image [ms]\n",
         op_tables(rows),
     ]
     if peers := peer_table(rows):
@@ -256,7 +234,7 @@ def machine_text(stem: str, result: dict, plots: list[str]) -> str:
         roof_table(rows),
     ]
     if result["skipped"]:
-        parts += ["### Skipped\n", skipped_list(result["skipped"])]
+        parts.append(f"Sizes left out for the time they take (reasons in the results): {skipped_words(result['skipped'])}.\n")
     return "\n".join(parts)
 
 
