@@ -43,6 +43,8 @@ NOISE = 0.1 / 255**2
 """Mean square that is added to both bands of detail: less than a level of an 8-bit image tells nothing."""
 DARKEST, BRIGHTEST = 0.04, 0.94
 """Colours in [0, 1] between which brightness is compared: outside, a photograph is black or clipped."""
+REMEDY = "fix it in the camera, or try --exposure"
+"""Remedy for photographs whose colours differ."""
 MAX_NAMED = 6
 """Photographs that one sentence names."""
 PROGRESS_INTERVAL = 5.0
@@ -198,14 +200,14 @@ def photo_notes(checks: Sequence[PhotoCheck]) -> list[str]:
         )
     exposed = sorted((c for c in checks if c.exposed_otherwise), key=lambda c: -abs(math.log(c.brightness)))
     if exposed:
-        notes.append(
-            "exposure differs from that of the photographs beside it: "
-            f"{_listed([f'{c.name} ({c.brightness:.2f} x as bright)' for c in exposed])}; fix it in the camera, or even it out"
-        )
+        factors = [f"{c.name} ({c.brightness:.2f} x as bright)" for c in exposed]
+        notes.append(f"exposure differs from that of the photographs beside it: {_listed(factors)}; {REMEDY}")
     tinted = [c for c in checks if c.tinted]
     if tinted:
         factors = [f"{c.name} (red {c.channels[0]:.2f}, green {c.channels[1]:.2f}, blue {c.channels[2]:.2f} x)" for c in tinted]
-        notes.append(f"white balance differs from that of the photographs beside it: {_listed(factors)}; fix it in the camera")
+        notes.append(
+            f"white balance differs from that of the photographs beside it: {_listed(factors)}; {REMEDY}"
+        )
     alone = [c.name for c in checks if not c.compared_with]
     if alone:
         notes.append(f"blur and exposure are unknown where too little matches the photographs beside it: {_listed(alone)}")

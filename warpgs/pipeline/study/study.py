@@ -242,7 +242,8 @@ def write_study(request: StudyRequest, runs: Runs, places: list[Place], device: 
     metrics, scenes = _metrics(runs), [p.name for p in places]
     title = "Ablation" if request.marks else "Comparison"
     what = scenes[0] if len(scenes) == 1 else f"the mean over {len(scenes)} scenes"
-    table = _table(request, runs, scenes, metrics, f"{title} on {what}, {request.seeds} seed{'' if request.seeds == 1 else 's'}")
+    seeds = f"{request.seeds} seed{'' if request.seeds == 1 else 's'}"
+    table = _table(request, runs, scenes, metrics, f"{title} on {what}, {seeds}")
     image, about = _figure(request, runs, places, device)
     notes = [*_notes(request, runs, metrics), about]
     parts = [f"# {table.caption}", markdown(table)]
