@@ -67,12 +67,6 @@ FEATURES = ("sse4_2", "avx", "fma", "avx2", "avx512f", "avx512_bf16", "avx512_fp
 
 LIBRARIES = ("torch.", "numpy.", "cv2.")
 """Beginnings of the names of stages of single functions."""
-SHOWN = (
-    ("demo", "decoded images"), ("`3dgs`: first PLY", "3dgs: first PLY"), ("`3dgs`: last PLY", "3dgs: last PLY"),
-    ("`quick`: depths", "quick: consistent depths"), ("`quick`: first PLY", "quick: first PLY"),
-    ("`quick`: last PLY", "quick: last PLY"),
-)  # fmt: skip
-"""Stages whose digests stand in docs/accuracy.md, and their names there."""
 
 Stage = tuple[str, str]
 
