@@ -33,42 +33,43 @@ def _worst(row: dict) -> dict[str, float]:
     return found | {"E depth": depth["E max"], "rel L2": max(g["rel L2"] for g in row["gradients"].values())}
 
 
+def _most(rows: list[dict]) -> str:
+    """Return the largest figures over all scenes, of those lines that no column shows too."""
+    gradients = [e for row in rows for e in row["gradients"].values()]
+    images = {k: max(_worst(row)[k] for row in rows) for k in ("E mean", "E max", "E depth")}
+    of = {k: _e(max(e[k] for e in gradients)) for k in ("rel L2", "1 - cosine", "bias")}
+    return (
+        f"Largest over all scenes: mean E {_e(images['E mean'])}, max E {_e(images['E max'])} (depth {_e(images['E depth'])}); "
+        f"of gradients relative L2 {of['rel L2']}, 1 - cosine {of['1 - cosine']}, bias {of['bias']}, wrong zeros "
+        f"{sum(e['wrong zeros'] for e in gradients)}; pixels flipped {sum(row['flips'] for row in rows)}."
+    )
+
+
 def budget_text(results: dict[str, dict]) -> str:
-    """Two tables of the first machine, images and gradients; a sentence on each of the others."""
+    """A table of the first machine, images and gradients by scene; a sentence on each machine."""
     parts = []
     for stem, result in results.items():
-        images, gradients = [], []
+        kept = "Every line is kept." if not result["broken"] else "Broken: " + "; ".join(result["broken"]) + "."
+        parts.append(f"{_machine(stem, result)} {kept} {_most(result['rows'])} All: `bench/results/budget_{stem}.json`.\n")
+        if len(parts) > 1:
+            continue
+        lines = []
         for row in result["rows"]:
             name = row["scene"] + ("" if row["rule"] == "exact" else f", `{row['rule']}`")
             both, v = _worst(row), row["gradients"]
-            images.append([
-                name, *(_e(both[k]) for k in ("E mean", "E max", "allowed", "P32 max", "E depth", "A mean", "A max")),
-                f"{row['in band']} of {row['pixels']}", str(row["flips"]),
+            worst = max(v, key=lambda n: v[n]["rel L2"])
+            lines.append([
+                name, *(_e(both[k]) for k in ("E mean", "E max", "allowed", "P32 max", "A mean", "A max")),
+                f"{row['in band']}/{row['pixels']}", f"{_e(both['rel L2'])} ({worst})",
+                _e(max(e["A max"] for e in v.values())),
             ])  # fmt: skip
-            name_of_worst = max(v, key=lambda n: v[n]["rel L2"])
-            gradients.append([
-                name, f"{_e(both['rel L2'])} ({name_of_worst})",
-                *(_e(max(e[k] for e in v.values())) for k in ("1 - cosine", "bias", "E max", "P32 max", "A max")),
-                str(sum(e["wrong zeros"] for e in v.values())),
-            ])  # fmt: skip
-        kept = "Every line is kept." if not result["broken"] else "Broken: " + "; ".join(result["broken"]) + "."
-        if parts:
-            most = {k: max(_worst(row)[k] for row in result["rows"]) for k in ("E mean", "E max", "rel L2")}
-            parts.append(
-                f"{_machine(stem, result)} {kept} Largest over all scenes: mean E {_e(most['E mean'])}, max E "
-                f"{_e(most['E max'])}, relative L2 of a gradient {_e(most['rel L2'])}; each: "
-                f"`bench/results/budget_{stem}.json`.\n"
-            )
-            continue
-        head = ["images", "mean E", "max E", "allowed", "max P32", "max E depth", "mean A", "max A", "band", "flips"]
-        parts += [f"{_machine(stem, result)} {kept}\n", _table(head, images)]
-        head = ["gradients", "relative L2", "1 - cosine", "bias", "max E", "max P32", "max A", "wrong zeros"]
-        parts.append(_table(head, gradients))
+        head = ["scene", "image: mean E", "max E", "allowed", "max P32", "mean A", "max A", "in band"]
+        parts.append(_table([*head, "gradient: relative L2", "max A"], lines))
     return "\n".join(parts)
 
 
 def needles_text(results: dict[str, dict]) -> str:
-    """A table of the first machine: max and mean errors by length, and how many times the factor form is better."""
+    """A table of the first machine: largest errors by length, and how many times the factor form is better."""
     parts = []
     for stem, result in list(results.items())[:1]:
         rows = []
@@ -76,13 +77,14 @@ def needles_text(results: dict[str, dict]) -> str:
             line = [f"{row['sigma']:,}"]
             for what, peers in (("weight", ("conic", "plain")), ("image", ("conic", "plain")), ("gradient", ("plain",))):
                 e = row[what]
-                line += [" / ".join(_e(e[n][k]) for k in ("max", "mean")) for n in ("factor", *peers)]
+                line += [_e(e[n]["max"]) for n in ("factor", *peers)]
                 line.append(f"{min(e[n]['max'] / e['factor']['max'] for n in peers):,.0f}")
             rows.append(line)
         head = ["length [px]", "weight: factor", "conic", "plain", "times", "image: factor", "conic", "plain", "times"]
-        of = f"Max / mean over {result['needles']} needles (weight) and {result['images']} (image, gradient)."
+        of = f"Largest over {result['needles']} needles (weight) and {result['images']} (image, gradient)."
         parts += [f"{_machine(stem, result)} {of}\n", _table([*head, "gradient: factor", "plain", "times"], rows)]
-    parts += [f"The same of another machine: `bench/results/needles_{stem}.json`.\n" for stem in list(results)[1:]]
+    files = ", ".join(f"`bench/results/needles_{stem}.json`" for stem in results)
+    parts.append(f"With means, and of every machine: {files}.\n")
     return "\n".join(parts)
 
 

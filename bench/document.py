@@ -5,20 +5,20 @@ usage: python -m bench.document
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Callable
 
 from bench import result_file
 from bench.harness import DISTURBED, OURS
 from bench.plot import Line, Panel, chart
-from bench.points import BASE, DIAGONAL
+from bench.points import BASE, DIAGONAL, Point
 from bench.series import SIZES, Series, along, diagonal, exponent, tasks
 
 COLORS = {
     "project": 0, "sh": 1, "tiles": 2, "blend": 3, "ssim": 4, "adam": 5, "knn": 6,
     "render forward": 0, "render both": 1, "step step": 2,
 }  # fmt: skip
-WORDS = ("op", "program", "direction", "peer", "bound by", "reason")
+WORDS = ("op", "program", "direction", "peer", "bound by")
 """Columns that hold words."""
 INTRODUCTION = """# Performance
 
@@ -30,19 +30,22 @@ python -m bench.ops --out bench/results/ops_MACHINE.json   # CUDA where there is
 python -m bench.document
 ```
 
-Times are wall times in ms of one call with its inputs loaded, from an idle device to an idle device: the median, whose
-quartiles stand in the results. Programs that are compared run in turn, one repeat each, unless one is over 30 times slower.
-`both` is forward and backward together, `step` a training step: rendering, loss, backward pass, Adam. A star marks figures
-during which other programs kept more than 0.2 cores busy, also on a second try.
+Times are medians of wall times in ms of one call, inputs loaded, from an idle device to an idle device. Programs that are
+compared run in turn, unless one is over 30 times slower. `both` is forward and backward together, `step` a training step:
+rendering, loss, backward pass, Adam. A star: other programs kept more than 0.2 cores busy, also on a second try.
 
-The scene is a random cloud whose Gaussians shrink as their number grows, rendered under rule `exact`. One size varies at a time
-around 100,000 Gaussians, 504 x 378 px, degree 3, one camera; a few points let Gaussians and image grow together. The tables
-have that point and those (an op that depends on one of the two sizes takes that one); the charts, and the results, have all.
+The scene is a random cloud under rule `exact`, degree 3, one camera; its Gaussians shrink as their number N grows. Columns of
+tables name N and the image [px]; charts, and the results with quartiles, have more sizes. *Over N* and *over px* are slopes of
+log time over log size through the last decade of sizes measured, around 100,000 Gaussians and 504 x 378 px: 1 is linear, below
+1 overhead still counts.
 
 Other programs: `torch conv2d` is SSIM as most trainers write it, `torch dense` a rasterizer without tiles in plain torch, up
-to 1,000 Gaussians, `naive` a kernel with one thread per pixel, `numpy` the paths of a sweep, a line at a time in numpy,
-`gsplat` that package with `packed=False`, `gsplat + torch` a step made of its rendering, the loss in plain torch and torch's
-fused Adam.
+to 1,000 Gaussians, `naive` a kernel with one thread per pixel, `numpy` a sweep's paths, a line at a time, `gsplat` that package
+with `packed=False`, `gsplat + torch` a step of its rendering, the loss in plain torch and torch's fused Adam.
+
+Roofline: the least bytes and operations of a stage, counted by `bench/roofline.py`, over ceilings measured at the start (the
+fastest of 30: triad of float32 arrays by torch.add, float32 multiply-adds in a Warp kernel). The fraction is the time at the
+roof over the time measured, on a GPU by its events; data that fits into caches can exceed 100 %.
 """
 
 
@@ -84,27 +87,33 @@ def _plain(row: dict) -> bool:
     return row.get("degree", BASE.degree) == BASE.degree and row.get("cameras", 1) == 1 and "threads" not in row
 
 
-def _size_table(rows: list[dict], cell: Callable[[dict], str]) -> str:
-    """Return a table of all tasks by the base point and those along the diagonal; an op takes of a point what it depends on."""
-    points = sorted({(BASE.count, BASE.width, BASE.height), *DIAGONAL[2:]})
+def _at(row: dict, point: Point) -> bool:
+    """Return whether a row was measured at a point, as far as its op depends on it."""
+    same = row.get("N", point.count) == point.count
+    return same and (row.get("width", point.width), row.get("height", point.height)) == (point.width, point.height)
+
+
+def _measured(row: dict | None) -> str:
+    """Return the time, and on CUDA the memory."""
+    memory = f" / {figure(row['peak_bytes'] / 2**20)}" if row and "peak_bytes" in row else ""
+    return _timing(row) + memory
+
+
+def times_table(rows: list[dict]) -> str:
+    """Tasks by sizes, of the base point and where Gaussians and image grow together, and the slopes along either size."""
+    plain = [r for r in rows if _plain(r)]
+    points = [Point(*sizes) for sizes in DIAGONAL[2:] if any(_at(r, Point(*sizes)) for r in plain)]
+    over = {axis: {(s.op, s.program, s.direction): s.points for s in along(rows, axis)} for axis in ("N", "pixels")}
     body = []
     for op, program, direction in tasks(rows):
-        own = [r for r in rows if (r["op"], r["program"], r["direction"]) == (op, program, direction) and _plain(r)]
-        found = [next((r for r in own if r.get("N", n) == n and r.get("width", w) == w), None) for n, w, _ in points]
-        if any(found):
-            body.append([op, direction, program, *("" if r is None else cell(r) for r in found)])
-    head = ["op", "direction", "program", *(f"{n:,}, {w} x {h}" for n, w, h in points)]
-    used = [k for k, name in enumerate(head) if name in WORDS or any(row[k] for row in body)]
-    return table([head[k] for k in used], [[row[k] for k in used] for row in body])
-
-
-def op_tables(rows: list[dict]) -> str:
-    """Return the table of times; on CUDA, a second one of memory."""
-    text = _size_table(rows, _timing)
-    if any("peak_bytes" in r for r in rows):
-        memory = _size_table(rows, lambda r: figure(r["peak_bytes"] / 2**20))
-        text += f"\nPeak device memory above the inputs [MiB]:\n\n{memory}"
-    return text
+        own = [r for r in plain if (r["op"], r["program"], r["direction"]) == (op, program, direction)]
+        cells = [_measured(next((r for r in own if _at(r, p)), None)) for p in points]
+        slopes = [exponent(over[axis].get((op, program, direction), ())) for axis in over]
+        cells += ["" if slope is None else f"{slope:.2f}" for slope in slopes]
+        if any(cells):
+            body.append([op, program, direction, *cells])
+    sizes = [f"{p.count:,}; {p.width} x {p.height}" for p in points]
+    return table(["op", "program", "direction", *sizes, "over N", "over px"], body)
 
 
 def peer_table(rows: list[dict]) -> str:
@@ -129,31 +138,19 @@ def roof_table(rows: list[dict]) -> str:
         if own:
             r = max(own, key=lambda r: r["roof_ms"])
             cells = [op, direction, *_sizes(r, ["N", "image"])]
-            cells += [figure(r["bytes"] / 1e6), figure(r["operations"] / 1e6), figure(r["roof_ms"]), r["bound"]]
-            body.append([*cells, figure(r.get("gpu_ms", r["median_ms"])), f"{figure(100 * r['fraction'])} %"])
-    head = ["op", "direction", "N", "image", "MB", "Mop", "roof [ms]", "bound by", "measured [ms]", "fraction"]
-    return table(head, body)
+            cells += [r["bound"], figure(r["roof_ms"]), figure(r.get("gpu_ms", r["median_ms"]))]
+            body.append([*cells, f"{figure(100 * r['fraction'])} %"])
+    return table(["op", "direction", "N", "image", "bound by", "roof [ms]", "measured [ms]", "fraction"], body)
 
 
-def exponent_table(rows: list[dict]) -> str:
-    """Local exponents of time over the last decade of N and of pixels."""
-    over = {axis: {(s.op, s.program, s.direction): s for s in along(rows, axis)} for axis in ("N", "pixels")}
-    body = []
-    for task in tasks(rows):
-        cells = []
-        for axis in ("N", "pixels"):
-            series = over[axis].get(task)
-            value = exponent(series.points) if series else None
-            cells += ["", ""] if value is None else [f"{value:.2f}", f"{series.points[-1][0]:,.0f}"]
-        if any(cells):
-            body.append([*task, *cells])
-    return table(["op", "program", "direction", "over N", "up to N", "over pixels", "up to pixels"], body)
-
-
-def skipped_words(skipped: list[dict]) -> str:
-    """Return the tasks that were not measured at some sizes, with their number."""
-    counts = Counter((r["op"], r["program"], r["direction"]) for r in skipped)
-    return ", ".join(f"{' '.join(task)} {count}" for task, count in counts.items())
+def skipped_list(skipped: list[dict]) -> str:
+    """Return a list of the reasons, the first of each kind, with the tasks not measured and at how many sizes."""
+    groups: dict[str, tuple[str, Counter]] = {}
+    for r in skipped:
+        _, counts = groups.setdefault(re.sub(r"[\d.]+", "", r["reason"]), (r["reason"], Counter()))
+        counts[f"{r['op']} {r['direction']} ({r['program']})"] += 1
+    lines = (f"- {why}: " + ", ".join(f"{n} of {task}" for task, n in counts.items()) for why, counts in groups.values())
+    return "\n".join(lines) + "\n"
 
 
 def _lines(series: list[Series], name) -> tuple[Line, ...]:
@@ -207,34 +204,29 @@ def machine_text(stem: str, result: dict, plots: list[str]) -> str:
     if machine["device"] == "cuda":
         facts = f"{machine['name']} ({machine['device_memory_gib']} GiB) beside {facts}"
     roof, rows = result["roofline"], result["rows"]
+    memory = ""
+    if busy := [r["gpu_ms"] / r["median_ms"] for r in rows if "gpu_ms" in r and "median_ms" in r]:
+        memory = " / peak memory above the inputs [MiB]"
+        memory += f". The GPU's own time, kept in the results, is {min(busy):.0%} to {max(busy):.0%} of the wall time"
     parts = [
         f"## {machine['name']} ({stem})\n",
         f"{facts}. {versions}. Commit {result['commit']}, {result['date']}, {result['repeats']} repeats."
         + (f" {result['note'].rstrip('.')}." if result.get("note") else "")
         + f" Results: `bench/results/ops_{stem}.json`.\n",
         *(f"![{name} of {stem}](plots/{stem}_{name}.svg)\n" for name in plots),
-        "### Times by number of Gaussians and image [ms]\n",
-        op_tables(rows),
+        f"### Times\n\nWall time [ms]{memory}.\n",
+        times_table(rows),
     ]
     if peers := peer_table(rows):
-        parts += ["### Beside other programs\n", peers]
+        parts += ["### Beside other programs\n\nAt the largest size that both programs did.\n", peers]
     if result.get("absent"):
         reasons = "; ".join(f"{name}: {reason}" for name, reason in sorted(result["absent"].items()))
         parts.append(f"Not measured, because not there or not working: {reasons}.\n")
-    parts += [
-        "### How steeply time grows\n",
-        "Slope of log time over log size through the last decade of sizes: 1 is linear, below 1 overhead still counts.\n",
-        exponent_table(rows),
-        "### Roofline\n",
-        f"Ceilings measured at the start: {roof['bytes_per_s'] / 1e9:,.1f} GB/s and {roof['operations_per_s'] / 1e9:,.0f} "
-        f"Gop/s ({roof['how']}). Bytes and operations are the least a stage has to do, counted as `bench/roofline.py` says; "
-        "the fraction is the time at the roof over the time measured"
-        + (" by GPU events" if machine["device"] == "cuda" else "")
-        + ". Data that fits into caches can exceed 100 %.\n",
-        roof_table(rows),
-    ]
+    ceilings = f"{roof['bytes_per_s'] / 1e9:,.1f} GB/s and {roof['operations_per_s'] / 1e9:,.0f} Gop/s"
+    parts += [f"### Roofline\n\nCeilings: {ceilings}. Each task at its heaviest.\n", roof_table(rows)]
     if result["skipped"]:
-        parts.append(f"Sizes left out for the time they take (reasons in the results): {skipped_words(result['skipped'])}.\n")
+        parts += ["### Not measured\n\nThe reason at the first of its kind, and the number of sizes.\n"]
+        parts.append(skipped_list(result["skipped"]))
     return "\n".join(parts)
 
 

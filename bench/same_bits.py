@@ -67,11 +67,6 @@ FEATURES = ("sse4_2", "avx", "fma", "avx2", "avx512f", "avx512_bf16", "avx512_fp
 
 LIBRARIES = ("torch.", "numpy.", "cv2.")
 """Beginnings of the names of stages of single functions."""
-SHOWN = (
-    ("demo", "decoded images"), ("`3dgs`: first PLY", "3dgs: first PLY"), ("last PLY", "3dgs: last PLY"),
-    ("`quick`: depths", "quick: consistent depths"), ("first PLY", "quick: first PLY"), ("last PLY", "quick: last PLY"),
-)  # fmt: skip
-"""Columns of the table in docs/accuracy.md, and their stages."""
 
 Stage = tuple[str, str]
 
@@ -285,7 +280,7 @@ def differing(one: dict, other: dict) -> list[str]:
 
 def table(rows: list[dict]) -> str:
     """Return the table of docs/accuracy.md: a row for each run, beside the first run on the same kind of device."""
-    head = ["run", *(title for title, _ in SHOWN), "functions that differ", "first stage that differs"]
+    head = ["run", "functions that differ", "first stage that differs"]
     lines = [head, ["---"] * len(head)]
     for r in rows:
         first = next(f for f in rows if f["machine"]["device"] == r["machine"]["device"])
@@ -294,8 +289,8 @@ def table(rows: list[dict]) -> str:
             (functions if name.startswith(LIBRARIES) else others).append(name)
         threads = r["machine"]["threads"]
         how = f"{r['label']}, torch {r['versions']['torch']}, {threads} thread{'s' if threads > 1 else ''}"
-        cells = [f"**{r['machine']['name']}**, {how}", *(f"`{r['stages'][stage]}`" for _, stage in SHOWN)]
-        lines.append([*cells, ", ".join(functions) or "none", others[0] if others else "none"])
+        run = f"**{r['machine']['name']}**, {how}"
+        lines.append([run, ", ".join(functions) or "none", others[0] if others else "none"])
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
