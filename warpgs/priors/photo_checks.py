@@ -205,9 +205,7 @@ def photo_notes(checks: Sequence[PhotoCheck]) -> list[str]:
     tinted = [c for c in checks if c.tinted]
     if tinted:
         factors = [f"{c.name} (red {c.channels[0]:.2f}, green {c.channels[1]:.2f}, blue {c.channels[2]:.2f} x)" for c in tinted]
-        notes.append(
-            f"white balance differs from that of the photographs beside it: {_listed(factors)}; {REMEDY}"
-        )
+        notes.append(f"white balance differs from that of the photographs beside it: {_listed(factors)}; {REMEDY}")
     alone = [c.name for c in checks if not c.compared_with]
     if alone:
         notes.append(f"blur and exposure are unknown where too little matches the photographs beside it: {_listed(alone)}")
