@@ -112,6 +112,16 @@ def test_too_few_that_fit_together_are_told_with_their_links():
         _check_found(Path("in"), found, photographs)
 
 
+@pytest.mark.parametrize(("focal", "count", "said"), [(None, 5, True), (None, 6, False), (0.8, 5, False)])
+def test_a_record_says_that_few_photographs_do_not_tell_the_focal_length(focal, count, said):
+    """Where EXIF does not tell it, up to five of them."""
+    view = mapping().views[0]
+    photographs = [Photograph(f"{n}.png", Path(str(n)), 320, 240, 1, "", focal, "0") for n in range(count)]
+    found = mapping(views=dict.fromkeys(range(count), view), keypoints=(900,) * count, matches={(0, 1): 200})
+    notes = record_of(found, photographs, "0", [])["notes"]
+    assert any(n.startswith(f"a focal length found from {count} photographs is often 5 % off") for n in notes) is said
+
+
 def test_a_record_says_what_does_not_repeat_and_who_has_no_pose():
     """Its lines name the photographs without a pose, why, and what to do."""
     photographs = [Photograph(f"{n}.png", Path(n), 320, 240, 1, "", None, "0") for n in "abcde"]
@@ -120,7 +130,7 @@ def test_a_record_says_what_does_not_repeat_and_who_has_no_pose():
     assert record["notes"][0] == "a note" and record["notes"][-1].endswith("from run to run")
     lines = report_lines(record)
     assert "poses found for 3 of 5 photographs" in lines[1] and "What to photograph next:" in lines
-    assert lines[7].startswith("d.png  NO POSE: it has 600 keypoints and 9 matches with c.png")
+    assert lines[8].startswith("d.png  NO POSE: it has 600 keypoints and 9 matches with c.png")
 
 
 def test_reasons_and_advice():

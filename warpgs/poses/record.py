@@ -18,6 +18,8 @@ FORMAT = 1
 """Number of the format of poses.json."""
 SHOWN_PARTNERS = 5
 """Matched photographs that the record names for each."""
+FEW = 5
+"""Photographs up to which a focal length that EXIF does not tell is called uncertain (docs/poses.md, what was measured)."""
 _PHOTOGRAPH = schema.fields(
     {
         "name": schema.text, "sha256": schema.text, "registered": schema.flag, "keypoints": schema.whole(0),
@@ -49,10 +51,19 @@ def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, no
             "matches": {names[j]: n for j, n in partners(found, i)[:SHOWN_PARTNERS]},
             "reason": None if registered else reason(found, i, names),
         })  # fmt: skip
-    again = ["global mapping joined more photographs than incremental mapping; its results differ a little from run to run"]
+    remarks = [summary(found, len(names))]
+    if len(found.views) <= FEW and any(photographs[i].focal is None for i in found.views):
+        remarks.append(
+            f"a focal length found from {len(found.views)} photographs is often 5 % off, at worst 20 % and more, and depth "
+            "with it: EXIF does not tell it, and more photographs, from more directions, would"
+        )
+    if found.method == "global":
+        remarks.append(
+            "global mapping joined more photographs than incremental mapping; its results differ a little from run to run"
+        )
     return {
         "format": FORMAT, "source_sha256": digest, "photographs": rows,
-        "notes": [*notes, summary(found, len(names)), *(again if found.method == "global" else [])],
+        "notes": [*notes, *remarks],
         "advice": advice(found, names), "mean_reprojection_error_px": found.error, "points": found.points,
         "method": found.method, "pairs_tried": found.tried, "pairs_matched": len([n for n in found.matches.values() if n]),
         "cameras": [dict(vars(c)) for c in found.cameras], "pycolmap": found.version,
