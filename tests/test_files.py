@@ -187,6 +187,7 @@ ELSEWHERE = {
     ("report/sheet.py", "save"): "Pillow, into memory",
     ("report/animation.py", "save"): "the same",
     ("export/sog.py", "save"): "the same",
+    ("poses/heic.py", "save"): "the same",
     ("report/events.py", "open ab"): "metrics.jsonl grows by lines",
     ("export/ply.py", "open xb"): "the temporary file of `replacing`",
     ("files.py", "open xb"): "the temporary file of `replacing`",

@@ -37,6 +37,18 @@ def by_topic(findings):
     return {f.topic: f for f in findings}
 
 
+def test_missing_extras_are_named_with_what_they_are_for(monkeypatch):
+    """With one command for all of them; where none is missing there is nothing to do."""
+    there = {"pycolmap", "viser", "zstandard"}
+    monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: object() if name in there else None)
+    (found,) = doctor._extras()
+    assert (found.status, found.detail, found.remedy) == (OK, "poses, view, formats", "")
+    there -= {"pycolmap", "zstandard"}
+    (found,) = doctor._extras()
+    assert found.status == NOTE and "view; not installed: poses (photographs without cameras), formats" in found.detail
+    assert found.remedy == "pip install 'warpgs[poses,formats]'"
+
+
 def test_this_machine_can_fit():
     findings = doctor.diagnose()
     topics = [f.topic for f in findings]

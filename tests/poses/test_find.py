@@ -92,18 +92,18 @@ def test_photographs_of_an_unread_format_are_named(sfm, tmp_path, capsys, comman
     """Alone they are an error that says what to do, a damaged one as well; among others they are told of, not passed over."""
     source = tmp_path / "in"
     source.mkdir()
-    for name in ("a.heic", "b.HEIC"):
-        (source / name).write_bytes(b"\0\0\0\x18ftypheic")
+    for name in ("a.nef", "b.NEF"):
+        (source / name).write_bytes(b"II*\0")
     words = [command, str(source), "--out", str(tmp_path / "out")]
     assert main(words) == DataError.exit_code
     said = capsys.readouterr().err
-    assert len(said.splitlines()) == 1 and "a.heic is a HEIC photograph, which is not read: convert" in said
+    assert len(said.splitlines()) == 1 and "a.nef is a camera's RAW file, which is not read: develop" in said
     assert "(2 such files)" in said
     for i in range(2):
         noise(source / f"{i}.png", i, 2)
     assert main(words) == DataError.exit_code
     said = capsys.readouterr().err.splitlines()[-1]
-    assert "has 2 photographs" in said and "left out: a.heic is a HEIC" in said
+    assert "has 2 photographs" in said and "left out: a.nef is a camera's RAW" in said
     assert [p.name for p in tmp_path.iterdir()] == ["in"]
 
 

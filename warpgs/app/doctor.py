@@ -75,6 +75,12 @@ PACKAGES = (
     Package("pyvista", "pyvista", False, "3D overviews in reports", imported=False),
     Package("vtk", "vtk", False, "3D overviews in reports", imported=False),
 )
+EXTRAS = {
+    "poses": ("pycolmap", "photographs without cameras"),
+    "view": ("viser", "the viewer and pages to send"),
+    "formats": ("zstandard", "SPZ of version 4"),
+}
+"""Extras that someone with photographs may want: the module that shows that one is there, and what it is for."""
 
 
 def _reason(error: BaseException) -> str:
@@ -128,6 +134,17 @@ def _package(package: Package) -> Finding:
 
 def _packages() -> Iterable[Finding]:
     return map(_package, PACKAGES)
+
+
+def _extras() -> Iterable[Finding]:
+    lacking = [name for name, (module, _) in EXTRAS.items() if importlib.util.find_spec(module) is None]
+    here = ", ".join(name for name in EXTRAS if name not in lacking)
+    if not lacking:
+        yield Finding("Extras", OK, here)
+        return
+    words = ", ".join(f"{name} ({EXTRAS[name][1]})" for name in lacking)
+    remedy = f"pip install 'warpgs[{','.join(lacking)}]'"
+    yield Finding("Extras", NOTE, f"{here + '; ' if here else ''}not installed: {words}", remedy)
 
 
 def _processor() -> Iterable[Finding]:
@@ -294,7 +311,7 @@ def _disk() -> Iterable[Finding]:
 
 
 CHECKS: tuple[Callable[[], Iterable[Finding]], ...] = (
-    _python, _packages, _processor, _cuda, _kernel_cache, _prior_cache, _rendering, _video, _disk,
+    _python, _packages, _extras, _processor, _cuda, _kernel_cache, _prior_cache, _rendering, _video, _disk,
 )  # fmt: skip
 
 

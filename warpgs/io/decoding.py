@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import io
+import struct
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from warpgs.errors import DataError, ResourceError
-from warpgs.io.image_formats import bmp, jpeg, png, tiff, webp
+from warpgs.io.image_formats import avif, bmp, jpeg, png, tiff, webp
 from warpgs.io.unread_formats import unread_format
+
+if TYPE_CHECKING:
+    from PIL import ImageFile
 
 MAX_PIXELS = 100_000_000
 """Largest number of pixels of an image where the user names none; decoded, it takes 1.2 GB."""
@@ -25,7 +31,9 @@ FORMATS: tuple[tuple[bytes, str, ModuleType], ...] = (
     (b"MM\0+", "TIFF", tiff),
     (b"RIFF", "WEBP", webp),
 )
-"""First bytes, name as Pillow has it, and module of each format that is read."""
+"""First bytes, name as Pillow has it, and module of each format that is read; AVIF is told by its brand."""
+READ = "JPEG, PNG, BMP, TIFF, WebP or AVIF"
+"""The formats that are read, for messages."""
 
 
 def format_of(data: bytes) -> tuple[str, ModuleType]:
@@ -37,7 +45,28 @@ def format_of(data: bytes) -> tuple[str, ModuleType]:
     for start, name, module in FORMATS:
         if data.startswith(start):
             return name, module
-    raise ValueError("it is no JPEG, PNG, BMP, TIFF or WebP file" if data else "it is empty")
+    if avif.kind(data) == "AVIF":
+        return "AVIF", avif
+    raise ValueError(f"it is no {READ} file" if data else "it is empty")
+
+
+def open_header(data: bytes) -> ImageFile.ImageFile:
+    """Return an image of Pillow for what its header says, such as EXIF; its pixels are not decoded.
+
+    Raises:
+        ValueError: It is no image that is read, or its header is broken.
+    """
+    from PIL import Image
+
+    name, module = format_of(data)
+    if module is avif:
+        return avif.open_image(data)
+    Image.init()
+    try:
+        # not Image.open, which has a limit of its own on the number of pixels
+        return Image.OPEN[name][0](io.BytesIO(data), "image")
+    except (OSError, SyntaxError, KeyError, TypeError, struct.error) as e:
+        raise ValueError(f"its header is broken: {e}") from e
 
 
 def read_image_file(path: Path) -> bytes:
@@ -75,15 +104,15 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
         if not pixels:
             raise ValueError(f"it has {width} x {height} px")
         raster: np.ndarray | None = None
-        if module is jpeg:
-            raster = jpeg.decode(data)
+        if module in (jpeg, avif):
+            raster = module.decode(data)
         else:
             module.check(data)
         if raster is None:
             # IMREAD_UNCHANGED also leaves the EXIF orientation alone: the camera, not the tag, says how the raster lies
             raster = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         if raster is None or raster.shape[:2] != (height, width):
-            raise ValueError("OpenCV cannot read it")
+            raise ValueError("its pixels cannot be read")
     except (ValueError, cv2.error) as e:
         if isinstance(e, cv2.error) and e.code == cv2.Error.StsNoMem:
             raise ResourceError(_too_large(path, pixels)) from e
@@ -107,7 +136,7 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS) -> tuple[np.ndarray, np.nda
     Gray, palette, 8- and 16-bit images and straight alpha are understood.
 
     Args:
-        path: A JPEG, PNG, BMP, TIFF or WebP file, whatever its suffix.
+        path: A JPEG, PNG, BMP, TIFF, WebP or AVIF file, whatever its suffix.
         max_pixels: Largest number of pixels that its header may announce.
 
     Returns:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError, UsageError
-from warpgs.io.decoding import MAX_PIXELS, decode, format_of, read_image_file
+from warpgs.io.decoding import MAX_PIXELS, decode, open_header, read_image_file
 
 BLACK = (0.0, 0.0, 0.0)
 REDUCED = "reduced to "
 """First words of what is noted of an image that `load_image` brought to its longest side."""
-SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif", ".hif")
 EXIF_ORIENTATION = 0x0112
 MIN_SIDE = 4
 """Smallest shorter side of an image [px]; below it there is nothing to fit."""
@@ -92,20 +91,16 @@ def list_images(folder: Path) -> list[Path]:
 
 def exif_orientation(path: Path) -> int:
     """Return the EXIF orientation, 1 to 8; 1 where the file has none."""
-    from PIL import Image, UnidentifiedImageError
-
     data = read_image_file(path)
-    Image.init()
     try:
-        # not Image.open, which has a limit of its own on the number of pixels
-        with Image.OPEN[format_of(data)[0]][0](io.BytesIO(data), str(path)) as image:
+        with open_header(data) as image:
             value = image.getexif().get(EXIF_ORIENTATION, 1)
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError, KeyError, TypeError, struct.error):
+    except (OSError, SyntaxError, ValueError, KeyError, TypeError, struct.error):
         return 1  # decode() has the last word on whether the file is an image
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
 
-def _turn(array: np.ndarray, orientation: int) -> np.ndarray:
+def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:
     """Rotate or mirror a raster [H, W, ...] upright as its EXIF orientation asks."""
     if orientation in (5, 6, 7, 8):
         array = np.swapaxes(array, 0, 1)
@@ -187,7 +182,7 @@ def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tu
     It is resampled as gray, and stays bool where it is.
     """
     if stored != upright and mask.shape == stored:
-        mask = _turn(mask, orientation)
+        mask = turn_upright(mask, orientation)
     height, width = upright
     if mask.shape == upright:
         return mask
@@ -253,7 +248,7 @@ def load_image(
         lens = lens(stored[1], stored[0])
     orientation = _upright(path, lens, image)
     if orientation != 1:
-        image, alpha = _turn(image, orientation), None if alpha is None else _turn(alpha, orientation)
+        image, alpha = turn_upright(image, orientation), None if alpha is None else turn_upright(alpha, orientation)
         done.append("turned by the EXIF tag, as the camera asks")
     height, width = image.shape[:2]
     K, kept = np.diag([width / lens.width, height / lens.height, 1.0]) @ lens.K, None

@@ -11,7 +11,7 @@ import numpy as np
 
 from warpgs.errors import DataError, UsageError
 from warpgs.io.black_background import cut_from_black
-from warpgs.io.decoding import MAX_PIXELS
+from warpgs.io.decoding import MAX_PIXELS, READ
 from warpgs.io.folders import SceneFolder
 from warpgs.io.images import list_images
 from warpgs.io.normalize import fingerprint, normalization_of, normalize_points, normalize_view
@@ -107,7 +107,7 @@ def detect(root: Path) -> tuple[Reader, list[str]]:
         if not images and (unread := unread_note(root)):
             raise DataError(f"{root}: {unread}")
         if not images:
-            images = ". It holds no photograph either (JPEG, PNG, BMP, TIFF, WebP)"
+            images = f". It holds no photograph either ({READ})"
         raise DataError(f"{root}: no scene format found. Looked for: {', '.join(r.description for r in readers)}{images}")
     taken, *others = complete
     notes = [f"{lack}; passed over, {taken.name} is complete" for lack in broken]

@@ -14,6 +14,7 @@ from warpgs.io.decoding import MAX_PIXELS, read_image_file
 from warpgs.io.readers import all_readers
 from warpgs.io.unread_formats import unread_note
 from warpgs.poses.advice import MIN_KEYPOINTS, partners
+from warpgs.poses.heic import is_heic, to_jpeg
 from warpgs.poses.mapping import Mapping, camera_groups, check_installed, find_model
 from warpgs.poses.photographs import Photograph, find_photographs, image_root, prepare, write_copy
 from warpgs.poses.record import record_of, write_record
@@ -115,7 +116,7 @@ def _check(source: Path, out: Path) -> None:
             what = "is no video that is read (mp4, mov, m4v, avi, mkv, webm)" if source.is_file() else "does not exist"
             raise DataError(f"{source}: {what}; give a folder of photographs, or a video")
         if not is_video(source) and not find_photographs(source):
-            none = "holds no image file that is read (JPEG, PNG, TIFF, BMP, WebP); give the folder of photographs"
+            none = "holds no image file that is read (JPEG, PNG, BMP, TIFF, WebP, AVIF or HEIC); give the folder of photographs"
             raise DataError(f"{source}: {unread_note(source) or none}")
         if out.exists() and not (out.is_dir() and is_empty(out)):
             raise UsageError(f"{out} exists already; choose another --out, or remove it")
@@ -144,10 +145,14 @@ def _prepared(
             f"better 8 to 20 that overlap by two thirds{'; left out: ' + unread if unread else ''}"
         )
     photographs, names = [], []
+    copies = to_jpeg([p for p in paths if is_heic(p)], root, work / "heic", max_pixels, progress)
+    if copies:
+        notes.append(f"{len(copies)} HEIC photograph{'s' if len(copies) != 1 else ''} coded again as JPEG")
     for i, path in enumerate(paths):
         progress(f"reading photographs: {i + 1} of {len(paths)}")
         names.append(f"{i:06d}.png")
-        photographs.append(prepare(path, root, work / "small" / names[-1], max_pixels))
+        source, below = (copies[path], work / "heic") if path in copies else (path, root)
+        photographs.append(prepare(source, below, work / "small" / names[-1], max_pixels))
     doubled = sorted({p.name for p in photographs if sum(q.name == p.name for q in photographs) > 1})
     if doubled:
         raise DataError(f"{source}: two files would both be called {doubled[0]!r} in the scene; rename one of them")

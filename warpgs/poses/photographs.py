@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import math
 import struct
 from dataclasses import dataclass
@@ -13,8 +12,8 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.files import make_folder, write_bytes
-from warpgs.io.decoding import MAX_PIXELS, decode, format_of, read_image_file
-from warpgs.io.images import exif_orientation, list_images
+from warpgs.io.decoding import MAX_PIXELS, decode, format_of, open_header, read_image_file
+from warpgs.io.images import exif_orientation, list_images, turn_upright
 from warpgs.poses.metadata import without_jpeg_metadata, without_png_metadata
 
 MASK_FOLDERS = ("mask", "masks", "idrmasks")
@@ -85,16 +84,12 @@ def _format(data: bytes) -> str:
 
 def _exif(data: bytes) -> tuple[str, float | None]:
     """Return maker and model of the device, and the equivalent focal length [mm] or None."""
-    from PIL import Image, UnidentifiedImageError
-
-    Image.init()
     try:
-        # not Image.open, which has a limit of its own on the number of pixels
-        with Image.OPEN[_format(data)][0](io.BytesIO(data), "photograph") as image:
+        with open_header(data) as image:
             exif = image.getexif()
             words = [str(exif.get(tag, "")).strip("\0 ") for tag in (MAKE, MODEL)]
             focal = exif.get_ifd(EXIF).get(FOCAL_35MM)
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError, KeyError, TypeError, struct.error):
+    except (OSError, SyntaxError, ValueError, KeyError, TypeError, struct.error):
         return "", None
     known = isinstance(focal, (int, float)) and 1 <= focal <= 10_000
     return " ".join(w for w in words if w)[:100], float(focal) if known else None
@@ -116,7 +111,7 @@ def prepare(path: Path, root: Path, small: Path, max_pixels: int = MAX_PIXELS) -
 
     data = read_image_file(path)
     name, orientation = path.relative_to(root).as_posix(), exif_orientation(path)
-    image = _upright(decode(path, max_pixels)[0], orientation)
+    image = turn_upright(decode(path, max_pixels)[0], orientation)
     height, width = image.shape[:2]
     scale = min(1.0, MATCHING_SIDE / max(width, height))
     if scale < 1:
@@ -128,14 +123,6 @@ def prepare(path: Path, root: Path, small: Path, max_pixels: int = MAX_PIXELS) -
     focal = None if film is None else film / DIAGONAL_35MM * math.hypot(width, height) / max(width, height)
     device = device if film is None else f"{device} {film:g} mm"
     return Photograph(scene_name(name, data), path, width, height, orientation, device, focal, hashlib.sha256(data).hexdigest())
-
-
-def _upright(image: np.ndarray, orientation: int) -> np.ndarray:
-    """Rotate or mirror an image [H, W, ...] as its EXIF orientation asks."""
-    if orientation in (5, 6, 7, 8):
-        image = np.swapaxes(image, 0, 1)
-    flips = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}.get(orientation, ())
-    return np.ascontiguousarray(np.flip(image, flips) if flips else image)
 
 
 def write_copy(photograph: Photograph, folder: Path, max_pixels: int = MAX_PIXELS) -> None:
@@ -158,7 +145,9 @@ def write_copy(photograph: Photograph, folder: Path, max_pixels: int = MAX_PIXEL
     if photograph.orientation == 1 and kind in ("JPEG", "PNG"):
         write_bytes(target, without_jpeg_metadata(data) if kind == "JPEG" else without_png_metadata(data))
         return
-    colors, alpha = (None if a is None else _upright(a, photograph.orientation) for a in decode(photograph.path, max_pixels))
+    colors, alpha = (
+        None if a is None else turn_upright(a, photograph.orientation) for a in decode(photograph.path, max_pixels)
+    )
     assert colors is not None
     pixels = colors[..., ::-1] if alpha is None else np.concatenate([colors[..., ::-1], alpha[..., None]], -1)
     suffix, options = (".jpg", [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]) if kind == "JPEG" else (".png", [])

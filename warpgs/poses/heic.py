@@ -1,0 +1,115 @@
+"""HEIC photographs, as phones take them: coded again as JPEG by a process of its own.
+
+pi-heif (libheif and libde265, LGPL) reads them. A file that is broken on purpose can end the process that it reads in, so it is
+called in another one, once for all photographs.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from warpgs.errors import DataError, UsageError
+from warpgs.files import make_folder, write_bytes, write_json
+from warpgs.io.decoding import read_image_file
+from warpgs.io.image_formats.avif import BROKEN, kind
+from warpgs.runtime.subprocesses import ProcessFailed, python_lines
+from warpgs.runtime.terminal import say
+
+QUALITY = 98
+"""JPEG quality of the copies, without subsampling of colours."""
+KEPT = {0: (0x010F, 0x0110), 0x8769: (0xA405,)}
+"""EXIF tags that the copies keep, by block: maker, model, equivalent focal length of 35 mm film."""
+
+
+def is_heic(path: Path) -> bool:
+    """Return whether a file begins as a HEIC file does.
+
+    Raises:
+        DataError: It cannot be read.
+    """
+    return kind(read_image_file(path)) == "HEIC"
+
+
+def to_jpeg(
+    paths: Sequence[Path], root: Path, folder: Path, max_pixels: int, progress: Callable[[str], object] = lambda line: None
+) -> dict[Path, Path]:
+    """Write upright JPEG copies of HEIC files, with what EXIF says of the lens and of nothing else; return them by file.
+
+    Args:
+        paths: HEIC files below ``root``.
+        root: The folder of photographs.
+        folder: Folder of the copies, which have the relative names with .jpg added.
+        max_pixels: Largest number of pixels that a header may announce.
+        progress: Called with lines for the user.
+
+    Raises:
+        DataError: A file cannot be decoded, or has too many pixels.
+        UsageError: pi-heif is not installed.
+    """
+    if not paths:
+        return {}
+    if importlib.util.find_spec("pi_heif") is None:
+        raise UsageError(
+            f"{paths[0]}: is a HEIC photograph, which pi-heif reads, and that is not installed; `pip install 'warpgs[poses]'`, "
+            "or convert all of them to JPEG"
+        )
+    copies = {p: folder / f"{p.relative_to(root).as_posix()}.jpg" for p in paths}
+    for copy in copies.values():
+        make_folder(copy.parent)
+    job = folder / "heic.json"
+    write_json(job, {"max_pixels": max_pixels, "files": [[str(p.resolve()), str(c)] for p, c in copies.items()]})
+    at, why = 0, "the decoder ended early"
+    try:
+        for line in python_lines("warpgs.poses.heic", str(job), folder=folder):
+            said = json.loads(line)
+            if "error" in said:
+                why = said["error"]
+                break
+            at = said["file"]
+            progress(f"reading HEIC: photograph {at + 1} of {len(paths)}")
+        else:
+            return copies
+    except ProcessFailed as e:
+        why = f"the decoder ended with code {e.code}"
+    raise DataError(f"{paths[at]}: the image cannot be decoded: {why}. Restore it from its source, or convert it to JPEG")
+
+
+def _copy(source: Path, target: Path, max_pixels: int) -> None:
+    """Write the copy of one file."""
+    import io
+
+    import pi_heif
+    from PIL import Image
+
+    with pi_heif.HeifImageFile(source) as image:
+        width, height = image.size
+        if width * height > max_pixels:
+            raise ValueError(f"{width} x {height} px are more than the limit of {max_pixels:,} pixels (--max-pixels)")
+        found, kept = image.getexif(), Image.Exif()
+        for block, tags in KEPT.items():
+            of, to = (e.get_ifd(block) if block else e for e in (found, kept))
+            to.update({t: of[t] for t in tags if t in of})
+        pixels = io.BytesIO()
+        image.convert("RGB").save(pixels, "JPEG", quality=QUALITY, subsampling=0, exif=kept)
+    write_bytes(target, pixels.getvalue())
+
+
+def main(path: str) -> None:
+    """Copy the files that a job names; print a line of JSON before each, and one with the error of the first that fails."""
+    job: dict[str, Any] = json.loads(Path(path).read_text("utf-8"))
+    for i, (source, target) in enumerate(job["files"]):
+        say(json.dumps({"file": i}))
+        try:
+            _copy(Path(source), Path(target), job["max_pixels"])
+        except BROKEN as e:
+            say(json.dumps({"error": str(e).strip().rstrip(".") or type(e).__name__}))
+            return
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
