@@ -10,7 +10,8 @@ from warpgs.pipeline.runs import with_poses as module
 from warpgs.pipeline.runs.fit import fit
 from warpgs.pipeline.runs.folder import StoredRun, run_folder
 from warpgs.pipeline.runs.request import SceneRequest
-from warpgs.pipeline.runs.with_poses import with_poses
+from warpgs.pipeline.runs.with_poses import lost_lines, with_poses
+from warpgs.poses.record import write_record
 
 
 def test_poses_are_kept_in_the_run_folder(tmp_path, photographs, found, monkeypatch):
@@ -36,6 +37,17 @@ def test_poses_are_kept_in_the_run_folder(tmp_path, photographs, found, monkeypa
     for resume in (False, True):  # a fit that ended before its first step begins again either way
         with run_folder(run, resume):
             pass
+
+
+def test_photographs_without_a_pose_are_told_of_at_the_end(tmp_path, found):
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    rows = found[1]["photographs"]
+    for lost, said in ((0, []), (2, [f"2 of 6 photographs have no pose and were not used: {scene / 'poses.txt'} says why"])):
+        unposed = [p | {"registered": False, "reason": "has none"} for p in rows[:lost]]
+        write_record(scene, found[1] | {"photographs": [*unposed, *rows[lost:]]})
+        assert [line.partition(", and")[0] for line in lost_lines(tmp_path)] == said
+    assert lost_lines(None) == lost_lines(scene) == []
 
 
 def test_other_requests_stay_as_they_are(tmp_path, photographs, found):

@@ -35,7 +35,7 @@ from warpgs.pipeline.runs.results import evaluate_run, overview_of, protocol_of,
 from warpgs.pipeline.runs.rule_report import rule_report_of
 from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, sampling_report_of
 from warpgs.pipeline.runs.shared import check_shared, shared_notes
-from warpgs.pipeline.runs.with_poses import with_poses
+from warpgs.pipeline.runs.with_poses import lost_lines, with_poses
 from warpgs.pipeline.train.background import choose_background, over_background
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.complexity import complexity_figures, complexity_summary
@@ -254,7 +254,7 @@ def _finish(job: FitJob, trainer: Trainer, state: State | None, record: dict[str
                 job.out, job.scene, job.split, trainer.gaussians, metrics, record,
                 sampling=sampling_report_of(trainer, job.out), overview=overview.result(), tell=job.progress,
             )  # fmt: skip
-    for line in result_lines(metrics, job.out):
+    for line in [*lost_lines(job.out), *result_lines(metrics, job.out)]:
         job.say(line)
     return FitResult(
         *_model_fields(job, trainer), job.config, metrics, tuple(job.notes), job.out,

@@ -49,6 +49,20 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
     return replace(request, path=str(scene)), _notes(record)
 
 
+def lost_lines(out: Path | None) -> list[str]:
+    """Return a line on the photographs of a run that have no pose, and so no part in it; an empty list where there are none.
+
+    Raises:
+        DataError: The record of the run's poses is not whole.
+    """
+    if out is None or not (out / POSED_SCENE / JSON).is_file():
+        return []
+    rows = read_record(out / POSED_SCENE)["photographs"]
+    lost = sum(not p["registered"] for p in rows)
+    why = out / POSED_SCENE / TEXT
+    return [f"{lost} of {len(rows)} photographs have no pose and were not used: {why} says why, and what to do"] if lost else []
+
+
 def _notes(record: dict[str, Any]) -> list[str]:
     """Return what the report says of found poses: how they were found, and who has none."""
     lost = [f"no pose: {p['name']} {p['reason']}" for p in record["photographs"] if not p["registered"]]
