@@ -92,6 +92,7 @@ def test_what_disturbs_is_counted_once():
     made.log_scales[0] = 4  # larger than the scene, and seen by nobody
     made.log_scales[1] = 4
     made.log_scales[2] = torch.tensor([0.5, -4.0, -5.0])  # a long needle
+    made.log_scales[4] = torch.tensor([0.5, 0.5 - math.log(30) - 1e-6, -5.0])  # at the limit that a fit holds, as rounded
     made.log_scales[3] = torch.tensor([-4.0, -9.0, -9.0])  # a short one, which stays
     maxima = torch.ones(100)
     maxima[0] = 0

@@ -15,14 +15,14 @@ from warpgs.errors import DataError, UsageError
 from warpgs.geometry import matmul, quaternions, rotation_matrices
 from warpgs.kernels.sh import basis
 from warpgs.pipeline.model.coverage import SEEN
+from warpgs.pipeline.model.scale_limits import NEEDLE, ROUNDING, long_axes
 from warpgs.scene import Gaussians
 
 INNER = 0.02
 """Fraction of the means left out at either end of each axis where the size of the scene is measured."""
-NEEDLE, NEEDLE_LENGTH = 30.0, 0.2
-"""Ratio of the longest to the middle axis beyond which a Gaussian is a needle, and the fraction of the scene's size that it
-must be long, too: shorter needles are hairs and edges of a good model. Of a tenth they cost up to 0.08 dB on held-out views
-(docs/decisions/014-formats.md)."""
+NEEDLE_LENGTH = 0.2
+"""Fraction of the scene's size that a Gaussian beyond the ratio `NEEDLE` must be long to be removed: shorter needles are hairs
+and edges of a good model. Of a tenth they cost up to 0.08 dB on held-out views (docs/decisions/014-formats.md)."""
 MAX_BOX_BYTES = 65536
 """Largest file of a box that is read [bytes]."""
 _NODES = ((-0.8611363115940526, 0.34785484513745385), (-0.33998104358485626, 0.6521451548625461))
@@ -130,11 +130,11 @@ def disturbing(gaussians: Gaussians, maxima: torch.Tensor | None = None) -> dict
     means = gaussians.means.double().cpu().numpy()
     low, high = np.quantile(means, [INNER, 1 - INNER], axis=0)
     size = max(math.sqrt(float(((high - low) ** 2).sum())), 1e-30)
-    axes = gaussians.log_scales.double().sort(dim=1).values
-    longest, middle = axes[:, 2], axes[:, 1]
+    longest, middle = long_axes(gaussians.log_scales.double())
+    needle = longest - middle > math.log(NEEDLE) + ROUNDING  # a fit holds many at the ratio itself
     found = {
         "larger than the scene": longest > math.log(size),
-        f"needles beyond {NEEDLE:g} to 1": (longest - middle > math.log(NEEDLE)) & (longest > math.log(NEEDLE_LENGTH * size)),
+        f"needles beyond {NEEDLE:g} to 1": needle & (longest > math.log(NEEDLE_LENGTH * size)),
     }
     if maxima is not None:
         found = {"seen by no training view": maxima < SEEN} | found
