@@ -15,12 +15,12 @@ WIDTH, HEIGHT = 240, 180
 MAKE, MODEL, GPS = 0x010F, 0x0110, 0x8825
 
 
-def with_exif(image: np.ndarray, orientation: int) -> bytes:
-    """A JPEG file of an RGB image as a phone writes it: turned, with its position, its owner and a maker."""
+def with_exif(image: np.ndarray, orientation: int, film: int = 34) -> bytes:
+    """A JPEG file of an RGB image as a phone writes it: turned, with its position, its owner, a maker and a lens."""
     exif = Image.Exif()
     exif[0x0112], exif[MAKE], exif[MODEL], exif[0x013B] = orientation, "ACME", "Phone 7", "Jane Owner"
     exif.get_ifd(GPS).update({1: "N", 2: (48.0, 8.0, 30.0)})
-    exif.get_ifd(0x8769)[0xA405] = 34
+    exif.get_ifd(0x8769)[0xA405] = film
     stored = io.BytesIO()
     Image.fromarray(image).save(stored, "JPEG", quality=95, exif=exif)
     return stored.getvalue()

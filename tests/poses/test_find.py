@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.poses.conftest import film, write_png
+from tests.poses.conftest import film, with_exif, write_png
 from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.io.load import load_scene
@@ -31,6 +31,23 @@ def test_all_photographs_get_the_poses_that_they_were_taken_from(found, still_li
     ]
     assert np.allclose(steps[0] / steps[0].sum(), steps[1] / steps[1].sum(), atol=0.03)
     assert scene.points is not None and len(scene.points) > 150
+
+
+@pytest.mark.parametrize(("factor", "kept"), [(1.0, True), (1.8, False)])
+def test_few_photographs_keep_the_focal_length_of_exif(sfm, still_life_views, tmp_path, factor, kept):
+    """Unless they contradict it: four tell it less well than EXIF, which a cropped photograph makes wrong."""
+    cameras, images = still_life_views
+    true = cameras[0].K[0, 0]
+    film = round(factor * true * np.hypot(36, 24) / np.hypot(cameras[0].width, cameras[0].height))
+    (tmp_path / "in").mkdir()
+    for i in range(1, 5):
+        (tmp_path / "in" / f"{i}.jpg").write_bytes(with_exif(images[i], 1, film))
+    record = find_poses(tmp_path / "in", tmp_path / "out", threads=2)
+    assert sum(p["registered"] for p in record["photographs"]) == 4
+    said = any(n.startswith("the focal length is kept as EXIF tells it: 4 photographs") for n in record["notes"])
+    (camera,) = record["cameras"]
+    exif = film / np.hypot(36, 24) * np.hypot(cameras[0].width, cameras[0].height)
+    assert said is kept is bool(abs(camera["focal"] - exif) < 1e-6)
 
 
 def test_images_are_upright_and_at_full_size(found, still_life_views):

@@ -73,6 +73,8 @@ class Mapping:
     """Mapper that the model is of, incremental or global."""
     version: str
     """Version of pycolmap."""
+    kept_focal: bool = False
+    """True where the focal length is EXIF's, since so few photographs do not tell it better."""
 
 
 def check_installed() -> None:
@@ -166,5 +168,5 @@ def find_model(
         tuple(result["keypoints"]), {(i, j): n for i, j, n in result["pairs"]}, result["tried"], dict(sorted(views.items())),
         tuple(FoundCamera(**c) for c in model["cameras"].values()),
         tuple(tuple(sorted(index[n] for n in group)) for group in result["groups"]),
-        model["points"], scale * model["error"], result["method"], result["version"],
+        model["points"], scale * model["error"], result["method"], result["version"], result["kept_focal"],
     )  # fmt: skip

@@ -52,7 +52,9 @@ def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, no
             "reason": None if registered else reason(found, i, names),
         })  # fmt: skip
     remarks = [summary(found, len(names))]
-    if len(found.views) <= FEW and any(photographs[i].focal is None for i in found.views):
+    if found.kept_focal:
+        remarks.append(f"the focal length is kept as EXIF tells it: {len(found.views)} photographs do not tell it better")
+    elif len(found.views) <= FEW and any(photographs[i].focal is None for i in found.views):
         remarks.append(
             f"a focal length found from {len(found.views)} photographs is often 5 % off, at worst 20 % and more, and depth "
             "with it: EXIF does not tell it, and more photographs, from more directions, would"

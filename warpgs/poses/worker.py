@@ -26,6 +26,11 @@ PEAK = 0.003
 CAMERA_MODEL = "SIMPLE_RADIAL"
 """One focal length and one coefficient of distortion: what a handful of photographs can tell."""
 
+KEEP_FOCAL = 4
+"""Most photographs with which a focal length that EXIF tells is kept: they tell it less well (docs/poses.md)."""
+MAX_RATIO = 1.05
+"""Mean reprojection error with EXIF's focal length over that with a free one, up to which EXIF is believed (docs/poses.md)."""
+
 
 def _say(**values: Any) -> None:
     say(json.dumps(values))
@@ -81,24 +86,34 @@ def match(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
     return {"keypoints": keypoints, "pairs": sorted(agreed), "tried": len(pairs)}
 
 
-def map_incrementally(pycolmap: Any, job: dict[str, Any]) -> list[Any]:
-    """Return the models that grow photograph by photograph from a good pair."""
+def map_incrementally(pycolmap: Any, job: dict[str, Any], keep_focal: bool = False) -> list[Any]:
+    """Return the models that grow photograph by photograph from a good pair; a kept focal length is EXIF's."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1  # else the last digits depend on which thread is done first
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
     options.min_model_size, options.min_num_matches = 2, MIN_INLIERS
     options.mapper.abs_pose_min_num_inliers = MIN_INLIERS
     options.triangulation.ignore_two_view_tracks = False  # most points of a few photographs are seen by two of them
+    options.ba_refine_focal_length = options.ba_refine_extra_params = not keep_focal
     registered = [2]
 
     def on_next() -> None:
         registered[0] += 1
         _say(progress=f"finding poses: photograph {min(registered[0], len(job['names']))} of {len(job['names'])}")
 
-    folder = Path(job["models"]) / "incremental"
+    folder = Path(job["models"]) / ("kept_focal" if keep_focal else "incremental")
     folder.mkdir()
     arguments = job["database"], job["images"], str(folder)
     return list(pycolmap.incremental_mapping(*arguments, options, next_image_callback=on_next).values())
+
+
+def believes_exif(kept: list[Any], free: list[Any]) -> bool:
+    """Return whether models with EXIF's focal length explain as many photographs as those with a free one, nearly as well."""
+    if not kept or not free:
+        return bool(kept)
+    best, other = (max(m, key=lambda r: (r.num_reg_images(), r.num_points3D())) for m in (kept, free))
+    as_well = best.compute_mean_reprojection_error() <= MAX_RATIO * other.compute_mean_reprojection_error()
+    return bool(best.num_reg_images() >= other.num_reg_images() and as_well)
 
 
 def map_globally(pycolmap: Any, job: dict[str, Any]) -> list[Any]:
@@ -152,15 +167,21 @@ def main(path: str) -> None:
     extract(pycolmap, job)
     result = match(pycolmap, job) | {"version": pycolmap.__version__}
     models: list[Any] = map_incrementally(pycolmap, job) if result["pairs"] else []
+    kept_focal = False
+    if result["pairs"] and len(job["names"]) <= KEEP_FOCAL and all(c["focal"] is not None for c in job["cameras"]):
+        kept = map_incrementally(pycolmap, job, keep_focal=True)
+        if kept_focal := believes_exif(kept, models):
+            models = kept
     largest = max((m.num_reg_images() for m in models), default=0)
     method = "incremental"
     if result["pairs"] and largest < len(job["names"]):
         others = map_globally(pycolmap, job)
         if max((m.num_reg_images() for m in others), default=0) > largest:
-            models, method = others, "global"
+            models, method, kept_focal = others, "global", False
     models.sort(key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
     groups = [sorted(m.image(i).name for i in m.reg_image_ids()) for m in models]
-    _say(result=result | {"method": method, "groups": groups, "model": finish(models[0], job) if models else None})
+    result |= {"method": method, "kept_focal": kept_focal, "groups": groups}
+    _say(result=result | {"model": finish(models[0], job) if models else None})
 
 
 if __name__ == "__main__":
