@@ -73,8 +73,8 @@ class Mapping:
     """Mapper that the model is of, incremental or global."""
     version: str
     """Version of pycolmap."""
-    kept_focal: bool = False
-    """True where the focal length is EXIF's, since so few photographs do not tell it better."""
+    kept_focal: bool | None = None
+    """True where the focal length is EXIF's, since so few photographs do not tell it better; False where they contradict it."""
 
 
 def check_installed() -> None:

@@ -167,7 +167,7 @@ def main(path: str) -> None:
     extract(pycolmap, job)
     result = match(pycolmap, job) | {"version": pycolmap.__version__}
     models: list[Any] = map_incrementally(pycolmap, job) if result["pairs"] else []
-    kept_focal = False
+    kept_focal = None
     if result["pairs"] and len(job["names"]) <= KEEP_FOCAL and all(c["focal"] is not None for c in job["cameras"]):
         kept = map_incrementally(pycolmap, job, keep_focal=True)
         if kept_focal := believes_exif(kept, models):
@@ -177,7 +177,7 @@ def main(path: str) -> None:
     if result["pairs"] and largest < len(job["names"]):
         others = map_globally(pycolmap, job)
         if max((m.num_reg_images() for m in others), default=0) > largest:
-            models, method, kept_focal = others, "global", False
+            models, method, kept_focal = others, "global", None
     models.sort(key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
     groups = [sorted(m.image(i).name for i in m.reg_image_ids()) for m in models]
     result |= {"method": method, "kept_focal": kept_focal, "groups": groups}
