@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from warpgs import files
-from warpgs.errors import DataError, ResourceError
+from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.files import LOCK, OWN_NAMES, filling, is_empty, make_folder, remove_leftovers, replacing, write_bytes
 
 ROOT = Path(__file__).parent.parent
@@ -159,6 +159,9 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt), filling(tmp_path / "d") as temporary:
         (temporary / "x").touch()
         raise KeyboardInterrupt
+    monkeypatch.chdir(tmp_path / "b")
+    with pytest.raises(UsageError, match="is the folder that you are in"), filling(Path(".")):
+        pass
     monkeypatch.setattr(files.os, "rename", full)
     with pytest.raises(ResourceError, match="d: cannot be made"), filling(tmp_path / "d"):
         pass

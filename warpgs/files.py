@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from warpgs.errors import ResourceError
+from warpgs.errors import ResourceError, UsageError
 
 LOCK = ".warpgs.lock"
 """Name of the file that a process holds while it writes into a folder."""
@@ -79,8 +79,11 @@ def filling(folder: Path) -> Iterator[Path]:
 
     Raises:
         ResourceError: The disk is full, or the folder above is not writable.
+        UsageError: It is the folder that this process works in, which would be lost to it.
     """
     target = Path(os.path.realpath(folder))
+    if target == Path.cwd():
+        raise UsageError(f"{folder}: is the folder that you are in, and it would be made anew under you; name another one")
     make_folder(target.parent)
     temporary = target.parent / f".warpgs-{secrets.token_hex(8)}.tmp"
     make_folder(temporary)

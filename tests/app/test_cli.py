@@ -134,7 +134,7 @@ def test_eval_measures_lpips(run, tmp_path, capsys):
 @pytest.mark.parametrize(("path", "pictures"), [("auto", 4), ("turntable", 4), ("spiral", 4), ("interpolate", 4), ("views", 9)])
 def test_render_paths(run, tmp_path, path, pictures):
     """Every path gives its pictures and a film."""
-    flags = ["--path", path, "--frames", "4", "--out", str(tmp_path), "--device", "cpu"]
+    flags = ["--path", path, *(() if path == "views" else ("--frames", "4")), "--out", str(tmp_path), "--device", "cpu"]
     assert main(["render", str(run), *flags]) == 0
     assert len(list(tmp_path.glob("*.png"))) == pictures and (tmp_path / "film.mp4").stat().st_size > 0
 
@@ -205,6 +205,12 @@ def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys)
     assert "holds no run" in failure(capsys, 3, "eval", str(tmp_path))
     again = ["fit", str(scene), "--split", split_spec(9), "--out", str(run), "--resume", "--device", "cpu", "--downscale", "2"]
     assert "differs from the run" in (said := failure(capsys, 2, *again)) and "(downscale was 1" in said
+    assert "leave out --frames" in failure(capsys, 2, "render", str(run), "--path", "views", "--frames", "2")
+    assert "is of --object" in failure(capsys, 2, "demo", out, "--format", "transforms")
+    assert "--format must be transforms or colmap" in failure(capsys, 2, "demo", out, "--object", "--format", "ply")
+    assert "--device is of --repeat" in failure(capsys, 2, "doctor", "--device", "tpu")
+    assert "is the folder of a run" in failure(capsys, 2, "poses", str(run), "--out", out)
+    assert "holds scenes, such as" in failure(capsys, 2, "poses", str(scene.parent), "--out", out)
     assert "path 'zigzag'" in failure(capsys, 2, "render", str(run), "--path", "zigzag")
     assert "format .obj is not supported" in failure(capsys, 2, "export", str(run), "--to", str(tmp_path / "a.obj"))
     assert not any((tmp_path / name).exists() for name in ("new", "b", "c", "d"))

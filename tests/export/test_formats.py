@@ -229,7 +229,8 @@ def test_changed_bytes_end_in_a_sentence_or_in_gaussians(suffix, tmp_path):
             changed[at] = random.integers(0, 256)
         path.write_bytes(changed)
         try:
-            assert len(read_gaussians(path)) >= 0
+            found = read_gaussians(path)
+            assert all(t.isfinite().all() for t in found.tensors().values())
         except DataError as e:
             assert "\n" not in str(e)
 

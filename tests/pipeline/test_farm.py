@@ -13,7 +13,7 @@ import pytest
 
 from tests.pipeline.farms import HereEngine, jobs_of, write_scenes
 from warpgs.app.cli import main
-from warpgs.errors import DataError
+from warpgs.errors import DataError, UsageError
 from warpgs.files import make_folder
 from warpgs.pipeline.farm import work
 from warpgs.pipeline.farm.ensure_run import Outcome
@@ -250,6 +250,8 @@ def test_a_process_that_another_farm_left_behind_is_waited_for(scenes, results):
 def test_a_job_as_text_is_the_same_job(scenes, tmp_path):
     (job, _) = jobs_of(scenes, tmp_path)
     assert job_of(job_text(job)) == job and job_of(job_text(job)).identity() == job.identity()
+    elsewhere = replace(job, request=replace(job.request, device="cuda"))
+    assert elsewhere.identity() != job.identity(), "photographs have another size on a GPU"
 
 
 def test_slots(monkeypatch):
@@ -260,6 +262,8 @@ def test_slots(monkeypatch):
     monkeypatch.setattr("torch.cuda.get_device_name", lambda _: "a GPU")
     monkeypatch.setattr("torch.get_num_threads", lambda: 8)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
+    with pytest.raises(UsageError, match="--slots and --per-gpu must be numbers from 1"):
+        local_slots("cuda", 0, 2)
     assert local_slots("cuda", None, 2) == [Slot("cuda", 2, {"CUDA_VISIBLE_DEVICES": n}) for n in "3535"]
 
 

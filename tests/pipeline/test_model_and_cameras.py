@@ -135,7 +135,7 @@ def test_a_file_shows_what_it_held(rule, tmp_path):
 def test_render_of_a_file(tmp_path):
     write_gaussians(tmp_path / "a.spz", cloud(50), units="file")
     write_cameras(tmp_path / "cameras.json", make_cameras())
-    out, settings = tmp_path / "out", FilmSettings(frames=1)
+    out, settings = tmp_path / "out", FilmSettings()
     lines = render(tmp_path / "a.spz", "views", out, settings, "cpu", file_of=(tmp_path / "cameras.json", None))
     assert any("cut-offs of inria" in line for line in lines) and any("black lies behind" in line for line in lines)
     assert len(list(out.glob("*.png"))) == 3

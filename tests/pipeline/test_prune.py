@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -22,7 +23,7 @@ from warpgs.pipeline.model.compress import (
 )
 from warpgs.pipeline.runs.checkpoint import load_checkpoint
 from warpgs.pipeline.runs.folder import open_run
-from warpgs.pipeline.runs.prune import prune
+from warpgs.pipeline.runs.prune import _new_folder, prune
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera
 from warpgs.synthetic.demo import split_spec, write_demo
@@ -114,6 +115,11 @@ def test_more_loss_allowed_more_goes(run, tmp_path):
 def test_loss_that_makes_no_sense(run, keep):
     with pytest.raises(UsageError, match="keep-psnr"):
         prune(run, keep, None, "cpu")
+
+
+def test_a_run_is_pruned_from_within(run, monkeypatch):
+    monkeypatch.chdir(run)
+    assert _new_folder(Path("."), None) == run.parent / f"{run.name}-pruned"
 
 
 def test_bad_input_is_named(run, tmp_path, capsys):

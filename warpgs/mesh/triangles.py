@@ -12,6 +12,11 @@ MAX_JUMP = 1.1
 """Largest difference of the distances at two neighbouring grid points, over the truncation, that a surface may lie between.
 With less, what is seen at a grazing angle is left out; with more, skirts hang behind the edges of what a view sees. Chosen, as
 the truncation was, on a demo scene of another seed than the one that is reported (docs/mesh.md)."""
+NO_SURFACE = (
+    "the training views agree on no surface inside the grid; give another --voxel (larger; smaller where it is near the size "
+    "of the scene), or fit with more steps"
+)
+"""Words where a grid holds no surface."""
 MIN_PART = 0.002
 """Fraction of all triangles that a connected part has at least; smaller ones float in front of surfaces."""
 
@@ -39,14 +44,14 @@ def extract(grid: DistanceGrid) -> Mesh:
     seen = weights > 0
     values = np.where(seen, distances, np.float32(1))
     if not (values < 0).any() or min(values.shape) < 2:
-        raise DataError("the training views agree on no surface inside the grid; give a larger --voxel, or fit with more steps")
+        raise DataError(NO_SURFACE)
     corners, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent", allow_degenerate=False)
     # A vertex lies on an edge of the grid: between the points below and above.
     below, above = (tuple(f(corners).astype(np.int64).T) for f in (np.floor, np.ceil))
     kept = seen[below] & seen[above] & (np.abs(values[below] - values[above]) <= MAX_JUMP)
     faces = faces[kept[faces].all(1)]
     if not len(faces):
-        raise DataError("the training views agree on no surface inside the grid; give a larger --voxel, or fit with more steps")
+        raise DataError(NO_SURFACE)
     return _compact(_grey(np.array(grid.origin) + grid.voxel * corners.astype(np.float64), faces))
 
 

@@ -88,8 +88,8 @@ def find_poses(
         UsageError: pycolmap is not installed, or ``out`` holds something already.
     """
     source, out = Path(source), Path(out)
-    check_installed()
     _check(source, out)
+    check_installed()
     with filling(out) as scene:
         work = scene / "work"
         make_folder(work / "small")
@@ -109,12 +109,24 @@ def find_poses(
     return record
 
 
+def _something_else(folder: Path) -> str:
+    """Return what a folder holds instead of photographs, and what to give in its place; empty where it may hold some."""
+    if (folder / "config.json").is_file() and (folder / "renders").is_dir():
+        return "is the folder of a run; give the scene that it was fitted to"
+    scenes = [d.name for d in sorted(folder.iterdir()) if d.is_dir() and any(r.probe(d) is not None for r in all_readers())]
+    if scenes:
+        return f"holds scenes, such as {scenes[0]}, and no loose photographs; give one of them, or all to `warpgs farm`"
+    return ""
+
+
 def _check(source: Path, out: Path) -> None:
     """Raise an error for a source or a target that cannot be, before any work."""
     try:
         if not is_video(source) and not source.is_dir():
             what = "is no video that is read (mp4, mov, m4v, avi, mkv, webm)" if source.is_file() else "does not exist"
             raise DataError(f"{source}: {what}; give a folder of photographs, or a video")
+        if not is_video(source) and (other := _something_else(source)):
+            raise UsageError(f"{source}: {other}")
         if not is_video(source) and not find_photographs(source):
             none = "holds no image file that is read (JPEG, PNG, BMP, TIFF, WebP, AVIF or HEIC); give the folder of photographs"
             raise DataError(f"{source}: {unread_note(source) or none}")
@@ -151,11 +163,14 @@ def _prepared(
     for i, path in enumerate(paths):
         progress(f"reading photographs: {i + 1} of {len(paths)}")
         names.append(f"{i:06d}.png")
-        source, below = (copies[path], work / "heic") if path in copies else (path, root)
-        photographs.append(prepare(source, below, work / "small" / names[-1], max_pixels))
-    doubled = sorted({p.name for p in photographs if sum(q.name == p.name for q in photographs) > 1})
-    if doubled:
-        raise DataError(f"{source}: two files would both be called {doubled[0]!r} in the scene; rename one of them")
+        file, below = (copies[path], work / "heic") if path in copies else (path, root)
+        photographs.append(prepare(file, below, work / "small" / names[-1], max_pixels))
+    for i, p in enumerate(photographs):
+        same = [paths[j].name for j in range(i) if photographs[j].name == p.name]
+        if same:
+            raise DataError(
+                f"{source}: {same[0]} and {paths[i].name} would both be {p.name!r} in the scene; rename one of them"
+            )
     return photographs, names, [*notes, *_notes(photographs)]
 
 

@@ -17,6 +17,7 @@ from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
 from warpgs.pipeline.runs.commands import scene_of
 from warpgs.pipeline.runs.folder import StoredRun, open_run
+from warpgs.pipeline.runs.model_and_cameras import RULE
 from warpgs.pipeline.train.strategies.importance_sampling import FINE
 from warpgs.scene import Normalization, View
 
@@ -90,7 +91,7 @@ def content_of_file(path: Path, device: str = "cpu") -> Content:
     normalization = Normalization((low + high) / 2, 1 / max(0.5 * float(np.linalg.norm(high - low)), 1e-12))
     gaussians = convert_gaussians(stored, normalization, "file", "scene")
     gaussians = dataclasses.replace(gaussians, **{n: t.to(device) for n, t in gaussians.tensors().items()})
-    model = FittedModel(gaussians, normalization, {}, (), (), "exact", (0.0, 0.0, 0.0), 0)
+    model = FittedModel(gaussians, normalization, {}, (), (), RULE, (0.0, 0.0, 0.0), 0)
     return Content(path.name, model, path.with_suffix(""))
 
 

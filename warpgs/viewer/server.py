@@ -93,7 +93,9 @@ def _check_free(port: int) -> None:
             probe.bind((HOST, port))
         except (OSError, OverflowError) as e:
             reason = e.strerror if isinstance(e, OSError) and e.strerror else str(e)
-            raise UsageError(f"port {port} cannot be used ({reason}); give another with --port, or 0 for any free one") from e
+            raise UsageError(
+                f"port {port} cannot be used ({reason}); give another with --port (fit: --view-port), or 0 for any free one"
+            ) from e
 
 
 def _refuses_others(port: int) -> bool:
@@ -130,7 +132,9 @@ def open_server(port: int = PORT, label: str = "warpgs") -> viser.ViserServer:
         server = LocalServer(host=HOST, port=port, label=label, verbose=False)
     failure: WarpgsError | None = None
     if port not in (0, server.get_port()):
-        failure = UsageError(f"port {port} was taken by another program; give another with --port, or 0 for any free one")
+        failure = UsageError(
+            f"port {port} was taken by another program; give another with --port (fit: --view-port), or 0 for any free one"
+        )
     elif not _refuses_others(server.get_port()):
         failure = ResourceError(f"viser {viser.__version__} does not let requests be checked, so it is not used; {REMEDY}")
     if failure is not None:

@@ -3,13 +3,18 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from warpgs.app.flags import check_range, parse_flags
+from warpgs.app.flags import check_range, parse_flags, word_after
+from warpgs.errors import UsageError
 from warpgs.report.progress import waiting
 from warpgs.runtime.terminal import say
 
 
 def run(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` heads its help."""
+    """Run the command; ``about`` heads its help.
+
+    Raises:
+        UsageError: Flags do not go together, or a value is none of those that a flag takes.
+    """
     import tyro
 
     @dataclass(frozen=True)
@@ -34,6 +39,10 @@ def run(arguments: list[str], about: str) -> int:
     check_range("--width", a.width, 8, 8192)
     check_range("--height", a.height, 8, 8192)
     check_range("--seed", a.seed, 0, 2**31 - 1)
+    if a.format not in ("transforms", "colmap"):
+        raise UsageError(f"--format must be transforms or colmap, not {a.format!r}")
+    if a.format != "colmap" and not a.object and word_after(arguments, "--format") is not None:
+        raise UsageError("--format is of --object: the still life is written as COLMAP; add --object, or leave it out")
     size = {"views": a.views, "width": a.width, "height": a.height, "seed": a.seed}
     if a.object:
         from warpgs.synthetic.cut_out import write_object

@@ -4,13 +4,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from warpgs.app.flags import parse_flags
+from warpgs.errors import UsageError
 from warpgs.report.progress import Stages, waiting
 from warpgs.runtime.imports import fast_imports
 from warpgs.runtime.terminal import say
 
 
 def run(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` heads its help."""
+    """Run the command; ``about`` heads its help.
+
+    Raises:
+        UsageError: Flags do not go together, or a value is none of those that a flag takes.
+    """
 
     @dataclass(frozen=True)
     class Doctor:
@@ -22,6 +27,8 @@ def run(arguments: list[str], about: str) -> int:
         """Device for --repeat: auto, cpu or cuda."""
 
     a = parse_flags(Doctor, arguments, "warpgs doctor", about)
+    if a.repeat is None and a.device != "auto":
+        raise UsageError("--device is of --repeat: leave it out, or name the step to compute again")
     if a.repeat is not None:
         from warpgs.pipeline.runs.commands import repeat_failed_step
 

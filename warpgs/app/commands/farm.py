@@ -27,7 +27,7 @@ def run(arguments: list[str], about: str) -> int:
     class Farm:
         jobs: tyro.conf.Positional[str]
         """Folder of scenes, a glob in quotes, or a .jsonl file: {"scene": FOLDER, "steps": 500} a line, with any flags of
-        `warpgs fit`."""
+        `warpgs fit`. Named before switches of `warpgs fit`, such as --strict."""
         out: Path
         """Folder of the results; the same command on it goes on where it stopped, several at once share the work."""
         engine: str = "local"
@@ -84,7 +84,12 @@ def _jobs(listed: list[ListedJob], shared: list[str], out: Path) -> list:
     jobs = []
     for job in listed:
         if job.flags not in requests:
-            requests[job.flags] = request_of(["SCENE", "--out", "RUN", *shared, *job.flags], "")
+            try:
+                requests[job.flags] = request_of(["SCENE", "--out", "RUN", *shared, *job.flags], "")
+            except SystemExit as e:
+                if not job.flags or not e.code:
+                    raise
+                raise UsageError(f"job {job.name}: a flag of its line, above, is wrong: {' '.join(job.flags)}") from e
         request, folder = requests[job.flags], out / job.name
         scene = dataclasses.replace(request.scene, path=str(job.scene))
         jobs.append(FarmJob(job.name, dataclasses.replace(request, scene=scene, out=folder / "run"), folder))

@@ -28,7 +28,7 @@ from warpgs.runtime.interop import set_threads
 from warpgs.runtime.ranks import join, place
 from warpgs.runtime.terminal import be_quiet, say
 
-CONTINUING = {"--out": 1, "--resume": 0, "--device": 1, "--threads": 1, "--view": 0, "--view-port": 1}
+CONTINUING = {"--out": 1, "--resume": 0, "--device": 1, "--threads": 1, "--view": 0, "--view-port": 1, "--lpips-weights": 1}
 """Flags that go with --resume where all else is as the run was started, and how many values each has."""
 
 
@@ -56,7 +56,8 @@ def _request_type() -> type:
         threads: int = 0
         """CPU threads; 0 for as many as there are cores."""
         resume: bool = False
-        """Continue the run in --out from its last checkpoint; `warpgs fit --out RUN --resume` takes all else from the run."""
+        """Continue the run in --out from its last checkpoint; `warpgs fit --out RUN --resume` takes all else but
+        --lpips-weights from the run."""
         strict: bool = False
         """A frame without an image file is an error."""
         allow_outside: bool = False
@@ -242,6 +243,8 @@ def _continued(arguments: list[str], about: str) -> FitRequest:
         """Show the model in a browser while it trains."""
         view_port: int = 8080
         """Port of --view; 0 for any free one."""
+        lpips_weights: Path | None = None
+        """File of `warpgs convert-lpips`; a run does not remember it, and without it LPIPS is not measured."""
 
     a = parse_flags(Continue, arguments, "warpgs fit", about)
     check_range("--threads", a.threads, 0, MAX_THREADS)
@@ -250,7 +253,8 @@ def _continued(arguments: list[str], about: str) -> FitRequest:
         set_threads(a.threads)
     request = stored_request(a.out)
     say(f"continued as it was started: preset {request.config.preset}, {request.config.steps:,} steps, {request.scene.path}")
-    return dataclasses.replace(request, device=a.device or request.device, view_port=a.view_port if a.view else None)
+    device, view_port = a.device or request.device, a.view_port if a.view else None
+    return dataclasses.replace(request, device=device, view_port=view_port, lpips_weights=a.lpips_weights)
 
 
 def request_of(arguments: list[str], about: str) -> FitRequest:

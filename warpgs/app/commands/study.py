@@ -54,7 +54,11 @@ def run_study_of(a, variants: dict, marks: dict) -> int:
 
     options = {"allow_outside": a.allow_outside, "max_pixels": a.max_pixels, "max_side": a.max_side}
     scenes = tuple(SceneRequest(str(s), a.split, a.downscale, **options) for s in a.scenes)
-    farm = None if a.slots is None and a.per_gpu is None else EngineRequest(slots=a.slots, per_gpu=a.per_gpu or 1)
+    farm = (
+        None
+        if a.slots is None and a.per_gpu is None
+        else EngineRequest(slots=a.slots, per_gpu=1 if a.per_gpu is None else a.per_gpu)
+    )
     for line in run_study(StudyRequest(scenes, variants, a.seeds, a.out, a.device, a.lpips_weights, farm, marks)):
         say(line)
     return 0

@@ -31,7 +31,7 @@ class FarmJob:
         """Return the first 16 hexadecimal digits of the SHA-256 of all that the result depends on but the images."""
         r = self.request
         weights = None if r.lpips_weights is None else str(r.lpips_weights)
-        values = [dataclasses.asdict(r.scene), r.config.to_json(), weights]
+        values = [dataclasses.asdict(r.scene), r.config.to_json(), weights, r.device]
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -48,7 +48,7 @@ def local_slots(device: str, slots: int | None, per_gpu: int) -> list[Slot]:
 
     kind = choose_device(device)[0].type
     gpus = torch.cuda.device_count() if kind == "cuda" else 0
-    count = slots or (gpus * per_gpu if gpus else 1)
+    count = (gpus * per_gpu if gpus else 1) if slots is None else slots
     if not 1 <= count <= MAX_SLOTS or not 1 <= per_gpu <= MAX_SLOTS:
         raise UsageError(f"--slots and --per-gpu must be numbers from 1 to {MAX_SLOTS}, not {slots} and {per_gpu}")
     if gpus and count > gpus * per_gpu:

@@ -56,7 +56,7 @@ def make_engine(request: EngineRequest, device: str, folder: Path) -> Engine:
         raise UsageError(f"--engine {r.engine!r} is not one of {', '.join(ENGINES)}")
     if r.engine == "local":
         return LocalEngine(local_slots(device, r.slots, r.per_gpu))
-    if min(r.slots or 1, r.per_gpu, r.threads, r.minutes) < 1:
+    if min(1 if r.slots is None else r.slots, r.per_gpu, r.threads, r.minutes) < 1:
         raise UsageError("--slots, --per-gpu, --threads and --minutes must be at least 1")
     if r.engine == "ray":
         from warpgs.pipeline.farm.ray import RayEngine

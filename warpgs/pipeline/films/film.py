@@ -131,6 +131,8 @@ def render_film(
     cut_out = isinstance(coverage, Sequence) and any(v.alpha is not None for v in coverage)
     in_sheet = {i * count // SHEET_FRAMES for i in range(SHEET_FRAMES)} if sheet else set()
     files = [] if alone else [folder / f"{name}.png" for name, _ in plan.cameras]
+    older = [] if alone else [p for p in folder.glob("*.png") if p not in files and p.name != SHEET]
+    left = [f"{len(older)} older images lie in {folder}, too: remove them, or give a new folder"] if older else []
 
     def images() -> Iterator[np.ndarray]:
         for i, (image, r) in enumerate(_renders(model, plan, options, tell)):
@@ -155,7 +157,7 @@ def render_film(
                 pass
         if sheet:
             write_bytes(sheet_path(out), png(frame_sheet(chosen)))
-    return RenderedPath([*files, film] if one_size else files, [*notes, *plan.notes, *check.notes(plan.remedy)])
+    return RenderedPath([*files, film] if one_size else files, [*notes, *plan.notes, *check.notes(plan.remedy), *left])
 
 
 def render_path(

@@ -146,6 +146,8 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
     train = [scene[n] for n in model.train]
     depth, coverage = depth_and_coverage(model.gaussians(), train, model.options())
     if path == "views":
+        if settings.frames is not None or settings.seconds is not None:
+            raise UsageError("--path views gives one image for each view; leave out --frames and --seconds")
         names = image_names(scene)
         shown = [(names[n], framed(c, settings.size, settings.fov_y)) for n, c in scene.items()]
         return FilmPlan(shown, coverage, "the model shows nothing there: `warpgs eval` scores each view", [])

@@ -138,7 +138,7 @@ def render(
     if color is None and background != "auto":
         raise UsageError(f"--background {background}: a render takes auto, black, white, #rrggbb or r,g,b")
     home = folder if file_of is None else folder.parent
-    out = home / f"path-{Path(path).stem}" if out is None else out
+    out = home / f"path-{Path(path).stem.replace('.', '-')}" if out is None else out
     notes: list[str] = []
     stored: FittedModel
     if file_of is None:

@@ -237,8 +237,11 @@ def stored_request(folder: Path) -> FitRequest:
         UsageError: The run used code from outside warpgs, which must be named again.
     """
     record = read_record(folder)
-    scene = _stored_scene(folder, record, None)
-    _check_named_again({}, record["config"], folder)
+    try:
+        scene = _stored_scene(folder, record, None)
+        _check_named_again({}, record["config"], folder)
+    except UsageError as e:
+        raise UsageError(f"{e}, beside the scene and all other flags that the run was started with") from e
     return FitRequest(scene, folder, FitConfig.from_json(record["config"]), record["device"], resume=True)
 
 

@@ -46,7 +46,7 @@ def mean_psnr(gaussians: Gaussians, views: list[View], options: RasterizeOptions
 
 def _new_folder(folder: Path, out: Path | None) -> Path:
     """Return the folder to write; UsageError where it exists already, or cannot be made."""
-    out = folder.with_name(f"{folder.resolve().name}-pruned") if out is None else out
+    out = folder.resolve().with_name(f"{folder.resolve().name}-pruned") if out is None else out
     if os.path.exists(out):
         raise UsageError(f"{out} exists already; choose another --out")
     if not os.path.isdir(out.parent):
