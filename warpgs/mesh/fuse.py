@@ -8,15 +8,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from warpgs.errors import UsageError
 from warpgs.kernels.tsdf import DistanceGrid, empty_grid, gather_colors, integrate
-from warpgs.mesh.grid import GridPlan, check_memory, plan_grid
-from warpgs.mesh.surface_views import SAMPLES, sample_surface, surface_views
+from warpgs.mesh.grid import MAX_RESOLUTION, MIN_RESOLUTION, GridPlan, check_memory, plan_grid
+from warpgs.mesh.surface_views import DEPTHS, SAMPLES, sample_surface, surface_views
 from warpgs.mesh.triangles import decimate, extract, remove_small_parts
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Mesh
 
 COLOR_TOLERANCE = 1.0
 """Distance in truncations up to which a vertex counts as seen by a view that gives it colour."""
+
+MIN_FACES = 4
+"""Fewest triangles of a body."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,21 @@ class MeshOptions:
     """Most triangles of the result; what has more is simplified."""
     depth: str = "median"
     """Rendered depth that is fused: median, or mean (expected depth), which mixes surfaces at edges."""
+
+    def __post_init__(self) -> None:
+        """Check the options, before any view is rendered.
+
+        Raises:
+            UsageError: One is out of its range, or two say the same.
+        """
+        if self.depth not in DEPTHS:
+            raise UsageError(f"--depth {self.depth!r} is not one of {', '.join(DEPTHS)}")
+        if self.voxel is not None and self.resolution is not None:
+            raise UsageError("--voxel and --resolution say the same; give one of them")
+        if self.resolution is not None and not MIN_RESOLUTION <= self.resolution <= MAX_RESOLUTION:
+            raise UsageError(f"--resolution must be {MIN_RESOLUTION} to {MAX_RESOLUTION} voxels, not {self.resolution}")
+        if self.max_faces < MIN_FACES:
+            raise UsageError(f"--max-faces must be at least {MIN_FACES}, not {self.max_faces}")
 
 
 @dataclass(frozen=True)

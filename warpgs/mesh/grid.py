@@ -83,10 +83,6 @@ def plan_grid(
     """
     if not len(points):
         raise DataError("no training view shows a surface: alpha is below 1/2 everywhere; fit again, with more steps")
-    if voxel is not None and resolution is not None:
-        raise UsageError("--voxel and --resolution say the same; give one of them")
-    if resolution is not None and not MIN_RESOLUTION <= resolution <= MAX_RESOLUTION:
-        raise UsageError(f"--resolution must be {MIN_RESOLUTION} to {MAX_RESOLUTION} voxels, not {resolution}")
     low, high = find_box(points)
     longest = float((high - low).max())
     if voxel is None:

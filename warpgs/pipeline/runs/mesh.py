@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.coordinates import convert_mesh
-from warpgs.errors import DataError, UsageError
+from warpgs.errors import DataError
 from warpgs.export.mesh import check_suffix, write_mesh
 from warpgs.mesh.fuse import FusedMesh, MeshOptions, fuse
 from warpgs.mesh.grid import GridPlan
@@ -47,8 +47,6 @@ def mesh(
         UsageError: The suffix is not supported, or an option is out of range.
     """
     check_suffix(target)
-    if options.max_faces < 4:
-        raise UsageError(f"--max-faces must be at least 4, not {options.max_faces}")
     device, _ = choose_device(device_name)
     run = open_run(folder, device)
     if not run.train:
