@@ -12,6 +12,7 @@ from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
 from warpgs.mesh.fuse import MeshOptions, fuse, vertex_colors
 from warpgs.mesh.surface_views import sample_surface, surface_view
+from warpgs.pipeline.films.rig import common_up
 from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.runs import mesh as run_mesh
 from warpgs.render.rasterize import RasterizeOptions
@@ -111,9 +112,9 @@ def test_the_command_writes_in_units_of_the_files(stored, tmp_path, capsys):
 def test_upright_where_the_cameras_agree(stored, tmp_path, capsys):
     """A .glb file turns their mean upward direction to +y; cameras that are turned all ways have none, which is said."""
     views = [c for c, d in zip(cameras(ALL_SIDES), ALL_SIDES) if abs(d[1]) < 0.9]
-    assert run_mesh.upwards(views) @ [0, -1, 0] > 0.7
+    assert common_up(views) @ [0, -1, 0] > 0.7
     half = np.diag([-1.0, -1, 1, 1])
-    assert run_mesh.upwards([*views, *(dataclasses.replace(c, viewmat=half @ c.viewmat) for c in views)]) is None
+    assert common_up([*views, *(dataclasses.replace(c, viewmat=half @ c.viewmat) for c in views)]) is None
     for upside_down in (False, True):
         kept = {n: c for n, c in stored.scene_cameras.items() if n in stored.train}
         for i, name in enumerate(kept if upside_down else ()):

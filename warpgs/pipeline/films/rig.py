@@ -25,6 +25,8 @@ MAX_GAP = math.radians(150)
 """Largest gap between azimuths of neighbouring cameras that a film turns through: three even views leave 120 degrees."""
 MIN_FORWARD = 0.5
 """Length of the mean viewing direction above which cameras without a common point look to one side."""
+MIN_UP = 0.5
+"""Length of the mean of the cameras' upward directions, each of length 1, from which on they agree on one."""
 MIN_SWING = math.radians(6)
 """Least range of azimuths of a film, for cameras that stand one above the other."""
 
@@ -212,3 +214,10 @@ def up_of(cameras: list[Camera], points: np.ndarray) -> np.ndarray:
     depths = np.concatenate([matmul(points - c.center, c.viewmat[2, :3]) for c in cameras[:: max(1, len(cameras) // 5)]])
     ahead = depths[depths > 0]
     return rig_of(cameras, float(np.median(ahead)) if len(ahead) else 1.0).up
+
+
+def common_up(cameras: list[Camera]) -> np.ndarray | None:
+    """Return the upward direction that cameras agree on, as films have it: of length 1, shape [3]; None where there is none."""
+    up, turned = _upward(cameras, focus_point(cameras))
+    mean = np.mean([c.viewmat[1, :3] for c in cameras], axis=0)
+    return up if turned or (mean * mean).sum() >= MIN_UP**2 else None

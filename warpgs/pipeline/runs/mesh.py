@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
 
 from warpgs.coordinates import convert_mesh
 from warpgs.errors import DataError
 from warpgs.export.mesh import check_suffix, write_mesh
 from warpgs.mesh.fuse import FusedMesh, MeshOptions, fuse
 from warpgs.mesh.grid import GridPlan
+from warpgs.pipeline.films.rig import common_up
 from warpgs.pipeline.runs.folder import open_run
 from warpgs.pipeline.runs.request import choose_device
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.folder_lock import hold_folder
-from warpgs.scene import Camera
-
-MIN_UP = 0.5
-"""Length of the mean of the cameras' upward directions, each of length 1, from which on they agree on one."""
 
 
 def mesh(
@@ -64,17 +59,11 @@ def mesh(
     with hold_folder(target.parent) as notes:
         found = fuse(run.scene_gaussians, cameras, run.options(), options, stage=stage, planned=planned)
         made = convert_mesh(found.mesh, run.normalization, "scene", "file")
-        up = upwards(cameras)
+        up = common_up(cameras)
         write_mesh(target, made, up)
     if up is None and target.suffix.lower() == ".glb":
-        notes = [*notes, "the cameras were not held upright together, so the mesh may lie on its side in a viewer"]
+        notes = [*notes, "the cameras agree on no upward direction, so the mesh may lie on its side in a viewer"]
     return [*notes, *_lines(found, len(cameras)), f"{target}: {format_bytes(os.path.getsize(target))}"]
-
-
-def upwards(cameras: Sequence[Camera]) -> np.ndarray | None:
-    """Return the mean upward direction of cameras, of any length, shape [3]; None where they do not agree on one."""
-    up: np.ndarray = -np.mean([c.viewmat[1, :3] for c in cameras], axis=0)
-    return up if np.linalg.norm(up) >= MIN_UP else None
 
 
 def _lines(found: FusedMesh, views: int) -> list[str]:

@@ -11,11 +11,11 @@ import torch
 from warpgs.coordinates import convert_gaussians
 from warpgs.errors import UsageError
 from warpgs.geometry import matmul
+from warpgs.pipeline.films.rig import common_up
 from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.model.coverage import coverage
 from warpgs.pipeline.model.filters import box_of, disturbing, inside, levelling, limit_degree, rotate, rotation_about, select
 from warpgs.pipeline.runs.folder import StoredRun
-from warpgs.pipeline.runs.mesh import upwards
 from warpgs.scene import Camera, Gaussians
 
 
@@ -109,7 +109,7 @@ def rotation_of(wish: str | None, cameras: list[Camera] | None) -> np.ndarray | 
     if wish == "level":
         if cameras is None:
             raise UsageError("--rotate level needs the cameras of a run: use warpgs export RUN, or give x,y,z,degrees")
-        up = upwards(cameras)
+        up = common_up(cameras)
         if up is None:
             raise UsageError("--rotate level: the cameras do not agree on an upward direction; give x,y,z,degrees")
         return levelling(up)
