@@ -89,7 +89,7 @@ class PhotoCheck:
 
 
 class _Places(NamedTuple):
-    """What a photograph looks like at its features."""
+    """Appearance of a photograph at its features."""
 
     features: Features
     detail: np.ndarray

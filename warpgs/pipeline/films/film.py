@@ -95,6 +95,12 @@ def _renders(
         yield r.rgb.cpu().numpy(), r
 
 
+def _older_images(folder: Path, files: list[Path]) -> list[str]:
+    """Return a note on images of an earlier film that lie between those of this one; an empty list where there are none."""
+    older = [p for p in folder.glob("*.png") if p not in files and p.name != SHEET]
+    return [f"{len(older)} older images lie in {folder}, too: remove them, or give a new folder"] if older else []
+
+
 def render_film(
     model: FittedModel,
     plan: FilmPlan,
@@ -131,8 +137,7 @@ def render_film(
     cut_out = isinstance(coverage, Sequence) and any(v.alpha is not None for v in coverage)
     in_sheet = {i * count // SHEET_FRAMES for i in range(SHEET_FRAMES)} if sheet else set()
     files = [] if alone else [folder / f"{name}.png" for name, _ in plan.cameras]
-    older = [] if alone else [p for p in folder.glob("*.png") if p not in files and p.name != SHEET]
-    left = [f"{len(older)} older images lie in {folder}, too: remove them, or give a new folder"] if older else []
+    left = [] if alone else _older_images(folder, files)
 
     def images() -> Iterator[np.ndarray]:
         for i, (image, r) in enumerate(_renders(model, plan, options, tell)):
