@@ -1,6 +1,7 @@
 """Run all commands that write, and compare what is there at the end with what Python saw being opened and renamed."""
 
 import os
+import shutil  # noqa: F401  (looks at os.open when it is imported)
 import sys
 from pathlib import Path
 
@@ -19,12 +20,27 @@ def note(event: str, values: tuple) -> None:
         if writes and path.is_relative_to(out):
             opened.add(path)
     elif event == "os.rename":
-        source, target = (Path(os.path.abspath(os.fsdecode(v))) for v in values[:2])
+        source, target = (path_of(name, at) for name, at in zip(values[:2], values[2:]))
         if target.is_relative_to(out):
             placed[target] = source
 
 
+def path_of(name: str | bytes, at: int) -> Path:
+    """Return the path of a name in an open folder, -1 for the current one."""
+    return Path(os.path.abspath(os.path.join(os.readlink(f"/proc/self/fd/{at}") if at >= 0 else "", os.fsdecode(name))))
+
+
+def seen_open(name: str, flags: int, *rest: object, dir_fd: int | None = None, **more: object) -> int:
+    """Open a file in an open folder, which Python does not hand to the hook."""
+    if dir_fd is not None and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
+        path = path_of(name, dir_fd)
+        if path.is_relative_to(out):
+            opened.add(path)
+    return real_open(name, flags, *rest, dir_fd=dir_fd, **more)
+
+
 sys.addaudithook(note)
+real_open, os.open = os.open, seen_open
 
 from warpgs.app.cli import main  # noqa: E402
 from warpgs.files import LOCK, OWN_NAMES  # noqa: E402

@@ -1,4 +1,4 @@
-"""Writing of files so that nothing is lost: a new file appears whole or not at all."""
+"""Writing of files so that nothing is lost: a new file appears whole or not at all, and no link leads it elsewhere."""
 
 from __future__ import annotations
 
@@ -6,27 +6,26 @@ import contextlib
 import errno
 import json
 import os
-import re
-import secrets
-import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 from warpgs.errors import ResourceError, UsageError
+from warpgs.output_folders import Folder, RefusedError, is_below, open_folder, output_folder
+from warpgs.temporary import NAMES as OWN_NAMES
+from warpgs.temporary import TemporaryFile, TemporaryFolder, sweep
 
 LOCK = ".warpgs.lock"
 """Name of the file that a process holds while it writes into a folder."""
-OWN_NAMES = re.compile(r"\.warpgs-[0-9a-f]{16}\.tmp(\.(mp4|webm))?")
-"""Names of temporary files and folders: short and of ASCII letters, so that they fit wherever the file itself does."""
 WINDOWS = sys.platform == "win32"
 PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Waits before a replacement is tried again on Windows [s]: a virus scanner holds a new file open for about that long."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Errors of a disk, or of a user's part of one, that has no room left."""
-NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES)
-"""Errors of file systems that cannot sync a folder; what they keep after a power failure is theirs to say."""
+DESCRIPTORS = Path("/proc/self/fd")
+"""Folder in which Linux shows the open files and folders of this process, by which a library can be given a place in one."""
 
 
 @contextlib.contextmanager
@@ -36,7 +35,7 @@ def replacing(
     """Give the path of a temporary file beside ``path``; once the block has written it, it takes the place of ``path``.
 
     It is synced to the disk and checked first, and the folder is synced after. Where anything fails, an error of the block
-    included, the temporary file goes and what was there before stays.
+    included, the temporary file goes and what was there before stays. Where ``path`` is a link, the link is replaced.
 
     Args:
         path: File to write or to replace.
@@ -45,71 +44,116 @@ def replacing(
         suffix: End of the temporary file's name, for libraries that take the format from it: none, .mp4 or .webm.
 
     Raises:
-        ResourceError: The disk is full, the folder is not writable, or the old file is open in another program on Windows.
+        ResourceError: The disk is full, the folder is not writable or behind a link that is not followed, or the old file is
+            open in another program on Windows.
     """
-    temporary = path.parent / f".warpgs-{secrets.token_hex(8)}.tmp{suffix}"
+    with _replaced(path, size, check, suffix) as (temporary, folder):
+        yield _reachable(folder) / temporary.name
+
+
+@contextlib.contextmanager
+def writing(path: Path, size: int | None = None) -> Iterator[BinaryIO]:
+    """Give a file to write to; at the end of the block it takes the place of ``path``, as `replacing` does it."""
+    with _replaced(path, size) as (temporary, _), open(temporary.descriptor, "wb", closefd=False) as file:
+        yield file
+
+
+@contextlib.contextmanager
+def _replaced(
+    path: Path, size: int | None, check: Callable[[Path], object] | None = None, suffix: str = ""
+) -> Iterator[tuple[TemporaryFile, Folder]]:
+    """Give a temporary file and its folder; after the block the file is synced, checked, and put in the place of ``path``."""
     try:
-        yield temporary
-        with temporary.open("rb+") as f:
-            os.fsync(f.fileno())
-        if size is not None and (found := temporary.stat().st_size) != size:  # some file systems report no error
-            raise OSError(errno.EIO, f"{found} of {size} bytes are there")
-        if check is not None:
-            check(temporary)
-        _replace(temporary, path)
+        with open_folder(path.parent) as folder:
+            with TemporaryFile(folder, suffix) as temporary:
+                yield temporary, folder
+                os.fsync(temporary.descriptor)
+                written = os.fstat(temporary.descriptor)
+                found = written.st_size
+                if not os.path.samestat(written, folder.lstat(temporary.name)):
+                    raise OSError(errno.EIO, "another file took the place of the temporary one")
+                if size is not None and found != size:  # some file systems report no error
+                    raise OSError(errno.EIO, f"{found} of {size} bytes are there")
+                if check is not None:
+                    check(_reachable(folder) / temporary.name)
+                _replace(folder, temporary, path.name)
+            _sync(folder)
+    except RefusedError as e:
+        raise ResourceError(f"{path}: cannot be written, as {e}") from e
     except OSError as e:
         amount = "" if size is None else f"{size / 2**20:.1f} MiB " if size >= 2**20 else f"{size:,} bytes "
         raise ResourceError(
             f"{path}: {amount}cannot be written ({e.strerror or e}); what was there before is untouched. {_remedy(e)}"
         ) from e
-    finally:
-        with contextlib.suppress(OSError):  # it hides nothing: an error above goes on, and what is left over is ours by name
-            temporary.unlink(missing_ok=True)
-    sync_folder(path.parent)
+
+
+def _reachable(folder: Folder) -> Path:
+    """Return a path to an open folder that libraries can use: that of its descriptor, where the system has such paths."""
+    shown = DESCRIPTORS / str(folder.descriptor)
+    return shown if folder.descriptor is not None and shown.is_dir() else folder.path
 
 
 @contextlib.contextmanager
 def filling(folder: Path) -> Iterator[Path]:
     """Give the path of a temporary folder beside ``folder``; once the block has filled it, it becomes that folder, whole.
 
-    Where anything fails, an error of the block included, the temporary folder goes and nothing is left of it.
+    Where anything fails, an error of the block included, the temporary folder goes and nothing is left of it. It is locked
+    meanwhile, and what killed writers left beside it is removed.
 
     Args:
         folder: Folder to make; it may exist if it is empty.
 
     Raises:
-        ResourceError: The disk is full, or the folder above is not writable.
+        ResourceError: The disk is full, or the folder above is not writable or behind a link that is not followed.
         UsageError: It is the folder that this process works in, which would be lost to it.
     """
-    target = Path(os.path.realpath(folder))
-    if target == Path.cwd():
+    target = folder.absolute() if is_below(folder) else Path(os.path.realpath(folder))
+    if os.path.realpath(target) == os.path.realpath(Path.cwd()):
         raise UsageError(f"{folder}: is the folder that you are in, and it would be made anew under you; name another one")
     make_folder(target.parent)
-    temporary = target.parent / f".warpgs-{secrets.token_hex(8)}.tmp"
-    make_folder(temporary)
     try:
-        yield temporary
+        above = open_folder(target.parent)
+        sweep(above)
+        temporary = TemporaryFolder(above)
+    except OSError as e:
+        raise _not_made(folder, e) from e
+    with temporary:
+        path = target.parent / temporary.name
+        with output_folder(path):
+            yield path
         try:
-            if target.is_dir():
-                remove_leftovers(target)
-                target.rmdir()
-            os.rename(temporary, target)
+            if above.is_link(target.name) or target.is_dir():
+                _clear(above, target.name)
+            above.rename(temporary.name, target.name)
         except OSError as e:
-            raise ResourceError(f"{folder}: cannot be made ({e.strerror or e}). {_remedy(e)}") from e
-        sync_folder(target.parent)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+            raise _not_made(folder, e) from e
+        _sync(above)
 
 
-def _replace(temporary: Path, path: Path) -> None:
+def _clear(above: Folder, name: str) -> None:
+    """Remove an empty folder, with what killed writers left in it."""
+    with above.folder(name) as inside:
+        sweep(inside)
+    above.rmdir(name)
+
+
+def _not_made(folder: Path, error: OSError) -> ResourceError:
+    if isinstance(error, RefusedError):
+        return ResourceError(f"{folder}: cannot be made, as {error}")
+    return ResourceError(f"{folder}: cannot be made ({error.strerror or error}). {_remedy(error)}")
+
+
+def _replace(folder: Folder, temporary: TemporaryFile, name: str) -> None:
     """Put a file in the place of another; on Windows, where no open file can be replaced, a few times."""
+    if WINDOWS:
+        temporary.close()
     for pause in PAUSES if WINDOWS else ():
         try:
-            os.replace(temporary, path)
+            folder.replace(temporary.name, name)
             return
         except PermissionError:
             time.sleep(pause)
-    os.replace(temporary, path)
+    folder.replace(temporary.name, name)
 
 
 def _remedy(error: OSError) -> str:
@@ -118,26 +162,19 @@ def _remedy(error: OSError) -> str:
     return "Free some disk space, or write elsewhere"
 
 
-def sync_folder(folder: Path) -> None:
-    """Have the disk keep the names in a folder through a power failure, where the system can: Windows has no such call.
+def _sync(folder: Folder) -> None:
+    """Have the disk keep the names in a folder through a power failure.
 
     Raises:
         ResourceError: The disk fails.
     """
-    if WINDOWS:
-        return
     try:
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        folder.sync()
     except OSError as e:
-        if e.errno not in NO_FOLDER_SYNC:
-            raise ResourceError(
-                f"{folder}: was written into, but the disk does not confirm it ({e.strerror or e}); check the disk, and what "
-                "was written last"
-            ) from e
+        raise ResourceError(
+            f"{folder.path}: was written into, but the disk does not confirm it ({e.strerror or e}); check the disk, and what "
+            "was written last"
+        ) from e
 
 
 def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:
@@ -146,7 +183,7 @@ def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:
     Raises:
         ResourceError: The disk is full or the folder not writable; what was there before is untouched.
     """
-    with replacing(path, size=sum(map(len, chunks))) as temporary, temporary.open("xb") as f:
+    with writing(path, sum(map(len, chunks))) as f:
         for chunk in chunks:
             f.write(chunk)
 
@@ -172,21 +209,80 @@ def plain(value: object) -> object:
     return value
 
 
+def appending(path: Path) -> BinaryIO:
+    """Open a file to append to, made if it is not there; a link is not followed.
+
+    Raises:
+        OSError: It cannot be opened, or is a link or no ordinary file.
+    """
+    with open_folder(path.parent) as folder:
+        descriptor = folder.open_regular(path.name, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+    return open(descriptor, "ab")
+
+
+def remove_file(path: Path) -> None:
+    """Remove a file, or a link itself, if it is there.
+
+    Raises:
+        ResourceError: It cannot be removed.
+    """
+    try:
+        with contextlib.suppress(FileNotFoundError), open_folder(path.parent) as folder:
+            folder.unlink(path.name)
+    except OSError as e:
+        raise ResourceError(f"{path}: cannot be removed ({e.strerror or e}); remove it by hand") from e
+
+
+def move_folder(folder: Path, name: str) -> Path:
+    """Give a folder another name where it is, and return its path.
+
+    Raises:
+        OSError: It cannot be moved, or is a link.
+    """
+    with open_folder(folder.parent) as above:
+        above.folder(folder.name).close()
+        above.rename(folder.name, name)
+    return folder.with_name(name)
+
+
 def make_folder(folder: Path) -> bool:
     """Make a folder, and those above it, where it is not there; return whether it was made.
 
     Raises:
-        ResourceError: It cannot be made.
+        ResourceError: It cannot be made, or lies behind a link that is not followed.
     """
     try:
         made = not os.path.exists(folder)  # False for what Path.exists raises an error about
-        folder.mkdir(parents=True, exist_ok=True)
+        if is_below(folder):
+            open_folder(folder, make=True).close()
+        else:
+            folder.mkdir(parents=True, exist_ok=True)
+    except RefusedError as e:
+        raise ResourceError(f"{folder}: cannot be written, as {e}") from e
     except OSError as e:
         raise ResourceError(
             f"{folder}: cannot be written, as the folder cannot be made ({e.strerror or e}); "
             f"{'free some disk space, or ' if e.errno in FULL else ''}choose another folder"
         ) from e
     return made
+
+
+@contextlib.contextmanager
+def writing_into(folder: Path) -> Iterator[bool]:
+    """Make a folder where it is not there, and follow no link below it in this block; gives whether it was made.
+
+    Raises:
+        ResourceError: It cannot be made or opened, or lies behind a link that is not followed.
+    """
+    made = make_folder(folder)
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(output_folder(folder))
+        except RefusedError as e:
+            raise ResourceError(f"{folder}: cannot be written, as {e}") from e
+        except OSError as e:
+            raise ResourceError(f"{folder}: cannot be written ({e.strerror or e}); choose another folder") from e
+        yield made
 
 
 def is_empty(folder: Path) -> bool:
@@ -204,15 +300,15 @@ def is_empty(folder: Path) -> bool:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files and folders of writers that were killed; for who holds the folder, as no other writes there.
+    """Remove temporary files and folders of writers that were killed; those that a process holds stay.
 
-    One that cannot be removed stays: it is in nobody's way.
+    Raises:
+        ResourceError: The folder is a link that is not followed.
     """
-    with contextlib.suppress(OSError):
-        for path in folder.iterdir():
-            if OWN_NAMES.fullmatch(path.name):
-                if path.is_dir() and not path.is_symlink():
-                    shutil.rmtree(path, ignore_errors=True)
-                else:
-                    with contextlib.suppress(OSError):
-                        path.unlink()
+    try:
+        with open_folder(folder) as found:
+            sweep(found)
+    except RefusedError as e:
+        raise ResourceError(f"{folder}: cannot be written, as {e}") from e
+    except OSError:  # it is not there, or cannot be looked into: nothing is in anybody's way
+        return

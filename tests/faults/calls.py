@@ -10,6 +10,7 @@ import builtins
 import contextlib
 import io
 import os
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+from warpgs import temporary
 from warpgs.report.events import EventLog
 from warpgs.runtime import folder_lock
 
@@ -49,11 +51,11 @@ class _Calls:
         self.lock = threading.Lock()
         self.descriptors: dict[int, str] = {}
 
-    def below(self, path: Any) -> str | None:
-        """Return the full path of what lies below the folder; None for all else."""
+    def below(self, path: Any, at: int | None = None) -> str | None:
+        """Return the full path of what lies below the folder, from an open folder where one is given; None for all else."""
         if isinstance(path, int):
             return self.descriptors.get(path)
-        full = os.path.abspath(os.fsdecode(path))
+        full = os.path.abspath(os.path.join(path_of(at) if at is not None else "", os.fsdecode(path)))
         # a file's own name may be a link, the folders above it are not
         full = os.path.join(os.path.realpath(os.path.dirname(full)), os.path.basename(full))
         return full if full.startswith(self.root + os.sep) or full == self.root else None
@@ -63,6 +65,15 @@ class _Calls:
         with self.lock:
             self.count += 1
             return self.before(Call(self.count, kind, Path(path), **more))
+
+
+def path_of(descriptor: int) -> str:
+    """Return the path of an open folder."""
+    if sys.platform == "darwin":
+        import fcntl
+
+        return os.fsdecode(fcntl.fcntl(descriptor, fcntl.F_GETPATH, bytes(1024)).rstrip(b"\0"))
+    return os.readlink(f"/proc/self/fd/{descriptor}")
 
 
 class _Raw(io.FileIO):
@@ -89,7 +100,7 @@ def _open(calls: _Calls, real: Callable[..., Any]) -> Callable[..., Any]:
             return real(file, mode, buffering, *rest, **more)
         if not isinstance(file, int):
             calls.note("open", where)
-        raw = _Raw(file, mode.replace("b", ""))
+        raw = _Raw(file, mode.replace("b", ""), closefd=more.get("closefd", True))
         raw.calls, raw.where = calls, where
         if buffering == 0:
             return raw
@@ -100,7 +111,7 @@ def _open(calls: _Calls, real: Callable[..., Any]) -> Callable[..., Any]:
 
 def _os_open(calls: _Calls, real: Callable[..., int]) -> Callable[..., int]:
     def opened(path: Any, flags: int, *rest: Any, **more: Any) -> int:
-        where = None if more.get("dir_fd") is not None else calls.below(path)
+        where = calls.below(path, more.get("dir_fd"))
         if where is not None and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
             calls.note("open", where)
         descriptor = real(path, flags, *rest, **more)
@@ -114,7 +125,7 @@ def _os_open(calls: _Calls, real: Callable[..., int]) -> Callable[..., int]:
 
 def _on_path(calls: _Calls, kind: str, real: Callable[..., Any]) -> Callable[..., Any]:
     def called(path: Any, *rest: Any, **more: Any) -> Any:
-        where = None if more.get("dir_fd") is not None else calls.below(path)
+        where = calls.below(path, more.get("dir_fd"))
         if where is not None:
             calls.note(kind, where)
         return real(path, *rest, **more)
@@ -124,9 +135,10 @@ def _on_path(calls: _Calls, kind: str, real: Callable[..., Any]) -> Callable[...
 
 def _moved(calls: _Calls, real: Callable[..., Any]) -> Callable[..., Any]:
     def moved(source: Any, target: Any, **more: Any) -> Any:
-        where = calls.below(target)
+        where = calls.below(target, more.get("dst_dir_fd"))
         if where is not None:
-            calls.note("replace", where, source=Path(os.fsdecode(source)))
+            at = more.get("src_dir_fd")
+            calls.note("replace", where, source=Path(path_of(at) if at is not None else "", os.fsdecode(source)))
         return real(source, target, **more)
 
     return moved
@@ -172,6 +184,7 @@ def numbered(root: Path, before: Callable[[Call], int | None]) -> Iterator[None]
             (os, "truncate", _on_path(calls, "truncate", os.truncate)),
             (os, "fsync", _on_descriptor(calls, "fsync", os.fsync)),
             (folder_lock, "lock_descriptor", _on_descriptor(calls, "lock", folder_lock.lock_descriptor)),
+            (temporary, "lock_descriptor", _on_descriptor(calls, "lock", temporary.lock_descriptor)),
             (EventLog, "write", _step(calls, EventLog.write)),
         ):
             stack.enter_context(mock.patch.object(owner, name, stand_in))

@@ -8,6 +8,7 @@ import sys
 
 import pytest
 
+from warpgs import temporary
 from warpgs.errors import ResourceError
 from warpgs.files import LOCK, is_empty
 from warpgs.runtime import folder_lock
@@ -80,7 +81,8 @@ def test_a_file_system_without_locks_is_noted(tmp_path, monkeypatch):
     def refuse(descriptor, blocking):
         raise OSError(errno.ENOSYS, "Function not implemented")
 
-    monkeypatch.setattr(folder_lock, "lock_descriptor", refuse)
+    for module in (folder_lock, temporary):
+        monkeypatch.setattr(module, "lock_descriptor", refuse)
     (tmp_path / LEFT).write_text("perhaps being written")
     with hold_folder(tmp_path) as notes:
         assert len(notes) == 1 and "has no locks" in notes[0] and str(tmp_path) in notes[0]

@@ -289,9 +289,10 @@ def _video() -> Iterable[Finding]:
         import numpy as np
 
         from warpgs.report.film import write_film
+        from warpgs.temporary import temporary_folder
 
-        with tempfile.TemporaryDirectory() as folder:
-            write_film(Path(folder) / "probe.mp4", (np.full((64, 64, 3), level) for level in (0, 0.5, 1)), 10)
+        with temporary_folder() as folder:
+            write_film(folder.path / "probe.mp4", (np.full((64, 64, 3), level) for level in (0, 0.5, 1)), 10)
         yield Finding(topic, OK, "VP9 through OpenCV")
         return
     except Exception as e:

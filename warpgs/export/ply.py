@@ -17,7 +17,7 @@ from warpgs.coordinates import checked_normalization, convert_gaussians
 from warpgs.errors import DataError
 from warpgs.export.arrays import arrays_of, check_finite
 from warpgs.export.ply_header import COMMENTS, MAX_HEADER_BYTES, Element, parse_header, ply_error
-from warpgs.files import replacing
+from warpgs.files import writing
 from warpgs.scene import Gaussians, Normalization
 
 CHUNK_ROWS = 65536
@@ -66,7 +66,7 @@ def write_ply(
 
     n, k = arrays["sh"].shape[:2]
     header = _header(n, 3 * (k - 1))
-    with replacing(path, size=len(header) + 4 * n * (14 + 3 * k)) as temporary, temporary.open("xb") as file:
+    with writing(path, len(header) + 4 * n * (14 + 3 * k)) as file:
         file.write(header)
         for start in range(0, n, CHUNK_ROWS):
             file.write(_rows({name: a[start : start + CHUNK_ROWS] for name, a in arrays.items()}).tobytes())

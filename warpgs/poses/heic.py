@@ -17,7 +17,7 @@ from warpgs.errors import DataError, UsageError
 from warpgs.files import make_folder, write_bytes, write_json
 from warpgs.io.decoding import read_image_file
 from warpgs.io.image_formats.avif import BROKEN, kind
-from warpgs.runtime.subprocesses import ProcessFailed, python_lines
+from warpgs.runtime.subprocesses import ProcessFailed, end_with_parent, python_lines
 from warpgs.runtime.terminal import say
 
 QUALITY = 98
@@ -112,4 +112,5 @@ def main(path: str) -> None:
 
 
 if __name__ == "__main__":
+    end_with_parent()
     main(sys.argv[1])

@@ -15,6 +15,7 @@ from typing import Any
 
 from warpgs.files import write_text
 from warpgs.poses.pairs import choose_pairs
+from warpgs.runtime.subprocesses import end_with_parent
 from warpgs.runtime.terminal import say
 
 SEED = 0
@@ -185,4 +186,5 @@ def main(path: str) -> None:
 
 
 if __name__ == "__main__":
+    end_with_parent()
     main(sys.argv[1])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import tempfile
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from warpgs.files import write_bytes, write_text
 from warpgs.priors.preprocess import HALF, IMAGENET, side_file
 from warpgs.priors.semantics import CLASSES
 from warpgs.priors.session import open_network
+from warpgs.temporary import temporary_folder
 
 if TYPE_CHECKING:
     import torch
@@ -175,8 +175,8 @@ def build(request: ExportRequest) -> torch.nn.Module:
 def _temporary_folder() -> Iterator[Path]:
     """Give a folder that is removed at the end of the block; ResourceError where the files in it cannot be written."""
     try:
-        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-            yield Path(folder)
+        with temporary_folder() as folder:
+            yield folder.path
     except OSError as e:
         raise ResourceError(
             f"temporary files cannot be written ({e.strerror or e}); free some disk space, or set TMPDIR (TEMP on Windows) to "

@@ -10,7 +10,8 @@ from typing import BinaryIO
 
 from warpgs import schema
 from warpgs.errors import ResourceError
-from warpgs.files import write_bytes
+from warpgs.files import appending, write_bytes
+from warpgs.output_folders import RefusedError, open_file
 
 _SERIES = schema.mapping(schema.or_null(schema.real))
 _STEP = schema.fields({"step": schema.whole(0)})
@@ -42,11 +43,11 @@ class EventLog:
         """
         if self._file is not None:
             self.close()
-        kept = [e for e in read_events(self.path) if e["step"] <= step] if step and self.path.is_file() else []
-        # The old log stays until the shortened one is on the disk.
-        write_bytes(self.path, *(_line(e) for e in kept))
         try:
-            self._file = self.path.open("ab")
+            kept = [e for e in read_events(self.path) if e["step"] <= step] if step and self.path.is_file() else []
+            # The old log stays until the shortened one is on the disk.
+            write_bytes(self.path, *(_line(e) for e in kept))
+            self._file = appending(self.path)
         except OSError as e:
             raise self._failure(e) from e
 
@@ -81,6 +82,8 @@ class EventLog:
             raise self._failure(e) from e
 
     def _failure(self, error: OSError) -> ResourceError:
+        if isinstance(error, RefusedError):
+            return ResourceError(f"{self.path}: cannot be written, as {error}")
         return ResourceError(f"{self.path}: cannot be written ({error.strerror or error}). Free some disk space")
 
 
@@ -91,7 +94,9 @@ def read_events(path: Path) -> list[dict]:
     last line incomplete. Null is read as NaN, so that a series has a number at every step.
     """
     events = []
-    for line in Path(path).read_bytes().splitlines():
+    with open_file(path, path.parent) as file:
+        lines = file.read().splitlines()
+    for line in lines:
         try:
             event = schema.parse(line)
             _SERIES(event, "")

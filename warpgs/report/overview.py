@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import subprocess
-import tempfile
-from pathlib import Path
 
 import numpy as np
 
 from warpgs.runtime.subprocesses import run_python
 from warpgs.scene import Camera
+from warpgs.temporary import temporary_folder
 
 REMEDY = "install a software renderer: on Debian or Ubuntu `apt-get install libegl1 libgl1 libgl1-mesa-dri libxrender1`"
 TIMEOUT = 90
@@ -131,8 +130,8 @@ def render_overview(
     core = points[((points >= low) & (points <= high)).all(1)]
     view = framing(np.concatenate([core, *(f.reshape(-1, 3) for f in lines.values())]), direction, up)
     try:
-        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-            source, target = (Path(folder).resolve() / name for name in ("scene.npz", "overview.png"))
+        with temporary_folder() as folder:
+            source, target = (folder.path / name for name in ("scene.npz", "overview.png"))
             np.savez(
                 source, points=points[inside].astype(np.float32),
                 colors=np.round(255 * np.clip(colors[inside], 0, 1)).astype(np.uint8), view=view, **lines,

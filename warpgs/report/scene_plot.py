@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-import tempfile
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +12,7 @@ from warpgs.errors import ResourceError
 from warpgs.report.images import png
 from warpgs.report.overview import TEST_COLOR, TRAIN_COLOR, VIEW_ANGLE, framing, frusta, remedy_for, run_pyvista
 from warpgs.scene import Camera
+from warpgs.temporary import temporary_folder
 
 INK = {"white": "#1b1d21", "black": "#e8e9ec"}
 """Colour of letters on each background."""
@@ -153,8 +152,8 @@ def render_plot(plot: ScenePlot, size: tuple[int, int], background: str) -> byte
 def _rendered(arrays: dict[str, np.ndarray], words: dict[str, object]) -> bytes:
     """Return what `PLOT_SCRIPT` renders of arrays and settings, as PNG bytes."""
     try:
-        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-            source, target = (Path(folder).resolve() / name for name in ("scene.npz", "plot.png"))
+        with temporary_folder() as folder:
+            source, target = (folder.path / name for name in ("scene.npz", "plot.png"))
             np.savez(source, **arrays)
             works, why = run_pyvista(PLOT_SCRIPT, str(source), json.dumps(words), str(target))
             if works and target.is_file():

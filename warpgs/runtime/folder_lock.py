@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import errno
 import json
 import os
 import platform
@@ -18,10 +17,10 @@ from typing import BinaryIO
 from filelock import lock_descriptor
 
 from warpgs.errors import FolderHeldError, ResourceError
-from warpgs.files import LOCK, make_folder, remove_leftovers
+from warpgs.files import LOCK, remove_leftovers, writing_into
+from warpgs.output_folders import Folder, RefusedError, open_folder
+from warpgs.temporary import NO_LOCKS, sweep_temporary_files
 
-NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
-"""Errors of file systems without locks."""
 SIGNED_WITHIN = 50
 """Times that the signature of who holds a lock is looked for, a hundredth of a second apart."""
 MOST_LETTERS = 200
@@ -33,12 +32,13 @@ def hold_folder(folder: Path, *parts: str) -> Iterator[list[str]]:
     """Hold a folder, which is made if it is not there, so that no other process writes into it meanwhile.
 
     The system gives the lock free when its holder ends, killed or not, and keeps it for processes in other containers, too; who
-    holds it stands in the lock file. What killed writers left in the folder is removed. A folder that was made here and is
-    still empty when an error ends the block is removed as well; no other folder ever is.
+    holds it stands in the lock file. What killed writers left in the folder, and where the system has temporary files, is
+    removed. In the block nothing below the folder is written through a link (`output_folder`). A folder that was made here and
+    is still empty when an error ends the block is removed as well; no other folder ever is.
 
     Args:
         folder: The folder.
-        parts: Folders in it that are written under the same lock.
+        parts: Folders in it that are written under the same lock; none may be a link.
 
     Returns:
         A note for the user where the file system has no locks; else nothing.
@@ -47,27 +47,27 @@ def hold_folder(folder: Path, *parts: str) -> Iterator[list[str]]:
         FolderHeldError: Another process holds the folder.
         ResourceError: It cannot be written.
     """
-    made = make_folder(folder)
-    try:
-        with _held(folder) as locked:
-            for name in (".", *parts) if locked else ():
-                remove_leftovers(folder / name)
-            yield ([] if locked else [f"{folder}: its file system has no locks; start no second process that writes there"])
-    except BaseException:
-        if made:
-            with contextlib.suppress(OSError):  # it is not empty, or in use: it stays
-                folder.rmdir()
-        raise
+    sweep_temporary_files()
+    with writing_into(folder) as made:
+        try:
+            with open_folder(folder) as opened, _held(opened) as locked:
+                for name in (".", *parts):
+                    remove_leftovers(folder / name)
+                yield ([] if locked else [f"{folder}: its file system has no locks; start no second process that writes there"])
+        except BaseException:
+            if made:
+                with contextlib.suppress(OSError), open_folder(folder.absolute().parent) as above:
+                    above.rmdir(folder.name)  # where it is not empty, or in use, it stays
+            raise
 
 
 @contextlib.contextmanager
-def _held(folder: Path) -> Iterator[bool]:
+def _held(folder: Folder) -> Iterator[bool]:
     """Hold the lock of a folder; gives whether there are locks."""
-    path = folder / LOCK
     while True:
-        file = _open(path)
+        file = _open(folder)
         try:
-            locked = _lock(file, folder)
+            locked = _lock(file, folder.path)
             # its last holder may have removed it between our two calls: then others lock a new one
             if not locked or os.fstat(file.fileno()).st_nlink:
                 break
@@ -83,18 +83,22 @@ def _held(folder: Path) -> Iterator[bool]:
         # Windows removes no open file; a system that does must remove it while the lock holds
         if sys.platform == "win32":
             file.close()
-        with contextlib.suppress(OSError):
-            path.unlink()
-        file.close()
+        try:
+            with contextlib.suppress(OSError):
+                folder.unlink(LOCK)
+        finally:
+            file.close()
 
 
-def _open(path: Path) -> BinaryIO:
+def _open(folder: Folder) -> BinaryIO:
     """Open a lock file to read and write, made if it is not there."""
     try:
-        return os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+b", buffering=0)
+        return os.fdopen(folder.open_regular(LOCK, os.O_RDWR | os.O_CREAT), "r+b", buffering=0)
+    except RefusedError as e:
+        raise ResourceError(f"{folder.path}: cannot be written, as {e}") from e
     except OSError as e:
         raise ResourceError(
-            f"{path.parent}: cannot be written, as its lock {path.name} cannot be opened ({e.strerror or e}); choose another "
+            f"{folder.path}: cannot be written, as its lock {LOCK} cannot be opened ({e.strerror or e}); choose another "
             "folder, or make this one writable"
         ) from e
 

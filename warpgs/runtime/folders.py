@@ -5,12 +5,11 @@ from __future__ import annotations
 import atexit
 import functools
 import os
-import shutil
 import sys
-import tempfile
 from pathlib import Path
 
 from warpgs.errors import ResourceError
+from warpgs.temporary import temporary_folder
 
 
 def cache_home() -> Path | None:
@@ -42,17 +41,11 @@ def private_folder() -> Path:
         ResourceError: No folder for temporary files can be written.
     """
     try:
-        made = Path(tempfile.mkdtemp(prefix="warpgs-")).resolve()
+        made = temporary_folder()
     except OSError as e:
         raise ResourceError(
             f"no folder for temporary files can be written ({e.strerror or e}). Set TMPDIR (TEMP on Windows) to a folder that "
             "you may write to"
         ) from e
-    owner = os.getpid()
-
-    def remove() -> None:
-        if os.getpid() == owner:  # a forked child leaves it to its parent
-            shutil.rmtree(made, ignore_errors=True)
-
-    atexit.register(remove)
-    return made
+    atexit.register(made.remove)
+    return made.path

@@ -7,8 +7,33 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator
 from pathlib import Path
+
+from warpgs.temporary import shared_locks, temporary_folder
+
+ENDS_WITH_PARENT = (
+    "import os as _os, threading as _threading\n"
+    "_threading.Thread(target=lambda: (_os.read(0, 1), _os._exit(1)), daemon=True).start()\n"
+)
+"""Beginning of a program that ends once its stdin does."""
+
+
+def end_with_parent() -> None:
+    """Have this process end when the one that started it does, killed or not: its stdin ends then."""
+    threading.Thread(target=lambda: (os.read(0, 1), os._exit(1)), daemon=True).start()
+
+
+@contextlib.contextmanager
+def _stdin_until_our_end() -> Iterator[int]:
+    """Give a stdin for a process that ends with this process or with the block, and holds nothing."""
+    read, write = os.pipe()
+    try:
+        yield read
+    finally:
+        os.close(read)
+        os.close(write)
 
 
 def run_python(
@@ -16,8 +41,8 @@ def run_python(
 ) -> subprocess.CompletedProcess[str]:
     """Run Python code in another process, and return its exit code and what it wrote.
 
-    It works in an empty folder that is removed afterwards, and neither it nor what it starts looks for modules in the current
-    folder (``-P``, PYTHONSAFEPATH): that may be a scene from anywhere, with a numpy.py in it.
+    It works in an empty folder that is removed afterwards, and ends when this process is killed. Neither it nor what it starts
+    looks for modules in the current folder (``-P``, PYTHONSAFEPATH): that may be a scene from anywhere, with a numpy.py in it.
 
     Args:
         code: What to run.
@@ -28,12 +53,13 @@ def run_python(
     Raises:
         subprocess.TimeoutExpired: It took too long.
     """
-    with tempfile.TemporaryDirectory(prefix="warpgs-", ignore_cleanup_errors=True) as folder:
+    with temporary_folder() as folder, shared_locks() as locks, _stdin_until_our_end() as stdin:
         return subprocess.run(
-            [sys.executable, "-P", "-c", code, *arguments],
+            [sys.executable, "-P", "-c", ENDS_WITH_PARENT + code, *arguments],
             env={**os.environ, "PYTHONSAFEPATH": "1", "PYTHONIOENCODING": "utf-8", **(environment or {})},
-            cwd=folder,
-            stdin=subprocess.DEVNULL,
+            cwd=folder.path,
+            stdin=stdin,
+            pass_fds=locks,
             capture_output=True,
             text=True,
             encoding="utf-8",
@@ -63,7 +89,8 @@ def _environment(more: dict[str, str] | None) -> dict[str, str]:
 def python_lines(module: str, *arguments: str, folder: Path, environment: dict[str, str] | None = None) -> Iterator[str]:
     """Run a module of this package in another process, and yield the lines of its stdout as they come.
 
-    It looks for modules no more in its folder than `run_python` does, and it ends where nobody listens any more.
+    It looks for modules no more in its folder than `run_python` does, and it ends where nobody listens any more; it calls
+    `end_with_parent` to end when this process is killed.
 
     Args:
         module: Full name of the module, run as ``__main__``.
@@ -74,10 +101,10 @@ def python_lines(module: str, *arguments: str, folder: Path, environment: dict[s
     Raises:
         ProcessFailed: It ended with another exit code than 0.
     """
-    with tempfile.TemporaryFile() as errors:
+    with tempfile.TemporaryFile() as errors, shared_locks() as locks, _stdin_until_our_end() as stdin:
         process = subprocess.Popen(
             [sys.executable, "-P", "-m", module, *arguments], env=_environment(environment), cwd=folder,
-            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors, text=True, encoding="utf-8", errors="replace",
+            stdin=stdin, stdout=subprocess.PIPE, stderr=errors, text=True, encoding="utf-8", errors="replace", pass_fds=locks,
         )  # fmt: skip
         try:
             assert process.stdout is not None

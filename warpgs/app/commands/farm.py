@@ -92,5 +92,5 @@ def _jobs(listed: list[ListedJob], shared: list[str], out: Path) -> list:
                 raise UsageError(f"job {job.name}: a flag of its line, above, is wrong: {' '.join(job.flags)}") from e
         request, folder = requests[job.flags], out / job.name
         scene = dataclasses.replace(request.scene, path=str(job.scene))
-        jobs.append(FarmJob(job.name, dataclasses.replace(request, scene=scene, out=folder / "run"), folder))
+        jobs.append(FarmJob(job.name, dataclasses.replace(request, scene=scene, out=folder / "run"), folder, out))
     return jobs

@@ -9,7 +9,7 @@ from typing import Any
 
 from warpgs import __version__, schema
 from warpgs.errors import DataError, ResourceError, UsageError, WarpgsError
-from warpgs.files import is_empty
+from warpgs.files import is_empty, move_folder
 from warpgs.io.splits import Split
 from warpgs.pipeline.runs.commands import evaluate
 from warpgs.pipeline.runs.fit import fit_request
@@ -66,13 +66,12 @@ def _set_aside(folder: Path) -> Path:
     with hold_folder(folder):
         pass  # nobody writes there; Windows moves no folder with an open file, so it is not held any longer
     number = 1
-    while (target := folder.with_name(f"{folder.name}.old{number}")).exists():
+    while os.path.lexists(target := folder.with_name(f"{folder.name}.old{number}")):
         number += 1
     try:
-        folder.rename(target)
+        return move_folder(folder, target.name)
     except OSError as e:
         raise ResourceError(f"{folder}: cannot be moved to {target.name} ({e.strerror or e}); move it by hand") from e
-    return target
 
 
 def _with_lpips(metrics: dict[str, Any], folder: Path, request: FitRequest, variants: dict[str, str]) -> dict[str, Any]:

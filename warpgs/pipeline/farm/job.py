@@ -26,6 +26,8 @@ class FarmJob:
     """The fit; ``out`` is its run folder."""
     folder: Path
     """Folder of the job's record, log and thumbnail, which is locked while a farm works on it."""
+    results: Path | None = None
+    """Folder of all results, above ``folder``: below it no link is followed; None where there is no other than ``folder``."""
 
     def identity(self) -> str:
         """Return the first 16 hexadecimal digits of the SHA-256 of all that the result depends on but the images."""
@@ -39,10 +41,11 @@ def job_text(job: FarmJob) -> str:
     """Return a job as one line of JSON."""
     r = job.request
     request = {
-        "scene": dataclasses.asdict(r.scene), "out": str(r.out.resolve()), "config": r.config.to_json(), "device": r.device,
+        "scene": dataclasses.asdict(r.scene), "out": str(r.out.absolute()), "config": r.config.to_json(), "device": r.device,
         "lpips_weights": None if r.lpips_weights is None else str(r.lpips_weights.resolve()), "notes": r.notes,
     }  # fmt: skip
-    return json.dumps({"name": job.name, "folder": str(job.folder.resolve()), "request": request})
+    places = {"folder": str(job.folder.absolute()), "results": None if job.results is None else str(job.results.absolute())}
+    return json.dumps({"name": job.name, **places, "request": request})
 
 
 def job_of(text: str) -> FarmJob:
@@ -63,4 +66,5 @@ def job_of(text: str) -> FarmJob:
     request = FitRequest(
         scene, Path(r["out"]), FitConfig.from_json(config), r["device"], lpips_weights=weights, notes=tuple(r["notes"])
     )
-    return FarmJob(values["name"], request, Path(values["folder"]))
+    results = None if values["results"] is None else Path(values["results"])
+    return FarmJob(values["name"], request, Path(values["folder"]), results)

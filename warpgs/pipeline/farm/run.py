@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from warpgs.errors import ResourceError, UsageError
-from warpgs.files import make_folder
+from warpgs.files import writing_into
 from warpgs.pipeline.farm.engine import Engine
 from warpgs.pipeline.farm.farm import JobStatus, run_farm, seconds_left
 from warpgs.pipeline.farm.index import INDEX, TABLE, row_of, write_index
@@ -83,13 +83,12 @@ def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bo
     Raises:
         ResourceError: The folder cannot be written, or no job could be started.
     """
-    make_folder(results)
     began = time.monotonic()
     shown = written = began - INDEX_INTERVAL
     count = f"{len(jobs)} job{'' if len(jobs) == 1 else 's'}"
     say(f"{count}, engine {engine.name}, {engine.slots} at a time; results: {results / INDEX}, {TABLE}")
     try:
-        with FarmTable(live=live) as table:
+        with writing_into(results), FarmTable(live=live) as table:
 
             def show(statuses: list[JobStatus]) -> None:
                 nonlocal shown, written

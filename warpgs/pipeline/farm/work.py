@@ -11,8 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from warpgs.errors import FolderHeldError, UsageError, WarpgsError
-from warpgs.files import make_folder, remove_leftovers, write_bytes
+from warpgs.errors import FolderHeldError, ResourceError, UsageError, WarpgsError
+from warpgs.files import appending, make_folder, remove_file, remove_leftovers, write_bytes, writing_into
 from warpgs.io.splits import Split
 from warpgs.pipeline.farm.ensure_run import Outcome, ensure_run
 from warpgs.pipeline.farm.job import FarmJob, job_of
@@ -59,17 +59,21 @@ def run_job(text: str, threads: int = 0, on_step: Callable[[StepReport], object]
     if threads:
         set_threads(threads)
     job = job_of(text)
-    make_folder(job.folder)
-    with _logged(job.folder / LOG):
-        return fit_job(job, on_step)
+    above = job.folder if job.results is None else job.results
+    with writing_into(above):
+        make_folder(job.folder)
+        with _logged(job.folder / LOG):
+            return fit_job(job, on_step)
 
 
 @contextlib.contextmanager
 def _logged(path: Path) -> Iterator[None]:
     """Append to a log all that is printed in the block, by native libraries too."""
-    if not path.is_file():
-        write_bytes(path)
-    with path.open("ab") as file, output_to(file.fileno()):
+    try:
+        file = appending(path)
+    except OSError as e:
+        raise ResourceError(f"{path}: cannot be written ({e.strerror or e}); write elsewhere, or free some disk space") from e
+    with file, output_to(file.fileno()):
         yield
 
 
@@ -117,7 +121,7 @@ def _ensure(job: FarmJob, on_step: Callable[[StepReport], object] | None) -> Out
     remove_leftovers(job.folder)
     before = read_record(job.folder)
     if before is not None and before.state == "done" and not is_whole(request.out, before):
-        (request.out / "metrics.json").unlink(missing_ok=True)  # continued from its checkpoint, it writes all files again
+        remove_file(request.out / "metrics.json")  # continued from its checkpoint, it writes all files again
     fingerprint, split, resolved = "", None, request.config
     if (request.out / CONFIG).is_file():
         fingerprint, split, resolved = _wanted(request, device.type)

@@ -5,17 +5,15 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-import secrets
-import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.errors import DataError, UsageError
 from warpgs.export.ply import write_ply
-from warpgs.files import sync_folder, write_json
+from warpgs.files import filling, write_json
 from warpgs.pipeline.metrics.evaluate import render_view, to_8_bit
 from warpgs.pipeline.metrics.psnr import psnr
 from warpgs.pipeline.metrics.region import scored_region
@@ -56,22 +54,14 @@ def _new_folder(folder: Path, out: Path | None) -> Path:
 
 def _write(out: Path, record: dict[str, Any], made: compress.Pruned, step: int, normalization: Normalization) -> list[str]:
     """Write the new run folder, whole or not at all; returns notes for the user."""
-    temporary = out.parent / f".warpgs-{secrets.token_hex(8)}.tmp"
     tensors = {f"params.{n}": t for n, t in made.gaussians.tensors().items() if n != "sh"}
     tensors |= {"params.sh_packed": pack(made.gaussians.sh, made.degrees), "degrees": made.degrees}
     with hold_folder(out.parent) as notes:
         _new_folder(out, out)  # another process may have made it before the folder above was ours
-        try:
-            temporary.mkdir()
+        with filling(out) as temporary:
             write_json(temporary / CONFIG, record)
             save_checkpoint(temporary, tensors, {"step": step})
             write_ply(temporary / "point_cloud.ply", made.gaussians, normalization)
-            os.rename(temporary, out)
-            sync_folder(out.parent)
-        except OSError as e:
-            raise ResourceError(f"{out}: cannot be written ({e.strerror or e}); choose another --out") from e
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
     return notes
 
 

@@ -1,0 +1,321 @@
+"""Folders that this process writes into: the one that the user names may be a link, below it no link is followed.
+
+`output_folder` opens such a folder for a block. Everything below it is then reached from its descriptor, folder by folder,
+without following links, so that nobody can lead a write or a read elsewhere. Of folders in each other the outermost counts.
+Windows has no descriptors of folders: there each name on the way is looked at before it is used.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import shutil
+import stat
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+WINDOWS = sys.platform == "win32"
+NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
+PLAIN = NO_FOLLOW | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 0)
+SEARCHED = getattr(os, "O_PATH", 0) | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 0)
+"""Flags that open a folder which may be written and entered, but not listed."""
+NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES)
+"""Errors of file systems that cannot sync a folder; what they keep after a power failure is theirs to say."""
+
+
+class RefusedError(OSError):
+    """A place that is not used: a link, no ordinary file, or a folder that was replaced; the text says how to fix it."""
+
+    def __init__(self, message: str):
+        """Take the whole message."""
+        super().__init__(errno.ELOOP, message)
+
+    def __str__(self) -> str:
+        return self.strerror
+
+
+class Folder:
+    """An open folder, whose entries are used by name without following links; a context manager that closes it."""
+
+    def __init__(self, path: Path, descriptor: int | None):
+        """Take its path, and its descriptor: None where the system has none."""
+        self.path, self.descriptor = path, descriptor
+
+    def __enter__(self) -> Folder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the descriptor."""
+        if self.descriptor is not None:
+            os.close(self.descriptor)
+
+    def _name(self, name: str) -> str:
+        return name if self.descriptor is not None else str(self.path / name)
+
+    def lstat(self, name: str) -> os.stat_result:
+        """Return what the system knows of an entry, which may be a link."""
+        return os.stat(self._name(name), dir_fd=self.descriptor, follow_symlinks=False)
+
+    def is_link(self, name: str) -> bool:
+        """Return whether an entry is a link or, on Windows, a junction."""
+        try:
+            found = self.lstat(name)
+        except OSError:
+            return False
+        return stat.S_ISLNK(found.st_mode) or getattr(found, "st_reparse_tag", 0) == getattr(
+            stat, "IO_REPARSE_TAG_MOUNT_POINT", -1
+        )
+
+    def _explained(self, name: str, error: OSError) -> OSError:
+        """Return the error to raise for an entry: that it is a link, where it is one."""
+        return _link(self.path / name) if self.is_link(name) else error
+
+    def open(self, name: str, flags: int, mode: int = 0o666) -> int:
+        """Open a file, and return its descriptor.
+
+        Raises:
+            OSError: It cannot be opened, or is a link.
+        """
+        if WINDOWS and self.is_link(name):
+            raise _link(self.path / name)
+        try:
+            return os.open(self._name(name), flags | PLAIN, mode, dir_fd=self.descriptor)
+        except OSError as e:
+            raise self._explained(name, e) from e
+
+    def open_regular(self, name: str, flags: int) -> int:
+        """Open an ordinary file, as `open` does.
+
+        Raises:
+            OSError: As for `open`.
+            RefusedError: It is a pipe or a device, which is not waited for.
+        """
+        descriptor = self.open(name, flags | getattr(os, "O_NONBLOCK", 0))
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            os.close(descriptor)
+            raise RefusedError(f"{self.path / name}: is no ordinary file; remove it")
+        return descriptor
+
+    def folder(self, name: str) -> Folder:
+        """Open a folder in this one.
+
+        Raises:
+            NotADirectoryError: It is a file.
+            OSError: It cannot be opened, or is a link.
+        """
+        path = self.path / name
+        if WINDOWS:
+            if self.is_link(name):
+                raise _link(path)
+            if not path.is_dir():
+                raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(path))
+            return Folder(path, None)
+        try:
+            return Folder(path, _opened(name, NO_FOLLOW, self.descriptor))
+        except OSError as e:
+            raise self._explained(name, e) from e
+
+    def mkdir(self, name: str, mode: int = 0o777) -> None:
+        """Make a folder."""
+        os.mkdir(self._name(name), mode, dir_fd=self.descriptor)
+
+    def rmdir(self, name: str) -> None:
+        """Remove an empty folder."""
+        os.rmdir(self._name(name), dir_fd=self.descriptor)
+
+    def unlink(self, name: str) -> None:
+        """Remove a file, or a link itself."""
+        os.unlink(self._name(name), dir_fd=self.descriptor)
+
+    def replace(self, old: str, new: str) -> None:
+        """Give an entry another name; a file of that name, or a link, is replaced."""
+        os.replace(self._name(old), self._name(new), src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
+
+    def rename(self, old: str, new: str) -> None:
+        """Give a folder another name, which must be free, or that of an empty folder."""
+        os.rename(self._name(old), self._name(new), src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
+
+    def remove_tree(self, name: str) -> None:
+        """Remove a folder with all that is in it; what cannot be removed stays."""
+        shutil.rmtree(self._name(name), ignore_errors=True, dir_fd=self.descriptor)
+
+    def names(self) -> list[str]:
+        """Return the names of all entries."""
+        return os.listdir(self.path if self.descriptor is None else self.descriptor)
+
+    def sync(self) -> None:
+        """Have the disk keep the names through a power failure, where the system can: Windows has no such call."""
+        if self.descriptor is None:
+            return
+        try:
+            os.fsync(self.descriptor)
+        except OSError as e:
+            if e.errno not in NO_FOLDER_SYNC:
+                raise
+
+
+@dataclass
+class _Root:
+    """A folder that is open for a block."""
+
+    path: Path
+    folder: Folder
+    identity: tuple[int, int]
+    blocks: int = 0
+
+
+_ROOTS: dict[tuple[str, ...], _Root] = {}
+_LOCK = threading.RLock()
+
+
+@contextlib.contextmanager
+def output_folder(folder: Path) -> Iterator[None]:
+    """Have all that is written below a folder, in this block, go through its descriptor and follow no link.
+
+    The folder itself may be reached through links, unless it lies below another one that is open. Where another folder takes
+    its place meanwhile, the next write is refused.
+
+    Raises:
+        OSError: It is not there, or lies behind a link below a folder that is open.
+    """
+    path = folder.absolute()
+    with _LOCK:
+        root = _ROOTS.get(path.parts)
+        if root is None:
+            opened = open_folder(path)
+            root = _ROOTS[path.parts] = _Root(path, opened, _identity(opened))
+        root.blocks += 1
+    try:
+        yield
+    finally:
+        with _LOCK:
+            root.blocks -= 1
+            if not root.blocks:
+                del _ROOTS[path.parts]
+                root.folder.close()
+
+
+def is_below(path: Path) -> bool:
+    """Return whether a path lies below a folder that is open, so that no link to it is followed."""
+    return _outermost(path.absolute().parent) is not None
+
+
+def open_folder(path: Path, make: bool = False) -> Folder:
+    """Open a folder, to use its entries: below an open `output_folder` without following links, else wherever the path leads.
+
+    Args:
+        path: The folder.
+        make: Whether to make folders on the way that are not there; below an open folder alone.
+
+    Raises:
+        OSError: It cannot be opened, or a link lies on the way.
+    """
+    path = path.absolute()
+    with _LOCK:
+        root = _outermost(path)
+        if root is None:
+            return Folder(path, None if WINDOWS else _opened(str(path), 0, None))
+        found = _again(root)
+    for i in range(len(root.path.parts), len(path.parts)):
+        with found as above:
+            found = _entered(above, path.parts[i], make)
+        inner = _ROOTS.get(path.parts[: i + 1])
+        if inner is not None and _identity(found) != inner.identity:
+            found.close()
+            raise _replaced(inner.path)
+    return found
+
+
+def open_file(path: Path, below: Path | None = None) -> BinaryIO:
+    """Open an ordinary file to read: no link is followed below an open folder, or below the folder that is named.
+
+    Args:
+        path: The file.
+        below: A folder above it that holds it; the way from there to the file must have no link. None where the file is the
+            user's own, and may be a link.
+
+    Raises:
+        OSError: It cannot be opened, or is a link.
+        RefusedError: It is no ordinary file.
+    """
+    with contextlib.ExitStack() as stack:
+        if below is not None:
+            stack.enter_context(output_folder(below))
+        if is_below(path):
+            folder = stack.enter_context(open_folder(path.parent))
+            return os.fdopen(folder.open_regular(path.name, os.O_RDONLY), "rb")
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise RefusedError(f"{path}: is no ordinary file; give one")
+    return os.fdopen(descriptor, "rb")
+
+
+def _opened(name: str, more: int, at: int | None) -> int:
+    """Open a folder and return its descriptor, also where it may not be listed."""
+    try:
+        return os.open(name, FOLDER | more, dir_fd=at)
+    except PermissionError:
+        if not getattr(os, "O_PATH", 0):
+            raise
+        return os.open(name, SEARCHED | more, dir_fd=at)
+
+
+def _outermost(path: Path) -> _Root | None:
+    """Return the open folder above a path, or at it, that has no other above it."""
+    parts = path.parts
+    return next((_ROOTS[parts[:i]] for i in range(1, len(parts) + 1) if parts[:i] in _ROOTS), None) if _ROOTS else None
+
+
+def _again(root: _Root) -> Folder:
+    """Return another opening of an open folder, which is still the one that its path names."""
+    try:
+        now = os.stat(root.path)
+    except OSError as e:
+        raise _replaced(root.path) from e
+    if (now.st_dev, now.st_ino) != root.identity:
+        raise _replaced(root.path)
+    return Folder(root.path, None if WINDOWS else _opened(".", 0, root.folder.descriptor))
+
+
+def _entered(above: Folder, name: str, make: bool) -> Folder:
+    """Open a folder in another one, and make it first if it is not there and shall be."""
+    if name == os.pardir:
+        raise RefusedError(f"{above.path / name}: leads out of the folder; name the place without {os.pardir}")
+    try:
+        return above.folder(name)
+    except FileNotFoundError:
+        if not make:
+            raise
+    with contextlib.suppress(FileExistsError):  # of another process, just now
+        above.mkdir(name)
+    return above.folder(name)
+
+
+def _identity(folder: Folder) -> tuple[int, int]:
+    """Return the numbers by which the system knows a folder."""
+    found = os.stat(folder.path) if folder.descriptor is None else os.fstat(folder.descriptor)
+    return found.st_dev, found.st_ino
+
+
+def _link(path: Path) -> RefusedError:
+    return RefusedError(
+        f"{path}: is a link, and links inside of a results folder are not followed; put the file or folder itself there, or "
+        "remove the link. The results folder itself may be a link"
+    )
+
+
+def _replaced(path: Path) -> RefusedError:
+    return RefusedError(
+        f"{path}: is no longer the folder that this command began to write into; it was moved, removed or replaced. Put it "
+        "back, or choose another folder"
+    )

@@ -1,0 +1,237 @@
+"""Temporary files and folders, each locked by its owner: whoever finds one that is not locked removes it.
+
+The system gives a lock free when its holder ends, killed or not. So a temporary file of a process at work is never taken for a
+leftover, and nothing of a killed one stays for longer than until the next command.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import functools
+import os
+import re
+import secrets
+import stat
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+from filelock import lock_descriptor
+
+from warpgs.output_folders import Folder, open_folder
+
+NAMES = re.compile(r"\.?warpgs-[0-9a-f]{16}\.tmp(\.(mp4|webm|lock))?")
+"""Names of temporary files, folders and their locks: short and of ASCII letters, so that they fit wherever the file does."""
+LOCKED = ".lock"
+"""End of the name of the lock beside a temporary folder."""
+NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
+"""Errors of file systems without locks."""
+
+_HELD: set[int] = set()
+"""Descriptors of the locks of temporary folders of this process."""
+_LOCK = threading.Lock()
+
+
+@contextlib.contextmanager
+def shared_locks() -> Iterator[tuple[int, ...]]:
+    """Give descriptors of all locks of temporary folders, for a child process to inherit (``pass_fds``).
+
+    It may work in these folders, and so they are held until it has ended, too, even if this process dies before.
+    """
+    with _LOCK:
+        copies = tuple(map(os.dup, _HELD)) if sys.platform != "win32" else ()
+    try:
+        yield copies
+    finally:
+        for descriptor in copies:
+            os.close(descriptor)
+
+
+class TemporaryFile:
+    """A new file that its owner holds, and removes where it still has its name at the end; use it with ``with``."""
+
+    def __init__(self, folder: Folder, suffix: str = ""):
+        """Make the file.
+
+        Args:
+            folder: Open folder that it is made in.
+            suffix: End of its name: none, .mp4 or .webm.
+
+        Raises:
+            OSError: It cannot be made.
+        """
+        self._folder = folder
+        self.name, self.descriptor = _own_file(folder, suffix, locks=sys.platform != "win32")
+        self._open = True
+
+    def __enter__(self) -> TemporaryFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if sys.platform == "win32":  # no open file is removed there; elsewhere the lock holds until it is gone
+            self.close()
+        try:
+            with contextlib.suppress(OSError):  # it hides nothing: what is left over is ours by name
+                self._folder.unlink(self.name)
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Close the file, and give its lock free; a file system may only now say that it could not keep it."""
+        if self._open:
+            self._open = False
+            os.close(self.descriptor)
+
+
+class TemporaryFolder:
+    """A new folder that its owner removes, or gives another name; the lock beside it says that the owner is at work."""
+
+    def __init__(self, above: Folder, prefix: str = ".warpgs-", mode: int = 0o777):
+        """Make the folder.
+
+        Args:
+            above: Open folder that it is made in; closed by `remove`.
+            prefix: Beginning of its name.
+            mode: Rights of the folder.
+
+        Raises:
+            OSError: It cannot be made.
+        """
+        self._above, self._process = above, os.getpid()
+        lock, self._descriptor = _own_file(above, LOCKED, locks=True, prefix=prefix, mode=0o600)
+        self.name = lock.removesuffix(LOCKED)
+        self.path = above.path / self.name
+        with _LOCK:
+            _HELD.add(self._descriptor)
+        try:
+            above.mkdir(self.name, mode)
+        except BaseException:
+            self.remove()
+            raise
+
+    def __enter__(self) -> TemporaryFolder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.remove()
+
+    def remove(self) -> None:
+        """Remove the folder, where it still has its name, and then its lock; a forked child leaves both to its parent."""
+        if os.getpid() != self._process or self._descriptor not in _HELD:
+            return
+        try:
+            self._above.remove_tree(self.name)
+        finally:
+            with _LOCK:
+                _HELD.discard(self._descriptor)
+            try:
+                _unlocked(self._above, self.name + LOCKED, self._descriptor)
+            finally:
+                self._above.close()
+
+
+def temporary_folder() -> TemporaryFolder:
+    """Make a folder that only this user can read or write, where the system has temporary files; use it with ``with``.
+
+    What killed commands of this user left there is removed.
+
+    Raises:
+        OSError: There is no place for it.
+    """
+    sweep_temporary_files()
+    return TemporaryFolder(open_folder(_system_folder()), "warpgs-", 0o700)
+
+
+@functools.cache
+def sweep_temporary_files() -> None:
+    """Remove what killed commands of this user left where the system has temporary files; looks once in each process."""
+    with contextlib.suppress(OSError), open_folder(_system_folder()) as folder:
+        sweep(folder, own=True)
+
+
+def _system_folder() -> Path:
+    return Path(tempfile.gettempdir()).resolve()
+
+
+def sweep(folder: Folder, own: bool = False) -> None:
+    """Remove temporary files and folders that nobody holds; what cannot be removed or locked stays: it is in nobody's way.
+
+    Args:
+        folder: The folder that they lie in.
+        own: Whether to touch only what belongs to this user.
+    """
+    with contextlib.suppress(OSError):
+        for name in filter(NAMES.fullmatch, folder.names()):
+            with contextlib.suppress(OSError):
+                found = folder.lstat(name)
+                if not own or not hasattr(os, "getuid") or found.st_uid == os.getuid():
+                    _sweep_one(folder, name, found.st_mode)
+
+
+def _sweep_one(folder: Folder, name: str, mode: int) -> None:
+    """Remove one temporary entry, if nobody holds it."""
+    if stat.S_ISLNK(mode):
+        folder.unlink(name)
+    elif stat.S_ISDIR(mode) or name.endswith(LOCKED):
+        lock = name.removesuffix(LOCKED) + LOCKED
+        descriptor = folder.open_regular(lock, os.O_RDWR | os.O_CREAT)
+        if not _locked(descriptor):
+            os.close(descriptor)
+            return
+        try:
+            folder.remove_tree(lock.removesuffix(LOCKED))
+        finally:
+            _unlocked(folder, lock, descriptor)
+    elif stat.S_ISREG(mode):
+        descriptor = folder.open_regular(name, os.O_RDWR)
+        if sys.platform == "win32" or _locked(descriptor):  # Windows itself refuses to remove an open file
+            _unlocked(folder, name, descriptor)
+        else:
+            os.close(descriptor)
+
+
+def _own_file(folder: Folder, suffix: str, *, locks: bool, prefix: str = ".warpgs-", mode: int = 0o666) -> tuple[str, int]:
+    """Make a file with a name of its own and lock it; return name and descriptor."""
+    while True:
+        name = f"{prefix}{secrets.token_hex(8)}.tmp{suffix}"
+        descriptor = folder.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL, mode)
+        try:
+            if not locks or _owned(descriptor):
+                return name, descriptor
+        except BaseException:
+            _unlocked(folder, name, descriptor)
+            raise
+        os.close(descriptor)  # another process found it before it was locked, and removes it
+
+
+def _owned(descriptor: int) -> bool:
+    """Lock a new file; return False where another process took it for a leftover just then."""
+    try:
+        return lock_descriptor(descriptor, blocking=False) and os.fstat(descriptor).st_nlink > 0
+    except OSError as e:
+        if e.errno in NO_LOCKS:  # nobody else can lock it either, and so nobody removes it
+            return True
+        raise
+
+
+def _locked(descriptor: int) -> bool:
+    """Lock a file; return False where it is held, or where nobody can tell."""
+    try:
+        return lock_descriptor(descriptor, blocking=False)
+    except OSError:
+        return False
+
+
+def _unlocked(folder: Folder, name: str, descriptor: int) -> None:
+    """Remove a locked file, and then give its lock free; Windows removes no open file."""
+    if sys.platform == "win32":
+        os.close(descriptor)
+    try:
+        with contextlib.suppress(OSError):
+            folder.unlink(name)
+    finally:
+        if sys.platform != "win32":
+            os.close(descriptor)
