@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from warpgs.errors import ResourceError, UsageError
-from warpgs.output_folders import Folder, RefusedError, is_below, open_folder, output_folder
+from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.output_folders import Folder, RefusedError, is_below, open_file, open_folder, output_folder
 from warpgs.temporary import NAMES as OWN_NAMES
 from warpgs.temporary import TemporaryFile, TemporaryFolder, sweep
 
@@ -207,6 +207,23 @@ def plain(value: object) -> object:
     if isinstance(value, (list, tuple)):
         return [plain(v) for v in value]
     return value
+
+
+def read_file(path: Path, below: Path) -> bytes:
+    """Return the contents of a file that a command has written, such as one of a run.
+
+    Args:
+        path: The file.
+        below: Folder that it lies in; no link on the way from there is followed.
+
+    Raises:
+        DataError: It cannot be read, or is a link or no ordinary file.
+    """
+    try:
+        with open_file(path, below) as file:
+            return file.read()
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({e.strerror or e}); restore it, or make it again") from e
 
 
 def appending(path: Path) -> BinaryIO:

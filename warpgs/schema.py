@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from warpgs.output_folders import open_file
+
 MAX_BYTES = 2**28
 """Size of the largest text that is read [bytes]; config.json of a thousand views takes one MiB."""
 MAX_DEPTH = 50
@@ -65,16 +67,19 @@ def _parts(value: Any) -> list[Any]:
     return value if isinstance(value, list) else []
 
 
-def read(path: Path) -> Any:
+def read(path: Path, below: Path | None = None) -> Any:
     """Return the value of a JSON file.
 
+    Args:
+        path: The file.
+        below: Folder, such as a run's, that the file lies in: no link on the way from there is followed. None for a file that
+            the user names.
+
     Raises:
-        OSError: It cannot be read.
-        SchemaError: It is no ordinary file, or `parse` refuses what it holds.
+        OSError: It cannot be read, is a link that is not followed, or no ordinary file.
+        SchemaError: `parse` refuses what it holds.
     """
-    if path.exists() and not path.is_file():  # a pipe would never end
-        raise SchemaError("is no ordinary file")
-    with path.open("rb") as f:
+    with open_file(path, below) as f:
         return parse(f.read(MAX_BYTES + 1))
 
 

@@ -78,7 +78,7 @@ def test_a_failing_write_leaves_the_old_file_alone(tmp_path, monkeypatch, stage)
     path = tmp_path / "a.json"
     write_json(path, {"old": 1})
 
-    def full(*_):
+    def full(*_, **__):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(f"warpgs.files.{stage}", full)

@@ -88,7 +88,7 @@ def test_nothing_can_be_written(python, tmp_path):
     code = """
 import sys, tempfile
 def refuse(*_, **__): raise FileNotFoundError(2, "No usable temporary directory found")
-tempfile.mkdtemp = refuse
+tempfile.gettempdir = refuse
 from warpgs.app.cli import main
 sys.exit(main(["eval", "run"]))
 """

@@ -124,7 +124,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     """
     path = folder / JSON
     try:
-        record: dict[str, Any] = schema.read(path)
+        record: dict[str, Any] = schema.read(path, folder)
         _RECORD(record, "")
     except (OSError, schema.SchemaError) as e:
         raise DataError(f"{path}: cannot be read ({e}); find the poses again with `warpgs poses`") from e

@@ -37,7 +37,7 @@ class Outcome:
 def _scores(path: Path) -> dict[str, Any] | None:
     """Read metrics.json or eval.json; None where there is none or it is not whole."""
     try:
-        value: dict[str, Any] = schema.read(path)
+        value: dict[str, Any] = schema.read(path, path.parent)
         METRICS(value, "")
     except (OSError, schema.SchemaError):
         return None
@@ -80,7 +80,7 @@ def _with_lpips(metrics: dict[str, Any], folder: Path, request: FitRequest, vari
         if found and found.get("config_hash") == metrics["config_hash"] and variants.items() <= found["variants"].items():
             return metrics | {k: found[k] for k in ("test", "views", "variants")}
     evaluate(folder, request.device, request.lpips_weights)
-    written = schema.read(folder / "eval.json")
+    written = schema.read(folder / "eval.json", folder)
     return metrics | {k: written[k] for k in ("test", "views", "variants")}
 
 

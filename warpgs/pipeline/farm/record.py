@@ -11,6 +11,7 @@ from pathlib import Path
 from warpgs import __version__, schema
 from warpgs.errors import ResourceError
 from warpgs.files import write_json
+from warpgs.output_folders import open_file
 from warpgs.pipeline.farm.job import FarmJob
 from warpgs.pipeline.runs.folder import CONFIG
 
@@ -84,7 +85,7 @@ def write_record(folder: Path, record: JobRecord) -> None:
 def read_record(folder: Path) -> JobRecord | None:
     """Read the record of a job; None where there is none, or it is not whole."""
     try:
-        values = schema.read(folder / RECORD)
+        values = schema.read(folder / RECORD, folder)
         _SCHEMA(values, "")
     except (OSError, schema.SchemaError):
         return None
@@ -98,7 +99,7 @@ def file_digest(path: Path) -> str:
         ResourceError: It cannot be read.
     """
     try:
-        with path.open("rb") as f:
+        with open_file(path, path.parent) as f:
             return hashlib.file_digest(f, "sha256").hexdigest()
     except OSError as e:
         raise ResourceError(f"{path}: cannot be read ({e.strerror or e}); check the disk, and fit the scene again") from e

@@ -11,8 +11,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from warpgs.errors import FolderHeldError, ResourceError, UsageError, WarpgsError
-from warpgs.files import appending, make_folder, remove_file, remove_leftovers, write_bytes, writing_into
+from warpgs.files import appending, make_folder, read_file, remove_file, remove_leftovers, write_bytes, writing_into
 from warpgs.io.splits import Split
 from warpgs.pipeline.farm.ensure_run import Outcome, ensure_run
 from warpgs.pipeline.farm.job import FarmJob, job_of
@@ -153,7 +155,9 @@ def write_thumbnail(renders: Path, path: Path) -> None:
     import cv2
 
     first = min(renders.glob("*.png"), default=None)
-    image = None if first is None else cv2.imread(str(first))
+    if first is None:
+        return
+    image = cv2.imdecode(np.frombuffer(read_file(first, renders.parent), np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         return
     pair = image[:, : image.shape[1] * 2 // 3]  # render, photograph, error

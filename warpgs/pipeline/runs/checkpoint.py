@@ -12,7 +12,7 @@ import torch
 
 from warpgs import __version__, schema
 from warpgs.errors import DataError, NotFiniteError
-from warpgs.files import write_bytes
+from warpgs.files import read_file, write_bytes
 
 TENSORS = "checkpoint.safetensors"
 FORMAT = 2
@@ -92,7 +92,7 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, An
     path = folder / TENSORS
     if not path.is_file():
         raise DataError(f"{folder} holds no {TENSORS}: there is nothing to continue or to render from; run `warpgs fit` first")
-    data = path.read_bytes()
+    data = read_file(path, folder)
     body, digest = data[:-32], data[-32:]
     if hashlib.sha256(body).digest() != digest:
         raise DataError(f"{path}: the checksum does not match, so the file was truncated or altered; fit again, or restore it")

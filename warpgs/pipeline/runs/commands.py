@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from warpgs.errors import DataError, UsageError, WarpgsError
-from warpgs.files import write_json
+from warpgs.files import write_json, writing_into
 from warpgs.io.splits import Split
 from warpgs.pipeline.films.film import COVERAGE, FILM, render_film, sheet_path
 from warpgs.pipeline.films.plan import FilmSettings, plan_film
@@ -137,7 +138,7 @@ def render(
     color = color_of(background)
     if color is None and background != "auto":
         raise UsageError(f"--background {background}: a render takes auto, black, white, #rrggbb or r,g,b")
-    home = folder if file_of is None else folder.parent
+    home, named = folder if file_of is None else folder.parent, out is not None
     out = home / f"path-{Path(path).stem.replace('.', '-')}" if out is None else out
     notes: list[str] = []
     stored: FittedModel
@@ -157,7 +158,8 @@ def render(
             training = True
             notes.append(f"what masks of training views hide counts as seen, since the scene cannot be read: {e}")
         notes.append(f"images in {out / COVERAGE}: {LEGEND}")
-    done = render_film(stored, plan, out, settings, coverage=training, sheet=sheet, tell=tell)
+    with contextlib.nullcontext() if named else writing_into(home):
+        done = render_film(stored, plan, out, settings, coverage=training, sheet=sheet, tell=tell)
     *files, last = done.files
     notes += done.notes + ([f"six frames in {sheet_path(out)}"] if sheet else [])
     if last == out:

@@ -109,7 +109,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     """
     path = folder / CONFIG
     try:
-        record = schema.read(path)
+        record = schema.read(path, folder)
     except FileNotFoundError as e:
         raise DataError(f"{folder}: holds no run (there is no {CONFIG}); give a folder that `warpgs fit --out` filled") from e
     except (OSError, schema.SchemaError) as e:
