@@ -12,7 +12,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-MAX_BYTES = 2**28
+from warpgs.input_files import read_input
+
+MAX_BYTES = 2**25
 """Size of the largest text that is read [bytes]; config.json of a thousand views takes one MiB."""
 MAX_DEPTH = 50
 """Number of lists and objects that may lie in each other: whoever walks through a value needs no guard of its own."""
@@ -69,13 +71,10 @@ def read(path: Path) -> Any:
     """Return the value of a JSON file.
 
     Raises:
-        OSError: It cannot be read.
-        SchemaError: It is no ordinary file, or `parse` refuses what it holds.
+        OSError: It cannot be read, is no regular file, or is larger than `MAX_BYTES`.
+        SchemaError: `parse` refuses what it holds.
     """
-    if path.exists() and not path.is_file():  # a pipe would never end
-        raise SchemaError("is no ordinary file")
-    with path.open("rb") as f:
-        return parse(f.read(MAX_BYTES + 1))
+    return parse(read_input(path, MAX_BYTES))
 
 
 def anything(value: Any, place: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import struct
 from pathlib import Path
 from types import ModuleType
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warpgs.errors import DataError, ResourceError
+from warpgs.input_files import read_input, read_start, unread_reason
 from warpgs.io.image_formats import avif, bmp, jpeg, png, tiff, webp
 from warpgs.io.unread_formats import unread_format
 
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
 
 MAX_PIXELS = 100_000_000
 """Largest number of pixels of an image where the user names none; decoded, it takes 1.2 GB."""
+FILE_BYTES_PER_PIXEL, EXTRA_FILE_BYTES = 16, 2**26
+"""Bytes that a pixel may take in a file, four channels as float32, and bytes for all else in it."""
 BYTES_PER_PIXEL = 32
 """Most memory that decoding takes per pixel [bytes]: four channels as float32, and the colours and alpha made of them."""
 FORMATS: tuple[tuple[bytes, str, ModuleType], ...] = (
@@ -69,19 +73,35 @@ def open_header(data: bytes) -> ImageFile.ImageFile:
         raise ValueError(f"its header is broken: {e}") from e
 
 
-def read_image_file(path: Path) -> bytes:
-    """Return the bytes of an image file.
+def read_image_file(path: Path, max_pixels: int = MAX_PIXELS) -> bytes:
+    """Return the bytes of an image file; none with so many pixels is larger than what is read.
 
     Raises:
-        DataError: It is missing or cannot be read.
+        DataError: It is missing, cannot be read, or is no regular file.
     """
-    if not path.is_file():
-        what = "is a link that leads to no file" if path.is_symlink() else "the image file is missing"
-        raise DataError(f"{path}: {what}; restore it, or remove its camera from the scene")
     try:
-        return path.read_bytes()
+        return read_input(path, FILE_BYTES_PER_PIXEL * max_pixels + EXTRA_FILE_BYTES)
     except OSError as e:
-        raise DataError(f"{path}: the image cannot be read ({e.strerror}); fix its permissions or copy it again") from e
+        raise _unreadable(path, e) from e
+
+
+def read_image_start(path: Path, count: int) -> bytes:
+    """Return the first bytes of an image file, at most ``count``.
+
+    Raises:
+        DataError: It is missing, cannot be read, or is no regular file.
+    """
+    try:
+        return read_start(path, count)
+    except OSError as e:
+        raise _unreadable(path, e) from e
+
+
+def _unreadable(path: Path, error: OSError) -> DataError:
+    if not os.path.exists(path):  # False for links that lead nowhere or round in circles
+        what = "is a link that leads to no file" if path.is_symlink() else "the image file is missing"
+        return DataError(f"{path}: {what}; restore it, or remove its camera from the scene")
+    return DataError(f"{path}: the image cannot be read ({unread_reason(error)}); fix its permissions or copy it again")
 
 
 def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
@@ -146,7 +166,7 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS) -> tuple[np.ndarray, np.nda
         DataError: The file is missing, no such image, too large, or damaged as far as its format lets one see it.
         ResourceError: There is not enough memory for it.
     """
-    raw = _raster(path, read_image_file(path), max_pixels)
+    raw = _raster(path, read_image_file(path, max_pixels), max_pixels)
     if raw.dtype in (np.uint8, np.uint16):
         values = raw.astype(np.float32)
         values /= np.iinfo(raw.dtype).max

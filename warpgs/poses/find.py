@@ -10,6 +10,7 @@ from typing import Any
 
 from warpgs.errors import DataError, UsageError
 from warpgs.files import filling, is_empty, make_folder, write_bytes
+from warpgs.input_files import input_digest
 from warpgs.io.decoding import MAX_PIXELS, read_image_file
 from warpgs.io.readers import all_readers
 from warpgs.io.unread_formats import unread_note
@@ -48,8 +49,7 @@ def source_digest(source: Path) -> str:
     """
     total = hashlib.sha256()
     if is_video(source):
-        with source.open("rb") as f:
-            return hashlib.file_digest(f, "sha256").hexdigest()
+        return input_digest(source)
     root = image_root(source)
     for path in find_photographs(source):
         name = path.relative_to(root).as_posix().encode("utf-8", "surrogateescape")

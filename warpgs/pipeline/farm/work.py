@@ -11,8 +11,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from warpgs.errors import FolderHeldError, UsageError, WarpgsError
 from warpgs.files import make_folder, remove_leftovers, write_bytes
+from warpgs.io.decoding import decode
 from warpgs.io.splits import Split
 from warpgs.pipeline.farm.ensure_run import Outcome, ensure_run
 from warpgs.pipeline.farm.job import FarmJob, job_of
@@ -149,9 +152,9 @@ def write_thumbnail(renders: Path, path: Path) -> None:
     import cv2
 
     first = min(renders.glob("*.png"), default=None)
-    image = None if first is None else cv2.imread(str(first))
-    if image is None:
+    if first is None:
         return
+    image = np.round(255 * decode(first)[0][..., ::-1]).astype(np.uint8)
     pair = image[:, : image.shape[1] * 2 // 3]  # render, photograph, error
     scale = min(1.0, THUMBNAIL_SIDE / max(pair.shape[:2]))
     size = max(1, round(pair.shape[1] * scale)), max(1, round(pair.shape[0] * scale))
