@@ -105,7 +105,7 @@ def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
         except Exception as e:  # torch, pickle and zipfile raise a dozen types on foreign bytes
             reason = str(e).splitlines()[0][:120] if str(e) else ""
             raise DataError(
-                f"{path}: cannot be read as a torch state dict ({type(e).__name__}: {reason}); download it again from its source"
+                f"{path}: cannot be read as a torch state dict ({type(e).__name__}: {reason}); download it again"
             ) from e
         file.seek(0)
         digest = hashlib.file_digest(file, "sha256").hexdigest()
