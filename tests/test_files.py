@@ -194,6 +194,7 @@ ELSEWHERE = {
     ("files.py", "open wb"): "the temporary file of `writing`",
     ("files.py", "open ab"): "a file that grows by lines: metrics.jsonl, the log of a job",
     ("output_folders.py", "os.open"): "folders and files by descriptor, for the functions of `warpgs.files`",
+    ("input_files.py", "os.open"): "files by descriptor, to read",
     ("pipeline/farm/worker.py", "open w"): "a copy of stdout",
     ("runtime/load_module.py", "open ab"): "a lock beside compiled kernels",
     ("runtime/folder_lock.py", "open r+b"): "the lock of a folder",

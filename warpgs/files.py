@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.output_folders import Folder, RefusedError, is_below, open_file, open_folder, output_folder
+from warpgs.input_files import read_input, unread_reason
+from warpgs.output_folders import Folder, RefusedError, is_below, open_folder, output_folder
 from warpgs.temporary import NAMES as OWN_NAMES
 from warpgs.temporary import TemporaryFile, TemporaryFolder, sweep
 
@@ -217,20 +218,19 @@ def read_file(path: Path, below: Path) -> bytes:
         below: Folder that it lies in; no link on the way from there is followed.
 
     Raises:
-        DataError: It cannot be read, or is a link or no ordinary file.
+        DataError: It cannot be read, or is a link or no regular file.
     """
     try:
-        with open_file(path, below) as file:
-            return file.read()
+        return read_input(path, below=below)
     except OSError as e:
-        raise DataError(f"{path}: cannot be read ({e.strerror or e}); restore it, or make it again") from e
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); restore it, or make it again") from e
 
 
 def appending(path: Path) -> BinaryIO:
     """Open a file to append to, made if it is not there; a link is not followed.
 
     Raises:
-        OSError: It cannot be opened, or is a link or no ordinary file.
+        OSError: It cannot be opened, or is a link or no regular file.
     """
     with open_folder(path.parent) as folder:
         descriptor = folder.open_regular(path.name, os.O_WRONLY | os.O_APPEND | os.O_CREAT)

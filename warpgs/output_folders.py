@@ -30,7 +30,7 @@ NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES)
 
 
 class RefusedError(OSError):
-    """A place that is not used: a link, no ordinary file, or a folder that was replaced; the text says how to fix it."""
+    """A place that is not used: a link, no regular file, or a folder that was replaced; the text says how to fix it."""
 
     def __init__(self, message: str):
         """Take the whole message."""
@@ -93,7 +93,7 @@ class Folder:
             raise self._explained(name, e) from e
 
     def open_regular(self, name: str, flags: int) -> int:
-        """Open an ordinary file, as `open` does.
+        """Open a regular file, as `open` does.
 
         Raises:
             OSError: As for `open`.
@@ -102,7 +102,7 @@ class Folder:
         descriptor = self.open(name, flags | getattr(os, "O_NONBLOCK", 0))
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             os.close(descriptor)
-            raise RefusedError(f"{self.path / name}: is no ordinary file; remove it")
+            raise RefusedError(f"{self.path / name}: is not a regular file; remove it")
         return descriptor
 
     def folder(self, name: str) -> Folder:
@@ -235,29 +235,19 @@ def open_folder(path: Path, make: bool = False) -> Folder:
     return found
 
 
-def open_file(path: Path, below: Path | None = None) -> BinaryIO:
-    """Open an ordinary file to read: no link is followed below an open folder, or below the folder that is named.
+def open_file(path: Path, below: Path) -> BinaryIO:
+    """Open a regular file below a folder to read; the way from there to the file must have no link.
 
     Args:
         path: The file.
-        below: A folder above it that holds it; the way from there to the file must have no link. None where the file is the
-            user's own, and may be a link.
+        below: Folder above it, such as that of a run.
 
     Raises:
         OSError: It cannot be opened, or is a link.
-        RefusedError: It is no ordinary file.
+        RefusedError: It is no regular file.
     """
-    with contextlib.ExitStack() as stack:
-        if below is not None:
-            stack.enter_context(output_folder(below))
-        if is_below(path):
-            folder = stack.enter_context(open_folder(path.parent))
-            return os.fdopen(folder.open_regular(path.name, os.O_RDONLY), "rb")
-    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise RefusedError(f"{path}: is no ordinary file; give one")
-    return os.fdopen(descriptor, "rb")
+    with output_folder(below), open_folder(path.parent) as folder:
+        return os.fdopen(folder.open_regular(path.name, os.O_RDONLY), "rb")
 
 
 def _opened(name: str, more: int, at: int | None) -> int:

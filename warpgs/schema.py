@@ -12,9 +12,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from warpgs.output_folders import open_file
+from warpgs.input_files import read_input
 
-MAX_BYTES = 2**28
+MAX_BYTES = 2**25
 """Size of the largest text that is read [bytes]; config.json of a thousand views takes one MiB."""
 MAX_DEPTH = 50
 """Number of lists and objects that may lie in each other: whoever walks through a value needs no guard of its own."""
@@ -76,11 +76,10 @@ def read(path: Path, below: Path | None = None) -> Any:
             the user names.
 
     Raises:
-        OSError: It cannot be read, is a link that is not followed, or no ordinary file.
+        OSError: It cannot be read, is a link that is not followed, no regular file, or larger than `MAX_BYTES`.
         SchemaError: `parse` refuses what it holds.
     """
-    with open_file(path, below) as f:
-        return parse(f.read(MAX_BYTES + 1))
+    return parse(read_input(path, MAX_BYTES, below))
 
 
 def anything(value: Any, place: str) -> None:

@@ -137,7 +137,11 @@ def test_boxes_of_files(tmp_path):
     lines = convert(tmp_path / "a.ply", tmp_path / "b.ply", Filters(crop=str(path), rotate="0,0,1,180"))
     assert f"{int((made.means[:, 0] < 0).sum())} Gaussians lie outside" in lines[0]
     assert float(read_gaussians(tmp_path / "b.ply").means[:, 0].max()) <= 0
-    for text, match in (("[1, 2]", "no JSON object"), ('{"center": 1}', "center takes 3"), (" " * 70000, "no JSON object")):
+    for text, match in (
+        ("[1, 2]", "no JSON object"),
+        ('{"center": 1}', "center takes 3"),
+        (" " * 70000, "larger than 65,536 bytes"),
+    ):
         path.write_text(text)
         with pytest.raises(DataError, match=match):
             box_of(str(path))

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from warpgs.errors import DataError
+from warpgs.input_files import read_input, unread_reason
 from warpgs.io import colmap, transforms
 from warpgs.io.images import Lens
 from warpgs.io.poses import from_camera_to_world, quat_rotation, rigid
 from warpgs.scene import Camera
 
-MAX_BYTES = 2**28
+MAX_BYTES = 2**25
 """Largest file of cameras that is read [bytes]."""
 
 
@@ -44,10 +45,10 @@ def read_cameras(path: Path) -> tuple[dict[str, Camera], list[str]]:
 def _json(path: Path) -> Any:
     """Return the values of a JSON file of bounded size."""
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise DataError(f"{path}: has more than {MAX_BYTES:,} bytes, which no set of cameras has. Write it again")
-        return json.loads(path.read_bytes().decode("utf-8-sig"))
-    except (OSError, ValueError, RecursionError) as e:
+        return json.loads(read_input(path, MAX_BYTES).decode("utf-8-sig"))
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path, or write it again") from e
+    except (ValueError, RecursionError) as e:
         raise DataError(f"{path}: cannot be read as JSON ({str(e)[:80]}). Check the path, or write it again") from e
 
 

@@ -14,6 +14,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from warpgs.errors import DataError
+from warpgs.input_files import read_input, unread_reason
 from warpgs.io.folders import SceneFolder, ViewList, has_folder, view_name
 from warpgs.io.images import Lens, list_images
 from warpgs.io.poses import quat_rotation, rigid
@@ -49,9 +50,9 @@ class _BinaryFile:
     def __init__(self, path: Path):
         self.path, self.at = path, 0
         try:
-            self.data = path.read_bytes()
+            self.data = read_input(path)
         except OSError as e:
-            raise DataError(f"{path}: cannot be read ({e.strerror}); fix its permissions or copy it again") from e
+            raise DataError(f"{path}: cannot be read ({unread_reason(e)}); fix its permissions or copy it again") from e
 
     def _need(self, size: int) -> None:
         if size > len(self.data) - self.at:
@@ -107,9 +108,9 @@ class _BinaryFile:
 def _lines(path: Path) -> list[tuple[int, str]]:
     """Return the numbered lines of a text file; only line feeds end a line, since names may hold other separators."""
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        text = read_input(path).decode("utf-8-sig")
     except OSError as e:
-        raise DataError(f"{path}: cannot be read ({e.strerror}); fix its permissions or copy it again") from e
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); fix its permissions or copy it again") from e
     except UnicodeDecodeError as e:
         raise DataError(f"{path}: is not UTF-8 text ({e.reason} at byte {e.start}); write it again") from e
     return list(enumerate(text.replace("\r\n", "\n").split("\n"), 1))

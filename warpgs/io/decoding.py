@@ -2,86 +2,54 @@
 
 from __future__ import annotations
 
-import io
-import struct
+import os
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from warpgs.errors import DataError, ResourceError
-from warpgs.io.image_formats import avif, bmp, jpeg, png, tiff, webp
+from warpgs.input_files import read_input, read_start, unread_reason
+from warpgs.io.image_formats import avif, jpeg
+from warpgs.io.image_formats.kinds import format_of
 from warpgs.io.unread_formats import unread_format
-
-if TYPE_CHECKING:
-    from PIL import ImageFile
 
 MAX_PIXELS = 100_000_000
 """Largest number of pixels of an image where the user names none; decoded, it takes 1.2 GB."""
+FILE_BYTES_PER_PIXEL, EXTRA_FILE_BYTES = 16, 2**26
+"""Bytes that a pixel may take in a file, four channels as float32, and bytes for all else in it."""
 BYTES_PER_PIXEL = 32
 """Most memory that decoding takes per pixel [bytes]: four channels as float32, and the colours and alpha made of them."""
-FORMATS: tuple[tuple[bytes, str, ModuleType], ...] = (
-    (b"\xff\xd8\xff", "JPEG", jpeg),
-    (png.SIGNATURE, "PNG", png),
-    (b"BM", "BMP", bmp),
-    (b"II*\0", "TIFF", tiff),
-    (b"MM\0*", "TIFF", tiff),
-    (b"II+\0", "TIFF", tiff),
-    (b"MM\0+", "TIFF", tiff),
-    (b"RIFF", "WEBP", webp),
-)
-"""First bytes, name as Pillow has it, and module of each format that is read; AVIF is told by its brand."""
-READ = "JPEG, PNG, BMP, TIFF, WebP or AVIF"
-"""The formats that are read, for messages."""
 
 
-def format_of(data: bytes) -> tuple[str, ModuleType]:
-    """Return name and module of the format of an image file, by its first bytes.
+def read_image_file(path: Path, max_pixels: int = MAX_PIXELS) -> bytes:
+    """Return the bytes of an image file; none with so many pixels is larger than what is read.
 
     Raises:
-        ValueError: It is none of them.
+        DataError: It is missing, cannot be read, or is no regular file.
     """
-    for start, name, module in FORMATS:
-        if data.startswith(start):
-            return name, module
-    if avif.kind(data) == "AVIF":
-        return "AVIF", avif
-    raise ValueError(f"it is no {READ} file" if data else "it is empty")
-
-
-def open_header(data: bytes) -> ImageFile.ImageFile:
-    """Return an image of Pillow for what its header says, such as EXIF; its pixels are not decoded.
-
-    Raises:
-        ValueError: It is no image that is read, or its header is broken.
-    """
-    from PIL import Image
-
-    name, module = format_of(data)
-    if module is avif:
-        return avif.open_image(data)
-    Image.init()
     try:
-        # not Image.open, which has a limit of its own on the number of pixels
-        return Image.OPEN[name][0](io.BytesIO(data), "image")
-    except (OSError, SyntaxError, KeyError, TypeError, struct.error) as e:
-        raise ValueError(f"its header is broken: {e}") from e
-
-
-def read_image_file(path: Path) -> bytes:
-    """Return the bytes of an image file.
-
-    Raises:
-        DataError: It is missing or cannot be read.
-    """
-    if not path.is_file():
-        what = "is a link that leads to no file" if path.is_symlink() else "the image file is missing"
-        raise DataError(f"{path}: {what}; restore it, or remove its camera from the scene")
-    try:
-        return path.read_bytes()
+        return read_input(path, FILE_BYTES_PER_PIXEL * max_pixels + EXTRA_FILE_BYTES)
     except OSError as e:
-        raise DataError(f"{path}: the image cannot be read ({e.strerror}); fix its permissions or copy it again") from e
+        raise _unreadable(path, e) from e
+
+
+def read_image_start(path: Path, count: int) -> bytes:
+    """Return the first bytes of an image file, at most ``count``.
+
+    Raises:
+        DataError: It is missing, cannot be read, or is no regular file.
+    """
+    try:
+        return read_start(path, count)
+    except OSError as e:
+        raise _unreadable(path, e) from e
+
+
+def _unreadable(path: Path, error: OSError) -> DataError:
+    if not os.path.exists(path):  # False for links that lead nowhere or round in circles
+        what = "is a link that leads to no file" if path.is_symlink() else "the image file is missing"
+        return DataError(f"{path}: {what}; restore it, or remove its camera from the scene")
+    return DataError(f"{path}: the image cannot be read ({unread_reason(error)}); fix its permissions or copy it again")
 
 
 def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
@@ -130,7 +98,7 @@ def _too_large(path: Path, pixels: int) -> str:
     return f"{path}: {needed:.1f} GiB to decode the image are not free; shrink it, or end other programs"
 
 
-def decode(path: Path, max_pixels: int = MAX_PIXELS) -> tuple[np.ndarray, np.ndarray | None]:
+def decode(path: Path, max_pixels: int = MAX_PIXELS, data: bytes | None = None) -> tuple[np.ndarray, np.ndarray | None]:
     """Decode an image file as stored, without rotation by its EXIF tag.
 
     Gray, palette, 8- and 16-bit images and straight alpha are understood.
@@ -138,6 +106,7 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS) -> tuple[np.ndarray, np.nda
     Args:
         path: A JPEG, PNG, BMP, TIFF, WebP or AVIF file, whatever its suffix.
         max_pixels: Largest number of pixels that its header may announce.
+        data: Its bytes, where they have been read already.
 
     Returns:
         Colours in [0, 1], float32, shape [H, W, 3]; and alpha in [0, 1], float32, shape [H, W], or None.
@@ -146,7 +115,7 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS) -> tuple[np.ndarray, np.nda
         DataError: The file is missing, no such image, too large, or damaged as far as its format lets one see it.
         ResourceError: There is not enough memory for it.
     """
-    raw = _raster(path, read_image_file(path), max_pixels)
+    raw = _raster(path, read_image_file(path, max_pixels) if data is None else data, max_pixels)
     if raw.dtype in (np.uint8, np.uint16):
         values = raw.astype(np.float32)
         values /= np.iinfo(raw.dtype).max

@@ -9,6 +9,7 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.geometry import matmul
+from warpgs.input_files import open_input
 from warpgs.io.folders import SceneFolder, ViewList, has_folder, resampling_note
 from warpgs.io.images import Lens, list_images
 from warpgs.io.poses import rigid
@@ -53,7 +54,7 @@ def _read_matrices(path: Path) -> dict[str, np.ndarray]:
     """Return the world and scale matrices of the archive by name, float64, shape [4, 4] each."""
     matrices = {}
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with open_input(path) as file, np.load(file, allow_pickle=False) as archive:
             for key in archive.files:
                 if key.startswith(("world_mat_", "scale_mat_")) and "inv" not in key:
                     if archive.zip.getinfo(f"{key}.npy").file_size > MAX_MATRIX_BYTES:

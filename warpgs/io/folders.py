@@ -87,11 +87,7 @@ class SceneFolder:
         Raises:
             DataError: It leads out.
         """
-        if not (self.options.allow_outside or _is_below(path, self.root)):
-            raise DataError(
-                f"{path}: a link leads out of the scene folder; put the files inside of it, or pass --allow-outside"
-            )
-        return path
+        return path if self.options.allow_outside else inside(path, self.root, "the scene folder")
 
     def child(self, folder: Path, name: object, where: str, *, root: Path | None = None) -> Path:
         """Return the path of a file that the scene names, as the function `child` does."""
@@ -184,6 +180,17 @@ def read_mask(path: Path, keeps: str = "white", max_pixels: int = MAX_PIXELS) ->
     """
     gray = np.ascontiguousarray(decode(path, max_pixels)[0][..., 0])
     return gray if keeps == "white" else 1 - gray
+
+
+def inside(path: Path, root: Path, noun: str) -> Path:
+    """Return a path after a check that no link on it leads out of ``root``, which messages call ``noun``.
+
+    Raises:
+        DataError: One does.
+    """
+    if not _is_below(path, root):
+        raise DataError(f"{path}: a link leads out of {noun}; put the files inside of it, or pass --allow-outside")
+    return path
 
 
 def _is_below(path: Path, root: Path) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError, UsageError
-from warpgs.io.decoding import MAX_PIXELS, decode, open_header, read_image_file
+from warpgs.io.decoding import MAX_PIXELS, decode, read_image_file
+from warpgs.io.exif import read_exif
 
 BLACK = (0.0, 0.0, 0.0)
 REDUCED = "reduced to "
 """First words of what is noted of an image that `load_image` brought to its longest side."""
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif", ".hif")
-EXIF_ORIENTATION = 0x0112
 MIN_SIDE = 4
 """Smallest shorter side of an image [px]; below it there is nothing to fit."""
 MAX_INTRINSIC = 1e9
@@ -91,13 +90,7 @@ def list_images(folder: Path) -> list[Path]:
 
 def exif_orientation(path: Path) -> int:
     """Return the EXIF orientation, 1 to 8; 1 where the file has none."""
-    data = read_image_file(path)
-    try:
-        with open_header(data) as image:
-            value = image.getexif().get(EXIF_ORIENTATION, 1)
-    except (OSError, SyntaxError, ValueError, KeyError, TypeError, struct.error):
-        return 1  # decode() has the last word on whether the file is an image
-    return value if isinstance(value, int) and 1 <= value <= 8 else 1
+    return read_exif(read_image_file(path)).orientation
 
 
 def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError
+from warpgs.input_files import open_input
 from warpgs.io.folders import SceneFolder, ViewList, has_folder
 from warpgs.io.images import Lens, list_images
 from warpgs.io.poses import from_camera_to_world
@@ -14,6 +15,8 @@ from warpgs.io.readers import Probe, Reader, ReadOptions, register
 from warpgs.scene import Scene
 
 FILE = "poses_bounds.npy"
+MAX_ROWS = 1_000_000
+"""Largest number of images."""
 
 
 def read_rows(path: Path) -> np.ndarray:
@@ -23,6 +26,7 @@ def read_rows(path: Path) -> np.ndarray:
         DataError: The file holds anything else.
     """
     try:
+        open_input(path).close()
         # mapped, because that holds the announced shape against the file's size before memory is taken
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception as e:  # numpy raises a dozen types on foreign bytes
@@ -32,6 +36,8 @@ def read_rows(path: Path) -> np.ndarray:
         raise DataError(f"{path}: is an archive of arrays, not one array [n, 17]; copy it again")
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu":
         raise DataError(f"{path}: must be an array [n, 17] of numbers, not {list(rows.shape)} of {rows.dtype}; make it again")
+    if len(rows) > MAX_ROWS:
+        raise DataError(f"{path}: has {len(rows):,} rows, and this reads {MAX_ROWS:,}; make it again")
     return rows.astype(np.float64)
 
 

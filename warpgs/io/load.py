@@ -11,8 +11,9 @@ import numpy as np
 
 from warpgs.errors import DataError, UsageError
 from warpgs.io.black_background import cut_from_black
-from warpgs.io.decoding import MAX_PIXELS, READ
+from warpgs.io.decoding import MAX_PIXELS
 from warpgs.io.folders import SceneFolder
+from warpgs.io.image_formats.kinds import READ
 from warpgs.io.images import list_images
 from warpgs.io.normalize import fingerprint, normalization_of, normalize_points, normalize_view
 from warpgs.io.poses import rigid

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError
+from warpgs.input_files import read_input, unread_reason
 from warpgs.io.folders import SceneFolder, ViewList, resampling_note, view_name_of
 from warpgs.io.images import BLACK, SUFFIXES, Lens
 from warpgs.io.poses import from_camera_to_world
@@ -50,11 +51,10 @@ def read_json(path: Path) -> dict:
         DataError: The file is malformed, too large or nested too deep, or holds NaN or Infinity.
     """
     try:
-        size = path.stat().st_size
-        if size > MAX_BYTES:
-            raise DataError(f"{path}: has {size:,} bytes, more than the {MAX_BYTES:,} of any real scene; write it again")
-        values = json.loads(path.read_bytes().decode("utf-8-sig"), parse_constant=_reject_constant)
-    except (OSError, ValueError, RecursionError) as e:
+        values = json.loads(read_input(path, MAX_BYTES).decode("utf-8-sig"), parse_constant=_reject_constant)
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); write it again") from e
+    except (ValueError, RecursionError) as e:
         raise DataError(f"{path}: cannot be read as JSON ({e}); write it again") from e
     try:
         check_depth(values, MAX_DEPTH)

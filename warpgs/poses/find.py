@@ -10,13 +10,21 @@ from typing import Any
 
 from warpgs.errors import DataError, UsageError
 from warpgs.files import filling, is_empty, make_folder, write_bytes
-from warpgs.io.decoding import MAX_PIXELS, read_image_file
+from warpgs.input_files import NOT_REGULAR, input_digest, unread_reason
+from warpgs.io.decoding import MAX_PIXELS
 from warpgs.io.readers import all_readers
 from warpgs.io.unread_formats import unread_note
 from warpgs.poses.advice import MIN_KEYPOINTS, partners
 from warpgs.poses.heic import is_heic, to_jpeg
-from warpgs.poses.mapping import Mapping, camera_groups, check_installed, find_model
-from warpgs.poses.photographs import Photograph, find_photographs, image_root, prepare, write_copy
+from warpgs.poses.mapping import Mapping, camera_groups, cameras_of, check_installed, find_model
+from warpgs.poses.photographs import (
+    Photograph,
+    find_photographs,
+    image_root,
+    photographs_inside,
+    prepare,
+    write_copy,
+)
 from warpgs.poses.record import record_of, write_record
 from warpgs.poses.video import is_video, write_frames
 
@@ -40,21 +48,27 @@ def needs_poses(path: Path) -> bool:
         return False
 
 
-def source_digest(source: Path) -> str:
+def source_digest(source: Path, allow_outside: bool = False) -> str:
     """Return the SHA-256 over the names and contents of a source's photographs, or of a video.
 
     Raises:
-        DataError: A file cannot be read.
+        DataError: A file cannot be read, or a link leads out of the folder and that is not allowed.
     """
     total = hashlib.sha256()
     if is_video(source):
-        with source.open("rb") as f:
-            return hashlib.file_digest(f, "sha256").hexdigest()
+        return _digest(source)
     root = image_root(source)
-    for path in find_photographs(source):
+    for path in photographs_inside(source, allow_outside):
         name = path.relative_to(root).as_posix().encode("utf-8", "surrogateescape")
-        total.update(name + b"\0" + hashlib.sha256(read_image_file(path)).digest())
+        total.update(name + b"\0" + bytes.fromhex(_digest(path)))
     return total.hexdigest()
+
+
+def _digest(path: Path) -> str:
+    try:
+        return input_digest(path)
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); fix its permissions or copy it again") from e
 
 
 def find_poses(
@@ -64,6 +78,7 @@ def find_poses(
     frames: int = FRAMES,
     threads: int = 0,
     max_pixels: int = MAX_PIXELS,
+    allow_outside: bool = False,
     progress: Callable[[str], object] = lambda line: None,
 ) -> dict[str, Any]:
     """Find the poses of photographs or of a video's sharpest frames, and write a scene folder that holds those registered.
@@ -77,18 +92,19 @@ def find_poses(
         frames: Frames that are taken of a video.
         threads: CPU threads; 0 for as many as there are cores.
         max_pixels: Largest number of pixels that an image may have.
+        allow_outside: Let links lead to photographs outside the folder.
         progress: Called with lines for the user.
 
     Returns:
         The record, as poses.json holds it.
 
     Raises:
-        DataError: There are no photographs or too few, one cannot be decoded, or fewer than three fit together.
+        DataError: There are no photographs or too few, one lies outside or cannot be decoded, or fewer than three fit together.
         ResourceError: pycolmap failed, or the folder cannot be written.
         UsageError: pycolmap is not installed, or ``out`` holds something already.
     """
     source, out = Path(source), Path(out)
-    _check(source, out)
+    _check(source, out, allow_outside)
     check_installed()
     with filling(out) as scene:
         work = scene / "work"
@@ -96,7 +112,7 @@ def find_poses(
         photographs, names, notes = _prepared(source, work, frames, max_pixels, progress)
         found = find_model(photographs, names, "video" if is_video(source) else "photographs", work, progress, threads)
         _check_found(source, found, photographs)
-        record = record_of(found, photographs, source_digest(source), notes)
+        record = record_of(found, photographs, source_digest(source, allow_outside), notes)
         for done, i in enumerate(found.views):
             progress(f"writing images: {done + 1} of {len(found.views)}")
             write_copy(photographs[i], scene / "images", max_pixels)
@@ -119,15 +135,16 @@ def _something_else(folder: Path) -> str:
     return ""
 
 
-def _check(source: Path, out: Path) -> None:
+def _check(source: Path, out: Path, allow_outside: bool) -> None:
     """Raise an error for a source or a target that cannot be, before any work."""
     try:
         if not is_video(source) and not source.is_dir():
-            what = "is no video that is read (mp4, mov, m4v, avi, mkv, webm)" if source.is_file() else "does not exist"
+            there = NOT_REGULAR if source.exists() else "does not exist"
+            what = "is no video that is read (mp4, mov, m4v, avi, mkv, webm)" if source.is_file() else there
             raise DataError(f"{source}: {what}; give a folder of photographs, or a video")
         if not is_video(source) and (other := _something_else(source)):
             raise UsageError(f"{source}: {other}")
-        if not is_video(source) and not find_photographs(source):
+        if not is_video(source) and not photographs_inside(source, allow_outside):
             none = "holds no image file that is read (JPEG, PNG, BMP, TIFF, WebP, AVIF or HEIC); give the folder of photographs"
             raise DataError(f"{source}: {unread_note(source) or none}")
         if out.exists() and not (out.is_dir() and is_empty(out)):
@@ -165,19 +182,16 @@ def _prepared(
         names.append(f"{i:06d}.png")
         file, below = (copies[path], work / "heic") if path in copies else (path, root)
         photographs.append(prepare(file, below, work / "small" / names[-1], max_pixels))
-    for i, p in enumerate(photographs):
-        same = [paths[j].name for j in range(i) if photographs[j].name == p.name]
-        if same:
-            raise DataError(
-                f"{source}: {same[0]} and {paths[i].name} would both be {p.name!r} in the scene; rename one of them"
-            )
+    taken: dict[str, Path] = {}
+    for p, path in zip(photographs, paths):
+        if (same := taken.setdefault(p.name, path)) is not path:
+            raise DataError(f"{source}: {same.name} and {path.name} would both be {p.name!r} in the scene; rename one of them")
     return photographs, names, [*notes, *_notes(photographs)]
 
 
 def _notes(photographs: list[Photograph]) -> list[str]:
     """Return what was assumed of the photographs, a sentence each."""
-    of = camera_groups(photographs)
-    cameras = [photographs[of.index(n)] for n in range(max(of) + 1)]
+    cameras = cameras_of(photographs, camera_groups(photographs))
     known = sum(c.focal is not None for c in cameras)
     source = "from EXIF" if known == len(cameras) else "unknown to EXIF" if not known else f"from EXIF for {known} of them"
     many = "one camera is" if len(cameras) == 1 else f"{len(cameras)} cameras, one for each device, lens and image size, are"

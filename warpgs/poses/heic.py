@@ -15,15 +15,14 @@ from typing import Any
 
 from warpgs.errors import DataError, UsageError
 from warpgs.files import make_folder, write_bytes, write_json
-from warpgs.io.decoding import read_image_file
-from warpgs.io.image_formats.avif import BROKEN, kind
+from warpgs.io.decoding import read_image_file, read_image_start
+from warpgs.io.exif import EXPOSURE, FOCAL_35MM, MAKE, MODEL, parse_exif
+from warpgs.io.image_formats.avif import BRANDS_END, kind
 from warpgs.runtime.subprocesses import ProcessFailed, end_with_parent, python_lines
 from warpgs.runtime.terminal import say
 
 QUALITY = 98
 """JPEG quality of the copies, without subsampling of colours."""
-KEPT = {0: (0x010F, 0x0110), 0x8769: (0xA405,)}
-"""EXIF tags that the copies keep, by block: maker, model, equivalent focal length of 35 mm film."""
 
 
 def is_heic(path: Path) -> bool:
@@ -32,7 +31,7 @@ def is_heic(path: Path) -> bool:
     Raises:
         DataError: It cannot be read.
     """
-    return kind(read_image_file(path)) == "HEIC"
+    return kind(read_image_start(path, BRANDS_END)) == "HEIC"
 
 
 def to_jpeg(
@@ -79,24 +78,24 @@ def to_jpeg(
     raise DataError(f"{paths[at]}: the image cannot be decoded: {why}. Restore it from its source, or convert it to JPEG")
 
 
-def _copy(source: Path, target: Path, max_pixels: int) -> None:
-    """Write the copy of one file."""
+def _coded_again(source: Path, max_pixels: int) -> bytes:
+    """Return the copy of one file."""
     import io
 
     import pi_heif
     from PIL import Image
 
-    with pi_heif.HeifImageFile(source) as image:
+    with pi_heif.HeifImageFile(io.BytesIO(read_image_file(source, max_pixels))) as image:
         width, height = image.size
         if width * height > max_pixels:
             raise ValueError(f"{width} x {height} px are more than the limit of {max_pixels:,} pixels (--max-pixels)")
-        found, kept = image.getexif(), Image.Exif()
-        for block, tags in KEPT.items():
-            of, to = (e.get_ifd(block) if block else e for e in (found, kept))
-            to.update({t: of[t] for t in tags if t in of})
+        found, kept = parse_exif(image.info.get("exif") or b""), Image.Exif()
+        kept.update({tag: text for tag, text in ((MAKE, found.maker), (MODEL, found.model)) if text})
+        if found.focal is not None:
+            kept.get_ifd(EXPOSURE)[FOCAL_35MM] = int(found.focal)
         pixels = io.BytesIO()
         image.convert("RGB").save(pixels, "JPEG", quality=QUALITY, subsampling=0, exif=kept)
-    write_bytes(target, pixels.getvalue())
+    return pixels.getvalue()
 
 
 def main(path: str) -> None:
@@ -105,10 +104,11 @@ def main(path: str) -> None:
     for i, (source, target) in enumerate(job["files"]):
         say(json.dumps({"file": i}))
         try:
-            _copy(Path(source), Path(target), job["max_pixels"])
-        except BROKEN as e:
+            copy = _coded_again(Path(source), job["max_pixels"])
+        except Exception as e:  # decoders raise a dozen types on foreign bytes; the caller names the file
             say(json.dumps({"error": str(e).strip().rstrip(".") or type(e).__name__}))
             return
+        write_bytes(Path(target), copy)
 
 
 if __name__ == "__main__":

@@ -93,12 +93,19 @@ def camera_groups(photographs: list[Photograph]) -> list[int]:
     return [numbers.setdefault((p.device, p.focal, p.width, p.height), len(numbers)) for p in photographs]
 
 
+def cameras_of(photographs: list[Photograph], groups: list[int]) -> list[Photograph]:
+    """Return the first photograph of each camera, by the number of the camera, from `camera_groups`."""
+    first: dict[int, Photograph] = {}
+    for number, photograph in zip(groups, photographs):
+        first.setdefault(number, photograph)
+    return [first[number] for number in range(len(first))]
+
+
 def _job(photographs: list[Photograph], names: list[str], kind: str, folder: Path, threads: int) -> dict[str, Any]:
     """Return what the worker is told."""
     of = camera_groups(photographs)
     cameras = []
-    for number in range(max(of) + 1):
-        p = photographs[of.index(number)]
+    for p in cameras_of(photographs, of):
         scale = min(1.0, MATCHING_SIDE / max(p.width, p.height))
         width, height = round(scale * p.width), round(scale * p.height)
         focal = None if p.focal is None else p.focal * max(width, height)

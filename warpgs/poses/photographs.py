@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import struct
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -12,8 +11,11 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.files import make_folder, write_bytes
-from warpgs.io.decoding import MAX_PIXELS, decode, format_of, open_header, read_image_file
-from warpgs.io.images import exif_orientation, list_images, turn_upright
+from warpgs.io.decoding import MAX_PIXELS, decode, read_image_file
+from warpgs.io.exif import read_exif
+from warpgs.io.folders import inside
+from warpgs.io.image_formats.kinds import format_of
+from warpgs.io.images import list_images, turn_upright
 from warpgs.poses.metadata import without_jpeg_metadata, without_png_metadata
 
 MASK_FOLDERS = ("mask", "masks", "idrmasks")
@@ -22,8 +24,6 @@ MATCHING_SIDE = 2000
 """Longer side of the copies that are matched [px]; larger ones cost time and find the same points."""
 DIAGONAL_35MM = math.hypot(36, 24)
 """Diagonal of 35 mm film [mm], by which the equivalent focal length in EXIF is defined (CIPA DCG-001)."""
-MAKE, MODEL, EXIF, FOCAL_35MM = 0x010F, 0x0110, 0x8769, 0xA405
-"""EXIF tags: maker and model of the device, the block of exposure data, and in it the equivalent focal length [mm]."""
 JPEG_QUALITY = 98
 """Quality of a photograph that must be coded again since it is turned upright."""
 
@@ -57,9 +57,19 @@ def image_root(folder: Path) -> Path:
 
 
 def find_photographs(folder: Path) -> list[Path]:
-    """Return the image files of a folder of photographs, sorted by name; masks are left out."""
+    """Return the image files of a folder of photographs, sorted by name; masks are left out. No file is opened."""
     root = image_root(folder)
     return [p for p in list_images(root) if not set(p.relative_to(root).parts[:-1]) & set(MASK_FOLDERS)]
+
+
+def photographs_inside(folder: Path, allow_outside: bool) -> list[Path]:
+    """Return the image files as `find_photographs` does, to be opened.
+
+    Raises:
+        DataError: A link leads out of the folder, and that is not allowed.
+    """
+    found = find_photographs(folder)
+    return found if allow_outside else [inside(p, folder, "the folder of photographs") for p in found]
 
 
 def scene_name(name: str, data: bytes) -> str:
@@ -82,19 +92,6 @@ def _format(data: bytes) -> str:
         return ""
 
 
-def _exif(data: bytes) -> tuple[str, float | None]:
-    """Return maker and model of the device, and the equivalent focal length [mm] or None."""
-    try:
-        with open_header(data) as image:
-            exif = image.getexif()
-            words = [str(exif.get(tag, "")).strip("\0 ") for tag in (MAKE, MODEL)]
-            focal = exif.get_ifd(EXIF).get(FOCAL_35MM)
-    except (OSError, SyntaxError, ValueError, KeyError, TypeError, struct.error):
-        return "", None
-    known = isinstance(focal, (int, float)) and 1 <= focal <= 10_000
-    return " ".join(w for w in words if w)[:100], float(focal) if known else None
-
-
 def prepare(path: Path, root: Path, small: Path, max_pixels: int = MAX_PIXELS) -> Photograph:
     """Read a photograph and write the upright copy that is matched, at most `MATCHING_SIDE` pixels wide and high.
 
@@ -109,9 +106,11 @@ def prepare(path: Path, root: Path, small: Path, max_pixels: int = MAX_PIXELS) -
     """
     import cv2
 
-    data = read_image_file(path)
-    name, orientation = path.relative_to(root).as_posix(), exif_orientation(path)
-    image = turn_upright(decode(path, max_pixels)[0], orientation)
+    data = read_image_file(path, max_pixels)
+    name, colors = path.relative_to(root).as_posix(), decode(path, max_pixels, data)[0]
+    exif = read_exif(data)  # of a file that has been found to be an image within the limits
+    image = turn_upright(colors, exif.orientation)
+    del colors
     height, width = image.shape[:2]
     scale = min(1.0, MATCHING_SIDE / max(width, height))
     if scale < 1:
@@ -119,10 +118,11 @@ def prepare(path: Path, root: Path, small: Path, max_pixels: int = MAX_PIXELS) -
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     _, png = cv2.imencode(".png", np.round(255 * image[..., ::-1]).astype(np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 1])
     write_bytes(small, png.tobytes())
-    device, film = _exif(data)
+    film = exif.focal
     focal = None if film is None else film / DIAGONAL_35MM * math.hypot(width, height) / max(width, height)
-    device = device if film is None else f"{device} {film:g} mm"
-    return Photograph(scene_name(name, data), path, width, height, orientation, device, focal, hashlib.sha256(data).hexdigest())
+    device = exif.device if film is None else f"{exif.device} {film:g} mm"
+    digest = hashlib.sha256(data).hexdigest()
+    return Photograph(scene_name(name, data), path, width, height, exif.orientation, device, focal, digest)
 
 
 def write_copy(photograph: Photograph, folder: Path, max_pixels: int = MAX_PIXELS) -> None:
@@ -137,7 +137,7 @@ def write_copy(photograph: Photograph, folder: Path, max_pixels: int = MAX_PIXEL
     """
     import cv2
 
-    data = read_image_file(photograph.path)
+    data = read_image_file(photograph.path, max_pixels)
     if hashlib.sha256(data).hexdigest() != photograph.digest:
         raise DataError(f"{photograph.path}: the file changed while its pose was sought; start again")
     kind, target = _format(data), folder / PurePosixPath(photograph.name)
@@ -146,7 +146,7 @@ def write_copy(photograph: Photograph, folder: Path, max_pixels: int = MAX_PIXEL
         write_bytes(target, without_jpeg_metadata(data) if kind == "JPEG" else without_png_metadata(data))
         return
     colors, alpha = (
-        None if a is None else turn_upright(a, photograph.orientation) for a in decode(photograph.path, max_pixels)
+        None if a is None else turn_upright(a, photograph.orientation) for a in decode(photograph.path, max_pixels, data)
     )
     assert colors is not None
     pixels = colors[..., ::-1] if alpha is None else np.concatenate([colors[..., ::-1], alpha[..., None]], -1)

@@ -10,7 +10,7 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.files import write_bytes
-from warpgs.io.decoding import MAX_PIXELS
+from warpgs.input_files import read_start, unread_reason
 from warpgs.runtime.native_output import hidden_stderr
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
@@ -19,6 +19,14 @@ SHARPNESS_SIDE = 640
 """Longer side at which frames are compared for sharpness [px]: what noise and compression add is averaged away."""
 MAX_FRAMES = 100_000
 """Longest video that is read [frames]: an hour at 25 a second."""
+MAX_FRAME_PIXELS = 2**26
+"""Largest frame that is read [px]: 8K has half of that."""
+MAX_TOTAL_PIXELS = 2**40
+"""Most pixels of all frames that are read: an hour and a half of 4K at 25 frames a second."""
+START = 12
+"""First bytes of a file, which tell its container."""
+BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")
+"""First boxes of MP4 and MOV files (ISO/IEC 14496-12, QuickTime)."""
 
 
 def is_video(path: Path) -> bool:
@@ -30,6 +38,7 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
     """Yield the frames of a video, uint8 BGR [H, W, 3], upright."""
     import cv2
 
+    _check_container(path)
     with hidden_stderr():  # of a broken file OpenCV and FFmpeg say the same, in their own words
         capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
@@ -38,16 +47,31 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
                 f"{path}: OpenCV cannot read it as a video; convert it to an mp4 file with H.264, or give its frames"
             )
         size = capture.get(cv2.CAP_PROP_FRAME_WIDTH) * capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
-        if not 0 < size <= MAX_PIXELS:
-            raise DataError(f"{path}: its frames have {size:,.0f} pixels, not 1 to {MAX_PIXELS:,}; convert the video")
+        if not 0 < size <= MAX_FRAME_PIXELS:
+            raise DataError(f"{path}: its frames have {size:,.0f} pixels, not 1 to {MAX_FRAME_PIXELS:,}; convert the video")
+        total = 0
         for _ in range(MAX_FRAMES):
             there, frame = capture.read()
             if not there:
                 return
+            total += frame.shape[0] * frame.shape[1]
+            if total > MAX_TOTAL_PIXELS:
+                raise DataError(f"{path}: has more than {MAX_TOTAL_PIXELS:,} pixels in all frames; cut it shorter or shrink it")
             yield frame
     finally:
         capture.release()
     raise DataError(f"{path}: has more than {MAX_FRAMES:,} frames; cut it shorter")
+
+
+def _check_container(path: Path) -> None:
+    """Raise a DataError where a file is no video container: FFmpeg would follow a playlist to other files."""
+    try:
+        start = read_start(path, START)
+    except OSError as e:
+        raise DataError(f"{path}: the video cannot be read ({unread_reason(e)}); fix its permissions or copy it again") from e
+    avi, matroska = start[:4] == b"RIFF" and start[8:] == b"AVI ", start[:4] == b"\x1a\x45\xdf\xa3"
+    if not (avi or matroska or start[4:8] in BOXES):
+        raise DataError(f"{path}: OpenCV cannot read it as a video; convert it to an mp4 file with H.264, or give its frames")
 
 
 def sharpness(frame: np.ndarray) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 
 from warpgs.errors import ResourceError
 from warpgs.files import write_bytes
+from warpgs.input_files import read_input
 from warpgs.runtime.folders import cache_home, private_folder
 from warpgs.runtime.terminal import say
 
@@ -90,7 +91,7 @@ class MapCache:
         from safetensors.numpy import load
 
         try:
-            stored = load(path.read_bytes())
+            stored = load(read_input(path))
         except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError, KeyError, safetensors.SafetensorError) as e:

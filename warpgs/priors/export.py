@@ -15,6 +15,7 @@ import numpy as np
 
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.files import write_bytes, write_text
+from warpgs.input_files import read_input
 from warpgs.priors.preprocess import HALF, IMAGENET, side_file
 from warpgs.priors.semantics import CLASSES
 from warpgs.priors.session import open_network
@@ -115,7 +116,7 @@ def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
     from safetensors.torch import load
 
     try:
-        network.load_state_dict(load(Path(request.weights).read_bytes()))
+        network.load_state_dict(load(read_input(request.weights)))
     except (OSError, SafetensorError, RuntimeError) as e:
         raise DataError(f"{request.weights}: no weights of fcn-resnet18 ({str(e).splitlines()[0][:200]})") from e
     return network

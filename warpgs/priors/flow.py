@@ -13,7 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError, UsageError
+from warpgs.input_files import read_input, unread_reason
 from warpgs.priors.epipolar import FlowBetween, fundamental, homogeneous
+from warpgs.priors.session import read_model
 from warpgs.scene import View
 
 KINDS = ("dis", "deepflow", "sparse")
@@ -22,6 +24,8 @@ FLO_MAGIC = np.float32(202021.25)
 MIN_UNKNOWN = 1e9
 """Smallest size of a component that means unknown flow (same source)."""
 MAX_SIDE = 1 << 15
+MAX_FLOW_PIXELS = 100_000_000
+"""Largest number of pixels of a .flo file that is read."""
 RATIO = 0.8
 """Lowe's ratio test for the matches of kind sparse."""
 LINE_DISTANCE = 2.0
@@ -41,9 +45,9 @@ def read_flo(path: Path) -> np.ndarray:
         DataError: The file is missing, of another kind, or cut short.
     """
     try:
-        raw = path.read_bytes()
+        raw = read_input(path, 12 + 8 * MAX_FLOW_PIXELS)
     except OSError as e:
-        raise DataError(f"{path}: flow cannot be read ({e.strerror}); check the path and its permissions") from e
+        raise DataError(f"{path}: flow cannot be read ({unread_reason(e)}); check the path and its permissions") from e
     if len(raw) < 12 or np.frombuffer(raw, "<f4", 1)[0] != FLO_MAGIC:
         raise DataError(f"{path}: not a Middlebury .flo file (its first number must be 202021.25); write the flow anew")
     width, height = (int(v) for v in np.frombuffer(raw, "<i4", 2, 4))
@@ -187,8 +191,9 @@ def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]
     import cv2
     import onnxruntime
 
+    data = read_model(path)
     try:
-        session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
     except Exception as e:
         raise DataError(f"{path}: onnxruntime cannot open it ({str(e).splitlines()[0]}); export the network anew") from e
     inputs = session.get_inputs()

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
+from warpgs import schema
 from warpgs.errors import DataError, UsageError
+from warpgs.input_files import unread_reason
 from warpgs.priors.session import Network
 
 IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
@@ -105,9 +106,10 @@ def read_side_file(model: Path) -> dict:
     if not path.exists():
         return {}
     try:
-        values = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as e:
-        raise DataError(f"{path}: cannot be read ({e}); fix or remove it") from e
+        values = schema.read(path)
+    except (OSError, schema.SchemaError) as e:
+        why = unread_reason(e) if isinstance(e, OSError) else e
+        raise DataError(f"{path}: cannot be read ({why}); fix or remove it") from e
     if not isinstance(values, dict):
         raise DataError(f"{path}: holds no JSON object; write one with the keys {', '.join(KEYS)}")
     for key, value in values.items():

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.input_files import read_input, unread_reason
 from warpgs.priors.onnx_file import check_onnx
 from warpgs.runtime.processor import usable_cores
 
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
 TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 ERRORS_ONLY = 3
+MAX_MODEL_BYTES = 2**31
+"""Largest model [bytes]: the largest message of protobuf."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,20 @@ def _input_axes(path: Path, shape: list) -> tuple[str, tuple[int, int] | None]:
     return layout, None if sides[0] is None else sides
 
 
+def read_model(path: Path) -> bytes:
+    """Return the bytes of an ONNX file that needs nothing but itself.
+
+    Raises:
+        DataError: It cannot be read, is no ONNX model, or needs other files or foreign operators.
+    """
+    try:
+        data = read_input(path, MAX_MODEL_BYTES)
+    except OSError as e:
+        raise DataError(f"{path}: the model cannot be read ({unread_reason(e)}); give the path of an ONNX file") from e
+    check_onnx(data, path)
+    return data
+
+
 def open_network(path: str | Path, *, provider: str = "cpu", threads: int = 0) -> Network:
     """Open an ONNX file and check that it maps one image to one output.
 
@@ -136,11 +153,7 @@ def open_network(path: str | Path, *, provider: str = "cpu", threads: int = 0) -
     if provider not in PROVIDERS:
         raise UsageError(f"onnx-provider {provider!r} is not one of {', '.join(PROVIDERS)}")
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as e:
-        raise DataError(f"{path}: the model cannot be read ({e.strerror or e}); give the path of an ONNX file") from e
-    check_onnx(data, path)
+    data = read_model(path)
     session = _start(data, path, provider, threads)
     inputs, outputs = session.get_inputs(), session.get_outputs()
     for what, found in (("input", inputs), ("output", outputs)):

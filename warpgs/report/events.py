@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -9,9 +10,13 @@ from pathlib import Path
 from typing import BinaryIO
 
 from warpgs import schema
-from warpgs.errors import ResourceError
+from warpgs.errors import DataError, ResourceError
 from warpgs.files import appending, write_bytes
-from warpgs.output_folders import RefusedError, open_file
+from warpgs.input_files import read_input, unread_reason
+from warpgs.output_folders import RefusedError
+
+MAX_BYTES = 2**30
+"""Largest log that is read [bytes]: a million steps take a third of it."""
 
 _SERIES = schema.mapping(schema.or_null(schema.real))
 _STEP = schema.fields({"step": schema.whole(0)})
@@ -92,11 +97,16 @@ def read_events(path: Path) -> list[dict]:
 
     A line that is no object with a whole-numbered ``step`` and numbers alone is skipped, because a killed run may leave its
     last line incomplete. Null is read as NaN, so that a series has a number at every step.
+
+    Raises:
+        DataError: The log cannot be read, or is larger than `MAX_BYTES`.
     """
     events = []
-    with open_file(path, path.parent) as file:
-        lines = file.read().splitlines()
-    for line in lines:
+    try:
+        data = read_input(path, MAX_BYTES, path.parent)
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); restore it, or fit again") from e
+    for line in io.BytesIO(data):
         try:
             event = schema.parse(line)
             _SERIES(event, "")

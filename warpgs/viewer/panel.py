@@ -10,6 +10,7 @@ import numpy as np
 from warpgs.errors import WarpgsError
 from warpgs.files import write_json
 from warpgs.geometry import rotation_matrices
+from warpgs.io.decoding import decode
 from warpgs.runtime.terminal import say
 from warpgs.scene import Camera
 from warpgs.viewer.content import Content
@@ -116,13 +117,12 @@ class Panel:
             return
 
         def show(event: Any) -> None:
-            import cv2
-
-            image = cv2.imread(str(sheet))
-            if image is None:
-                return self.explain("the image of importance cannot be read")
+            try:
+                image = np.round(255 * decode(sheet)[0]).astype(np.uint8)
+            except WarpgsError as e:
+                return self.explain(str(e))
             with event.client.gui.add_modal("Where importance placed Gaussians") as modal:
-                event.client.gui.add_image(image[..., ::-1], format="jpeg")
+                event.client.gui.add_image(image, format="jpeg")
                 event.client.gui.add_button("close").on_click(lambda _: modal.close())
 
         self.server.gui.add_button("importance", hint="views of a sampling event of the fit").on_click(show)

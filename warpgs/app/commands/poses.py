@@ -26,6 +26,8 @@ def run(arguments: list[str], about: str) -> int:
         """CPU threads; 0 for as many as there are cores."""
         max_pixels: int = MAX_PIXELS
         """Largest number of pixels that an image may have."""
+        allow_outside: bool = False
+        """Let links lead to photographs outside the folder."""
 
     a = parse_flags(Poses, arguments, "warpgs poses", about)
     check_range("--frames", a.frames, 3, 1000)
@@ -34,7 +36,10 @@ def run(arguments: list[str], about: str) -> int:
     from warpgs.poses.record import TEXT, report_lines
     from warpgs.report.progress import Stages
 
-    record = find_poses(a.photographs, a.out, frames=a.frames, threads=a.threads, max_pixels=a.max_pixels, progress=Stages())
+    record = find_poses(
+        a.photographs, a.out, frames=a.frames, threads=a.threads, max_pixels=a.max_pixels, allow_outside=a.allow_outside,
+        progress=Stages(),
+    )  # fmt: skip
     for line in report_lines(record):
         say(line)
     say(f"{a.out}: a COLMAP scene; what is above also stands in {a.out / TEXT}")

@@ -14,16 +14,18 @@ import numpy as np
 SOF = (0xC0, 0xC1, 0xC2)
 """Frames with Huffman codes: baseline, extended, progressive."""
 OTHER_SOF = (0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF)
-SOI, EOI, SOS = 0xD8, 0xD9, 0xDA
+SOI, EOI, SOS, APP1 = 0xD8, 0xD9, 0xDA, 0xE1
 LONE = (0x01, *range(0xD0, 0xD8))
 """Markers without a length."""
 MARKER = re.compile(rb"\xff+([^\xff])")
 NEXT_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 """End of the coded data of a scan: any marker but a restart."""
 COEFFICIENTS = 64
+MAX_SCANS = 100
+"""Largest number of scans, each of which passes over the whole image; progressive files have about ten."""
 
 
-def _segments(data: bytes) -> Iterator[tuple[int, bytes]]:
+def segments(data: bytes) -> Iterator[tuple[int, bytes]]:
     """Yield marker and contents of each segment up to the end of the image; coded data is skipped."""
     at = 2
     while True:
@@ -67,7 +69,7 @@ def size(data: bytes) -> tuple[int, int]:
     Raises:
         ValueError: The header is broken, or of a kind that is not read.
     """
-    for marker, body in _segments(data):
+    for marker, body in segments(data):
         if marker in SOF + OTHER_SOF:
             return _frame(marker, body)[:2]
     raise ValueError("it has no frame header")
@@ -76,13 +78,17 @@ def size(data: bytes) -> tuple[int, int]:
 def _check_scans(data: bytes) -> None:
     """Check that the scans bring every coefficient of every component to its full precision."""
     missing: dict[int, list[int]] = {}
-    for marker, body in _segments(data):
+    scans = 0
+    for marker, body in segments(data):
         if marker in SOF + OTHER_SOF:
             if missing:
                 raise ValueError("it has two frame headers")
             # number of low bits that are still unknown; 15 where nothing is known
             missing = {number: [15] * COEFFICIENTS for number in _frame(marker, body)[2]}
         elif marker == SOS:
+            scans += 1
+            if scans > MAX_SCANS:
+                raise ValueError(f"it has more than {MAX_SCANS} scans; save it as PNG")
             count = body[0] if body else 0
             if len(body) != 4 + 2 * count:
                 raise ValueError("the header of a scan is broken")

@@ -13,8 +13,8 @@ DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 1
 """Bits per sample that a type of colour may have."""
 PASSES = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
 """First column, first row and steps of the passes of an interlaced image."""
-PIECE = 1 << 20
-"""Bytes unpacked at a time."""
+PIECE, INPUT_PIECE = 1 << 20, 1 << 14
+"""Bytes unpacked at a time, and bytes that are given to the unpacker at a time."""
 
 
 def _header(data: bytes) -> tuple[int, int, int, int, int]:
@@ -36,7 +36,7 @@ def size(data: bytes) -> tuple[int, int]:
     return _header(data)[:2]
 
 
-def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
+def chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
     """Yield kind and contents of each chunk up to the last; each is checked against its checksum."""
     at, view, kind = len(SIGNATURE), memoryview(data), b""
     while kind != b"IEND":
@@ -74,10 +74,11 @@ def unpacked_size(pieces: Iterator[memoryview], limit: int) -> int:
     stream, total = zlib.decompressobj(), 0
     try:
         for piece in pieces:
-            left: bytes | memoryview = piece
-            while left and total <= limit and not stream.eof:
-                total += len(stream.decompress(left, PIECE))
-                left = stream.unconsumed_tail
+            for at in range(0, len(piece), INPUT_PIECE):  # zlib copies all that is left of its input each time
+                left: bytes | memoryview = piece[at : at + INPUT_PIECE]
+                while left and total <= limit and not stream.eof:
+                    total += len(stream.decompress(left, PIECE))
+                    left = stream.unconsumed_tail
         while not stream.eof and total <= limit and (more := stream.decompress(b"", PIECE)):
             total += len(more)
     except zlib.error as e:
@@ -94,7 +95,7 @@ def check(data: bytes) -> None:
         ValueError: They are not, or a checksum does not match.
     """
     width, height, depth, color, interlaced = _header(data)
-    chunks = list(_chunks(data))
+    parts = list(chunks(data))
     expected = _raw_size(width, height, depth * CHANNELS[color], interlaced)
-    if unpacked_size((body for kind, body in chunks if kind == b"IDAT"), expected) != expected:
+    if unpacked_size((body for kind, body in parts if kind == b"IDAT"), expected) != expected:
         raise ValueError("it holds another number of pixels than its header says")

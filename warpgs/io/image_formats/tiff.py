@@ -14,10 +14,17 @@ from warpgs.io.image_formats.png import unpacked_size
 
 TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
 """Layouts of the whole numbers that tags may hold, by type."""
+SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 6: 1, 7: 1, 8: 2, 9: 4, 11: 4, 13: 4}
+"""Bytes of a value by type; those of all others have 8."""
 WIDTH, HEIGHT, BITS, COMPRESSION, CHANNELS, PLANES = 256, 257, 258, 259, 277, 284
 ROWS, OFFSETS, COUNTS = 278, 273, 279
 TILE_WIDTH, TILE_HEIGHT, TILE_OFFSETS, TILE_COUNTS = 322, 323, 324, 325
 PHOTOMETRIC, YCBCR = 262, 6
+READ = (
+    WIDTH, HEIGHT, BITS, COMPRESSION, CHANNELS, PLANES, ROWS, OFFSETS, COUNTS, TILE_WIDTH, TILE_HEIGHT, TILE_OFFSETS,
+    TILE_COUNTS, PHOTOMETRIC,
+)  # fmt: skip
+"""Tags whose values are read here."""
 RAW, DEFLATE = 1, (8, 32946)
 MAX_ENTRIES = 4096
 """Largest number of tags in a directory."""
@@ -34,14 +41,17 @@ def _tags(data: bytes) -> dict[int, tuple[int, ...]]:
         at += 8 if big else 2
         if count > MAX_ENTRIES:
             raise ValueError(f"its directory announces {count} tags")
-        tags = {}
+        tags, room = {}, len(data)
         for _ in range(count):
             tag, kind, length = struct.unpack_from(order + entry, data, at)
             place = at + struct.calcsize(order + entry)
             at = place + slot
-            if kind not in TYPES:
+            room -= max(0, SIZES.get(kind, 8) * length - slot)
+            if room < 0:
+                raise ValueError("its tags overlap, or lie outside of the file")
+            if tag not in READ or kind not in TYPES:
                 continue
-            layout = order + f"{min(length, len(data))}{TYPES[kind]}"
+            layout = order + f"{length}{TYPES[kind]}"
             if struct.calcsize(layout) > slot:
                 (place,) = struct.unpack_from(order + number, data, place)
             tags[tag] = struct.unpack_from(layout, data, place)

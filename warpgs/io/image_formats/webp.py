@@ -9,10 +9,11 @@ PIXELS = (b"VP8 ", b"VP8L", b"ANMF")
 """Chunks that hold pixels: lossy, lossless, a frame of an animation."""
 
 
-def _chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Yield kind and the first ten bytes of each chunk."""
+def chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
+    """Yield kind and contents of each chunk."""
     if len(data) < 20 or data[8:12] != b"WEBP":
         raise ValueError("it is no WebP file")
+    view = memoryview(data)
     end, at = 8 + struct.unpack_from("<I", data, 4)[0], 12
     if end > len(data):
         raise ValueError(f"it ends early: it has {len(data)} bytes and announces {end}")
@@ -22,7 +23,7 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
         kind, length = struct.unpack_from("<4sI", data, at)
         if at + 8 + length > end:
             raise ValueError("it ends within a chunk")
-        yield kind, data[at + 8 : at + 8 + min(length, 10)]
+        yield kind, view[at + 8 : at + 8 + length]
         at += 8 + length + length % 2
 
 
@@ -32,7 +33,7 @@ def size(data: bytes) -> tuple[int, int]:
     Raises:
         ValueError: The header is broken.
     """
-    kind, body = next(_chunks(data), (b"", b""))
+    kind, body = next(chunks(data), (b"", memoryview(b"")))
     if len(body) >= 10 and kind == b"VP8X":
         width, height = (int.from_bytes(body[i : i + 3], "little") + 1 for i in (4, 7))
     elif len(body) >= 10 and kind == b"VP8 " and body[3:6] == b"\x9d\x01\x2a":
@@ -51,5 +52,5 @@ def check(data: bytes) -> None:
     Raises:
         ValueError: One is not, or there are no pixels.
     """
-    if not any(kind in PIXELS for kind, _ in _chunks(data)):
+    if not any(kind in PIXELS for kind, _ in chunks(data)):
         raise ValueError("it holds no pixels")

@@ -11,6 +11,7 @@ from typing import Any
 
 from warpgs import schema
 from warpgs.errors import DataError, UsageError
+from warpgs.input_files import read_input, unread_reason
 from warpgs.io.readers import all_readers
 
 NAME = re.compile(r"[^\W_][^/\\:*?\"<>|\x00-\x1f]{0,99}")
@@ -77,14 +78,11 @@ def _named(scenes: list[Path]) -> list[ListedJob]:
 def _read(path: Path) -> list[ListedJob]:
     """Read a file of jobs: ``{"scene": FOLDER}`` a line, with a ``name`` and flags of `warpgs fit` beside it."""
     try:
-        if not path.is_file():
-            raise OSError("it is no file")
-        with path.open("rb") as f:
-            data = f.read(schema.MAX_BYTES + 1)
+        data = read_input(path, schema.MAX_BYTES)
     except OSError as e:
-        raise DataError(f"{path}: cannot be read ({e}); give a file with a line of JSON for each job") from e
-    if len(data) > schema.MAX_BYTES:
-        raise DataError(f"{path}: is larger than {schema.MAX_BYTES / 2**20:.0f} MiB; split it into several farms")
+        raise DataError(
+            f"{path}: cannot be read ({unread_reason(e)}); give a file with a line of JSON for each job, or several farms"
+        ) from e
     found = []
     for number, line in enumerate(data.splitlines(), 1):
         if line.strip():

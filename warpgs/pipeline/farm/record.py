@@ -11,7 +11,7 @@ from pathlib import Path
 from warpgs import __version__, schema
 from warpgs.errors import ResourceError
 from warpgs.files import write_json
-from warpgs.output_folders import open_file
+from warpgs.input_files import input_digest, unread_reason
 from warpgs.pipeline.farm.job import FarmJob
 from warpgs.pipeline.runs.folder import CONFIG
 
@@ -99,10 +99,9 @@ def file_digest(path: Path) -> str:
         ResourceError: It cannot be read.
     """
     try:
-        with open_file(path, path.parent) as f:
-            return hashlib.file_digest(f, "sha256").hexdigest()
+        return input_digest(path, path.parent)
     except OSError as e:
-        raise ResourceError(f"{path}: cannot be read ({e.strerror or e}); check the disk, and fit the scene again") from e
+        raise ResourceError(f"{path}: cannot be read ({unread_reason(e)}); check the disk, and fit the scene again") from e
 
 
 def source_stamp(scene: Path) -> str:

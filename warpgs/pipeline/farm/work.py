@@ -15,6 +15,7 @@ import numpy as np
 
 from warpgs.errors import FolderHeldError, ResourceError, UsageError, WarpgsError
 from warpgs.files import appending, make_folder, read_file, remove_file, remove_leftovers, write_bytes, writing_into
+from warpgs.io.decoding import decode
 from warpgs.io.splits import Split
 from warpgs.pipeline.farm.ensure_run import Outcome, ensure_run
 from warpgs.pipeline.farm.job import FarmJob, job_of
@@ -157,9 +158,7 @@ def write_thumbnail(renders: Path, path: Path) -> None:
     first = min(renders.glob("*.png"), default=None)
     if first is None:
         return
-    image = cv2.imdecode(np.frombuffer(read_file(first, renders.parent), np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
-        return
+    image = np.round(255 * decode(first, data=read_file(first, renders.parent))[0][..., ::-1]).astype(np.uint8)
     pair = image[:, : image.shape[1] * 2 // 3]  # render, photograph, error
     scale = min(1.0, THUMBNAIL_SIDE / max(pair.shape[:2]))
     size = max(1, round(pair.shape[1] * scale)), max(1, round(pair.shape[0] * scale))

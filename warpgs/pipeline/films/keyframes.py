@@ -14,6 +14,7 @@ from warpgs import schema
 from warpgs.coordinates import convert_camera
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import matmul, nearest_rotation, quaternions, rotation_matrices
+from warpgs.input_files import read_input, unread_reason
 from warpgs.pipeline.films.camera_paths import framed
 from warpgs.scene import Camera, Normalization
 
@@ -136,13 +137,12 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
         DataError: The file cannot be read, or a value in it is another than it may be; the message names it.
     """
     try:
-        if path.is_file() and path.stat().st_size > MAX_BYTES:
-            raise DataError(f"{path}: is larger than {MAX_BYTES // 2**20} MiB, and no list of keyframes; give the right file")
-        values = schema.read(path)
+        values = schema.parse(read_input(path, MAX_BYTES))
         KEYFRAMES(values, "keyframes")
     except (OSError, schema.SchemaError) as e:
+        why = unread_reason(e) if isinstance(e, OSError) else e
         raise DataError(
-            f"{path}: cannot be read as keyframes ({e}); give a JSON list of objects with c2w (4 rows of 4), fov_y [rad] and "
+            f"{path}: cannot be read as keyframes ({why}); give a JSON list of objects with c2w (4 rows of 4), fov_y [rad] and "
             "seconds"
         ) from e
     if not 1 <= len(values) <= MAX_KEYFRAMES:

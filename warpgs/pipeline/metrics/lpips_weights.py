@@ -13,6 +13,7 @@ import torch
 
 from warpgs.errors import DataError, UsageError
 from warpgs.files import write_bytes
+from warpgs.input_files import open_input, read_input, unread_reason
 
 FORMAT = "warpgs-lpips-1"
 
@@ -91,20 +92,26 @@ HEADS = {
 
 def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
     """The tensors of a .pth file by name, and the file's SHA-256."""
-    if not path.is_file():
-        raise DataError(f"{path}: there is no such file; give a .pth file with a state dict")
     try:
-        # weights_only: tensors and plain containers, nothing that could run
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as e:  # torch, pickle and zipfile raise a dozen types on foreign bytes
-        reason = str(e).splitlines()[0][:120] if str(e) else ""
-        raise DataError(
-            f"{path}: cannot be read as a torch state dict ({type(e).__name__}: {reason}); download it again from its source"
-        ) from e
+        file = open_input(path)
+    except FileNotFoundError as e:
+        raise DataError(f"{path}: there is no such file; give a .pth file with a state dict") from e
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); give a .pth file with a state dict") from e
+    with file:
+        try:
+            # weights_only: tensors and plain containers, nothing that could run
+            state = torch.load(file, map_location="cpu", weights_only=True)
+        except Exception as e:  # torch, pickle and zipfile raise a dozen types on foreign bytes
+            reason = str(e).splitlines()[0][:120] if str(e) else ""
+            raise DataError(
+                f"{path}: cannot be read as a torch state dict ({type(e).__name__}: {reason}); download it again"
+            ) from e
+        file.seek(0)
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
     if not isinstance(state, dict):
         raise DataError(f"{path}: holds a {type(state).__name__}, not a state dict of named tensors; give the weights alone")
-    with path.open("rb") as f:
-        return state, hashlib.file_digest(f, "sha256").hexdigest()
+    return state, digest
 
 
 def _net_of(heads: dict[str, torch.Tensor], path: Path) -> Net:
@@ -182,9 +189,12 @@ def read_lpips(path: Path) -> tuple[Net, dict[str, torch.Tensor], dict[str, str]
     from safetensors import SafetensorError
     from safetensors.torch import load
 
-    if not path.is_file():
-        raise DataError(f"{path}: there is no such file; `warpgs convert-lpips` makes one from published weights")
-    data = path.read_bytes()
+    try:
+        data = read_input(path)
+    except FileNotFoundError as e:
+        raise DataError(f"{path}: there is no such file; `warpgs convert-lpips` makes one from published weights") from e
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); `warpgs convert-lpips` makes such a file") from e
     try:
         tensors = load(data)
         metadata = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__") or {}

@@ -13,6 +13,7 @@ import torch
 
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import matmul, quaternions, rotation_matrices
+from warpgs.input_files import read_input, unread_reason
 from warpgs.kernels.sh import basis
 from warpgs.pipeline.model.coverage import SEEN
 from warpgs.pipeline.model.scale_limits import NEEDLE, ROUNDING, long_axes
@@ -88,12 +89,12 @@ def box_of(text: str) -> Box:
 def _box_of_file(path: Path) -> Box:
     """Return the box of a JSON file, such as the viewer saves; DataError where it holds none."""
     try:
-        with path.open("rb") as file:
-            text = file.read(MAX_BOX_BYTES + 1).decode("utf-8-sig")
+        text = read_input(path, MAX_BOX_BYTES).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as e:
-        raise DataError(f"{path}: cannot be read as a box ({e}); give a JSON file with center and size") from e
+        why = unread_reason(e) if isinstance(e, OSError) else e
+        raise DataError(f"{path}: cannot be read as a box ({why}); give a JSON file with center and size") from e
     try:
-        if len(text) > MAX_BOX_BYTES or not text.lstrip().startswith("{"):
+        if not text.lstrip().startswith("{"):
             raise UsageError("it is no JSON object with center and size")
         return box_of(text)
     except UsageError as e:

@@ -14,6 +14,7 @@ from warpgs import __version__, schema
 from warpgs.coordinates import checked_normalization, convert_camera, convert_gaussians
 from warpgs.errors import DataError, UsageError
 from warpgs.files import write_bytes
+from warpgs.input_files import read_input, unread_reason
 from warpgs.pipeline.metrics.evaluate import options_for
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Normalization
@@ -117,11 +118,11 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
 
     path = Path(path)
     try:
-        data = path.read_bytes()
+        data = read_input(path)
         tensors = from_bytes(data)
         header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__") or {}
     except OSError as e:
-        raise DataError(f"{path}: cannot be read ({e.strerror or e}); check the path and its permissions") from e
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); check the path and its permissions") from e
     except (SafetensorError, ValueError) as e:
         raise DataError(f"{path}: is damaged or no safetensors file ({e}); write it again with warpgs.save") from e
     if header.get("format") != FORMAT or tensors.keys() != Gaussians.__dataclass_fields__.keys():

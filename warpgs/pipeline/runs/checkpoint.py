@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ import torch
 
 from warpgs import __version__, schema
 from warpgs.errors import DataError, NotFiniteError
-from warpgs.files import read_file, write_bytes
+from warpgs.files import write_bytes
+from warpgs.input_files import open_input, unread_reason
 
 TENSORS = "checkpoint.safetensors"
 FORMAT = 2
@@ -92,8 +94,12 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, An
     path = folder / TENSORS
     if not path.is_file():
         raise DataError(f"{folder} holds no {TENSORS}: there is nothing to continue or to render from; run `warpgs fit` first")
-    data = read_file(path, folder)
-    body, digest = data[:-32], data[-32:]
+    try:
+        with open_input(path, folder) as file:
+            body = file.read(max(0, os.fstat(file.fileno()).st_size - 32))
+            digest = file.read(33)
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); restore it, or fit again") from e
     if hashlib.sha256(body).digest() != digest:
         raise DataError(f"{path}: the checksum does not match, so the file was truncated or altered; fit again, or restore it")
     try:

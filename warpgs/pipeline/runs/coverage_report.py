@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from warpgs.files import make_folder, read_file, write_bytes
+from warpgs.io.decoding import decode
 from warpgs.pipeline.metrics.coverage_scores import CLASSES, score_by_coverage
 from warpgs.pipeline.metrics.evaluate import options_for
 from warpgs.report.coverage_image import LEGEND, coverage_image
@@ -98,6 +99,6 @@ def coverage_section(out: Path, coverage: dict[str, Any], shown: list[str], name
     head, *rows = coverage_table(coverage)
     return CoverageReport(
         f"{coverage['summary'][0].upper()}{coverage['summary'][1:]}. {EXPECTED}", LEGEND,
-        [(n, webp(read_file(f, out), 640)) for n, f in files.items() if f.is_file()],
+        [(n, webp(decode(f, data=read_file(f, out))[0], 640)) for n, f in files.items() if f.is_file()],
         [head[1:], *(r[1:] for r in rows if r[0] == "all views")],
     )  # fmt: skip

@@ -11,6 +11,7 @@ import torch
 
 from warpgs.errors import DataError
 from warpgs.files import write_bytes
+from warpgs.input_files import open_input
 from warpgs.kernels.dropout import opacity_dropout
 from warpgs.pipeline.runs.checkpoint import safetensors_chunks
 from warpgs.pipeline.train.config import FitConfig
@@ -83,6 +84,7 @@ def read_failed_step(path: Path, device: torch.device) -> Bundle:
     from safetensors import SafetensorError, safe_open
 
     try:
+        open_input(path).close()
         with safe_open(path, framework="pt", device=str(device)) as f:
             return {n: f.get_tensor(n) for n in f.keys()}, json.loads((f.metadata() or {})["step"])
     except (OSError, SafetensorError, KeyError, ValueError, RecursionError) as e:

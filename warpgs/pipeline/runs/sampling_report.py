@@ -13,6 +13,7 @@ import numpy as np
 
 from warpgs.errors import ResourceError
 from warpgs.files import make_folder, read_file, write_bytes
+from warpgs.io.decoding import decode
 from warpgs.pipeline.train.schedule import Phases
 from warpgs.pipeline.train.strategies.importance_sampling import Event, ImportanceSampling, MethodConfig, SampledView
 from warpgs.pipeline.train.strategies.sampler import SUPPORT
@@ -203,5 +204,7 @@ def sampling_report_of(fit: Trainer, out: Path) -> SamplingReport | None:
         [f"{n:,}" for n in (events["count"], events["added"], events["evicted"], layers["coarse"], layers["fine"])],
     ]
     files = sorted((out / FOLDER).glob("*.png"))
-    images = [(f"sampling after step {int(p.stem):,}", webp(read_file(p, out), SHEET_WIDTH, 70)) for p in files]
+    images = [
+        (f"sampling after step {int(p.stem):,}", webp(decode(p, data=read_file(p, out))[0], SHEET_WIDTH, 70)) for p in files
+    ]
     return SamplingReport(words, images, table)

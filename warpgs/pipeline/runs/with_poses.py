@@ -40,12 +40,15 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
     scene = out / POSED_SCENE
     if (scene / JSON).is_file():
         record = read_record(scene)
-        if record["source_sha256"] != source_digest(source):
+        if record["source_sha256"] != source_digest(source, request.allow_outside):
             raise UsageError(f"{source} does not hold the photographs of {scene}, whose poses it keeps; give another --out")
     else:
         progress(f"{source} holds no cameras: finding poses, which {scene} keeps")
         threads = torch.get_num_threads()
-        record = find_poses(source, scene, threads=threads, max_pixels=request.max_pixels, progress=progress)
+        record = find_poses(
+            source, scene, threads=threads, max_pixels=request.max_pixels, allow_outside=request.allow_outside,
+            progress=progress,
+        )  # fmt: skip
     return replace(request, path=str(scene)), _notes(record)
 
 
