@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import json
+import threading
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,7 +21,7 @@ from warpgs.viewer import watch
 from warpgs.viewer.content import content_of_file, content_of_run, views_of
 from warpgs.viewer.maps import COVERAGE, DEPTH, ERROR, GAUSSIANS, MAPS, RENDER, placed
 from warpgs.viewer.panel import COARSE, FINE
-from warpgs.viewer.saved import CROP, PATH, keyframe
+from warpgs.viewer.saved import CROP, MAX_KEYFRAMES, PATH, keyframe
 from warpgs.viewer.server import open_server, stop_server
 from warpgs.viewer.window import Window
 
@@ -157,6 +158,43 @@ def test_a_browser_gets_the_image_that_it_asks_for(window):
     assert sent[-1].shape == (2, 2, 3) and not window.panel._note.visible
 
 
+def test_an_unknown_wish_ends_no_thread(window, monkeypatch):
+    """The panel says what is wrong, and the thread that renders goes on."""
+    monkeypatch.setattr(window.server, "get_clients", lambda: {1: SimpleNamespace(client_id=1)})
+    told, said_all = [], threading.Event()
+
+    def explain(note):
+        told.append(note)
+        said_all.set()
+
+    def fail(client):
+        raise KeyError("unknown")
+
+    monkeypatch.setattr(window, "_render_for", fail)
+    monkeypatch.setattr(window.panel, "explain", explain)
+    for _ in range(2):
+        said_all.clear()
+        window._wake.set()
+        assert said_all.wait(60) and window._thread.is_alive()
+    assert set(told) == {"no image: KeyError: 'unknown'"}
+
+
+def test_keyframes_are_bounded(window, monkeypatch):
+    """One more than there may be is refused with a note, and the path keeps what it has."""
+    panel, told = window.panel, []
+    camera = window.content.model.scene_cameras[window.content.model.train[0]]
+    monkeypatch.setattr(panel, "keyframes", [])
+    monkeypatch.setattr(panel, "explain", told.append)
+    monkeypatch.setattr(window, "camera_of", lambda client: camera)
+    add = next(
+        h for h in window.server.gui._gui_input_handle_from_uuid.values() if getattr(h, "label", "") == "add this camera"
+    )
+    (append,) = add._impl.update_cb
+    for _ in range(MAX_KEYFRAMES + 3):
+        append(SimpleNamespace(client=None))
+    assert len(panel.keyframes) == MAX_KEYFRAMES and told == ["a path has at most 1,000 keyframes"] * 3
+
+
 def test_a_ply_and_what_is_neither(folder, tmp_path):
     """A PLY file is shown without cameras, about its middle; saved files lie beside it; others are one sentence."""
     content = content_of_file(folder / "run" / "point_cloud.ply")
@@ -184,10 +222,16 @@ def test_a_run_is_followed_until_it_is_interrupted(folder, monkeypatch, capsys):
     monkeypatch.setattr(watch, "_pause", pause)
     monkeypatch.setattr(watch, "modified", lambda _: next(times))
     monkeypatch.setattr(watch, "Window", lambda _, content: SimpleNamespace(content=content, show=shown.append))
-    monkeypatch.setattr(watch, "open_server", lambda port: SimpleNamespace(get_port=lambda: 1, stop=lambda: None))
+    monkeypatch.setattr(watch, "open_server", lambda port: SimpleNamespace(stop=lambda: None))
+    monkeypatch.setattr(watch, "address", lambda _: "http://127.0.0.1:1/word/")
     assert main(["view", str(folder / "run"), "--device", "cpu"]) == 0
     told = capsys.readouterr().out
-    assert "waiting for the first checkpoint" in told and "step 12" in told and len(shown) == 1 and "127.0.0.1:1" in told
+    assert (
+        "waiting for the first checkpoint" in told
+        and "step 12" in told
+        and len(shown) == 1
+        and "http://127.0.0.1:1/word/" in told
+    )
 
 
 def test_a_page_names_nobody(folder, tmp_path, capsys):

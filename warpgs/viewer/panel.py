@@ -13,9 +13,10 @@ from warpgs.geometry import rotation_matrices
 from warpgs.io.decoding import decode
 from warpgs.runtime.terminal import say
 from warpgs.scene import Camera
+from warpgs.viewer.callbacks import guarded
 from warpgs.viewer.content import Content
 from warpgs.viewer.maps import GAUSSIANS, MAPS
-from warpgs.viewer.saved import CROP, PATH, CropBox, keyframe
+from warpgs.viewer.saved import CROP, MAX_KEYFRAMES, PATH, CropBox, keyframe
 
 if TYPE_CHECKING:
     import viser
@@ -59,7 +60,7 @@ class Panel:
         self._cameras = gui.add_checkbox("cameras", True, visible=bool(content.model.scene_cameras))
         self._note = gui.add_markdown("", visible=False)
         for control in (self._kind, self._degree, self._layer, self._cameras):
-            control.on_update(lambda _: self.window.redraw())
+            control.on_update(guarded(lambda _: self.window.redraw()))
         self._add_stepping()
         self._add_importance()
         self._add_crop()
@@ -106,9 +107,12 @@ class Panel:
         names = list(self.content.model.scene_cameras)
         if names:
             chooser = self.server.gui.add_dropdown("step into", (NOWHERE, *names), initial_value=NOWHERE)
-            chooser.on_update(
-                lambda event: None if chooser.value == NOWHERE else self.window.step_into(chooser.value, event.client)
-            )
+
+            def step(event: Any) -> None:
+                if chooser.value != NOWHERE:
+                    self.window.step_into(chooser.value, event.client)
+
+            chooser.on_update(guarded(step))
 
     def _add_importance(self) -> None:
         """Offer the fit's own image of where importance placed Gaussians."""
@@ -125,7 +129,7 @@ class Panel:
                 event.client.gui.add_image(image, format="jpeg")
                 event.client.gui.add_button("close").on_click(lambda _: modal.close())
 
-        self.server.gui.add_button("importance", hint="views of a sampling event of the fit").on_click(show)
+        self.server.gui.add_button("importance", hint="views of a sampling event of the fit").on_click(guarded(show))
 
     def _add_crop(self) -> None:
         """Offer a box that is moved and turned by its handles, and saved."""
@@ -145,9 +149,9 @@ class Panel:
             )
             self.window.redraw()
 
-        self._crop.on_update(draw)
-        self._size.on_update(draw)
-        self._gizmo.on_update(lambda event: self.window.redraw() if event.phase == "end" else None)
+        self._crop.on_update(guarded(draw))
+        self._size.on_update(guarded(draw))
+        self._gizmo.on_update(guarded(lambda event: self.window.redraw() if event.phase == "end" else None))
 
         def store(_: Any) -> None:
             box = self.crop_box()
@@ -155,7 +159,7 @@ class Panel:
                 return self.explain("there is no crop box yet: tick crop, and move the box")
             self._save(CROP, box.to_json(self.content.model.normalization))
 
-        save.on_click(store)
+        save.on_click(guarded(store))
 
     def _add_keyframes(self) -> None:
         """Offer to keep the present camera as the next of a path, and to save the path."""
@@ -170,6 +174,8 @@ class Panel:
 
         def append(event: Any) -> None:
             with self._lock:
+                if len(self.keyframes) >= MAX_KEYFRAMES:
+                    return self.explain(f"a path has at most {MAX_KEYFRAMES:,} keyframes")
                 at = self.keyframes[-1]["seconds"] + float(seconds.value) if self.keyframes else 0.0
                 camera = self.window.camera_of(event.client)
                 self.keyframes.append(keyframe(camera, at, self.content.model.normalization))
@@ -180,9 +186,11 @@ class Panel:
                 del self.keyframes[-1:]
                 changed()
 
-        add.on_click(append)
-        remove.on_click(pop)
-        save.on_click(lambda _: self._save(PATH, self.keyframes) if self.keyframes else self.explain("add a camera first"))
+        add.on_click(guarded(append))
+        remove.on_click(guarded(pop))
+        save.on_click(
+            guarded(lambda _: self._save(PATH, self.keyframes) if self.keyframes else self.explain("add a camera first"))
+        )
 
     def _save(self, name: str, values: Any) -> None:
         """Write a file beside what is shown, and say where it is."""

@@ -14,6 +14,8 @@ from warpgs.viewer.poses import fov_y
 
 CROP, PATH = "crop.json", "path.json"
 """Names of the files in a run folder."""
+MAX_KEYFRAMES = 1000
+"""Largest number of keyframes of a path: half an hour at the default of 2 s between them."""
 
 
 @dataclass(frozen=True)

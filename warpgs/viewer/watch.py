@@ -20,7 +20,7 @@ from warpgs.report.progress import waiting
 from warpgs.runtime.terminal import say
 from warpgs.scene import Gaussians
 from warpgs.viewer.content import Content, content_of_file, content_of_run, modified, views_of
-from warpgs.viewer.server import HOST, PORT, open_server, require_viser, stop_server
+from warpgs.viewer.server import PORT, address, open_server, require_viser, stop_server
 from warpgs.viewer.window import Window
 
 if TYPE_CHECKING:
@@ -28,11 +28,6 @@ if TYPE_CHECKING:
 
 POLL = 1.0
 """Time between looks at a run folder, and between states of a fit in this process [s]."""
-
-
-def address(server: viser.ViserServer) -> str:
-    """Return the address to open in a browser."""
-    return f"http://{HOST}:{server.get_port()}"
 
 
 def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None = None) -> None:

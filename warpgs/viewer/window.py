@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from warpgs.errors import WarpgsError
 from warpgs.geometry import camera_extent
 from warpgs.report.images import resized
 from warpgs.scene import Camera, Gaussians
+from warpgs.viewer.callbacks import guarded, said
 from warpgs.viewer.content import Content
 from warpgs.viewer.html import place_first_camera, plain_background
 from warpgs.viewer.maps import GAUSSIANS, Maps
@@ -60,7 +60,7 @@ class Window:
         self.panel = Panel(server, content, self, maps)
         self._draw_cameras()
         self.redraw()
-        server.on_client_connect(self._connected)
+        server.on_client_connect(guarded(self._connected))
         self._thread = threading.Thread(target=self._render_maps, name="viewer maps", daemon=True)
         self._thread.start()
 
@@ -121,7 +121,7 @@ class Window:
                 color=TEST_COLOR if name in model.test else TRAIN_COLOR, image=None if view is None else _small(view.image),
                 format="jpeg", wxyz=wxyz_of(camera), position=camera.center, cast_shadow=False, receive_shadow=False,
             )  # fmt: skip
-            frustum.on_click(lambda event, name=name: self.step_into(name, event.client))
+            frustum.on_click(guarded(lambda event, name=name: self.step_into(name, event.client)))
             self._frusta[name] = frustum
 
     def step_into(self, name: str, client: viser.ClientHandle | None) -> None:
@@ -146,7 +146,7 @@ class Window:
         return camera_at(state.wxyz, state.position, state.fov, *size)
 
     def _connected(self, client: viser.ClientHandle) -> None:
-        client.camera.on_update(lambda _: (self._hide_near(), self._wake.set()))
+        client.camera.on_update(guarded(lambda _: (self._hide_near(), self._wake.set())))
         self._wake.set()
 
     def _hide_near(self) -> None:
@@ -171,8 +171,8 @@ class Window:
                     self._render_for(client)
                 except AssertionError:  # a browser that has not told its camera yet; it will wake us
                     continue
-                except (WarpgsError, RuntimeError) as e:  # of torch: no memory for this image; the next one may be smaller
-                    self.panel.explain(f"no image: {e}")
+                except Exception as e:  # there may be no memory for this image; the next one may be smaller
+                    self.panel.explain(f"no image: {said(e)}")
 
     def _render_for(self, client: viser.ClientHandle) -> None:
         """Put the image that the panel asks for behind a browser's scene, where the one it has is another."""

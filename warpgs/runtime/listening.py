@@ -1,0 +1,176 @@
+"""Guards of everything that listens: sockets of this machine alone, and who may talk to a page that is served there.
+
+Any page in a browser can send requests to any port of the machine that its reader sits at, and so can every program of every
+user of the machine. So a server of warpgs binds the loopback address, answers below a random path that is new at every start,
+and looks at ``Host`` and ``Origin`` before anything else does.
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import re
+import secrets
+import socket
+import sys
+import time
+from collections.abc import Callable, Sequence
+
+from warpgs.errors import ResourceError, UsageError
+
+HOST = "127.0.0.1"
+"""Address that servers listen at: only this machine reaches it."""
+NAMES = (HOST, "localhost")
+"""Names under which a browser may ask for a server, at any port: that of an SSH tunnel may differ from ours."""
+TOKEN_BYTES = 24
+"""Random bytes of a token: 32 letters."""
+_PLAIN = re.compile(r"[A-Za-z0-9._/-]*")
+
+
+def loopback_socket(port: int, fix: str, host: str = HOST) -> socket.socket:
+    """Return a socket that is bound to the loopback address and does not listen yet.
+
+    Args:
+        port: Port; 0 for any free one.
+        fix: What the user can do where the port is taken.
+        host: 127.0.0.1 or ::1.
+
+    Raises:
+        UsageError: The port is taken, or no port.
+    """
+    opened = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    # on Windows SO_REUSEADDR would let another program bind the same port beside us
+    name = "SO_EXCLUSIVEADDRUSE" if sys.platform == "win32" else "SO_REUSEADDR"
+    try:
+        opened.setsockopt(socket.SOL_SOCKET, getattr(socket, name), 1)
+        opened.bind((host, port))
+    except (OSError, OverflowError) as e:
+        opened.close()
+        reason = e.strerror if isinstance(e, OSError) and e.strerror else str(e)
+        raise UsageError(f"port {port} cannot be used ({reason}); {fix}") from e
+    return opened
+
+
+def loopback_of(name: str) -> str | None:
+    """Return the loopback address that a host name or address stands for, 127.0.0.1 before ::1; None for other hosts."""
+    try:
+        found = [str(info[4][0]) for info in socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)]
+    except (OSError, UnicodeError):  # it cannot be resolved; whoever connects to it says so
+        return None
+    if not found or not all(ipaddress.ip_address(a.partition("%")[0]).is_loopback for a in found):
+        return None
+    return min(found, key=lambda a: (":" in a, a))
+
+
+def loopback_interface(host: str = HOST) -> str:
+    """Return the name of the network interface that has a loopback address, such as lo.
+
+    Raises:
+        ResourceError: No interface has it.
+    """
+    import psutil
+
+    for name, addresses in psutil.net_if_addrs().items():
+        if any(a.address == host for a in addresses):
+            return str(name)
+    raise ResourceError(f"no network interface has the address {host}; bring up the loopback interface (ip link set lo up)")
+
+
+class Allowance:
+    """A number of messages that may come, refilled with time up to a limit."""
+
+    def __init__(self, per_second: float, most: float, clock: Callable[[], float] = time.monotonic):
+        """Begin full.
+
+        Args:
+            per_second: Messages by which it grows in a second.
+            most: Largest number of messages at once.
+            clock: Returns the time [s].
+        """
+        self._per_second, self._most, self._clock = per_second, most, clock
+        self._left, self._last = most, clock()
+
+    def take(self) -> bool:
+        """Take one message; returns False where there is none left."""
+        now = self._clock()
+        self._left = min(self._most, self._left + self._per_second * (now - self._last))
+        self._last = now
+        if self._left < 1:
+            return False
+        self._left -= 1
+        return True
+
+
+class WebGuard:
+    """Rules for requests to a web server of this machine: its secret path, its names, and the headers of its answers."""
+
+    def __init__(self) -> None:
+        """Draw a token, which is valid until the process ends."""
+        self.token = secrets.token_urlsafe(TOKEN_BYTES)
+
+    def address(self, port: int) -> str:
+        """Return the address to open in a browser."""
+        return f"http://{HOST}:{port}/{self.token}/"
+
+    def admitted_path(self, target: str, hosts: Sequence[str], origins: Sequence[str], upgrade: bool) -> str | None:
+        """Return the path below the token that a request asks for, or None where it must be refused.
+
+        Args:
+            target: Target of the request line. One with a query is refused: pages obey parameters that others choose.
+            hosts: Values of all headers ``Host``. There must be one, with one of `NAMES`: a foreign name that resolves to
+                127.0.0.1 is refused.
+            origins: Values of all headers ``Origin``. Each must be the server's own, and a websocket must have exactly one.
+            upgrade: Whether a websocket is asked for, which is found at the top alone.
+        """
+        if len(hosts) != 1 or not _is_own(hosts[0]):
+            return None
+        if any(origin != f"http://{hosts[0]}" for origin in origins) or (upgrade and len(origins) != 1):
+            return None
+        first, _, rest = target.removeprefix("/").partition("/")
+        if not target.startswith("/") or not hmac.compare_digest(_bytes(first), _bytes(self.token)):
+            return None
+        if not _PLAIN.fullmatch(rest) or ".." in rest or (upgrade and rest):
+            return None
+        return f"/{rest}"
+
+    @staticmethod
+    def headers(host: str, nonce: str) -> dict[str, str]:
+        """Return the headers of every answer.
+
+        Args:
+            host: Value of the request's header ``Host``; of a refused request, anything.
+            nonce: Word that scripts of the page carry; others do not run.
+        """
+        # Safari takes 'self' for http alone; a host that is not our own must not come into the header
+        sockets = f" ws://{host}" if _is_own(host) else ""
+        policy = {
+            "default-src": "'none'",
+            "script-src": f"'nonce-{nonce}' 'unsafe-eval'",  # of the worker that sorts Gaussians
+            "worker-src": "blob:",
+            "style-src": "'unsafe-inline'",
+            "img-src": "'self' data: blob:",
+            "font-src": "data:",
+            "connect-src": f"'self'{sockets} data: blob:",
+            "base-uri": "'none'",
+            "form-action": "'none'",
+            "frame-ancestors": "'none'",
+        }
+        return {
+            "Content-Security-Policy": "; ".join(f"{name} {value}" for name, value in policy.items()),
+            "X-Frame-Options": "DENY",
+            "Referrer-Policy": "no-referrer",
+            "X-Content-Type-Options": "nosniff",
+            "Cache-Control": "no-store",
+            "Cross-Origin-Opener-Policy": "same-origin",
+            "Cross-Origin-Resource-Policy": "same-origin",
+        }
+
+
+def _is_own(host: str) -> bool:
+    """Return whether a value of ``Host`` is one of `NAMES`, with or without a port."""
+    name, colon, port = host.partition(":")
+    return name in NAMES and (not colon or (port.isascii() and port.isdecimal() and len(port) <= 5))
+
+
+def _bytes(text: str) -> bytes:
+    return text.encode("utf-8", "surrogateescape")

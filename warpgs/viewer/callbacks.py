@@ -1,0 +1,29 @@
+"""Callbacks of the viewer's controls that end in one line where they fail: viser would print a traceback."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+from warpgs.errors import WarpgsError
+from warpgs.runtime.terminal import say
+
+
+def said(error: BaseException) -> str:
+    """Return an error as one line, shortened; with its kind where it is not one of ours."""
+    line = (str(error).strip().splitlines() or [""])[0][:200]
+    return line if isinstance(error, WarpgsError) else f"{type(error).__name__}: {line}"
+
+
+def guarded(callback: Callable[..., Any]) -> Callable[..., None]:
+    """Return a callback that prints one line on stderr where another raises an error."""
+
+    @functools.wraps(callback)
+    def call(*args: Any) -> None:
+        try:
+            callback(*args)
+        except Exception as e:  # of whatever a browser asked for; the viewer goes on
+            say(f"the viewer could not do what a browser asked for ({said(e)})", error=True)
+
+    return call

@@ -1,0 +1,27 @@
+"""The page of viser as the viewer serves it: parameters of its address have no effect, and only its own scripts run."""
+
+from __future__ import annotations
+
+NO_PARAMETERS = "URLSearchParams=class extends URLSearchParams{constructor(){super()}set(){}};"
+"""JavaScript before viser's own: parameters such as ``websocket`` and ``playbackPath``, which name servers and files to load,
+have no effect, and none is added."""
+NO_TEXT_AS_CODE = "Function=new Proxy(Function,{construct(){throw Error('refused')}});eval=()=>{throw Error('refused')};"
+"""JavaScript before viser's own: messages that hold JavaScript are refused. The content policy cannot do this, since the worker
+that sorts Gaussians makes functions of text."""
+_MARK_LOADED = (
+    "document.createElement=function(name,...rest){"
+    "const made=Document.prototype.createElement.call(this,name,...rest);"
+    "if(name==='script'){made.nonce='NONCE';delete document.createElement}return made};"
+)
+"""JavaScript that gives the nonce to the one script that viser's page unpacks."""
+
+
+def live_page(text: str, nonce: str) -> str:
+    """Return viser's page for a content policy that runs scripts with a nonce alone.
+
+    Args:
+        text: The page as viser has it.
+        nonce: Word of the policy, of letters that are safe in an attribute.
+    """
+    own = f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}{_MARK_LOADED.replace('NONCE', nonce)}</script>"
+    return text.replace("<head>", f"<head>{own}", 1).replace("<script", f'<script nonce="{nonce}"')
