@@ -18,7 +18,7 @@ from warpgs.files import make_folder, write_bytes, write_json
 from warpgs.io.decoding import read_image_file
 from warpgs.io.image_formats.avif import BROKEN, kind
 from warpgs.runtime.subprocesses import ProcessFailed, python_lines
-from warpgs.runtime.terminal import say
+from warpgs.runtime.terminal import answer
 
 QUALITY = 98
 """JPEG quality of the copies, without subsampling of colours."""
@@ -103,11 +103,11 @@ def main(path: str) -> None:
     """Copy the files that a job names; print a line of JSON before each, and one with the error of the first that fails."""
     job: dict[str, Any] = json.loads(Path(path).read_text("utf-8"))
     for i, (source, target) in enumerate(job["files"]):
-        say(json.dumps({"file": i}))
+        answer(json.dumps({"file": i}))
         try:
             _copy(Path(source), Path(target), job["max_pixels"])
         except BROKEN as e:
-            say(json.dumps({"error": str(e).strip().rstrip(".") or type(e).__name__}))
+            answer(json.dumps({"error": str(e).strip().rstrip(".") or type(e).__name__}))
             return
 
 
