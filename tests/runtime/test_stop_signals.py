@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: one sentence and one exit code wherever they come, and none where they are ignored."""
+"""Ctrl-C, SIGTERM and SIGHUP: one sentence and one exit code wherever they come, and none where they are ignored."""
 
 import signal
 import threading
@@ -10,7 +10,7 @@ from warpgs.pipeline.runs.checkpoint import load_checkpoint
 from warpgs.runtime.stop_signals import ignored_signals, interrupting_signals, noted_signals
 from warpgs.synthetic.demo import split_spec, write_demo
 
-SIGNALS = [pytest.param(signal.SIGINT, id="SIGINT"), pytest.param(signal.SIGTERM, id="SIGTERM")]
+SIGNALS = [pytest.param(s, id=n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if (s := getattr(signal, n, None))]
 CONTEXTS = [interrupting_signals, noted_signals, ignored_signals]
 SENTENCE = "warpgs: interrupted; --resume continues from the last checkpoint\n"
 UNSAVED = "warpgs: interrupted; no step was saved: the same command begins again\n"
@@ -20,8 +20,8 @@ UNSAVED = "warpgs: interrupted; no step was saved: the same command begins again
 def handlers():
     """The handlers that a program starts with; whatever a test sets, those of pytest are back after it."""
     before = {s.values[0]: signal.getsignal(s.values[0]) for s in SIGNALS}
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    for number in before:
+        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
@@ -101,8 +101,7 @@ STAGES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("number", SIGNALS)
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize(("stage", "number"), [(s, SIGNALS[i % len(SIGNALS)].values[0]) for i, s in enumerate(STAGES)])
 def test_outside_the_steps_the_end_is_the_same(scene, tmp_path, capsys, monkeypatch, stage, number):
     """While the scene is read, priors are made, results are scored and written: code 130, and nothing but the sentence."""
     monkeypatch.setattr(f"warpgs.pipeline.runs.{stage}", lambda *_, **__: signal.raise_signal(number))

@@ -1,7 +1,6 @@
 """The command line: finds the command, runs it, and turns errors into sentences and exit codes."""
 
 import importlib
-import os
 import sys
 
 from warpgs import __version__
@@ -11,6 +10,7 @@ from warpgs.errors import UsageError, WarpgsError
 from warpgs.report.progress import waiting
 from warpgs.runtime.device_memory import is_out_of_memory
 from warpgs.runtime.imports import fast_imports
+from warpgs.runtime.output_streams import careful_output
 from warpgs.runtime.ranks import last_words
 from warpgs.runtime.stop_signals import ignored_signals, interrupting_signals
 from warpgs.runtime.terminal import accept_all_letters, say
@@ -47,6 +47,12 @@ GROUPS = {
 """Names of the commands by purpose."""
 
 
+PRINTING = ("doctor", "compare", "ablate")
+"""Commands whose product is what they print."""
+ASKING = {"-h", "--help", "--help-all", "help", "--version", "-V"}
+"""Words that ask for text alone."""
+
+
 def _help() -> str:
     width = max(map(len, COMMANDS))
     groups = (
@@ -62,10 +68,22 @@ def _help() -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; returns its exit code: 0 done, 2 usage, 3 data, 4 resources, 5 internal, 130 interrupted."""
-    accept_all_letters()
-    with interrupting_signals():
-        return _run(sys.argv[1:] if arguments is None else arguments)
+    """Run one command; returns its exit code: 0 done, 2 usage, 3 data, 4 resources, 5 internal, 130 interrupted.
+
+    Raises:
+        SystemExit: Help of a command was asked for, or a word is wrong.
+    """
+    words = sys.argv[1:] if arguments is None else arguments
+    prints = words[:1] in ([], *([name] for name in PRINTING)) and "--warm" not in words
+    with careful_output(prints or bool(ASKING & {*words})) as output:
+        accept_all_letters()
+        try:
+            with interrupting_signals():
+                return output.exit_code(_run(words))
+        except SystemExit as e:  # tyro has printed the help, or said which word is wrong
+            if e.code or not (code := output.exit_code(0)):
+                raise
+            raise SystemExit(code) from e
 
 
 def _run(arguments: list[str]) -> int:
@@ -97,9 +115,6 @@ def _run(arguments: list[str]) -> int:
     except KeyboardInterrupt as e:
         with ignored_signals():
             return last_words("; ".join(["warpgs: interrupted", *map(str, e.args)]), 130)
-    except BrokenPipeError:  # the reader, `head` for one, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     except Exception as e:
         return report_no_memory(e) if is_out_of_memory(e) else report_defect(e, arguments)
 

@@ -19,7 +19,7 @@ from warpgs.io.decoding import read_image_file, read_image_start
 from warpgs.io.exif import EXPOSURE, FOCAL_35MM, MAKE, MODEL, parse_exif
 from warpgs.io.image_formats.avif import BRANDS_END, kind
 from warpgs.runtime.subprocesses import ProcessFailed, end_with_parent, python_lines
-from warpgs.runtime.terminal import say
+from warpgs.runtime.terminal import answer
 
 QUALITY = 98
 """JPEG quality of the copies, without subsampling of colours."""
@@ -102,11 +102,11 @@ def main(path: str) -> None:
     """Copy the files that a job names; print a line of JSON before each, and one with the error of the first that fails."""
     job: dict[str, Any] = json.loads(Path(path).read_text("utf-8"))
     for i, (source, target) in enumerate(job["files"]):
-        say(json.dumps({"file": i}))
+        answer(json.dumps({"file": i}))
         try:
             copy = _coded_again(Path(source), job["max_pixels"])
         except Exception as e:  # decoders raise a dozen types on foreign bytes; the caller names the file
-            say(json.dumps({"error": str(e).strip().rstrip(".") or type(e).__name__}))
+            answer(json.dumps({"error": str(e).strip().rstrip(".") or type(e).__name__}))
             return
         write_bytes(Path(target), copy)
 

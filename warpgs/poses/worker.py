@@ -16,7 +16,7 @@ from typing import Any
 from warpgs.files import write_text
 from warpgs.poses.pairs import choose_pairs
 from warpgs.runtime.subprocesses import end_with_parent
-from warpgs.runtime.terminal import say
+from warpgs.runtime.terminal import answer
 
 SEED = 0
 """Seed of everything that is sampled."""
@@ -34,7 +34,7 @@ MAX_RATIO = 1.05
 
 
 def _say(**values: Any) -> None:
-    say(json.dumps(values))
+    answer(json.dumps(values))
 
 
 def extract(pycolmap: Any, job: dict[str, Any]) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from warpgs.report.progress import PLAIN_INTERVAL, duration, is_live, waiting
+from warpgs.runtime.output_streams import careful
 from warpgs.runtime.terminal import printable, say
 
 if TYPE_CHECKING:
@@ -62,10 +64,11 @@ class FarmTable:
     def __enter__(self) -> FarmTable:
         """Start the display."""
         if self.live:
+            from rich.console import Console
             from rich.live import Live
 
             waiting().clear()
-            self.display = Live(self.panel(), refresh_per_second=4)
+            self.display = Live(self.panel(), console=Console(file=careful(sys.stdout)), refresh_per_second=4)
             self.display.__enter__()
         return self
 

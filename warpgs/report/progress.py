@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 
+from warpgs.runtime.output_streams import careful
 from warpgs.runtime.terminal import printable, say
 
 PLAIN_INTERVAL = 10.0
@@ -34,7 +35,7 @@ def duration(seconds: float) -> str:
 def is_live() -> bool:
     """Return whether stdout is a terminal in which a line can be written anew."""
     stdout = getattr(sys.stdout, "rich_proxied_file", sys.stdout)  # while a line is shown, rich stands before it
-    return stdout.isatty() and os.environ.get("TERM") != "dumb"
+    return stdout is not None and stdout.isatty() and os.environ.get("TERM") != "dumb"
 
 
 class _StatusLine:
@@ -76,13 +77,13 @@ class _StatusLine:
         from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
         from rich.progress import Progress as Display
 
-        console = Console()
+        console = Console(file=careful(sys.stdout))
         columns = (
             SpinnerColumn("dots" if (console.encoding or "").startswith("utf") else "line"),
             TextColumn("{task.description}", markup=False), BarColumn(24), TextColumn("{task.fields[detail]}", markup=False),
             TimeElapsedColumn(),
         )  # fmt: skip
-        own = sys.stderr.isatty()  # else errors go where they were sent, and do not meet the line
+        own = sys.stderr is not None and sys.stderr.isatty()  # else errors go where they were sent, and do not meet the line
         display = Display(*columns, console=console, transient=True, refresh_per_second=8, redirect_stderr=own)
         display.start()
         return display
@@ -164,8 +165,9 @@ class Progress:
 
             _STATUS.clear()
             self.spinner = Spinner("dots" if (sys.stdout.encoding or "").lower().startswith("utf") else "line")
-            own = sys.stderr.isatty()
-            self.display = Live(console=Console(), get_renderable=self._panel, refresh_per_second=8, redirect_stderr=own)
+            own = sys.stderr is not None and sys.stderr.isatty()
+            console = Console(file=careful(sys.stdout))
+            self.display = Live(console=console, get_renderable=self._panel, refresh_per_second=8, redirect_stderr=own)
             self.display.__enter__()
             _PANELS.append(self)
         return self

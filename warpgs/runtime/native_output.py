@@ -7,11 +7,14 @@ import os
 import sys
 from collections.abc import Iterator
 
+from warpgs.runtime.output_streams import open_missing_descriptors
+
 
 @contextlib.contextmanager
 def hidden_stderr() -> Iterator[None]:
     """Hide what is written to stderr in the block, by native libraries too; that of other threads is hidden with it."""
-    sys.stderr.flush()
+    open_missing_descriptors()
+    _flush(2)
     saved, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(sink, 2)
     try:
@@ -25,17 +28,24 @@ def hidden_stderr() -> Iterator[None]:
 @contextlib.contextmanager
 def output_to(descriptor: int) -> Iterator[None]:
     """Send what is written to stdout and stderr in the block to an open file, by native libraries and other threads too."""
-    streams = (sys.stdout, sys.stderr)
-    for stream in streams:
-        stream.flush()
+    open_missing_descriptors()
+    _flush(1, 2)
     saved = [os.dup(number) for number in (1, 2)]
     try:
         for number in (1, 2):
             os.dup2(descriptor, number)
         yield
     finally:
-        for stream in streams:
-            stream.flush()
+        _flush(1, 2)
         for number, old in zip((1, 2), saved, strict=True):
             os.dup2(old, number)
             os.close(old)
+
+
+def _flush(*numbers: int) -> None:
+    """Flush stdout (1) or stderr (2), if there is one and it can be written."""
+    for number in numbers:
+        stream = (sys.stdout, sys.stderr)[number - 1]
+        if stream is not None:
+            with contextlib.suppress(OSError, ValueError):
+                stream.flush()

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: both end the program in the same way, wherever they come. A process that ignores one goes on to."""
+"""Ctrl-C, SIGTERM, and SIGHUP of a closed terminal: all end the program in one way. A process that ignores one goes on to."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
-STOPPING = (signal.SIGINT, signal.SIGTERM)
+STOPPING = tuple(s for n in ("SIGINT", "SIGTERM", "SIGHUP") if (s := getattr(signal, n, None)))  # Windows has no SIGHUP
 AGAIN = 0.05
 """Time after which a signal that Python threw away is sent again [s]."""
 

@@ -7,6 +7,8 @@ import unicodedata
 from collections.abc import Callable, Iterator, Sequence
 from typing import TypeVar
 
+from warpgs.runtime.output_streams import say_lost
+
 T = TypeVar("T")
 
 HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
@@ -29,6 +31,7 @@ def printable(text: object) -> str:
 
 
 _quiet = False
+_lost = False
 
 
 def be_quiet() -> None:
@@ -40,15 +43,34 @@ def be_quiet() -> None:
 def say(line: object = "", *, error: bool = False) -> None:
     """Print one line at once: `printable`, and with codes for the letters that the terminal does not have.
 
+    Where it cannot be written, a line on stderr says so once, and the program goes on.
+
     Args:
         line: The line.
         error: Whether it goes to stderr, not to stdout.
-
-    Raises:
-        BrokenPipeError: Nobody reads any more.
     """
+    global _lost
     if _quiet and not error:
         return
+    try:
+        _print(line, error)
+    except OSError as e:
+        if not (error or _lost):
+            _lost = True
+            say_lost("stdout", e)
+
+
+def answer(line: object) -> None:
+    """Print one line to the process that started this one.
+
+    Raises:
+        OSError: It has ended, so that nobody needs the answer.
+    """
+    _print(line, False)
+
+
+def _print(line: object, error: bool) -> None:
+    """Print one line as `say` does."""
     stream = sys.stderr if error else sys.stdout
     encoding = getattr(stream, "encoding", None) or "utf-8"
     print(printable(line).encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)

@@ -1,0 +1,171 @@
+"""Output that cannot be written: said once on stderr, and no reason for a command to stop.
+
+A pipe whose reader has gone, a full disk, a closed descriptor, a terminal that has hung up: from the first write that fails
+on, output goes to the null device, that of native libraries too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import os
+import sys
+from collections.abc import Iterator
+from typing import Any, TextIO, cast
+
+from warpgs.errors import ResourceError
+from warpgs.files import FULL
+
+NAMES = ("stdin", "stdout", "stderr")
+"""Standard streams by their descriptors."""
+
+
+def open_missing_descriptors() -> None:
+    """Open the null device in place of a closed stdin, stdout or stderr.
+
+    Otherwise the next file that is opened gets that number, and output is written into it.
+    """
+    for number in range(len(NAMES)):
+        try:
+            os.fstat(number)
+        except OSError:
+            _send_to_null(number)
+
+
+def _send_to_null(number: int) -> None:
+    """Let a descriptor lead to the null device; a process without any further descriptor keeps the one it has."""
+    with contextlib.suppress(OSError):
+        null = os.open(os.devnull, os.O_RDWR)
+        if null == number:  # it was closed, and the lowest one free
+            os.set_inheritable(number, True)
+            return
+        os.dup2(null, number)
+        os.close(null)
+
+
+def is_gone_reader(error: BaseException | None) -> bool:
+    """Return whether a write failed because nobody reads the pipe any more, as with ``| head``."""
+    return isinstance(error, BrokenPipeError) or (
+        sys.platform == "win32" and isinstance(error, OSError) and error.errno == errno.EINVAL
+    )
+
+
+def reason(error: BaseException) -> str:
+    """Return why a write failed, in words of the system."""
+    return (isinstance(error, OSError) and error.strerror) or str(error)
+
+
+class CarefulStream:
+    """A text stream whose writes do not fail: the first error is kept, and what follows goes nowhere."""
+
+    def __init__(self, stream: TextIO | None, name: str, goes_on: bool = True):
+        """Wrap a stream.
+
+        Args:
+            stream: The stream; None for one whose descriptor was closed when Python started.
+            name: stdout or stderr.
+            goes_on: Say on stderr at once that the command goes on without this stream.
+        """
+        self.closed_at_start = stream is None
+        self.stream: TextIO = io.StringIO() if stream is None else stream
+        self.name, self.goes_on = name, goes_on
+        self.failure: BaseException | None = None
+
+    def write(self, text: str) -> int:
+        """Write text, if the stream takes it; return its length."""
+        try:
+            if self.closed_at_start:
+                raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+            if self.failure is None:
+                self.stream.write(text)
+        except (OSError, ValueError) as e:
+            self._lose(e)
+        return len(text)
+
+    def flush(self) -> None:
+        """Write what is buffered, if the stream takes it."""
+        try:
+            if self.failure is None:
+                self.stream.flush()
+        except (OSError, ValueError) as e:
+            self._lose(e)
+
+    def writelines(self, lines: Any) -> None:
+        """Write several texts."""
+        for line in lines:
+            self.write(line)
+
+    def _lose(self, error: OSError | ValueError) -> None:
+        """Keep the first error, and let the descriptor lead nowhere: buffers are flushed once more when Python ends."""
+        if isinstance(error, ValueError) and not isinstance(error, OSError) and not self.stream.closed:
+            raise error
+        if self.failure is not None:
+            return
+        self.failure = error
+        if not self.closed_at_start:
+            with contextlib.suppress(OSError, ValueError):
+                _send_to_null(self.stream.fileno())
+        if self.goes_on:
+            say_lost(self.name, error)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+
+def say_lost(name: str, error: BaseException) -> None:
+    """Print on stderr that the command goes on without stdout; of a lost stderr nothing can be said."""
+    if name == "stdout":
+        _to_stderr(f"warpgs: stdout cannot be written ({reason(error)}); the command goes on without it")
+
+
+def _to_stderr(line: str) -> None:
+    """Write a line to stderr, if that is possible."""
+    if sys.stderr is not None:
+        with contextlib.suppress(OSError, ValueError):
+            print(line.encode("ascii", "backslashreplace").decode(), file=sys.stderr, flush=True)
+
+
+class CarefulOutput:
+    """Streams of a command, and what became of them."""
+
+    def __init__(self, stdout: CarefulStream, stderr: CarefulStream, is_product: bool):
+        """Keep both, and whether what goes to stdout is all that the command is called for."""
+        self.stdout, self.stderr, self.is_product = stdout, stderr, is_product
+
+    def exit_code(self, code: int) -> int:
+        """Return the exit code of a command that ends with ``code``: another one where its only product was not written."""
+        self.stdout.flush()
+        self.stderr.flush()
+        failure = self.stdout.failure
+        if code or failure is None or not self.is_product or is_gone_reader(failure):
+            return code
+        full = isinstance(failure, OSError) and failure.errno in FULL
+        remedy = "free some disk space, or send the output elsewhere" if full else "send the output elsewhere"
+        _to_stderr(f"warpgs: stdout cannot be written ({reason(failure)}); {remedy}")
+        return ResourceError.exit_code
+
+
+@contextlib.contextmanager
+def careful_output(is_product: bool) -> Iterator[CarefulOutput]:
+    """Put streams whose writes do not fail in the place of stdout and stderr.
+
+    Args:
+        is_product: What goes to stdout is all that the command is called for. Then a failure is its own, but for a reader who
+            has seen enough; else the command goes on, and says so.
+    """
+    open_missing_descriptors()
+    before = sys.stdout, sys.stderr
+    streams = CarefulStream(before[0], "stdout", not is_product), CarefulStream(before[1], "stderr", False)
+    sys.stdout, sys.stderr = (cast(TextIO, s) for s in streams)
+    try:
+        yield CarefulOutput(*streams, is_product)
+    finally:
+        for stream in streams:
+            stream.flush()
+        sys.stdout, sys.stderr = before
+
+
+def careful(stream: TextIO) -> TextIO:
+    """Return a stream as it is where its writes do not fail, else wrapped; for displays that draw while a fit goes on."""
+    return stream if isinstance(stream, CarefulStream) else cast(TextIO, CarefulStream(stream, "stdout"))
