@@ -20,7 +20,7 @@ COPY --chown=warpgs warpgs /opt/warpgs/source/warpgs
 FROM base AS cpu
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 RUN pip install --no-cache-dir --constraint /opt/warpgs/source/constraints.txt --index-url "$TORCH_INDEX" torch
-RUN pip install --no-cache-dir --constraint /opt/warpgs/source/constraints.txt "/opt/warpgs/source[ray,slurm]"
+RUN pip install --no-cache-dir --constraint /opt/warpgs/source/constraints.txt "/opt/warpgs/source[ray]"
 # kernels for the CPU, into the image
 RUN warpgs doctor --warm
 WORKDIR /data
@@ -30,7 +30,7 @@ CMD ["--help"]
 FROM base AS cuda
 # PyPI's torch for Linux brings its CUDA libraries
 RUN pip install --no-cache-dir --constraint /opt/warpgs/source/constraints.txt torch
-RUN pip install --no-cache-dir --constraint /opt/warpgs/source/constraints.txt "/opt/warpgs/source[ray,slurm]"
+RUN pip install --no-cache-dir --constraint /opt/warpgs/source/constraints.txt "/opt/warpgs/source[ray]"
 # kernels for the CPU, which scores on every machine; those for the GPU are compiled at the first start, as there is none now
 RUN warpgs doctor --warm
 WORKDIR /data
