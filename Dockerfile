@@ -4,7 +4,8 @@
 #   docker run --gpus all --volume "$PWD:/data" warpgs:cuda farm scenes --out results
 # Nothing runs as root but the installation of the system's libraries. `python -m tools.run_dockerfile cpu` runs the other RUN lines in
 # a clean folder.
-FROM python:3.11-slim-bookworm AS base
+# Python 3.11.16, all architectures
+FROM python:3.11-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19c2028c637cecc392d97f980d4fec56b AS base
 # libEGL and Mesa: the 3D overview in reports; libgomp: threads
 RUN apt-get update \
     && apt-get install --yes --no-install-recommends libegl1 libgl1 libgl1-mesa-dri libglib2.0-0 libgomp1 \

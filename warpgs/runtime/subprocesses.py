@@ -98,7 +98,7 @@ class ProgramResult(NamedTuple):
     """Exit code; 1 if the program could not be run or took too long."""
     output: str
     errors: str
-    """What it wrote to stderr, or why it could not be run."""
+    """Its stderr, or the reason why it could not be run."""
 
 
 def run_program(program: str, *options: str, stdin: str, timeout: float, hidden: str) -> ProgramResult:
