@@ -4,7 +4,8 @@
 #   docker run --gpus all --volume "$PWD:/data" warpgs:cuda farm scenes --out results
 # Nothing runs as root but the installation of the system's libraries. `python -m tools.run_dockerfile cpu` runs the other RUN lines in
 # a clean folder.
-FROM python:3.11-slim-bookworm AS base
+# Python 3.11.16, all architectures
+FROM python:3.11-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19c2028c637cecc392d97f980d4fec56b AS base
 # libEGL and Mesa: the 3D overview in reports; libgomp: threads
 RUN apt-get update \
     && apt-get install --yes --no-install-recommends libegl1 libgl1 libgl1-mesa-dri libglib2.0-0 libgomp1 \
@@ -20,7 +21,7 @@ COPY --chown=warpgs warpgs /opt/warpgs/source/warpgs
 FROM base AS cpu
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 RUN pip install --no-cache-dir --constraint /opt/warpgs/source/constraints.txt --index-url "$TORCH_INDEX" torch
-RUN pip install --no-cache-dir --constraint /opt/warpgs/source/constraints.txt "/opt/warpgs/source[ray,slurm]"
+RUN pip install --no-cache-dir --constraint /opt/warpgs/source/constraints.txt "/opt/warpgs/source[ray]"
 # kernels for the CPU, into the image
 RUN warpgs doctor --warm
 WORKDIR /data
@@ -30,7 +31,7 @@ CMD ["--help"]
 FROM base AS cuda
 # PyPI's torch for Linux brings its CUDA libraries
 RUN pip install --no-cache-dir --constraint /opt/warpgs/source/constraints.txt torch
-RUN pip install --no-cache-dir --constraint /opt/warpgs/source/constraints.txt "/opt/warpgs/source[ray,slurm]"
+RUN pip install --no-cache-dir --constraint /opt/warpgs/source/constraints.txt "/opt/warpgs/source[ray]"
 # kernels for the CPU, which scores on every machine; those for the GPU are compiled at the first start, as there is none now
 RUN warpgs doctor --warm
 WORKDIR /data

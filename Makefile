@@ -12,6 +12,13 @@ export PYTHONUTF8 := 1
 # compiled modules are kept, or each of the many processes that tests start compiles them anew
 export PYTHONDONTWRITEBYTECODE :=
 OUT ?= runs/demo
+# What tests need. One that is skipped because an extra is missing fails, but on Linux for ARM, where pycolmap has no wheel.
+ifeq ($(shell uname -sm),Linux aarch64)
+EXTRAS ?= dev,formats,ray,view
+else
+EXTRAS ?= dev,formats,poses,ray,view
+export WARPGS_EXTRAS_INSTALLED := 1
+endif
 
 .PHONY: demo install lint types docs docs-links docs-run test test-slow test-fault test-browser test-audit test-cuda clean
 
@@ -24,7 +31,7 @@ ifdef LOCKED
 else
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[$(EXTRAS)]'
 endif
 	touch $@
 
@@ -63,9 +70,8 @@ docs: install
 docs-links: install
 	$(BIN)/python -m sphinx --quiet --builder linkcheck docs site/links
 
-# The commands and snippets of the README and of all pages, in temporary folders with a small scene; installs what pages ask for.
+# The commands and snippets of the README and of all pages, in temporary folders with a small scene.
 docs-run: install
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[poses,view,formats]'
 	$(BIN)/python -m tools.run_docs
 
 # Run these before a change is called done: CONTRIBUTING.md says which one when. Properties get more examples here;

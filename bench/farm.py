@@ -130,12 +130,11 @@ def engines(scenes: int, steps: int, slots: int, work: Path) -> list[dict]:
         "local, 1 slot": (EngineRequest("local", 1), lambda *_: None),
         "local, a worker killed": (EngineRequest("local", slots), kill_once(killed)),
         "ray": (EngineRequest("ray", slots), lambda *_: None),
-        "slurm, local executor": (EngineRequest("slurm", slots, slurm_local=True), lambda *_: None),
     }
     for way, (request, show) in ways.items():
         out = work / way.replace(" ", "-").replace(",", "")
         out.mkdir()
-        row = timed(jobs_of(found, out, config), lambda: make_engine(request, "cpu", out), show)  # noqa: B023
+        row = timed(jobs_of(found, out, config), lambda: make_engine(request, "cpu"), show)  # noqa: B023
         rows.append({"way": way, "slots": request.slots, **row, "same_bytes": digests(out, names) == wanted})
     row = shared(found, work / "scenes", work / "shared", steps)
     rows.append({"way": "two farms of 1 slot", "slots": 2, **row, "same_bytes": digests(work / "shared", names) == wanted})

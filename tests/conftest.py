@@ -1,6 +1,7 @@
 """Fixtures that every op's tests share: the devices there are, and both scalar types."""
 
 import os
+import re
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ["OMP_NUM_THREADS"] = "1"  # workers share the cores; tests that are about threads set their number
@@ -13,6 +14,30 @@ from hypothesis import settings
 settings.register_profile("few", max_examples=4)
 settings.register_profile("many", max_examples=40)
 settings.load_profile("few")
+
+MISSING = re.compile(r"could not import '|not installed: ")
+"""Reasons of skipped tests that miss a package; those of the extra `export`, which is in no lock, may be skipped."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport():
+    """Let a test fail that is skipped because an extra is missing, where the Makefile says that all are installed."""
+    return without_missing_extras((yield))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report():
+    """Do the same for a file of tests."""
+    return without_missing_extras((yield))
+
+
+def without_missing_extras(report):
+    """Return a report, failed where its test was skipped for a missing extra."""
+    reason = str(report.longrepr)
+    if report.skipped and os.environ.get("WARPGS_EXTRAS_INSTALLED") and MISSING.search(reason) and "[export]" not in reason:
+        report.outcome, report.longrepr = "failed", f"an extra is missing: {reason}"
+    return report
+
 
 DEVICES = [pytest.param("cpu")]
 if torch.cuda.is_available():

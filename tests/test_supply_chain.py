@@ -4,6 +4,12 @@ import importlib.metadata
 import re
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from tests.conftest import without_missing_extras
+from tools.run_dockerfile import instructions
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
@@ -15,6 +21,10 @@ ALLOWED = {
 FORBIDDEN = re.compile(r"\bA?GPL|GNU (Affero )?General Public|non-?commercial|\bCC-BY-NC", re.IGNORECASE)
 NVIDIA = ("nvidia-", "cuda-")
 """Beginnings of names of CUDA libraries, of which docs/dependencies.md speaks by itself."""
+COPYLEFT = {"pi-heif": {"LGPL-3.0-only"}, "pycolmap": {"LGPL-2.1-or-later", "GPL-2.0-or-later"}}
+"""Licences of libraries inside the wheels of the extra `poses`, of which docs/dependencies.md says what follows from them."""
+UNLOCKED = ("export",)
+"""Extras that are in no lock: large, and needed by slow tests alone."""
 EXPLAINED = ("docutils",)
 """Packages whose metadata name a licence of files that are not in the wheel, as docs/dependencies.md explains."""
 
@@ -44,8 +54,12 @@ def table() -> dict[str, tuple[str, str]]:
 def test_the_lock_is_of_this_project():
     """It holds all that pyproject.toml asks for, at the versions of constraints.txt."""
     pins = dict(line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line)
-    lock = locked()
-    assert {plain(r) for r in PROJECT["dependencies"] + PROJECT["optional-dependencies"]["dev"]} <= lock.keys()
+    lock, extras = locked(), PROJECT["optional-dependencies"]
+    named = {plain(r) for e in extras.keys() - set(UNLOCKED) - {"dev"} for r in extras[e]} | {
+        plain(r) for r in PROJECT["dependencies"]
+    }
+    assert named | {plain(r) for r in extras["dev"]} <= lock.keys()
+    assert named <= pins.keys()
     assert {n: [v] for n, v in pins.items()} == {n: lock[n] for n in pins}
 
 
@@ -60,7 +74,45 @@ def test_every_package_stands_in_the_table_with_its_use():
 
 def test_no_licence_forbids_or_demands():
     for name, (licence, _) in table().items():
-        assert set(re.split(r" AND | OR | WITH ", licence)) <= ALLOWED, name
+        assert set(re.split(r" AND | OR | WITH ", licence)) <= ALLOWED | COPYLEFT.get(name, set()), name
+    assert {name for name, (_, use) in table().items() if use == "poses"} == COPYLEFT.keys()
+
+
+def test_the_lock_knows_nothing_of_the_machine_that_wrote_it():
+    """No index, no path, no URL: hashes of PyPI's files alone."""
+    lines = (ROOT / "requirements.lock").read_text("utf-8").splitlines()
+    assert [n for n in lines if re.search(r"file:|://|--(extra-)?index|--find-links|/opt/| @ ", n)] == []
+
+
+def test_the_lock_was_written_with_all_extras_that_tests_need():
+    """And both ways to install bring them."""
+    extras = sorted(PROJECT["optional-dependencies"].keys() - set(UNLOCKED))
+    text, makefile = (ROOT / "requirements.lock").read_text("utf-8"), (ROOT / "Makefile").read_text("utf-8")
+    assert re.findall(r"--extra (\w+)", text.partition("==")[0]) == extras
+    assert f"EXTRAS ?= {','.join(extras)}\nexport WARPGS_EXTRAS_INSTALLED := 1" in makefile
+
+
+def test_actions_and_images_are_named_by_what_they_contain():
+    """A commit or a digest; a tag can be moved to other code. The version stands beside it."""
+    used = [n for p in (ROOT / ".github").rglob("*.yml") for n in re.findall(r"uses:.*", p.read_text("utf-8"))]
+    assert used and [n for n in used if not re.fullmatch(r"uses: [\w./-]+@[0-9a-f]{40}  # v[0-9.]+", n)] == []
+    assert len(set(used)) == len({n.partition("@")[0] for n in used}), "one version of each"
+    found = instructions((ROOT / "Dockerfile").read_text("utf-8"))
+    bases = [rest.split()[0] for word, rest in found if word == "FROM"]
+    stages = {rest.split()[2] for word, rest in found if word == "FROM"}
+    assert [b for b in bases if b not in stages and not re.fullmatch(r"[\w./-]+:[\w.-]+@sha256:[0-9a-f]{64}", b)] == []
+
+
+@pytest.mark.parametrize(
+    ("reason", "fails"),
+    [("could not import 'viser'", True), ("onnx not installed: pip install warpgs[export]", False), ("no CUDA device", False)],
+)
+def test_a_skipped_test_fails_where_all_extras_are_said_to_be_installed(monkeypatch, reason, fails):
+    """The Makefile says so; who runs pytest without them sees the test skipped."""
+    for value, outcome in (("1", "failed" if fails else "skipped"), ("", "skipped")):
+        monkeypatch.setenv("WARPGS_EXTRAS_INSTALLED", value)
+        report = SimpleNamespace(skipped=True, outcome="skipped", longrepr=("a_test.py", 3, f"Skipped: {reason}"))
+        assert without_missing_extras(report).outcome == outcome
 
 
 def test_installed_packages_say_the_same():

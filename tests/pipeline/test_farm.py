@@ -6,11 +6,13 @@ import json
 import os
 import shutil
 import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from tests.pipeline.fake_slurm import install_slurm
 from tests.pipeline.farms import HereEngine, jobs_of, write_scenes
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
@@ -21,11 +23,13 @@ from warpgs.pipeline.farm.farm import run_farm
 from warpgs.pipeline.farm.job import job_of, job_text
 from warpgs.pipeline.farm.local import LocalEngine, Slot, local_slots
 from warpgs.pipeline.farm.record import CHECKED, LOG, PLY, RECORD, THUMBNAIL, file_digest, finished, read_record
+from warpgs.pipeline.farm.slurm import SlurmEngine
 from warpgs.pipeline.farm.work import run_job
 from warpgs.pipeline.runs.fit import fit_request
 from warpgs.pipeline.train.config import PRESETS
 from warpgs.pipeline.train.loss import LOSS_TERMS
 from warpgs.runtime.folder_lock import hold_folder
+from warpgs.runtime.subprocesses import run_python
 
 
 @pytest.fixture(scope="module")
@@ -291,26 +295,43 @@ def test_the_command_fits_a_file_of_jobs_and_writes_its_index(scenes, tmp_path, 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ray", "slurm"])
 def test_engines_of_clusters_give_the_same_bytes(scenes, single, tmp_path, monkeypatch, kind):
-    """Ray with two workers, one of which is killed in mid-job, on this machine; Slurm's as processes of this machine."""
-    pytest.importorskip("ray" if kind == "ray" else "submitit")
+    """Ray with two workers, one of which is killed in mid-job; Slurm's as processes of this machine, from a planted folder."""
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent.parent.parent))
     jobs = jobs_of(scenes, tmp_path / "out")
     killed = tmp_path / "killed"
     if kind == "ray":
+        pytest.importorskip("ray")
         from warpgs.pipeline.farm.ray import RayEngine
 
         engine = RayEngine("cpu", 2, 1)
+        address = sys.modules["ray"].get_runtime_context().gcs_address
+        stranger = run_python(JOIN, address, timeout=120, environment={"RAY_AUTH_TOKEN": "0" * 64})
+        assert stranger.stdout == "refused\n", stranger.stderr
         engine.use(_die_once(str(killed)))
     else:
-        from warpgs.pipeline.farm.slurm import SlurmEngine
-
-        engine = SlurmEngine(tmp_path / "slurm", "cpu", 2, local=True)
+        install_slurm(tmp_path / "bin", tmp_path / "cluster")
+        monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}")
+        (tmp_path / "torch.py").write_text("raise SystemExit('planted')")
+        monkeypatch.chdir(tmp_path)
+        engine = SlurmEngine("cpu", 2, folder=tmp_path / "private")
     try:
         statuses = run_farm(jobs, engine)
     finally:
         engine.close()
     assert [s.state for s in statuses] == ["done", "done"] and digests(statuses) == single
     assert killed.exists() == (kind == "ray")
+    assert kind == "ray" or [p.name for p in (tmp_path / "private").iterdir()] == ["lock"]
+
+
+JOIN = """
+import sys, ray
+try:
+    ray.init(address=sys.argv[1], log_to_driver=False)
+    print("joined")
+except ConnectionError:
+    print("refused")
+"""
+"""What a process of another user does to run code in a cluster."""
 
 
 def _die_once(mark):

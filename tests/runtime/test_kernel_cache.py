@@ -129,14 +129,14 @@ def test_a_folder_that_others_can_write_to_is_refused(monkeypatch, tmp_path, whe
 @POSIX
 def test_groups_links_and_owners(monkeypatch, tmp_path):
     """A group of other users may not write, the user's own may; links in a cache and folders of others are not followed."""
-    from warpgs.runtime import kernel_cache
+    from warpgs.runtime import permissions
 
     cache = tmp_path / "cache"
     cache.mkdir()
     cache.chmod(0o775)
-    monkeypatch.setattr(kernel_cache, "_is_own_group", lambda gid: True)
+    monkeypatch.setattr(permissions, "_is_own_group", lambda gid: True)
     assert not chosen(monkeypatch, cache)[1]
-    monkeypatch.setattr(kernel_cache, "_is_own_group", lambda gid: False)
+    monkeypatch.setattr(permissions, "_is_own_group", lambda gid: False)
     assert "other users" in chosen(monkeypatch, cache)[1]
     cache.chmod(0o755)
     (cache / "1.0").symlink_to(tmp_path)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import os
-import stat
 import sys
 import tempfile
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import NamedTuple
 
 from warpgs.errors import ResourceError
 from warpgs.runtime.folders import cache_home, private_folder
+from warpgs.runtime.permissions import open_to_others
 from warpgs.runtime.terminal import say
 
 REMEDY = "Set WARP_CACHE_PATH to a folder of your own to keep compiled kernels"
@@ -94,56 +94,7 @@ def _fault(folder: Path) -> str:
         with tempfile.TemporaryFile(dir=folder) as f:
             f.write(b"0")
             f.flush()
-        others = _open_to_others(folder)
+        others = open_to_others(folder, depth=3)  # its versions, the modules in them, and their files
     except OSError as e:
         return f"the kernel cache {folder} cannot be written ({e.strerror or e})"
     return f"the kernel cache {folder} is not safe: other users can write to {others}" if others else ""
-
-
-def _open_to_others(folder: Path) -> Path | None:
-    """Return what another user could change in a cache: a folder above, it, or what is in it; None where nobody can.
-
-    On Windows nothing is looked at: mode bits say nothing there, and the folder of a user's caches is private. Root is trusted,
-    as root may do anything, and so is who owns the whole file system.
-    """
-    if not hasattr(os, "getuid"):
-        return None
-    trusted = {os.getuid(), 0, Path(folder.anchor).stat().st_uid}
-    for above in folder.parents:  # whoever can write there can put another folder in the place of this one
-        found = above.stat()
-        sticky = found.st_mode & stat.S_ISVTX  # as /tmp: others cannot move what is not theirs
-        if found.st_uid not in trusted or (_writable_by_others(found, trusted) and not sticky):
-            return above
-    if _writable_by_others(folder.stat(), trusted):
-        return folder
-    if not folder.stat().st_mode & (stat.S_IXGRP | stat.S_IXOTH):
-        return None  # others do not even get in
-    # its versions, the modules in them, and their files
-    for pattern in ("*", "*/*", "*/*/*"):
-        for path in folder.glob(pattern):
-            try:
-                found = path.lstat()
-            except FileNotFoundError:  # another process has put its new module in place
-                continue
-            if stat.S_ISLNK(found.st_mode) or _writable_by_others(found, trusted):
-                return path
-    return None
-
-
-def _writable_by_others(found: os.stat_result, trusted: set[int]) -> bool:
-    if found.st_uid not in trusted or found.st_mode & stat.S_IWOTH:
-        return True
-    return bool(found.st_mode & stat.S_IWGRP) and not _is_own_group(found.st_gid)
-
-
-def _is_own_group(gid: int) -> bool:
-    """Return whether a group is that of this user alone, which many systems make for each user under the user's number."""
-    import grp
-    import pwd
-
-    try:
-        name = pwd.getpwuid(os.getuid()).pw_name
-        group = grp.getgrgid(gid)
-    except KeyError:
-        return False
-    return set(group.gr_mem) <= {name} and (gid == os.getuid() or group.gr_name == name)

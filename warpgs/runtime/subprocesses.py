@@ -1,4 +1,4 @@
-"""Python processes of our own, which import nothing from the folder that warpgs was called in."""
+"""Other processes. Those of Python import nothing from the folder that warpgs was called in; no shell is started."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 from warpgs.temporary import shared_locks, temporary_folder
 
@@ -115,6 +116,37 @@ def python_lines(module: str, *arguments: str, folder: Path, environment: dict[s
         finally:
             process.kill()
             process.wait()
+
+
+class ProgramResult(NamedTuple):
+    """Outcome of a program."""
+
+    code: int
+    """Exit code; 1 if the program could not be run or took too long."""
+    output: str
+    errors: str
+    """Its stderr, or the reason why it could not be run."""
+
+
+def run_program(program: str, *options: str, stdin: str, timeout: float, hidden: str) -> ProgramResult:
+    """Run a program that starts this package elsewhere, and return its outcome.
+
+    Args:
+        program: Name of the program, searched in PATH.
+        options: Its arguments.
+        stdin: Text for its stdin.
+        timeout: Seconds until it is ended.
+        hidden: Beginning of the names of variables that it does not get.
+    """
+    environment = {k: v for k, v in _environment(None).items() if not k.startswith(hidden)}
+    try:
+        done = subprocess.run(
+            [program, *options], input=stdin, env=environment, capture_output=True, text=True, encoding="utf-8",
+            errors="replace", timeout=timeout, check=False,
+        )  # fmt: skip
+    except (OSError, subprocess.TimeoutExpired) as e:
+        return ProgramResult(1, "", str(e))
+    return ProgramResult(done.returncode, done.stdout, done.stderr)
 
 
 class PythonWorker:

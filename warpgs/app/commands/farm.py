@@ -9,9 +9,9 @@ from warpgs.app.flags import parse_flags
 from warpgs.errors import UsageError
 from warpgs.pipeline.farm.listing import FARM_FLAGS, ListedJob
 
-OWN = ("engine", "slots", "per-gpu", "threads", "minutes", "partition", "slurm-local", "out", "help")
+OWN = ("engine", "slots", "per-gpu", "threads", "minutes", "partition", "slurm-folder", "out", "help")
 """Flags of the farm itself; all others are those of `warpgs fit`."""
-SWITCHES = ("slurm-local", "help")
+SWITCHES = ("help",)
 """Flags of these that take no value."""
 
 
@@ -42,8 +42,8 @@ def run(arguments: list[str], about: str) -> int:
         """Time after which slurm ends a job [min]."""
         partition: str | None = None
         """Slurm's partition."""
-        slurm_local: bool = False
-        """Run slurm's jobs as processes of this machine, to try it."""
+        slurm_folder: Path | None = None
+        """Folder for slurm's job files, private and seen by all nodes; where not given, ~/.cache/warpgs/slurm."""
 
     more = "All flags of `warpgs fit` but those of one run hold for every job: --preset, --split, --steps, --device, ..."
     a = parse_flags(Farm, own, "warpgs farm", f"{about}\n\n{more}")
@@ -51,7 +51,7 @@ def run(arguments: list[str], about: str) -> int:
 
     jobs = _jobs(list_jobs(a.jobs), shared, a.out)
     names = [f.name for f in dataclasses.fields(EngineRequest)]
-    engine = make_engine(EngineRequest(**{n: getattr(a, n) for n in names}), jobs[0].request.device, a.out)
+    engine = make_engine(EngineRequest(**{n: getattr(a, n) for n in names}), jobs[0].request.device)
     check_failures(run_and_show(jobs, engine, a.out))
     return 0
 

@@ -1,14 +1,21 @@
-"""The engine for clusters that Ray runs: a task for each job, with a fraction of a GPU. Extra `ray`."""
+"""The engine for clusters that Ray runs: a task for each job, with a fraction of a GPU. Extra `ray`.
+
+Ray sends functions and results as pickles: every process that its ports accept can run code as the user. A cluster that is
+started here accepts only processes with its token; the token of another cluster is its owner's choice.
+"""
 
 from __future__ import annotations
 
+import os
+import secrets
 from collections.abc import Callable
 from typing import Any
 
-from warpgs.errors import UsageError
+from warpgs.errors import ResourceError, UsageError
 from warpgs.pipeline.farm.engine import Event
 from warpgs.pipeline.farm.job import FarmJob, job_text
 from warpgs.pipeline.farm.work import run_job
+from warpgs.runtime.folders import private_folder
 
 
 class RayEngine:
@@ -27,16 +34,19 @@ class RayEngine:
             address: Address of the cluster; None for the one that RAY_ADDRESS names, or a new one on this machine.
 
         Raises:
+            ResourceError: The cluster cannot be reached, or Ray does not start.
             UsageError: Ray is not installed, or no job fits into the cluster.
         """
+        address = address or os.environ.get("RAY_ADDRESS") or "local"
+        if address == "local":  # Ray asks for a token unless RAY_AUTH_MODE says otherwise; without this it keeps one in ~/.ray
+            os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
         try:
             import ray
         except ImportError as e:
             raise UsageError("--engine ray needs Ray: pip install 'warpgs[ray]'") from e
         self._ray, self._threads = ray, threads
         if not ray.is_initialized():
-            own = {} if address else {"include_dashboard": False}
-            ray.init(address=address, log_to_driver=False, logging_level="warning", **own)
+            _connect(ray, address)
         gpus = 1 / per_gpu if device == "cuda" else 0
         found = ray.cluster_resources()
         room = min(found.get("CPU", 0) / threads, found.get("GPU", 0) / gpus if gpus else float("inf"))
@@ -79,3 +89,16 @@ class RayEngine:
             self._ray.cancel(reference)  # KeyboardInterrupt there: the fit saves its state
         self._ray.wait(list(self._running), num_returns=len(self._running), timeout=60) if self._running else None
         self._ray.shutdown()
+
+
+def _connect(ray: Any, address: str) -> None:
+    """Join a cluster, or start one whose sockets lie in a private folder: Ray gives its own folders to everybody (mode 0777).
+
+    The address is never that of ``/tmp/ray``, where other users can write one.
+    """
+    own = {"include_dashboard": False, "_temp_dir": str(private_folder() / "ray")} if address == "local" else {}
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level="warning", **own)
+    except (OSError, RuntimeError, ValueError) as e:
+        remedy = "set TMPDIR to a folder with a short path" if own else "check RAY_ADDRESS and RAY_AUTH_TOKEN"
+        raise ResourceError(f"Ray at {address} does not answer: {e}; {remedy}, or leave --engine ray out") from e

@@ -40,16 +40,17 @@ class EngineRequest:
     """Time after which slurm ends a job [min]."""
     partition: str | None = None
     """Slurm's partition."""
-    slurm_local: bool = False
-    """Slurm's jobs are processes of this machine."""
+    slurm_folder: Path | None = None
+    """Private folder for Slurm's job files; None for one in the user's cache."""
 
 
-def make_engine(request: EngineRequest, device: str, folder: Path) -> Engine:
+def make_engine(request: EngineRequest, device: str) -> Engine:
     """Make the engine that is asked for.
 
     Raises:
         ResourceError: The device is not there.
-        UsageError: There is no such engine, what it needs is not installed, or it cannot have so many slots.
+        UsageError: There is no such engine, what it needs is not installed, it cannot have so many slots, or other users can
+            write to ``slurm_folder``.
     """
     r = request
     if r.engine not in ENGINES:
@@ -64,8 +65,8 @@ def make_engine(request: EngineRequest, device: str, folder: Path) -> Engine:
         return RayEngine(choose_device(device)[0].type, r.slots, r.per_gpu, r.threads)
     from warpgs.pipeline.farm.slurm import SlurmEngine
 
-    kind = choose_device(device)[0].type if r.slurm_local or device == "auto" else device
-    return SlurmEngine(folder / ".slurm", kind, r.slots, r.threads, r.minutes, r.partition, r.slurm_local)
+    kind = choose_device(device)[0].type if device == "auto" else device
+    return SlurmEngine(kind, r.slots, r.threads, r.minutes, r.partition, r.slurm_folder)
 
 
 def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bool | None = None) -> list[JobStatus]:

@@ -1,85 +1,191 @@
-"""The engine for clusters that Slurm runs: a job of Slurm for each scene, by submitit. Extra `slurm`."""
+"""The engine for clusters that Slurm runs: a job of Slurm for each scene, by sbatch, squeue and scancel.
+
+A job goes to its node as JSON and comes back as one word, both in a private folder. All else is read from the job's record.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import itertools
+import os
+import shlex
+import shutil
+import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from warpgs.errors import UsageError
+from warpgs.errors import ResourceError, UsageError
+from warpgs.files import write_text
 from warpgs.pipeline.farm.engine import Event
 from warpgs.pipeline.farm.job import FarmJob, job_text
-from warpgs.pipeline.farm.work import run_job
+from warpgs.pipeline.farm.private_folder import private_shared_folder
+from warpgs.runtime.subprocesses import ProgramResult, run_program
+from warpgs.runtime.terminal import say
 
 QUEUED = 100
 """Jobs that are handed to Slurm at a time, where nothing else is asked for."""
 ASK_EVERY = 1.0
-"""Time between two looks at the jobs [s]."""
+"""Time between two looks for answers [s]."""
+QUEUE_EVERY = 15.0
+"""Time between two calls of squeue, which lists all jobs [s]."""
+MISSED = 3
+"""Calls of squeue that do not list a job before it counts as ended: a network file system shows its answer late."""
+NAME = "warpgs"
+STATES = ("done", "failed", "held")
+SECONDS_TO_SAVE = 120
+"""Time before its limit at which Slurm interrupts a job, so that the fit saves its state [s]."""
+LAST_BYTES = 2000
+"""End of a job's output that is searched for its last line."""
+PATIENCE = 60.0
+"""Time that a command of Slurm gets [s]."""
+
+
+@dataclass
+class _Queued:
+    """A job that Slurm has."""
+
+    slurm_id: str
+    number: int
+    """Its files in the private folder are named by it."""
+    missed: int = 0
+    """Calls of squeue that did not list it."""
 
 
 class SlurmEngine:
-    """Hands each job to Slurm; its scripts and the output of its processes lie in a folder of the results."""
+    """Hands each job to Slurm."""
 
     name = "slurm"
 
     def __init__(
         self,
-        folder: Path,
         device: str,
         slots: int | None,
         threads: int = 1,
         minutes: int = 240,
         partition: str | None = None,
-        local: bool = False,
+        folder: Path | None = None,
     ):
-        """Look for Slurm.
+        """Look for Slurm, and make a private folder.
 
         Args:
-            folder: Folder for scripts and output, on a file system that the machines of the cluster share.
             device: cpu or cuda.
             slots: Jobs that are queued or running at a time; None for 100.
             threads: CPU threads of a job.
             minutes: Time after which Slurm ends a job [min].
             partition: Slurm's partition; None for its default.
-            local: Run jobs as processes of this machine, without Slurm: to try it.
+            folder: As the base of `private_shared_folder`.
 
         Raises:
-            UsageError: submitit is not installed, or there is no Slurm here.
+            ResourceError: The private folder cannot be written.
+            UsageError: There is no Slurm here, or other users can write to the folder.
         """
-        try:
-            import submitit
-        except ImportError as e:
-            raise UsageError("--engine slurm needs submitit: pip install 'warpgs[slurm]'") from e
-        try:
-            self._executor = submitit.AutoExecutor(folder=folder, cluster="local" if local else "slurm")
-        except RuntimeError as e:
-            raise UsageError(f"--engine slurm: {e}; call it where sbatch is, or try it with --slurm-local") from e
-        self.slots, self._threads = slots or (1 if local else QUEUED), threads
-        more = {} if local or partition is None else {"slurm_partition": partition}
-        gpus = 1 if device == "cuda" else 0
-        self._executor.update_parameters(timeout_min=minutes, cpus_per_task=threads, gpus_per_node=gpus, name="warpgs", **more)
-        self._running: dict[str, Any] = {}
+        missing = [p for p in ("sbatch", "squeue", "scancel") if shutil.which(p) is None]
+        if missing:
+            raise UsageError(f"--engine slurm needs Slurm's {', '.join(missing)}: call it on a machine of the cluster")
+        self.slots, self._threads = slots or QUEUED, threads
+        self._options = [
+            f"--job-name={NAME}", f"--time={minutes}", "--ntasks=1", f"--cpus-per-task={threads}", "--open-mode=append",
+            f"--signal=B:INT@{SECONDS_TO_SAVE}",
+        ]  # fmt: skip
+        self._options += ["--gpus-per-node=1"] if device == "cuda" else []
+        self._options += [] if partition is None else [f"--partition={partition}"]
+        self._stack = contextlib.ExitStack()
+        self._folder = self._stack.enter_context(private_shared_folder(folder))
+        self._numbers = itertools.count()
+        self._running: dict[str, _Queued] = {}
+        self._asked = float("-inf")
+        self._told = False
 
     def start(self, job: FarmJob) -> None:
-        """Hand a job to Slurm."""
-        self._running[job.name] = self._executor.submit(run_job, job_text(job), self._threads)
+        """Hand a job to Slurm.
+
+        Raises:
+            ResourceError: Slurm refuses it.
+        """
+        number = next(self._numbers)
+        text, answer, log = (self._folder / f"{number}.{kind}" for kind in ("json", "answer", "log"))
+        write_text(text, job_text(job))
+        command = [sys.executable, "-P", "-m", "warpgs.pipeline.farm.batch", str(text), str(answer), str(self._threads)]
+        script = f"#!/bin/sh\nexec {shlex.join(command)}\n"
+        done = _call("sbatch", "--parsable", *self._options, f"--output={log}", script=script)
+        slurm_id = done.output.strip().partition(";")[0]
+        if done.code or not slurm_id.isdecimal():
+            raise ResourceError(f"sbatch did not take job {job.name}: {_last_line(done.errors + done.output)}")
+        self._running[job.name] = _Queued(slurm_id, number)
 
     def wait(self, seconds: float) -> list[Event]:
-        """Return the jobs that have ended; asks once a second."""
+        """Return the jobs that have ended: looks for answers once a second, and asks Slurm four times a minute."""
         last = time.monotonic() + seconds
         while True:
-            ended = [name for name, job in self._running.items() if job.done()]
+            ended = self._ended()
             if ended or time.monotonic() >= last:
-                return [self._event(name, self._running.pop(name)) for name in ended]
+                return ended
             time.sleep(min(ASK_EVERY, seconds))
 
-    def _event(self, name: str, job: Any) -> Event:
-        error = job.exception()
-        if error is None:
-            return Event(name, job.result())
-        return Event(name, "crashed", str(error).strip().splitlines()[-1])
+    def _ended(self) -> list[Event]:
+        """Return the jobs with an answer, and those that Slurm no longer has."""
+        if time.monotonic() - self._asked >= QUEUE_EVERY:
+            self._asked = time.monotonic()
+            self._count_missed()
+        self._folder.chmod(0o700)  # makes network file systems show files that are new
+        there = set(os.listdir(self._folder))
+        events = []
+        for name, job in list(self._running.items()):
+            if f"{job.number}.answer" in there:
+                events.append(self._answered(name, job))
+            elif job.missed >= MISSED:
+                reason = _last_line(self._output(job)) or "no output"
+                events.append(Event(name, "crashed", f"Slurm's job {job.slurm_id} ended without an answer: {reason}"))
+        for event in events:
+            del self._running[event.name]
+        return events
+
+    def _count_missed(self) -> None:
+        """Ask Slurm which jobs it has."""
+        done = _call("squeue", "--noheader", "--me", f"--name={NAME}", "--format=%A")
+        if done.code:  # Slurm is busy or away: nothing is known, and answers still count
+            if not self._told:
+                self._told = True
+                say(f"squeue failed, and is called again: {_last_line(done.errors)}", error=True)
+            return
+        there = set(done.output.split())
+        for job in self._running.values():
+            job.missed = 0 if job.slurm_id in there else job.missed + 1
+
+    def _answered(self, name: str, job: _Queued) -> Event:
+        state = (self._folder / f"{job.number}.answer").read_text("utf-8")
+        if state not in STATES:
+            return Event(name, "crashed", f"Slurm's job {job.slurm_id} gave no known answer")
+        for kind in ("json", "answer", "log"):
+            (self._folder / f"{job.number}.{kind}").unlink(missing_ok=True)
+        return Event(name, state)
+
+    def _output(self, job: _Queued) -> str:
+        """Return the end of what a job wrote outside its log."""
+        try:
+            with (self._folder / f"{job.number}.log").open("rb") as f:
+                f.seek(0, os.SEEK_END)
+                f.seek(max(0, f.tell() - LAST_BYTES))
+                return f.read().decode("utf-8", "replace")
+        except OSError:  # the job never began
+            return ""
 
     def close(self) -> None:
-        """End what runs or is queued."""
-        for job in self._running.values():
-            job.cancel()
+        """End what runs or is queued, and remove the private folder; running fits save their state."""
+        if self._running:
+            done = _call("scancel", *(job.slurm_id for job in self._running.values()))
+            if done.code:
+                say(f"scancel failed, jobs may still run: {_last_line(done.errors)}", error=True)
+        self._running.clear()
+        self._stack.close()
+
+
+def _call(program: str, *options: str, script: str = "") -> ProgramResult:
+    """Call a command of Slurm. Variables such as SBATCH_ACCOUNT hold; those of squeue are dropped, as they would hide jobs."""
+    return run_program(program, *options, stdin=script, timeout=PATIENCE, hidden="SQUEUE_")
+
+
+def _last_line(text: str) -> str:
+    """Return the last line that is not empty; empty where there is none."""
+    return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")

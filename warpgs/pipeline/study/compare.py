@@ -112,7 +112,7 @@ def _farmed(request: StudyRequest, fits: dict[Key, tuple[Place, FitRequest]]) ->
     for key, (_, fit) in fits.items():
         name = "-".join(map(str, key)).replace(" ", "-")
         jobs[name] = FarmJob(name, fit, request.out / "farm" / name, request.out)
-    engine = make_engine(request.engine, request.device, request.out)
+    engine = make_engine(request.engine, request.device)
     statuses = run_and_show(list(jobs.values()), engine, request.out)
     return {key: s.record for key, s in zip(fits, statuses, strict=True) if s.record is not None}
 
