@@ -1,5 +1,6 @@
 """A fit of several processes: what they write, and what they say when one is lost."""
 
+import json
 import os
 import signal
 import socket
@@ -12,6 +13,7 @@ from tests.app import rank_that_dies
 from warpgs.app.cli import main
 from warpgs.errors import UsageError
 from warpgs.runtime import rank_watch, ranks
+from warpgs.runtime.listening import is_loopback, loopback_interface
 from warpgs.synthetic.demo import write_demo
 
 
@@ -144,3 +146,37 @@ def test_the_end_of_a_process_is_seen():
         ended.wait()
     assert rank_watch.is_gone(ended.pid) and not rank_watch.is_gone(os.getpid())
     ended.wait()
+
+
+LISTENING = """
+import json, sys
+from warpgs.runtime.listening import listening_at
+from warpgs.runtime.ranks import join
+import torch
+ranks = join("cpu")
+ranks.gather(torch.ones(1), torch.empty(2))
+found = listening_at()
+ranks.part(); ranks.leave()
+print(json.dumps(found))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="torch takes no socket of ours there")
+def test_ranks_of_one_machine_listen_there_alone():
+    """The store and gloo, on both ranks; and nothing is said about it."""
+    for code, out, errors in ended(started(2, "-c", LISTENING)):
+        assert code == 0, errors
+        (line,) = out.splitlines()
+        assert json.loads(line) and all(is_loopback(ip) for ip, _ in json.loads(line)), line
+
+
+def test_another_host_keeps_its_interfaces(monkeypatch):
+    """Interfaces are named for ranks of this machine alone, and not over those that the user named."""
+    for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"):
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+    assert ranks._stay_home("192.0.2.1") is None and "GLOO_SOCKET_IFNAME" not in os.environ
+    monkeypatch.setenv("NCCL_SOCKET_IFNAME", "mine")
+    assert ranks._stay_home("127.0.0.1") == "127.0.0.1"
+    if sys.platform != "win32":
+        assert os.environ["GLOO_SOCKET_IFNAME"] == loopback_interface() and os.environ["NCCL_SOCKET_IFNAME"] == "mine"

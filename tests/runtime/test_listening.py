@@ -6,7 +6,15 @@ import pytest
 
 from warpgs.errors import UsageError
 from warpgs.runtime import listening
-from warpgs.runtime.listening import Allowance, WebGuard, loopback_interface, loopback_of, loopback_socket
+from warpgs.runtime.listening import (
+    Allowance,
+    WebGuard,
+    listeners,
+    loopback_interface,
+    loopback_of,
+    loopback_socket,
+    say_what_is_open,
+)
 
 OWN = "127.0.0.1:8080"
 
@@ -79,6 +87,19 @@ def test_the_policy_names_this_server_alone():
         "default-src 'none'" in policy and "script-src 'nonce-word' " in policy and "script-src 'unsafe-inline'" not in policy
     )
     assert "ws:" not in WebGuard.headers("example.org; script-src *", "word")["Content-Security-Policy"]
+
+
+def test_what_others_can_reach_is_printed(capsys):
+    """All of it in one line, but for sockets of the loopback address; and what listens in this process is found."""
+    opened = [("rank 0", "127.0.0.1", 1), ("rank 0", "192.0.2.1", 2), ("gloo", "::ffff:127.0.0.1", 3), ("torchrun", "::", 4)]
+    say_what_is_open(opened)
+    line = "open to other machines, without encryption: rank 0 at 192.0.2.1, port 2; torchrun at ::, port 4; "
+    assert capsys.readouterr().out.startswith(line)
+    say_what_is_open(opened[::2])
+    assert capsys.readouterr().out == ""
+    with loopback_socket(0, "") as own:
+        own.listen()
+        assert ("this process", *own.getsockname()) in listeners()
 
 
 def test_an_allowance_is_refilled_with_time():

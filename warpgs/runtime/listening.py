@@ -7,6 +7,7 @@ and looks at ``Host`` and ``Origin`` before anything else does.
 
 from __future__ import annotations
 
+import contextlib
 import hmac
 import ipaddress
 import re
@@ -17,6 +18,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from warpgs.errors import ResourceError, UsageError
+from warpgs.runtime.terminal import say
 
 HOST = "127.0.0.1"
 """Address that servers listen at: only this machine reaches it."""
@@ -57,7 +59,7 @@ def loopback_of(name: str) -> str | None:
         found = [str(info[4][0]) for info in socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)]
     except (OSError, UnicodeError):  # it cannot be resolved; whoever connects to it says so
         return None
-    if not found or not all(ipaddress.ip_address(a.partition("%")[0]).is_loopback for a in found):
+    if not found or not all(map(is_loopback, found)):
         return None
     return min(found, key=lambda a: (":" in a, a))
 
@@ -74,6 +76,49 @@ def loopback_interface(host: str = HOST) -> str:
         if any(a.address == host for a in addresses):
             return str(name)
     raise ResourceError(f"no network interface has the address {host}; bring up the loopback interface (ip link set lo up)")
+
+
+def listening_at(process: int | None = None) -> list[tuple[str, int]]:
+    """Return the addresses and ports at which a process listens, sorted; none where the system does not let us ask.
+
+    Args:
+        process: Number of the process; None for this one.
+    """
+    import psutil
+
+    try:
+        found = psutil.Process(process).net_connections("inet")
+    except psutil.Error:  # it has ended, or belongs to another user
+        return []
+    return sorted({(c.laddr.ip, c.laddr.port) for c in found if c.status == psutil.CONN_LISTEN})
+
+
+def listeners() -> list[tuple[str, str, int]]:
+    """Return name, address and port of everything that this process and its children listen at."""
+    import psutil
+
+    found = [("this process", *at) for at in listening_at()]
+    for child in psutil.Process().children(recursive=True):
+        with contextlib.suppress(psutil.Error):  # it has ended
+            found += [(child.name(), *at) for at in listening_at(child.pid)]
+    return found
+
+
+def say_what_is_open(found: Sequence[tuple[str, str, int]]) -> None:
+    """Print in one line what other machines can reach, if anything.
+
+    Args:
+        found: Name, address and port of what listens.
+    """
+    reached = [f"{who} at {ip}, port {port}" for who, ip, port in found if not is_loopback(ip)]
+    if reached:
+        say(f"open to other machines, without encryption: {'; '.join(reached)}; use a network that you trust")
+
+
+def is_loopback(address: str) -> bool:
+    """Return whether an address of a socket is one that only this machine reaches."""
+    found = ipaddress.ip_address(address.partition("%")[0])
+    return (getattr(found, "ipv4_mapped", None) or found).is_loopback
 
 
 class Allowance:

@@ -15,6 +15,7 @@ from datetime import timedelta
 from typing import TYPE_CHECKING
 
 from warpgs.errors import ResourceError, UsageError
+from warpgs.runtime.listening import listening_at, loopback_interface, loopback_of, loopback_socket, say_what_is_open
 from warpgs.runtime.rank_watch import LOST_SECONDS, RankWatch
 from warpgs.runtime.terminal import say
 
@@ -163,9 +164,20 @@ def join(device: str) -> Ranks:
     agent = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"  # torchrun itself holds the store then
     cuda = device != "cpu" and (device.startswith("cuda") or torch.cuda.is_available())
 
+    home = _stay_home(address)
+
     def connected(hosts: bool) -> dist.Store:
+        own = {}
+        if hosts and home and sys.platform != "win32":  # torch takes it over, and would listen on every interface
+            own["master_listen_fd"] = loopback_socket(port, "set another MASTER_PORT for all ranks", home).detach()
         store = dist.TCPStore(
-            address, port, count, is_master=hosts, timeout=timedelta(seconds=JOIN_SECONDS), wait_for_workers=False
+            home or address,
+            port,
+            count,
+            is_master=hosts,
+            timeout=timedelta(seconds=JOIN_SECONDS),
+            wait_for_workers=False,
+            **own,
         )
         run = [os.environ.get(f"TORCHELASTIC_{name}", "0") for name in ("RUN_ID", "RESTART_COUNT")]
         return dist.PrefixStore("/".join(["warpgs", *run]), store)
@@ -193,7 +205,25 @@ def join(device: str) -> Ranks:
         )
     except RuntimeError as e:
         raise ResourceError(f"{backend} cannot connect the {count} ranks ({str(e).splitlines()[0][:200]})") from e
+    if rank == 0:
+        torchrun = [("torchrun", *at) for at in listening_at(os.getppid()) if agent and at[1] == port]
+        say_what_is_open([*(("rank 0", *at) for at in listening_at()), *torchrun])
     return _joined
+
+
+def _stay_home(address: str) -> str | None:
+    """Have gloo and NCCL listen at the loopback interface where all ranks are on this machine; returns its address.
+
+    Interfaces that the user names stay.
+
+    Args:
+        address: Value of MASTER_ADDR.
+    """
+    home = loopback_of(address)
+    if home and sys.platform != "win32":  # gloo finds no interface by its name there
+        for library in ("GLOO", "NCCL"):
+            os.environ.setdefault(f"{library}_SOCKET_IFNAME", loopback_interface(home))
+    return home
 
 
 def last_words(line: str, code: int) -> int:

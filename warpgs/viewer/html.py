@@ -21,6 +21,7 @@ from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Camera, Gaussians
 from warpgs.viewer.packing import packed
+from warpgs.viewer.page import NO_PARAMETERS, NO_TEXT_AS_CODE
 from warpgs.viewer.poses import camera_before, distance_ahead, fov_y
 from warpgs.viewer.server import open_server, require_viser, stop_server
 
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; style-src 'unsafe-inline'; "
-    "img-src data: blob:; font-src data:; worker-src blob: data:; connect-src data: blob:"
+    "img-src data: blob:; font-src data:; worker-src blob: data:; connect-src data: blob:; base-uri 'none'; form-action 'none'"
 )
 """Content security policy of the page: it may use what is in it, and ask nobody for anything."""
 SORT_FROM_DISK = (
@@ -91,7 +92,8 @@ def page_of(
         text = server.get_scene_serializer().as_html(dark_mode=True)
     finally:
         stop_server(server)
-    head = f'<head><meta http-equiv="Content-Security-Policy" content="{POLICY}" />{SORT_FROM_DISK}'
+    head = f'<head><meta http-equiv="Content-Security-Policy" content="{POLICY}" />'
+    head += f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}</script>{SORT_FROM_DISK}"
     text = re.sub(r"<title>[^<]*</title>", lambda _: f"<title>{html.escape(title)}</title>", text, count=1)
     notes = ["the page shows colours of degree 0: those that change with the direction stay in the run and in its PLY"]
     if gaussians.sh_degree == 0:

@@ -5,9 +5,12 @@ from __future__ import annotations
 NO_PARAMETERS = "URLSearchParams=class extends URLSearchParams{constructor(){super()}set(){}};"
 """JavaScript before viser's own: parameters such as ``websocket`` and ``playbackPath``, which name servers and files to load,
 have no effect, and none is added."""
-NO_TEXT_AS_CODE = "Function=new Proxy(Function,{construct(){throw Error('refused')}});eval=()=>{throw Error('refused')};"
-"""JavaScript before viser's own: messages that hold JavaScript are refused. The content policy cannot do this, since the worker
-that sorts Gaussians makes functions of text."""
+NO_TEXT_AS_CODE = (
+    "{const made=Function,nothing=()=>{},make=args=>args.length>1?made(...args):nothing;"
+    "eval=nothing;Function=new Proxy(made,{apply:(f,self,args)=>make(args),construct:(f,args)=>make(args)})}"
+)
+"""JavaScript before viser's own: messages that hold JavaScript do nothing. The content policy cannot do this, since the code
+that sorts Gaussians makes functions of text, too; but those have parameters."""
 _MARK_LOADED = (
     "document.createElement=function(name,...rest){"
     "const made=Document.prototype.createElement.call(this,name,...rest);"

@@ -1,7 +1,8 @@
 """The engine for clusters that Ray runs: a task for each job, with a fraction of a GPU. Extra `ray`.
 
 Ray sends functions and results as pickles: every process that its ports accept can run code as the user. A cluster that is
-started here accepts only processes with its token; the token of another cluster is its owner's choice.
+started here listens at the loopback address and accepts only processes with its token; the token of another cluster is its
+owner's choice.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from warpgs.pipeline.farm.engine import Event
 from warpgs.pipeline.farm.job import FarmJob, job_text
 from warpgs.pipeline.farm.work import run_job
 from warpgs.runtime.folders import private_folder
+from warpgs.runtime.listening import listeners, say_what_is_open
 
 
 class RayEngine:
@@ -40,6 +42,7 @@ class RayEngine:
         address = address or os.environ.get("RAY_ADDRESS") or "local"
         if address == "local":  # Ray asks for a token unless RAY_AUTH_MODE says otherwise; without this it keeps one in ~/.ray
             os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+            os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # on every system, Ray listens at the loopback address then
         try:
             import ray
         except ImportError as e:
@@ -102,3 +105,5 @@ def _connect(ray: Any, address: str) -> None:
     except (OSError, RuntimeError, ValueError) as e:
         remedy = "set TMPDIR to a folder with a short path" if own else "check RAY_ADDRESS and RAY_AUTH_TOKEN"
         raise ResourceError(f"Ray at {address} does not answer: {e}; {remedy}, or leave --engine ray out") from e
+    if own:  # where Ray was imported before us it listens at every interface
+        say_what_is_open(listeners())
