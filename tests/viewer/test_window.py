@@ -238,7 +238,11 @@ def test_a_page_names_nobody(folder, tmp_path, capsys):
     """One file without a path, an image's name or an address in the network; cleaned, and it starts at a training camera."""
     assert main(["export", str(folder / "run"), "--to", str(tmp_path / "scene.html"), "--rotate", "level"]) == 0
     text = (tmp_path / "scene.html").read_text("utf-8")
-    assert "default-src 'none'" in text and "<title>warpgs</title>" in text
+    assert (
+        "default-src 'none'" in text
+        and text.index("URLSearchParams=") < text.index("<script data-p")
+        and "<title>warpgs</title>" in text
+    )
     head, _, data = text.partition('__VISER_EMBED_DATA__="')
     assert str(folder) not in text and "warpgs/" not in head
     scene = zstandard.ZstdDecompressor().decompressobj().decompress(base64.b64decode(data.partition('"')[0])[8:])
