@@ -32,7 +32,7 @@ class Call:
     number: int
     """Its number among all calls, from 1."""
     kind: str
-    """One of `KINDS`; ``step`` is the log's line of a training step, at its end."""
+    """One of `KINDS`; ``step`` is the log's line of a training step, at its end, or one of another process."""
     path: Path
     """What it changes; for a replacement what is put in place, and for ``fsync`` the folder of all."""
     source: Path | None = None
@@ -96,7 +96,7 @@ class _Raw(io.FileIO):
 def _open(calls: _Calls, real: Callable[..., Any]) -> Callable[..., Any]:
     def opened(file: Any, mode: str = "r", buffering: int = -1, *rest: Any, **more: Any) -> Any:
         where = calls.below(file)
-        if where is None or "b" not in mode or not set(mode) & set("wxa+"):
+        if where is None or "b" not in mode or not set(mode) & set("wxa+") or more.get("opener"):  # that opens by os.open
             return real(file, mode, buffering, *rest, **more)
         if not isinstance(file, int):
             calls.note("open", where)
@@ -160,13 +160,23 @@ def _step(calls: _Calls, real: Callable[..., None]) -> Callable[..., None]:
     return written
 
 
+def _lines(calls: _Calls, real: Callable[..., Iterator[str]]) -> Callable[..., Iterator[str]]:
+    def lines(*words: Any, **more: Any) -> Iterator[str]:
+        for line in real(*words, **more):
+            calls.note("step", calls.root)
+            yield line
+
+    return lines
+
+
 @contextlib.contextmanager
-def numbered(root: Path, before: Callable[[Call], int | None]) -> Iterator[None]:
+def numbered(root: Path, before: Callable[[Call], int | None], talker: Any = None) -> Iterator[None]:
     """Hand every call that changes something below a folder to a function, which may raise, or end the process.
 
     Args:
         root: The folder, which need not be there yet.
         before: Takes a call before it is made; what it returns for a write stands for that write's result.
+        talker: Module whose `python_lines` reads what another process says; each line is a step, too.
     """
     calls = _Calls(root, before)
     opened = _open(calls, io.open)
@@ -188,4 +198,6 @@ def numbered(root: Path, before: Callable[[Call], int | None]) -> Iterator[None]
             (EventLog, "write", _step(calls, EventLog.write)),
         ):
             stack.enter_context(mock.patch.object(owner, name, stand_in))
+        if talker is not None:
+            stack.enter_context(mock.patch.object(talker, "python_lines", _lines(calls, talker.python_lines)))
         yield

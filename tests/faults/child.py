@@ -2,24 +2,100 @@
 
 Arguments: the folder whose calls are numbered; the number of the call, 0 for none; the file for the calls; then the words of
 the commands, those of one command after those of another with a ``+`` between. Each command numbers its calls anew, and
-only the last one is killed. ``keep A B`` copies a folder.
+only the last one is killed. ``keep A B`` copies a folder, ``worker`` is a farm whose jobs run in the process of the farm.
+
+With ``serve`` alone it reads such arguments as lines of JSON, ``{"words": [...], "tmp": FOLDER, "said": FILE}``, and forks for
+each: what takes long to import is there already. It answers with the exit code once all that it started has ended.
 """
 
+import contextlib
+import ctypes
 import hashlib
 import itertools
+import json
 import os
 import shutil
 import sys
+import tempfile
 from pathlib import Path
+from unittest import mock
 
 from tests.faults.calls import Call, numbered
 from warpgs.app.cli import main
+from warpgs.pipeline.farm.engine import Event
+from warpgs.pipeline.farm.job import job_text
+from warpgs.pipeline.farm.work import run_job
 from warpgs.pipeline.runs import results
+from warpgs.poses import mapping
+from warpgs.temporary import temporary_folder
+
+SUBREAPER = 36
+"""Number of Linux's prctl that gives a process the orphans of its children."""
+
+
+class OneProcess:
+    """Engine of a farm that runs its jobs in the farm's own process."""
+
+    name, slots = "one process", 1
+
+    def __init__(self, *_: object):
+        self.jobs: list = []
+
+    def start(self, job) -> None:
+        self.jobs.append(job)
+
+    def wait(self, seconds: float) -> list[Event]:
+        job = self.jobs.pop(0)
+        return [Event(job.name, run_job(job_text(job)))]
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def overview(*_: object) -> tuple[None, str]:
+    """Stand in for the overview, whose renderer takes seconds: a temporary folder, and no image."""
+    with temporary_folder() as folder:
+        (folder.path / "scene.npz").write_bytes(b"points")
+    return None, "no overview image: this is a test"
+
+
+@contextlib.contextmanager
+def saving_viewer():
+    """Have `warpgs view` save a crop box and a path once it shows something, and end."""
+    from warpgs.viewer import watch
+    from warpgs.viewer.saved import CROP, PATH, keyframe
+
+    windows: list = []
+
+    def window(*given):
+        windows.append(watch_window(*given))
+        return windows[-1]
+
+    def pause() -> None:
+        (shown,) = windows
+        panel, model = shown.panel, shown.content.model
+        panel._crop.value = True
+        panel._save(CROP, panel.crop_box().to_json(model.normalization))
+        panel._save(PATH, [keyframe(model.scene_cameras[n], float(i), model.normalization) for i, n in enumerate(model.train)])
+        raise KeyboardInterrupt
+
+    watch_window = watch.Window
+    with mock.patch.object(watch, "Window", window), mock.patch.object(watch, "_pause", pause):
+        yield
+
+
+def run_one(words: list[str]) -> int:
+    """Run one command; returns its exit code."""
+    if words[0] == "worker":
+        with mock.patch("warpgs.pipeline.farm.run.LocalEngine", OneProcess):
+            return main(["farm", *words[1:]])
+    with saving_viewer() if words[0] == "view" else contextlib.nullcontext():
+        return main(words)
 
 
 def run(root: Path, at: int, trace: Path, commands: list[list[str]]) -> int:
     """Run commands; returns the exit code of the first that fails, or 0."""
-    results.render_overview = lambda *_: (None, "no overview image: this is a test")
+    results.render_overview = overview
     with trace.open("wb", buffering=0) as log:
         for words in commands:
             if words[0] == "keep":
@@ -38,13 +114,55 @@ def run(root: Path, at: int, trace: Path, commands: list[list[str]]) -> int:
                         call.half()
                     os.kill(os.getpid(), 9)  # SIGKILL; on Windows the end of the process
 
-            with numbered(root, before):
-                code = main(words)
+            with numbered(root, before, mapping):
+                code = run_one(words)
             if code:
                 return code
     return 0
 
 
+def run_words(words: list[str]) -> int:
+    """Run the commands of a command line."""
+    groups = [list(g) for plus, g in itertools.groupby(words[3:], lambda w: w == "+") if not plus]
+    return run(Path(os.path.realpath(words[0])), int(words[1]), Path(words[2]), groups)
+
+
+def serve() -> None:
+    """Fork for each line of stdin, and answer with exit codes."""
+    import warpgs.viewer.watch  # noqa: F401  (and all that commands import late)
+    from warpgs.app.commands import compare, convert, eval, export, farm, fit, mesh, poses, prune, render, view  # noqa: F401
+    from warpgs.pipeline.runs import commands, share  # noqa: F401
+    from warpgs.pipeline.study import compare as study  # noqa: F401
+
+    if sys.platform.startswith("linux"):
+        ctypes.CDLL(None).prctl(SUBREAPER, 1, 0, 0, 0)
+    for line in sys.stdin:
+        job = json.loads(line)
+        child = os.fork()
+        if not child:
+            said = os.open(job["said"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            for number in (1, 2):
+                os.dup2(said, number)
+            os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+            os.environ["TMPDIR"], tempfile.tempdir = job["tmp"], None
+            code = 70
+            try:
+                code = run_words(job["words"])
+            except BaseException as e:
+                print(repr(e), file=sys.stderr)
+            finally:
+                for stream in (sys.stdout, sys.stderr):
+                    stream.flush()
+                os._exit(code)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        with contextlib.suppress(ChildProcessError):  # and orphans, such as workers of a farm
+            while True:
+                os.waitpid(-1, 0)
+        print(code, flush=True)
+
+
 if __name__ == "__main__":
-    groups = [list(g) for plus, g in itertools.groupby(sys.argv[4:], lambda w: w == "+") if not plus]
-    sys.exit(run(Path(os.path.realpath(sys.argv[1])), int(sys.argv[2]), Path(sys.argv[3]), groups))
+    if sys.argv[1:] == ["serve"]:
+        serve()
+    else:
+        sys.exit(run_words(sys.argv[1:]))

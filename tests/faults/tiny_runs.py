@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
+import importlib.util
 import json
 import os
 import shutil
@@ -14,27 +16,42 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tests.faults.child import run
 from warpgs.export.formats import read_gaussians
 from warpgs.export.ply import read_ply
 from warpgs.files import LOCK, OWN_NAMES
 from warpgs.pipeline.runs.checkpoint import load_checkpoint
 from warpgs.report.film import _decoded_sizes
-from warpgs.synthetic.demo import split_spec, write_demo
+from warpgs.synthetic import raycast
+from warpgs.synthetic.demo import camera_path, split_spec, still_life, write_demo
 
 ROOT = Path(__file__).parent.parent.parent
 STEPS, FRAMES, VIEWS = 60, 4, 8
 HALF_WAY = 33
 """Step at which the run is interrupted that the other commands start from; its checkpoint is of step 30."""
-COMMANDS = ("fit", "resume", "render", "export", "convert", "mesh", "prune", "eval")
-SAME_BYTES = (".ply", ".spz", ".glb", ".png", ".mp4", ".safetensors")
+COMMANDS = (
+    "fit", "resume", "render", "export", "convert", "mesh", "prune", "eval", "view", "compare", "worker", "farm", "poses",
+)  # fmt: skip
+"""The commands; ``worker`` is a farm whose jobs run in its own process, so that their calls are seen."""
+NEEDS = {"view": "viser", "poses": "pycolmap"}
+"""Modules that a command needs and that may be missing."""
+SAME_BYTES = (".ply", ".spz", ".glb", ".png", ".jpg", ".mp4", ".safetensors")
 """Suffixes of files that are the same whenever they are written again; the others hold times and places."""
+
+TEXTS = (".txt", ".md", ".csv", ".tex", ".svg")
+"""Suffixes of texts that nothing reads back."""
 
 OWN = {
     "fit": ("run/",), "resume": ("run/",), "eval": ("run/eval.json", "run/renders/", "run/depth/"), "render": ("film/",),
     "prune": ("run-pruned/",), "export": ("a.ply",), "convert": ("b.spz",), "mesh": ("m.glb",),
+    "view": ("run/crop.json", "run/path.json"), "compare": ("study/",), "worker": ("results/",), "farm": ("results/",),
+    "poses": ("posed/",),
 }  # fmt: skip
 """Beginnings of the paths that a command writes."""
+
+
+def can_run(command: str) -> bool:
+    """Return whether what a command needs is installed."""
+    return command not in NEEDS or importlib.util.find_spec(NEEDS[command]) is not None
 
 
 def words_of(command: str, scene: Path, work: Path) -> list[str]:
@@ -44,6 +61,17 @@ def words_of(command: str, scene: Path, work: Path) -> list[str]:
         "fit", str(scene), "--out", run, "--split", split_spec(VIEWS), "--steps", str(STEPS), "--preset", "quick",
         "--checkpoint-every", "10", "--checkpoint-seconds", "0", "--threads", "1", *cpu,
     ]  # fmt: skip
+    short = ["--split", split_spec(VIEWS), "--steps", "4", *cpu]
+    farm = [
+        str(scene.parent / "scenes"),
+        "--out",
+        str(work / "results"),
+        "--preset",
+        "quick",
+        "--checkpoint-every",
+        "1",
+        *short,
+    ]
     return {
         "fit": fit,
         "resume": [*fit, "--resume"],
@@ -53,6 +81,11 @@ def words_of(command: str, scene: Path, work: Path) -> list[str]:
         "mesh": ["mesh", run, "--out", str(work / "m.glb"), "--resolution", "24", *cpu],
         "prune": ["prune", run, "--keep-psnr", "3", *cpu],
         "eval": ["eval", run, *cpu],
+        "view": ["view", run, "--port", "0", *cpu],
+        "compare": ["compare", str(scene), "--out", str(work / "study"), "--presets", "3dgs,mcmc", "--seeds", "1", *short],
+        "farm": ["farm", *farm],
+        "worker": ["worker", *farm],
+        "poses": ["poses", str(scene.parent / "photographs"), "--out", str(work / "posed"), "--threads", "1"],
     }[command]
 
 
@@ -74,21 +107,32 @@ class Done:
     """By command: kind of each call, its path from the folder, and the SHA-256 of what a replacement puts there."""
 
 
+@functools.cache
+def server() -> subprocess.Popen:
+    """Start the process that forks for each command; it ends with this one."""
+    words = [sys.executable, "-P", "-m", "tests.faults.child", "serve"]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    return subprocess.Popen(words, env=environment(), text=True, bufsize=1, **pipes)
+
+
 def child(work: Path, *commands: list[str], kill_at: int = 0) -> Done:
-    """Run commands in one process, which kills itself before a call of the last one, where that is not 0."""
-    trace = work.with_name(f"{work.name}.calls")
+    """Run commands in one process, which kills itself before a call of the last one, where that is not 0.
+
+    Its temporary files lie in a folder of ``work``. What it started has ended, too, when this returns.
+    """
+    trace, said = (work.with_name(f"{work.name}.{end}") for end in ("calls", "said"))
+    tmp = work / "tmp"
+    tmp.mkdir(exist_ok=True)
     words = [str(work), str(kill_at), str(trace), *commands[0], *(w for c in commands[1:] for w in ("+", *c))]
-    done = subprocess.run(
-        [sys.executable, "-P", "-m", "tests.faults.child", *words], env=environment(), capture_output=True, text=True,
-        check=False, encoding="utf-8",
-    )  # fmt: skip
-    return Done(done.returncode, done.stdout + done.stderr, calls_in(trace))
-
-
-def here(work: Path, *commands: list[str]) -> Done:
-    """Run commands in this process, which has imported what they need."""
-    trace = work.with_name(f"{work.name}.calls")
-    return Done(run(work, 0, trace, list(commands)), "its output was printed", calls_in(trace))
+    if not hasattr(os, "fork"):
+        process = [sys.executable, "-P", "-m", "tests.faults.child", *words]
+        with said.open("wb") as file:
+            ended = subprocess.run(process, env=environment() | {"TEMP": str(tmp)}, stdout=file, stderr=file, check=False)
+        code = ended.returncode
+    else:
+        print(json.dumps({"words": words, "tmp": str(tmp), "said": str(said)}), file=server().stdin, flush=True)
+        code = int(server().stdout.readline())
+    return Done(code, said.read_text("utf-8", errors="replace"), calls_in(trace))
 
 
 def calls_in(trace: Path) -> dict[str, list[tuple[str, str, str]]]:
@@ -129,7 +173,7 @@ def leftovers(folder: Path) -> list[str]:
 def check_whole(folder: Path, *, ended: bool) -> None:
     """Read every file back that has a name of its own; a log may lack the end of its last line where it has not ended."""
     for path in folder.rglob("*"):
-        if path.is_dir() or path.suffix == ".txt" or is_temporary(path.relative_to(folder).as_posix()):
+        if path.is_dir() or path.suffix in TEXTS or is_temporary(path.relative_to(folder).as_posix()):
             continue
         if path.suffix == ".json":
             json.loads(path.read_text("utf-8"))
@@ -141,6 +185,10 @@ def check_whole(folder: Path, *, ended: bool) -> None:
             assert _decoded_sizes(path) == [(48, 36)] * FRAMES, path
         elif path.suffix == ".ply":
             assert len(read_ply(path)), path
+        elif path.suffix == ".jpg":
+            assert cv2.imread(str(path)) is not None, path
+        elif path.suffix == ".bin":
+            assert path.stat().st_size, path
         elif path.suffix == ".spz":
             assert len(read_gaussians(path)), path
         elif path.suffix == ".glb":
@@ -157,7 +205,8 @@ def check_log(path: Path, ended: bool) -> None:
     last = lines.pop()
     assert not (ended and last), path
     steps = [json.loads(line)["step"] for line in lines]
-    assert steps == list(range(1, len(steps) + 1)) and (not ended or len(steps) == STEPS), path
+    asked = json.loads((path.parent / "config.json").read_text("utf-8"))["config"]["steps"]
+    assert steps == list(range(1, len(steps) + 1)) and (not ended or len(steps) == asked), path
 
 
 @dataclass(frozen=True)
@@ -174,15 +223,27 @@ class Reference:
     def before(self, command: str, work: Path) -> None:
         """Make the folder that a command starts from."""
         work.mkdir()
-        start = {"fit": None, "resume": "interrupted"}.get(command, "finished")
+        start = {"fit": None, "worker": None, "farm": None, "resume": "interrupted"}.get(command, "finished")
         if start is not None:
             shutil.copytree(self.folder / start, work, dirs_exist_ok=True)
+
+
+def write_photographs(folder: Path) -> None:
+    """Write four photographs that overlap, large enough for poses to be found."""
+    folder.mkdir()
+    shapes = still_life(0)
+    for i, c in enumerate(camera_path(8, 240, 180)[1:5]):
+        image = raycast.render(shapes, raycast.Light(), c.K, c.viewmat, 240, 180)
+        cv2.imwrite(str(folder / f"{i}.png"), np.round(255 * image[..., ::-1]).astype(np.uint8))
 
 
 def build_reference(folder: Path) -> None:
     """Run every command once, and keep what there was before and after it."""
     scene, work = folder / "scene", folder / "work"
     write_demo(scene, views=VIEWS, width=48, height=36)
+    for name in ("s0", "s1"):
+        shutil.copytree(scene, folder / "scenes" / name)
+    write_photographs(folder / "photographs")
 
     def words(command: str) -> list[str]:
         return words_of(command, scene, work)
@@ -191,18 +252,21 @@ def build_reference(folder: Path) -> None:
         return ["keep", str(work), str(folder / name)]
 
     work.mkdir()
-    alone = succeeded(here(work, words("fit"))).calls["fit"]
-    after = {"fit": digests(work)}
-    shutil.rmtree(work)
-    work.mkdir()
-    at = [i for i, call in enumerate(alone, 1) if call[0] == "step"][HALF_WAY - 1]
+    alone, after = {}, {}
+    for command in ("worker", "farm", "fit"):
+        alone[command] = succeeded(child(work, words(command))).calls[command]
+        after[command] = digests(work)
+        shutil.rmtree(work)
+        work.mkdir()
+    at = [i for i, call in enumerate(alone["fit"], 1) if call[0] == "step"][HALF_WAY - 1]
     assert child(work, words("fit"), kill_at=at).code not in range(6)
     (work / "other.txt").write_text("the user's own")
     # older results of the same commands: what they replace must not get lost
     older = [*(words(c) for c in ("render", "export", "convert", "mesh", "eval")), keep("interrupted")]
     # convert comes first, since export replaces what it reads
-    last = [words(c) for c in ("convert", "render", "export", "mesh", "prune", "eval")]
-    done = succeeded(here(work, *older, words("resume"), keep("finished"), *last))
-    after |= {"resume": digests(folder / "finished")} | {w[0]: digests(work) for w in last}
-    calls = done.calls | {"fit": alone, "resume": done.calls["fit"]}
+    last = ["convert", "render", "export", "mesh", "prune", "eval", "view", "compare", "poses"]
+    last = [c for c in last if can_run(c)]
+    done = succeeded(child(work, *older, words("resume"), keep("finished"), *map(words, last)))
+    calls = done.calls | alone | {"resume": done.calls["fit"]}
+    after |= {"resume": digests(folder / "finished")} | {c: digests(work) for c in last}
     (folder / "reference.json").write_text(json.dumps({"calls": calls, "after": after}))

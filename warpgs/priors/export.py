@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.files import write_bytes, write_text
+from warpgs.files import remove_leftovers, write_bytes, write_text
 from warpgs.input_files import read_input
 from warpgs.priors.preprocess import HALF, IMAGENET, side_file
 from warpgs.priors.semantics import CLASSES
@@ -250,6 +250,7 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
             f"{out}: not written, as onnxruntime and torch differ by {difference:.1e} standard deviations; try other "
             "versions of both"
         )
+    remove_leftovers(out.parent)
     write_bytes(out, data)
     write_text(side_file(out), description)
     flag = "--depth-model" if request.model == "dpt" else "--segmentation-model"

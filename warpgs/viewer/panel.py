@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from warpgs.errors import WarpgsError
-from warpgs.files import write_json
+from warpgs.files import remove_leftovers, write_json
 from warpgs.geometry import rotation_matrices
 from warpgs.io.decoding import decode
 from warpgs.runtime.terminal import say
@@ -195,6 +195,7 @@ class Panel:
     def _save(self, name: str, values: Any) -> None:
         """Write a file beside what is shown, and say where it is."""
         path = self.content.saved(name)
+        remove_leftovers(path.parent)
         try:
             write_json(path, values)
         except WarpgsError as e:

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from warpgs.errors import DataError, UsageError
-from warpgs.files import write_bytes
+from warpgs.files import remove_leftovers, write_bytes
 from warpgs.input_files import open_input, read_input, unread_reason
 
 FORMAT = "warpgs-lpips-1"
@@ -165,6 +165,7 @@ def convert_lpips(backbone: Path, heads: Path, out: Path) -> list[str]:
     metadata = {
         "format": FORMAT, "net": net.name, "version": version, "backbone_sha256": backbone_hash, "heads_sha256": head_hash,
     }  # fmt: skip
+    remove_leftovers(out.parent)
     write_bytes(out, save(tensors, metadata))
     notes = [f"{out}: LPIPS with {net.title}, heads of version {version}"]
     if not backbone_hash.startswith(net.published):
