@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -157,7 +158,7 @@ def _check_properties(path: Path, vertex: Element) -> int:
     """Return the number of coefficients above degree 0; DataError where the layout is incomplete."""
     names = [name for name, _ in vertex.properties]
     if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
+        twice = Counter(names).most_common(1)[0][0]
         raise ply_error(path, f"property {twice[:40]!r} appears twice")
     rest = sum(bool(re.fullmatch(r"f_rest_[0-9]+", name)) for name in names)
     if rest not in _REST_COUNTS:

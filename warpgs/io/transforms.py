@@ -176,7 +176,7 @@ class _Reading:
         if not path.is_file():
             self.missing.append(str(frame["file_path"]))
             return
-        name = view_name_of(path, self.root)
+        name = self.views.claim(view_name_of(path, self.root), where)
         self.outside += name.startswith("outside/")
         where = f"{where} ({name})"
         viewmat = from_camera_to_world(matrix_of(frame, where), where, opengl=True)
