@@ -6,6 +6,7 @@ first, the rest channel-major), opacity as a logit, log scales, rotation wxyz as
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import re
@@ -189,21 +190,7 @@ def _assemble(path: Path, read: Callable[[slice], np.ndarray], n: int, rest: int
     for part in parts(n):
         rows = read(part)
 
-        def columns(
-            names: list[str] | tuple[str, ...], least: float = -np.inf, most: float = np.inf, rows=rows, first=part.start
-        ) -> np.ndarray:
-            out = np.empty((len(rows), len(names)), np.float32)
-            # A double beyond float32 becomes an infinity, and the check below names it.
-            with np.errstate(over="ignore", invalid="ignore"):
-                for i, name in enumerate(names):
-                    out[:, i] = rows[name]
-            out[out == -np.inf], out[out == np.inf] = least, most
-            bad = ~np.isfinite(out)
-            if bad.any():
-                row, column = np.argwhere(bad)[0]
-                raise ply_error(path, f"{names[column]} of Gaussian {first + row} is not finite in float32")
-            return out
-
+        columns = functools.partial(_columns, path, rows, part.start)
         arrays["sh"][part, 0] = columns(_DC)
         if rest:
             above = columns([f"f_rest_{i}" for i in range(rest)])
@@ -216,3 +203,20 @@ def _assemble(path: Path, read: Callable[[slice], np.ndarray], n: int, rest: int
         arrays["log_scales"][part] = columns(_SCALE, least=FLAT)
         arrays["logit_opacities"][part] = columns(["opacity"], -OPAQUE, OPAQUE)[:, 0]
     return Gaussians(**{name: torch.from_numpy(array) for name, array in arrays.items()})
+
+
+def _columns(
+    path: Path, rows: np.ndarray, first: int, names: list[str] | tuple[str, ...], least: float = -np.inf, most: float = np.inf
+) -> np.ndarray:
+    """Return columns of structured rows from the row ``first`` on, float32 [N, C]; infinities become ``least`` and ``most``."""
+    out = np.empty((len(rows), len(names)), np.float32)
+    # A double beyond float32 becomes an infinity, and the check below names it.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for i, name in enumerate(names):
+            out[:, i] = rows[name]
+    out[out == -np.inf], out[out == np.inf] = least, most
+    bad = ~np.isfinite(out)
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise ply_error(path, f"{names[column]} of Gaussian {first + row} is not finite in float32")
+    return out

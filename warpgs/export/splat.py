@@ -31,8 +31,10 @@ def decode(path: Path, data: bytes) -> Arrays:
     """Return the Gaussians of a file's bytes.
 
     Raises:
-        DataError: The size is no multiple of 32 bytes, or an axis length is negative.
+        DataError: The file is empty, its size is no multiple of 32 bytes, or an axis length is negative.
     """
+    if not data:
+        raise malformed(path, "it is empty")
     if len(data) % _ROW.itemsize:
         raise malformed(path, f"its {len(data)} bytes are no multiple of {_ROW.itemsize}")
     rows = np.frombuffer(data, _ROW)

@@ -14,6 +14,7 @@ from warpgs.io import colmap, transforms
 from warpgs.io.images import Lens
 from warpgs.io.poses import from_camera_to_world, quat_rotation, rigid
 from warpgs.scene import Camera
+from warpgs.schema import check_parts
 
 MAX_BYTES = 2**25
 """Largest file of cameras that is read [bytes]."""
@@ -45,7 +46,9 @@ def read_cameras(path: Path) -> tuple[dict[str, Camera], list[str]]:
 def _json(path: Path) -> Any:
     """Return the values of a JSON file of bounded size."""
     try:
-        return json.loads(read_input(path, MAX_BYTES).decode("utf-8-sig"))
+        text = read_input(path, MAX_BYTES).decode("utf-8-sig")
+        check_parts(text)
+        return json.loads(text)
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path, or write it again") from e
     except (ValueError, RecursionError) as e:
