@@ -65,6 +65,16 @@ def test_what_is_no_json(bad, tmp_path):
         schema.read(tmp_path / "a")
 
 
+@pytest.mark.parametrize("text", ["[" + "[]," * 20 + "[]]", b"[" + b"{}," * 20 + b"{}]"])
+def test_many_lists_are_refused_before_they_are_made(text, monkeypatch):
+    """Two bytes of text become seventy."""
+    assert len(schema.parse(text)) == 21
+    monkeypatch.setattr(schema, "MAX_PARTS", 20)
+    monkeypatch.setattr(schema.json, "loads", lambda text: pytest.fail("it was parsed"))
+    with pytest.raises(SchemaError, match="more than 20 lists and objects"):
+        schema.parse(text)
+
+
 def test_only_ordinary_files_are_read(tmp_path):
     with pytest.raises(IsADirectoryError):
         schema.read(tmp_path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import importlib.util
+import os
 import pkgutil
 import sys
 from collections.abc import Callable
@@ -156,7 +157,7 @@ def _import_module(name: str) -> ModuleType:
 
 def _load_file(path: Path) -> ModuleType:
     """Import a file by its path, once, under a name of its own."""
-    path = path.resolve()
+    path = Path(os.path.realpath(path))  # Path.resolve raises a RuntimeError on links that lead round in circles
     name = f"_warpgs_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
     if name in sys.modules:
         return sys.modules[name]

@@ -7,6 +7,7 @@ Conventions (docs/conventions.md): camera_from_world poses, OpenCV axes (+x righ
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -134,10 +135,11 @@ class Scene:
         Raises:
             KeyError: No view has this name.
         """
-        for v in self.views:
-            if v.name == name:
-                return v
-        raise KeyError(name)
+        return self._by_name[name]
+
+    @cached_property
+    def _by_name(self) -> dict[str, View]:
+        return {v.name: v for v in reversed(self.views)}  # the first of equal names
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,8 @@ MAX_BYTES = 2**25
 """Size of the largest text that is read [bytes]; config.json of a thousand views takes one MiB."""
 MAX_DEPTH = 50
 """Number of lists and objects that may lie in each other: whoever walks through a value needs no guard of its own."""
+MAX_PARTS = 2**19
+"""Number of lists and objects, each of which takes some thirty times as much memory as text."""
 MAX_WHOLE = 2**63 - 1
 """Largest whole number: that of 64 bits."""
 MAX_NUMBER = 1e300
@@ -34,10 +36,11 @@ def parse(text: str | bytes) -> Any:
     """Return the value of a JSON text.
 
     Raises:
-        SchemaError: It is no JSON, longer than `MAX_BYTES` or deeper than `MAX_DEPTH`.
+        SchemaError: It is no JSON, longer than `MAX_BYTES`, deeper than `MAX_DEPTH`, or has more than `MAX_PARTS`.
     """
     if len(text) > MAX_BYTES:
         raise SchemaError(f"is larger than {MAX_BYTES / 2**20:.0f} MiB")
+    check_parts(text)
     try:
         value = json.loads(text)
     except RecursionError as e:
@@ -46,6 +49,17 @@ def parse(text: str | bytes) -> Any:
         raise SchemaError(f"is no JSON: {e}") from e
     check_depth(value, MAX_DEPTH)
     return value
+
+
+def check_parts(text: str | bytes) -> None:
+    """Check the number of lists and objects of a JSON text before it is parsed.
+
+    Raises:
+        SchemaError: There are more than `MAX_PARTS`.
+    """
+    count = text.count("[") + text.count("{") if isinstance(text, str) else text.count(b"[") + text.count(b"{")
+    if count > MAX_PARTS:
+        raise SchemaError(f"has more than {MAX_PARTS:,} lists and objects")
 
 
 def check_depth(value: Any, most: int) -> None:

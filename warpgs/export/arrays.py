@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,8 @@ import numpy as np
 from warpgs.errors import DataError
 from warpgs.scene import Gaussians
 
+ROWS = 16384
+"""Gaussians that are decoded at a time, so that float64 copies of a whole model never exist."""
 Arrays = dict[str, np.ndarray]
 """The five tensors of `Gaussians` by field name, as numpy arrays of any float type, means and log scales in file units."""
 
@@ -26,6 +29,22 @@ def malformed(path: Path, what: str) -> DataError:
     return DataError(
         f"{path}: not a usable {path.suffix or 'model'} file: {what}. Export the model again, or use another format."
     )
+
+
+def by_rows(n: int, shape: tuple[int, ...], rows: Callable[[slice], np.ndarray]) -> np.ndarray:
+    """Return an array, float32 [n, *shape], of pieces of at most `ROWS` rows that are asked for in their order.
+
+    What leaves float32 becomes an infinity, which `gaussians_of` names.
+    """
+    out = np.empty((n, *shape), np.float32)
+    for part in parts(n):
+        out[part] = rows(part)
+    return out
+
+
+def parts(n: int) -> Iterator[slice]:
+    """Yield slices of at most `ROWS` rows that make up ``n``."""
+    return (slice(start, min(start + ROWS, n)) for start in range(0, n, ROWS))
 
 
 def arrays_of(gaussians: Gaussians) -> Arrays:
@@ -59,9 +78,11 @@ def gaussians_of(path: Path, arrays: Arrays) -> Gaussians:
     with np.errstate(over="ignore", invalid="ignore"):  # what leaves float32 becomes an infinity, which is named below
         single = {name: np.ascontiguousarray(array, dtype=np.float32) for name, array in arrays.items()}
     for name, array in single.items():
-        bad = ~np.isfinite(array)
-        if bad.any():
-            raise malformed(path, f"{name} of Gaussian {int(np.argwhere(bad)[0][0])} is not finite in float32")
+        for part in parts(len(array)):
+            bad = ~np.isfinite(array[part])
+            if bad.any():
+                row = part.start + int(np.argwhere(bad)[0][0])
+                raise malformed(path, f"{name} of Gaussian {row} is not finite in float32")
     zero = ~single["quats"].any(axis=1)
     if zero.any():
         raise malformed(path, f"the rotation of Gaussian {int(np.argmax(zero))} has zero length")
@@ -121,11 +142,19 @@ def half_turn(arrays: Arrays, axis: str) -> Arrays:
         arrays: The Gaussians.
         axis: x (between the axes of SPZ, RUB, and those of PLY, RDF) or z (between PLY and the y-up axes of glTF).
     """
+    copies = arrays | {name: np.array(arrays[name]) for name in ("means", "quats", "sh")}
+    half_turn_in_place(copies, axis)
+    return copies
+
+
+def half_turn_in_place(arrays: Arrays, axis: str) -> None:
+    """Turn arrays of a float type as `half_turn` does, without a copy."""
     turned = {a: 1.0 if a == axis else -1.0 for a in "xyz"}
     signs = np.array([turned[a] for a in "xyz"], np.float32)
     harmonics = np.array([np.prod([turned[a] for a in axes]) for axes in _AXES], np.float32)[: arrays["sh"].shape[1]]
-    quats = arrays["quats"] * np.concatenate([[1], signs]).astype(np.float32)
-    return arrays | {"means": arrays["means"] * signs, "quats": quats, "sh": arrays["sh"] * harmonics[:, None]}
+    arrays["means"] *= signs
+    arrays["quats"] *= np.concatenate([[1], signs]).astype(np.float32)
+    arrays["sh"] *= harmonics[:, None]
 
 
 def rounded(values: np.ndarray, most: int) -> np.ndarray:

@@ -7,6 +7,7 @@ stored best when they are near each other in space: `warpgs.export.formats` says
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from warpgs.export.arrays import (
     SH_SIZES,
     SQRT2,
     Arrays,
+    by_rows,
     from_smallest_three,
     logits,
     malformed,
@@ -88,39 +90,60 @@ def decode(path: Path, data: bytes) -> Arrays:
     n = len(vertex)
     if len(chunk) != -(-n // CHUNK):
         raise malformed(path, f"{len(chunk)} chunks for {n} Gaussians")
-    position, rotation, scale, color = (_column(path, vertex, name, "<u4").astype(np.int64) for name in _VERTEX_NAMES)
-    rgba = _unpack(color, (8, 8, 8, 8))
-    rows = np.arange(n) // CHUNK
-    values = [_unpack(position, _BITS), _unpack(scale, _BITS), rgba[:, :3]]
-    for i, group in enumerate(_GROUPS):
-        if i == 2 and "min_r" not in (chunk.dtype.names or ()):
-            break  # older files: colours between 0 and 1
-        low, high = (
-            np.stack([_column(path, chunk, f"{end}_{name}", "<f4") for name in group], 1).astype(np.float64)[rows]
-            for end in ("min", "max")
-        )
-        values[i] = low * (1 - values[i]) + high * values[i]
-    others = (_unpack(rotation & (2**30 - 1), (10, 10, 10)) - 0.5) * SQRT2
-    harmonics = [((values[2] - 0.5) / C0)[:, None]]
-    if sh is not None:
-        harmonics.append(_harmonics(path, sh, n))
+    position, rotation, scale, color = (_column(path, vertex, name, "<u4") for name in _VERTEX_NAMES)
+    bounds = [_bounds(path, chunk, group) for group in _GROUPS]
+
+    def values(i: int, packed: np.ndarray, bits: tuple[int, ...], part: slice) -> np.ndarray:
+        """Return the numbers of the i-th group [P, 3], between the bounds of their chunks."""
+        fractions = _unpack(packed[part].astype(np.int64), bits)[:, :3]
+        if (ends := bounds[i]) is None:
+            return fractions
+        rows = np.arange(part.start, part.stop) // CHUNK
+        return ends[0][rows] * (1 - fractions) + ends[1][rows] * fractions
+
+    def quats(part: slice) -> np.ndarray:
+        packed = rotation[part].astype(np.int64)
+        return from_smallest_three(packed >> 30, (_unpack(packed & (2**30 - 1), (10, 10, 10)) - 0.5) * SQRT2)
+
+    def harmonics(part: slice) -> np.ndarray:
+        first = ((values(2, color, (8, 8, 8, 8), part) - 0.5) / C0)[:, None]
+        return first if rest is None else np.concatenate([first, rest(part)], 1)
+
+    rest, k = (None, 1) if sh is None else _harmonics(path, sh, n)
     return {
-        "means": values[0],
-        "quats": from_smallest_three(rotation >> 30, others),
-        "log_scales": values[1],
-        "logit_opacities": logits(rgba[:, 3], 1 / 255),
-        "sh": np.concatenate(harmonics, 1),
+        "sh": by_rows(n, (k, 3), harmonics),
+        "means": by_rows(n, (3,), lambda p: values(0, position, _BITS, p)),
+        "quats": by_rows(n, (4,), quats),
+        "log_scales": by_rows(n, (3,), lambda p: values(1, scale, _BITS, p)),
+        "logit_opacities": by_rows(n, (), lambda p: logits(_unpack(color[p].astype(np.int64), (8, 8, 8, 8))[:, 3], 1 / 255)),
     }
 
 
-def _harmonics(path: Path, sh: np.ndarray, n: int) -> np.ndarray:
-    """Return the coefficients above degree 0 [N, K - 1, 3]."""
+def _bounds(path: Path, chunk: np.ndarray, group: tuple[str, ...]) -> list[np.ndarray] | None:
+    """Return the least and the largest numbers of each chunk, float64 [C, 3]; None for colours from 0 to 1, in older files."""
+    if group == _GROUPS[2] and "min_r" not in (chunk.dtype.names or ()):
+        return None
+    return [
+        np.stack([_column(path, chunk, f"{end}_{name}", "<f4") for name in group], 1).astype(np.float64)
+        for end in ("min", "max")
+    ]
+
+
+def _harmonics(path: Path, sh: np.ndarray, n: int) -> tuple[Callable[[slice], np.ndarray], int]:
+    """Return a function for the coefficients above degree 0 [P, K - 1, 3] of some rows, and K."""
     count = len(sh.dtype.names or ())
     if len(sh) != n or count // 3 + 1 not in SH_SIZES or count % 3:
         raise malformed(path, f"{len(sh)} rows of {count} harmonics for {n} Gaussians")
-    levels = np.stack([_column(path, sh, f"f_rest_{i}", "u1") for i in range(count)], 1).astype(np.float64)
-    fraction = np.where(levels == 0, 0, np.where(levels == 255, 1, (levels + 0.5) / 256))
-    return ((fraction - 0.5) * SH_RANGE).reshape(n, 3, count // 3).transpose(0, 2, 1)
+    columns = [_column(path, sh, f"f_rest_{i}", "u1") for i in range(count)]
+
+    def rows(part: slice) -> np.ndarray:
+        levels = np.empty((part.stop - part.start, count))
+        for i, column in enumerate(columns):
+            levels[:, i] = column[part]
+        fraction = np.where(levels == 0, 0, np.where(levels == 255, 1, (levels + 0.5) / 256))
+        return ((fraction - 0.5) * SH_RANGE).reshape(len(levels), 3, count // 3).transpose(0, 2, 1)
+
+    return rows, count // 3 + 1
 
 
 def _table(path: Path, data: bytes, element: Element, start: int) -> tuple[np.ndarray, int]:

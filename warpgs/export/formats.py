@@ -18,10 +18,8 @@ from warpgs.export import compressed_ply, gltf, sog, splat, spz
 from warpgs.export.arrays import Arrays, arrays_of, check_finite, gaussians_of, malformed
 from warpgs.export.ply import read_ply, write_ply
 from warpgs.files import write_bytes
+from warpgs.input_files import read_input, read_start, unread_reason
 from warpgs.scene import Gaussians, Normalization
-
-MAX_BYTES = 2**34
-"""Largest file that is read [bytes]: beyond, a decoder that holds it whole would not fit into memory either."""
 
 
 @dataclass(frozen=True)
@@ -140,15 +138,12 @@ def read_gaussians(
     decode = kind.decode
     try:
         if decode is None:
-            with path.open("rb") as file:
-                if not compressed_ply.is_compressed(path, file.read(compressed_ply.MAX_HEADER_BYTES)):
-                    return read_ply(path, normalization, units=units)
+            if not compressed_ply.is_compressed(path, read_start(path, compressed_ply.MAX_HEADER_BYTES)):
+                return read_ply(path, normalization, units=units)
             decode = compressed_ply.decode
-        if path.stat().st_size > MAX_BYTES:
-            raise malformed(path, f"it has more than {MAX_BYTES} bytes")
-        data = path.read_bytes()
+        data = read_input(path)
     except OSError as e:
-        raise DataError(f"{path}: cannot be read ({e.strerror or e}). Check the path and its permissions.") from e
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
     try:
         with np.errstate(all="ignore"):  # infinities and NaN of a broken file are named below, with their Gaussian
             arrays = decode(path, data)

@@ -10,16 +10,30 @@ import binascii
 import json
 import math
 import struct
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from warpgs.export.arrays import SH_SIZES, Arrays, half_turn, logits, malformed, sigmoid, unit_quats
+from warpgs.export.arrays import (
+    SH_SIZES,
+    Arrays,
+    by_rows,
+    half_turn,
+    half_turn_in_place,
+    logits,
+    malformed,
+    parts,
+    sigmoid,
+    unit_quats,
+)
 
 EXTENSION = "KHR_gaussian_splatting"
 COLOR_SPACE = "srgb_rec709_display"
 GLB, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
+MAX_PARTS = 100_000
+"""Most lists and objects in a document, each of which takes some thirty times as much memory as text."""
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _TINY = 1e-37
@@ -107,7 +121,7 @@ def decode(path: Path, data: bytes) -> Arrays:
     primitive = _primitive(path, document)
     names = primitive["attributes"]
 
-    def values(name: str) -> np.ndarray:
+    def values(name: str) -> _Table:
         if name not in names:
             raise malformed(path, f"the attribute {name} is missing")
         return _accessor(path, document, body, names[name])
@@ -116,34 +130,69 @@ def decode(path: Path, data: bytes) -> Arrays:
     if degrees != list(range(len(degrees))) or not degrees:
         raise malformed(path, f"it has harmonics of degrees {degrees}")
     orders = [(math.isqrt(k), k - math.isqrt(k) ** 2) for k in range(SH_SIZES[degrees[-1]])]
-    scales = values(f"{EXTENSION}:SCALE")
-    if (scales < 0).any():
-        raise malformed(path, "an axis has a negative length")
-    arrays = {
-        "means": values("POSITION"),
-        "quats": values(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]],
-        "log_scales": np.log(np.maximum(scales, _TINY)),
-        "logit_opacities": logits(values(f"{EXTENSION}:OPACITY")[:, 0], 2.0**-22),
-    }
+    means, turns, scales, opacities = (
+        values(name) for name in ("POSITION", *(f"{EXTENSION}:{n}" for n in ("ROTATION", "SCALE", "OPACITY")))
+    )
     harmonics = [values(f"{EXTENSION}:SH_DEGREE_{d}_COEF_{c}") for d, c in orders]
-    if len({len(v) for v in [*arrays.values(), *harmonics]}) != 1:
+    n = len(means)
+    if any(len(v) != n for v in (turns, scales, opacities, *harmonics)):
         raise malformed(path, "its attributes differ in length")
-    shapes = [arrays["means"].shape[1], arrays["log_scales"].shape[1], *(h.shape[1] for h in harmonics)]
-    if set(shapes) != {3}:
+    if {v.width for v in (means, scales, *harmonics)} != {3}:
         raise malformed(path, "a position, scale or harmonic does not have three components")
-    return half_turn(arrays | {"sh": np.stack(harmonics, 1)}, "z")
+
+    def logs(part: slice) -> np.ndarray:
+        lengths = scales.rows(part)
+        if (lengths < 0).any():
+            raise malformed(path, "an axis has a negative length")
+        return np.log(np.maximum(lengths, _TINY))
+
+    sh = np.empty((n, len(harmonics), 3), np.float32)
+    for k, table in enumerate(harmonics):
+        for part in parts(n):
+            sh[part, k] = table.rows(part)
+    arrays = {
+        "sh": sh,
+        "means": by_rows(n, (3,), means.rows),
+        "quats": by_rows(n, (4,), lambda p: turns.rows(p)[:, [3, 0, 1, 2]]),
+        "log_scales": by_rows(n, (3,), logs),
+        "logit_opacities": by_rows(n, (), lambda p: logits(opacities.rows(p)[:, 0], 2.0**-22)),
+    }
+    half_turn_in_place(arrays, "z")
+    return arrays
 
 
-def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
+@dataclass(frozen=True)
+class _Table:
+    """The numbers of an accessor, as they lie in the file."""
+
+    block: np.ndarray
+    """float32, or integers that stand for fractions [N, W]."""
+
+    def __len__(self) -> int:
+        return len(self.block)
+
+    @property
+    def width(self) -> int:
+        return int(self.block.shape[1])
+
+    def rows(self, part: slice) -> np.ndarray:
+        """Return some rows [P, W]: float32, or fractions in float64."""
+        block = self.block[part]
+        if block.dtype.kind == "f":
+            return block.astype(np.float32)
+        return np.maximum(block / float(np.iinfo(block.dtype).max), -1.0)
+
+
+def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | memoryview]:
     """Return the document and the binary chunk (empty where there is none) of a file."""
-    body = b""
+    body: bytes | memoryview = b""
     if data[:4] == b"glTF":
         if len(data) < 20:
             raise malformed(path, "its header is cut short")
         _, version, total, size, kind = struct.unpack_from("<IIIII", data)
         if version != 2 or kind != JSON_CHUNK or not 20 + size <= total <= len(data):
             raise malformed(path, f"its header announces {total} bytes, it has {len(data)}")
-        text, rest = data[20 : 20 + size], data[20 + size : total]
+        text, rest = data[20 : 20 + size], memoryview(data)[20 + size : total]
         if len(rest) >= 8:
             size, kind = struct.unpack_from("<II", rest)
             if kind != BINARY_CHUNK or size > len(rest) - 8:
@@ -151,6 +200,8 @@ def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
             body = rest[8 : 8 + size]
     else:
         text = data
+    if text.count(b"[") + text.count(b"{") > MAX_PARTS:
+        raise malformed(path, f"its JSON has more than {MAX_PARTS:,} lists and objects")
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as e:
@@ -196,8 +247,8 @@ def _primitive(path: Path, document: dict[str, Any]) -> dict[str, Any]:
     return found[0]
 
 
-def _accessor(path: Path, document: dict[str, Any], body: bytes, index: object) -> np.ndarray:
-    """Return the numbers of an accessor [count, width]: float32, or normalized integers as fractions in float64."""
+def _accessor(path: Path, document: dict[str, Any], body: bytes | memoryview, index: object) -> _Table:
+    """Return the numbers of an accessor, checked to lie in the file."""
 
     def item(table: str, at: object) -> dict[str, Any]:
         rows = document.get(table)
@@ -225,8 +276,5 @@ def _accessor(path: Path, document: dict[str, Any], body: bytes, index: object) 
     if stride < size or start + length > len(body) or (rows and offset + (rows - 1) * stride + size > length):
         raise malformed(path, f"accessor {index} reaches beyond its {length} bytes")
     if not rows:
-        return np.empty((0, width), np.float32)
-    block = np.ndarray((rows, width), dtype, body, start + offset, (stride, dtype.itemsize))
-    if kind == "<f4":
-        return block.astype(np.float32)
-    return np.maximum(block / float(np.iinfo(dtype).max), -1.0)
+        return _Table(np.empty((0, width), np.float32))
+    return _Table(np.ndarray((rows, width), dtype, body, start + offset, (stride, dtype.itemsize)))

@@ -6,18 +6,22 @@ first, the rest channel-major), opacity as a logit, log scales, rotation wxyz as
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import re
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from warpgs.coordinates import checked_normalization, convert_gaussians
 from warpgs.errors import DataError
-from warpgs.export.arrays import arrays_of, check_finite
+from warpgs.export.arrays import arrays_of, check_finite, parts
 from warpgs.export.ply_header import COMMENTS, MAX_HEADER_BYTES, Element, parse_header, ply_error
 from warpgs.files import writing
+from warpgs.input_files import open_input, unread_reason
 from warpgs.scene import Gaussians, Normalization
 
 CHUNK_ROWS = 65536
@@ -96,7 +100,7 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
     path = Path(path)
     normalization = checked_normalization(normalization, units, str(path))
     try:
-        with open(path, "rb") as file:
+        with open_input(path) as file:
             size = os.fstat(file.fileno()).st_size
             elements, start = parse_header(path, file.read(MAX_HEADER_BYTES))
             vertex, start = _locate_vertices(path, elements, start)
@@ -109,12 +113,17 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
                     f"cut short: {vertex.count} Gaussians of {dtype.itemsize} bytes need {end} bytes, it has {size}",
                 )
             file.seek(start)
-            rows = np.fromfile(file, dtype=dtype, count=vertex.count)
+
+            def rows(part: slice) -> np.ndarray:
+                found = np.fromfile(file, dtype=dtype, count=part.stop - part.start)
+                if len(found) != part.stop - part.start:
+                    raise ply_error(path, f"cut short: {vertex.count} Gaussians announced, {part.start + len(found)} read")
+                return found
+
+            gaussians = _assemble(path, rows, vertex.count, rest)
     except OSError as e:
-        raise DataError(f"{path}: cannot be read ({e.strerror or e}). Check the path and its permissions.") from e
-    if len(rows) != vertex.count:
-        raise ply_error(path, f"cut short: {vertex.count} Gaussians announced, {len(rows)} read")
-    return convert_gaussians(_assemble(path, rows, rest), normalization, "file", units)
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
+    return convert_gaussians(gaussians, normalization, "file", units)
 
 
 def _names(rest: int) -> list[str]:
@@ -157,7 +166,7 @@ def _check_properties(path: Path, vertex: Element) -> int:
     """Return the number of coefficients above degree 0; DataError where the layout is incomplete."""
     names = [name for name, _ in vertex.properties]
     if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
+        twice = Counter(names).most_common(1)[0][0]
         raise ply_error(path, f"property {twice[:40]!r} appears twice")
     rest = sum(bool(re.fullmatch(r"f_rest_[0-9]+", name)) for name in names)
     if rest not in _REST_COUNTS:
@@ -171,36 +180,43 @@ def _check_properties(path: Path, vertex: Element) -> int:
     return rest
 
 
-def _assemble(path: Path, rows: np.ndarray, rest: int) -> Gaussians:
-    """Return the Gaussians of structured rows, shape [N]; DataError where a value cannot be used."""
+def _assemble(path: Path, read: Callable[[slice], np.ndarray], n: int, rest: int) -> Gaussians:
+    """Return N Gaussians of structured rows, which are read in their order; DataError where a value cannot be used."""
     import torch
 
-    def columns(names: list[str] | tuple[str, ...], least: float = -np.inf, most: float = np.inf) -> np.ndarray:
-        out = np.empty((len(rows), len(names)), np.float32)
-        # A double beyond float32 becomes an infinity, and the check below names it.
-        with np.errstate(over="ignore", invalid="ignore"):
-            for i, name in enumerate(names):
-                out[:, i] = rows[name]
-        out[out == -np.inf], out[out == np.inf] = least, most
-        bad = ~np.isfinite(out)
-        if bad.any():
-            row, column = np.argwhere(bad)[0]
-            raise ply_error(path, f"{names[column]} of Gaussian {row} is not finite in float32")
-        return out
+    k = rest // 3
+    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh": (1 + k, 3)}
+    arrays = {name: np.empty((n, *shape), np.float32) for name, shape in shapes.items()}
+    for part in parts(n):
+        rows = read(part)
 
-    sh = np.empty((len(rows), 1 + rest // 3, 3), np.float32)
-    sh[:, 0, :] = columns(_DC)
-    if rest:
-        sh[:, 1:, :] = columns([f"f_rest_{i}" for i in range(rest)]).reshape(len(rows), 3, rest // 3).transpose(0, 2, 1)
-    quats = columns(_ROTATION)
-    zero = ~quats.any(axis=1)
-    if zero.any():
-        raise ply_error(path, f"the rotation of Gaussian {int(np.argmax(zero))} has zero length")
+        columns = functools.partial(_columns, path, rows, part.start)
+        arrays["sh"][part, 0] = columns(_DC)
+        if rest:
+            above = columns([f"f_rest_{i}" for i in range(rest)])
+            arrays["sh"][part, 1:] = above.reshape(len(rows), 3, k).transpose(0, 2, 1)
+        quats = arrays["quats"][part] = columns(_ROTATION)
+        zero = ~quats.any(axis=1)
+        if zero.any():
+            raise ply_error(path, f"the rotation of Gaussian {part.start + int(np.argmax(zero))} has zero length")
+        arrays["means"][part] = columns(_POSITION)
+        arrays["log_scales"][part] = columns(_SCALE, least=FLAT)
+        arrays["logit_opacities"][part] = columns(["opacity"], -OPAQUE, OPAQUE)[:, 0]
+    return Gaussians(**{name: torch.from_numpy(array) for name, array in arrays.items()})
 
-    return Gaussians(
-        means=torch.from_numpy(columns(_POSITION)),
-        quats=torch.from_numpy(quats),
-        log_scales=torch.from_numpy(columns(_SCALE, least=FLAT)),
-        logit_opacities=torch.from_numpy(columns(["opacity"], -OPAQUE, OPAQUE)[:, 0]),
-        sh=torch.from_numpy(sh),
-    )
+
+def _columns(
+    path: Path, rows: np.ndarray, first: int, names: list[str] | tuple[str, ...], least: float = -np.inf, most: float = np.inf
+) -> np.ndarray:
+    """Return columns of structured rows from the row ``first`` on, float32 [N, C]; infinities become ``least`` and ``most``."""
+    out = np.empty((len(rows), len(names)), np.float32)
+    # A double beyond float32 becomes an infinity, and the check below names it.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for i, name in enumerate(names):
+            out[:, i] = rows[name]
+    out[out == -np.inf], out[out == np.inf] = least, most
+    bad = ~np.isfinite(out)
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise ply_error(path, f"{names[column]} of Gaussian {first + row} is not finite in float32")
+    return out

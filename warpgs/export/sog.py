@@ -10,8 +10,9 @@ from __future__ import annotations
 import io
 import json
 import math
-import warnings
+import struct
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,11 @@ from warpgs.export.arrays import (
     SH_SIZES,
     SQRT2,
     Arrays,
+    by_rows,
     from_smallest_three,
     logits,
     malformed,
+    parts,
     rounded,
     sigmoid,
     smallest_three,
@@ -162,27 +165,59 @@ def decode(path: Path, data: bytes) -> Arrays:
             name = meta[part]["files"][i]
             return _pixels(path, str(name), _member(path, archive, name, len(data)), n)
 
-        levels = pixels("means", 0)[:n, :3].astype(np.int64) | pixels("means", 1)[:n, :3].astype(np.int64) << 8
-        quats, scales, colors = (pixels(part, 0)[:n] for part in ("quats", "scales", "sh0"))
-        harmonics = [_book(path, meta["sh0"])[colors[:, :3]][:, None]]
-        if meta.get("shN") is not None:
-            labels = pixels("shN", 1)[:n].astype(np.int64)
-            name = meta["shN"]["files"][0]
-            rows = _palette_rows(path, meta["shN"], _member(path, archive, name, len(data)))
-            harmonics.append(rows[_within(path, labels[:, 0] | labels[:, 1] << 8, len(rows))])
-    low, high = (np.array(meta["means"][key], np.float64).reshape(3) for key in ("mins", "maxs"))
-    logs = low + np.where(high != low, high - low, 1) * levels / 65535
-    if (quats[:, 3] < 252).any():
-        raise malformed(path, f"the rotation of Gaussian {int(np.argmax(quats[:, 3] < 252))} has no largest component")
-    with np.errstate(over="ignore"):  # an infinity is named with its Gaussian afterwards
-        means = np.sign(logs) * np.expm1(np.abs(logs))
-    return {
-        "means": means,
-        "quats": from_smallest_three(quats[:, 3].astype(np.int64) - 252, (quats[:, :3] / 255 - 0.5) * SQRT2),
-        "log_scales": _book(path, meta["scales"])[scales[:, :3]],
-        "logit_opacities": logits(colors[:, 3] / 255, 1 / 255),
-        "sh": np.concatenate(harmonics, 1),
-    }
+        # one attribute after another, the largest first, so that little lies in memory beside the result
+        sh = _harmonics(path, meta, n, pixels, lambda name: _member(path, archive, name, len(data)))
+        opacities = _colors(_book(path, meta["sh0"]), pixels("sh0", 0), sh)
+        quats = _quats(path, pixels("quats", 0), n)
+        means = _means(meta["means"], pixels("means", 0), pixels("means", 1), n)
+        scales, book = pixels("scales", 0), _book(path, meta["scales"])
+        log_scales = by_rows(n, (3,), lambda p: book[scales[p, :3]])
+    return {"means": means, "quats": quats, "log_scales": log_scales, "logit_opacities": opacities, "sh": sh}
+
+
+def _harmonics(
+    path: Path, meta: dict[str, Any], n: int, pixels: Callable[[str, int], np.ndarray], member: Callable[[object], bytes]
+) -> np.ndarray:
+    """Return the coefficients [N, K, 3], all but the first of which come from the palette; that one is not set yet."""
+    if meta.get("shN") is None:
+        return np.empty((n, 1, 3), np.float32)
+    rows = _palette_rows(path, meta["shN"], member(meta["shN"]["files"][0]))
+    labels = pixels("shN", 1)
+    sh = np.empty((n, 1 + rows.shape[1], 3), np.float32)
+    for part in parts(n):
+        label = labels[part, 0].astype(np.int64) | labels[part, 1].astype(np.int64) << 8
+        sh[part, 1:] = rows[_within(path, label, len(rows), part.start)]
+    return sh
+
+
+def _colors(book: np.ndarray, pixels: np.ndarray, sh: np.ndarray) -> np.ndarray:
+    """Set the first of the coefficients [N, K, 3] by their pixels [P, 4]; returns the logits of the opacities [N]."""
+    for part in parts(len(sh)):
+        sh[part, 0] = book[pixels[part, :3]]
+    return by_rows(len(sh), (), lambda p: logits(pixels[p, 3] / 255, 1 / 255))
+
+
+def _means(part: dict[str, Any], lower: np.ndarray, upper: np.ndarray, n: int) -> np.ndarray:
+    """Return the means [N, 3] of the lower and the upper bytes of their levels [P, 4]."""
+    low, high = (np.array(part[key], np.float64).reshape(3) for key in ("mins", "maxs"))
+
+    def rows(p: slice) -> np.ndarray:
+        levels = lower[p, :3].astype(np.int64) | upper[p, :3].astype(np.int64) << 8
+        logs = low + np.where(high != low, high - low, 1) * levels / 65535
+        with np.errstate(over="ignore"):  # an infinity is named with its Gaussian afterwards
+            return np.sign(logs) * np.expm1(np.abs(logs))
+
+    return by_rows(n, (3,), rows)
+
+
+def _quats(path: Path, pixels: np.ndarray, n: int) -> np.ndarray:
+    """Return the rotations [N, 4] of their pixels [P, 4]."""
+    largest = pixels[:n, 3]
+    if (largest < 252).any():
+        raise malformed(path, f"the rotation of Gaussian {int(np.argmax(largest < 252))} has no largest component")
+    return by_rows(
+        n, (4,), lambda p: from_smallest_three(largest[p].astype(np.int64) - 252, (pixels[p, :3] / 255 - 0.5) * SQRT2)
+    )
 
 
 def _member(path: Path, archive: zipfile.ZipFile, name: object, most: int) -> bytes:
@@ -200,17 +235,36 @@ def _member(path: Path, archive: zipfile.ZipFile, name: object, most: int) -> by
 
 def _pixels(path: Path, name: str, content: bytes, n: int) -> np.ndarray:
     """Return the RGBA pixels [P, 4] of an image of at least ``n``, whose size is checked before it is decoded."""
-    from PIL import Image
+    import cv2
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the bound below is tighter
-        try:
-            image = Image.open(io.BytesIO(content), formats=["WEBP"])
-            if not n <= image.width * image.height <= MAX_PIXELS * n + SMALL:
-                raise malformed(path, f"{name[:40]!r} has {image.width} x {image.height} pixels for {n} values")
-            return np.asarray(image.convert("RGBA")).reshape(-1, 4)
-        except (OSError, Image.DecompressionBombError, SyntaxError) as e:
-            raise malformed(path, f"{name[:40]!r} is no WebP image that can be read") from e
+    width, height = _webp_size(content)
+    if not width * height:
+        raise malformed(path, f"{name[:40]!r} is no lossless WebP image")
+    if not n <= width * height <= MAX_PIXELS * n + SMALL:
+        raise malformed(path, f"{name[:40]!r} has {width} x {height} pixels for {n} values")
+    try:
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as e:
+        raise malformed(path, f"{name[:40]!r} is no WebP image that can be read") from e
+    if image is None or image.shape[:2] != (height, width) or image.dtype != np.uint8 or image.ndim != 3:
+        raise malformed(path, f"{name[:40]!r} is no WebP image that can be read")
+    if image.shape[2] == 4:
+        return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA, image).reshape(-1, 4)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGBA).reshape(-1, 4)
+
+
+def _webp_size(data: bytes) -> tuple[int, int]:
+    """Return width and height [px] of a lossless WebP image that is no animation; zeros for any other file."""
+    at = 12 if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else len(data)
+    while at + 13 <= len(data):
+        kind, length = struct.unpack_from("<4sI", data, at)
+        if kind == b"VP8L":
+            bits = int.from_bytes(data[at + 9 : at + 13], "little")
+            return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+        if kind in (b"VP8 ", b"ANIM", b"ANMF") or (kind == b"VP8X" and data[at + 8] & 2):
+            break
+        at += 8 + length + length % 2
+    return 0, 0
 
 
 def _book(path: Path, part: dict[str, Any]) -> np.ndarray:
@@ -230,11 +284,12 @@ def _palette_rows(path: Path, part: dict[str, Any], content: bytes) -> np.ndarra
     pixels = _pixels(path, "harmonics", content, count * k)
     if len(pixels) % (COLUMNS * k):
         raise malformed(path, "its image of harmonics has another width")
-    return _book(path, part)[pixels[: count * k, :3].reshape(count, k, 3)]
+    return _book(path, part).astype(np.float32)[pixels[: count * k, :3].reshape(count, k, 3)]
 
 
-def _within(path: Path, labels: np.ndarray, count: int) -> np.ndarray:
-    """Return labels that all lie below ``count``; DataError where one does not."""
+def _within(path: Path, labels: np.ndarray, count: int, first: int) -> np.ndarray:
+    """Return labels of Gaussians from ``first`` on that all lie below ``count``; DataError where one does not."""
     if (labels >= count).any():
-        raise malformed(path, f"Gaussian {int(np.argmax(labels >= count))} points beyond its {count} rows of harmonics")
+        row = first + int(np.argmax(labels >= count))
+        raise malformed(path, f"Gaussian {row} points beyond its {count} rows of harmonics")
     return labels

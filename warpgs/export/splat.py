@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgs.export.arrays import C0, Arrays, logits, malformed, rounded, sigmoid, unit_quats
+from warpgs.export.arrays import C0, Arrays, by_rows, logits, malformed, parts, rounded, sigmoid, unit_quats
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 _TINY = 1e-37
@@ -31,19 +31,22 @@ def decode(path: Path, data: bytes) -> Arrays:
     """Return the Gaussians of a file's bytes.
 
     Raises:
-        DataError: The size is no multiple of 32 bytes, or an axis length is negative.
+        DataError: The file is empty, its size is no multiple of 32 bytes, or an axis length is negative.
     """
+    if not data:
+        raise malformed(path, "it is empty")
     if len(data) % _ROW.itemsize:
         raise malformed(path, f"its {len(data)} bytes are no multiple of {_ROW.itemsize}")
     rows = np.frombuffer(data, _ROW)
-    scales = rows["scale"].astype(np.float64)
-    if (scales < 0).any():
-        raise malformed(path, f"an axis of Gaussian {int(np.argwhere(scales < 0)[0][0])} has a negative length")
-    colors = rows["rgba"][:, :3].astype(np.float64) / 255
+    n = len(rows)
+    for part in parts(n):
+        if (rows["scale"][part] < 0).any():
+            row = part.start + int(np.argwhere(rows["scale"][part] < 0)[0][0])
+            raise malformed(path, f"an axis of Gaussian {row} has a negative length")
     return {
-        "means": rows["mean"],
-        "quats": (rows["quat"].astype(np.float64) - 128) / 128,
-        "log_scales": np.log(np.maximum(scales, _TINY)),
-        "logit_opacities": logits(rows["rgba"][:, 3] / 255, 1 / 255),
-        "sh": ((colors - 0.5) / C0)[:, None, :],
+        "means": by_rows(n, (3,), lambda p: rows["mean"][p]),
+        "quats": by_rows(n, (4,), lambda p: (rows["quat"][p].astype(np.float64) - 128) / 128),
+        "log_scales": by_rows(n, (3,), lambda p: np.log(np.maximum(rows["scale"][p].astype(np.float64), _TINY))),
+        "logit_opacities": by_rows(n, (), lambda p: logits(rows["rgba"][p, 3] / 255, 1 / 255)),
+        "sh": by_rows(n, (1, 3), lambda p: (rows["rgba"][p, None, :3].astype(np.float64) / 255 - 0.5) / C0),
     }

@@ -6,12 +6,15 @@ are RUB (x right, y up, z back), a half turn about x from those of PLY.
 
 from __future__ import annotations
 
+import functools
 import gzip
+import io
 import math
 import struct
 import zlib
-from itertools import pairwise
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -20,16 +23,21 @@ from warpgs.export.arrays import (
     SH_SIZES,
     SQRT2,
     Arrays,
+    by_rows,
     from_smallest_three,
     half_turn,
+    half_turn_in_place,
     logits,
     malformed,
+    parts,
     rounded,
     sigmoid,
     smallest_three,
     unit_quats,
 )
 
+Section = Callable[[int], bytes]
+"""Function that returns the next bytes of a section, exactly as many as are asked for."""
 VERSION = 3
 """Version that is written where none is asked for: programs of any age read gzip."""
 VERSIONS = (2, 3, 4)
@@ -38,7 +46,7 @@ MAGIC = 0x5053474E
 HEADER, HEADER_4 = struct.Struct("<IIIBBBB"), struct.Struct("<IIIBBBBI12x")
 COLOR = 0.15 * 255
 MAX_FRACTIONAL_BITS = 24
-MAX_WINDOW = 2**27
+MAX_WINDOW = 2**26
 """Most memory that a zstd stream may ask for [bytes]."""
 MAX_RATIO, SMALL = 32, 65536
 """Most bytes that a byte of a file may unpack to, and bytes that any file may: real ones have 2 or 3, a bomb has 1000."""
@@ -121,25 +129,52 @@ def decode(path: Path, data: bytes) -> Arrays:
         UsageError: It is of version 4, and zstandard is not installed.
     """
     if data[:2] == b"\x1f\x8b":
-        stream = zlib.decompressobj(31)
-        head = stream.decompress(data, HEADER.size)
+        stream = gzip.GzipFile(fileobj=io.BytesIO(data))
+        head = _inflated(path, stream, HEADER.size)
         if len(head) < HEADER.size:
             raise malformed(path, "its header is cut short")
         magic, version, n, degree, bits, flags, _ = HEADER.unpack(head)
         sizes = _checked(path, len(data), (magic, version, n, degree, bits, flags), (2, 3))
-        body = stream.decompress(stream.unconsumed_tail, sum(sizes) + 1)
-        if len(body) != sum(sizes) or not stream.eof:  # at its end zlib has compared the checksum
-            what = "more" if len(body) > sum(sizes) else "fewer, or its end is cut off"
-            raise malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, it has {what}")
-        ends = np.cumsum([0, *sizes]).tolist()
-        sections = [body[i:j] for i, j in pairwise(ends)]
+        sections = _parts_of_gzip(path, stream, n, sizes)
     else:
         if len(data) < HEADER_4.size:
             raise malformed(path, "its header is cut short")
         magic, version, n, degree, bits, flags, count, place = HEADER_4.unpack_from(data)
         sizes = _checked(path, len(data), (magic, version, n, degree, bits, flags), (4,))
         sections = _streams(path, data, sizes, count, place)
-    return half_turn(_unpack(sections, n, degree, bits, version), "x")
+    arrays = _unpack(sections, n, degree, bits, version)
+    next(sections, None)  # checks the end of the last one
+    half_turn_in_place(arrays, "x")
+    return arrays
+
+
+def _inflated(path: Path, stream: gzip.GzipFile, size: int) -> bytes:
+    """Return the next bytes of a gzip stream, fewer where it is cut off."""
+    try:
+        return stream.read(size)
+    except EOFError:
+        return b""
+    except (OSError, zlib.error) as e:  # a wrong checksum is an OSError here
+        raise malformed(path, f"its compressed content is damaged ({str(e)[:80]})") from e
+
+
+def _parts_of_gzip(path: Path, stream: gzip.GzipFile, n: int, sizes: list[int]) -> Iterator[Section]:
+    """Yield the sections of a file of version 2 or 3, each to be read to its end before the next."""
+
+    def read(size: int) -> bytes:
+        data = _inflated(path, stream, size)
+        if len(data) != size:
+            raise malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, it has fewer, or its end is cut off")
+        return data
+
+    for _ in sizes:
+        yield read
+    try:
+        more = stream.read(1)  # at its end the checksum has been compared
+    except (EOFError, OSError, zlib.error) as e:
+        raise malformed(path, f"its compressed content is damaged ({str(e)[:80]}), or its end is cut off") from e
+    if more:
+        raise malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, it has more")
 
 
 def _checked(path: Path, size: int, header: tuple[int, ...], versions: tuple[int, ...]) -> list[int]:
@@ -161,53 +196,79 @@ def _checked(path: Path, size: int, header: tuple[int, ...], versions: tuple[int
     return sizes
 
 
-def _streams(path: Path, data: bytes, sizes: list[int], count: int, place: int) -> list[bytes]:
-    """Return the sections of a version-4 file; an empty section has no stream."""
+def _streams(path: Path, data: bytes, sizes: list[int], count: int, place: int) -> Iterator[Section]:
+    """Yield the sections of a version-4 file, each to be read to its end before the next; an empty section has no stream."""
     wanted = [s for s in sizes if s]
     if count != len(wanted) or place < HEADER_4.size or place + 16 * count > len(data):
         raise malformed(path, f"its table of {count} streams at byte {place} makes no sense")
-    zstandard = _zstandard()
-    decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
-    out, start = [], place + 16 * count
-    for i, size in enumerate(wanted):
+    decompressor = _zstandard().ZstdDecompressor(max_window_size=MAX_WINDOW)
+    view, i, start = memoryview(data), 0, place + 16 * count
+    for size in sizes:
+        if not size:
+            yield bytes
+            continue
         packed, plain = struct.unpack_from("<QQ", data, place + 16 * i)
         if plain != size or start + packed > len(data):
             raise malformed(path, f"stream {i} announces {packed} bytes that become {plain}, not {size}")
-        try:
-            with decompressor.stream_reader(data[start : start + packed]) as reader:
-                section = reader.read(size + 1)  # never more than was announced, whatever the frame says
-        except zstandard.ZstdError as e:
-            raise malformed(path, f"stream {i} is no zstd stream") from e
-        if len(section) != size:
-            raise malformed(path, f"stream {i} does not hold its {size} bytes")
-        out.append(section)
-        start += packed
-    rest = iter(out)
-    return [next(rest) if s else b"" for s in sizes]
+        with decompressor.stream_reader(view[start : start + packed]) as reader:
+            yield functools.partial(_decompressed, path, reader, i, size)
+            if _decompressed(path, reader, i, size, 1, end=True):
+                raise malformed(path, f"stream {i} does not hold its {size} bytes")
+        i, start = i + 1, start + packed
 
 
-def _unpack(sections: list[bytes], n: int, degree: int, bits: int, version: int) -> Arrays:
+def _decompressed(path: Path, reader: BinaryIO, i: int, whole: int, size: int, *, end: bool = False) -> bytes:
+    """Return the next ``size`` bytes of the i-th stream, whose content has ``whole`` of them; at its end maybe fewer."""
+    try:
+        data = reader.read(size)
+    except _zstandard().ZstdError as e:
+        raise malformed(path, f"stream {i} is no zstd stream, or asks for more than {MAX_WINDOW >> 20} MiB") from e
+    if len(data) != size and not end:
+        raise malformed(path, f"stream {i} does not hold its {whole} bytes")
+    return data
+
+
+def _unpack(sections: Iterator[Section], n: int, degree: int, bits: int, version: int) -> Arrays:
     """Return the Gaussians of the sections, in RUB axes."""
-    positions, alphas, colors, scales, rotations, rest = (np.frombuffer(s, "u1") for s in sections)
-    fixed = np.zeros((n, 3, 4), "u1")
-    fixed[:, :, 1:] = positions.reshape(n, 3, 3)  # in the upper bytes, whose shift down keeps the sign
-    if version == 2:
-        xyz = rotations.reshape(n, 3) / 127.5 - 1
-        xyzw = np.concatenate([xyz, np.sqrt(np.clip(1 - (xyz * xyz).sum(1, keepdims=True), 0, None))], 1)
-    else:
-        packed = rotations.view("<u4").astype(np.int64)
-        parts = np.stack([(packed >> s) & 1023 for s in (20, 10, 0)], 1)
-        xyzw = from_smallest_three(packed >> 30, np.where(parts & 512, -1, 1) * (parts & 511) / (511 * SQRT2))
-    sh = np.empty((n, SH_SIZES[degree], 3))
-    sh[:, 0] = (colors.reshape(n, 3) - 127.5) / COLOR
-    sh[:, 1:] = (rest.reshape(n, -1, 3).astype(np.float64) - 128) / 128
-    return {
-        "means": (fixed.reshape(n, 12).view("<i4") >> 8) / 2.0**bits,
-        "quats": xyzw[:, [3, 0, 1, 2]],
-        "log_scales": scales.reshape(n, 3) / 16 - 10,
-        "logit_opacities": logits(alphas / 255, 1 / 255),
-        "sh": sh,
-    }
+
+    def take(width: int, shape: tuple[int, ...], make: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        read = next(sections)
+        return by_rows(n, shape, lambda p: make(np.frombuffer(read((p.stop - p.start) * width), "u1").reshape(-1, width)))
+
+    means = take(9, (3,), lambda data: _fixed(data) / 2.0**bits)
+    opacities = take(1, (), lambda data: logits(data[:, 0] / 255, 1 / 255))
+    k = SH_SIZES[degree] - 1
+    read, sh = next(sections), np.empty((n, k + 1, 3), np.float32)
+    for p in parts(n):
+        sh[p, 0] = (np.frombuffer(read((p.stop - p.start) * 3), "u1").reshape(-1, 3) - 127.5) / COLOR
+    scales = take(3, (3,), lambda data: data / 16 - 10)
+    quats = take(3, (4,), _quats_2) if version == 2 else take(4, (4,), _quats)
+    read = next(sections)
+    for p in parts(n):
+        rest = np.frombuffer(read((p.stop - p.start) * 3 * k), "u1").reshape(p.stop - p.start, k, 3)
+        sh[p, 1:] = (rest.astype(np.float64) - 128) / 128
+    return {"means": means, "quats": quats, "log_scales": scales, "logit_opacities": opacities, "sh": sh}
+
+
+def _fixed(data: np.ndarray) -> np.ndarray:
+    """Return coordinates of 24 bits [P, 9], signed, as whole numbers [P, 3]."""
+    fixed = np.zeros((len(data), 3, 4), "u1")
+    fixed[:, :, 1:] = data.reshape(-1, 3, 3)  # in the upper bytes, whose shift down keeps the sign
+    return fixed.reshape(-1, 12).view("<i4") >> 8
+
+
+def _quats_2(data: np.ndarray) -> np.ndarray:
+    """Return rotations of version 2 [P, 3] as wxyz [P, 4]."""
+    xyz = data / 127.5 - 1
+    return np.concatenate([np.sqrt(np.clip(1 - (xyz * xyz).sum(1, keepdims=True), 0, None)), xyz], 1)
+
+
+def _quats(data: np.ndarray) -> np.ndarray:
+    """Return rotations of versions 3 and 4 [P, 4] as wxyz [P, 4]."""
+    packed = np.ascontiguousarray(data).view("<u4")[:, 0].astype(np.int64)
+    components = np.stack([(packed >> s) & 1023 for s in (20, 10, 0)], 1)
+    fractions = np.where(components & 512, -1, 1) * (components & 511) / (511 * SQRT2)
+    return from_smallest_three(packed >> 30, fractions)[:, [3, 0, 1, 2]]
 
 
 def _zstandard():

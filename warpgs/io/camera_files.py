@@ -14,6 +14,7 @@ from warpgs.io import colmap, transforms
 from warpgs.io.images import Lens
 from warpgs.io.poses import from_camera_to_world, quat_rotation, rigid
 from warpgs.scene import Camera
+from warpgs.schema import check_parts
 
 MAX_BYTES = 2**25
 """Largest file of cameras that is read [bytes]."""
@@ -45,7 +46,9 @@ def read_cameras(path: Path) -> tuple[dict[str, Camera], list[str]]:
 def _json(path: Path) -> Any:
     """Return the values of a JSON file of bounded size."""
     try:
-        return json.loads(read_input(path, MAX_BYTES).decode("utf-8-sig"))
+        text = read_input(path, MAX_BYTES).decode("utf-8-sig")
+        check_parts(text)
+        return json.loads(text)
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path, or write it again") from e
     except (ValueError, RecursionError) as e:
@@ -54,7 +57,7 @@ def _json(path: Path) -> Any:
 
 def _inria(path: Path, rows: list[Any]) -> dict[str, tuple[np.ndarray, Lens]]:
     """Return pose and lens of each row; its rotation is camera to world, in OpenCV axes, and its position the centre."""
-    found = {}
+    found = _Names()
     for i, row in enumerate(rows):
         where = f"{path}, camera {i}"
         try:
@@ -67,14 +70,14 @@ def _inria(path: Path, rows: list[Any]) -> dict[str, tuple[np.ndarray, Lens]]:
             name = str(row.get("img_name", i))
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as e:
             raise DataError(f"{where}: needs rotation, position, width, height, fx and fy as numbers. Write it again") from e
-        found[_free(found, name)] = (from_camera_to_world(pose, where, opengl=False), lens.checked(where))
+        found.add(name, from_camera_to_world(pose, where, opengl=False), lens.checked(where))
     return found
 
 
 def _transforms(path: Path) -> dict[str, tuple[np.ndarray, Lens]]:
     """Return pose and lens of each frame, whose image size the file must give."""
     shared = transforms.read_json(path)
-    found = {}
+    found = _Names()
     for i, frame in enumerate(shared["frames"]):
         where = f"{path}, frame {i}"
         if not isinstance(frame, dict):
@@ -83,7 +86,7 @@ def _transforms(path: Path) -> dict[str, tuple[np.ndarray, Lens]]:
             raise DataError(f"{where}: gives no w and h, so its size is unknown. Add them, or give the scene's folder")
         lens = transforms.lens_of(frame, shared, 0, 0, where)
         viewmat = from_camera_to_world(transforms.matrix_of(frame, where), where, opengl=True)
-        found[_free(found, str(frame.get("file_path", i)))] = (viewmat, lens)
+        found.add(str(frame.get("file_path", i)), viewmat, lens)
     return found
 
 
@@ -100,7 +103,7 @@ def _colmap(folder: Path) -> dict[str, tuple[np.ndarray, Lens]]:
     if model is None or kind is None:
         raise DataError(f"{folder}: holds no cameras and images file of COLMAP. Give cameras.json, transforms.json or a scene")
     lenses = colmap.read_cameras(model / f"cameras.{kind}")
-    found = {}
+    found = _Names()
     for pose in sorted(colmap.read_poses(model / f"images.{kind}").values(), key=lambda p: p.name):
         where = f"{model}, image {pose.name!r}"
         if pose.camera_id not in lenses:
@@ -108,13 +111,20 @@ def _colmap(folder: Path) -> dict[str, tuple[np.ndarray, Lens]]:
         viewmat = np.eye(4)
         viewmat[:3, :3] = quat_rotation(pose.quat, where)
         viewmat[:3, 3] = pose.translation
-        found[_free(found, pose.name)] = (rigid(viewmat, where), lenses[pose.camera_id])
+        found.add(pose.name, rigid(viewmat, where), lenses[pose.camera_id])
     return found
 
 
-def _free(taken: dict[str, Any], name: str) -> str:
-    """Return a name that is not taken: the name, or the name with a number."""
-    number, free = 2, name
-    while free in taken:
-        free, number = f"{name}-{number}", number + 1
-    return free
+class _Names(dict[str, tuple[np.ndarray, Lens]]):
+    """Pose and lens by a name that is unique: of equal names all but the first get a number."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._next: dict[str, int] = {}
+
+    def add(self, name: str, viewmat: np.ndarray, lens: Lens) -> None:
+        free, number = name, self._next.get(name, 2)
+        while free in self:  # each number of a name is tried once
+            free, number = f"{name}-{number}", number + 1
+        self._next[name] = number
+        self[free] = viewmat, lens

@@ -105,15 +105,19 @@ class _BinaryFile:
             )
 
 
-def _lines(path: Path) -> list[tuple[int, str]]:
-    """Return the numbered lines of a text file; only line feeds end a line, since names may hold other separators."""
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield the numbered lines of a text file; only line feeds end a line, since names may hold other separators."""
     try:
         text = read_input(path).decode("utf-8-sig")
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); fix its permissions or copy it again") from e
     except UnicodeDecodeError as e:
         raise DataError(f"{path}: is not UTF-8 text ({e.reason} at byte {e.start}); write it again") from e
-    return list(enumerate(text.replace("\r\n", "\n").split("\n"), 1))
+    at, number = 0, 1
+    while (end := text.find("\n", at)) >= 0:  # one at a time: a list takes a hundred bytes for each empty line
+        yield number, text[at:end].removesuffix("\r")
+        at, number = end + 1, number + 1
+    yield number, text[at:]
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -209,7 +213,7 @@ def read_poses(path: Path) -> dict[int, Pose]:
             _store(poses, number, pose, str(path))
         r.end()
         return poses
-    lines = iter(_lines(path))
+    lines = _lines(path)
     for line, text in lines:
         if not text.strip() or text.lstrip().startswith("#"):
             continue
@@ -371,9 +375,9 @@ def _read_views(scene: SceneFolder, model: Path, kind: str, poses: dict[int, Pos
         viewmat = np.eye(4)
         viewmat[:3, :3] = quat_rotation(pose.quat, where)
         viewmat[:3, 3] = pose.translation
-        path = paths[pose.name]
+        path, view = paths[pose.name], views.claim(view_name(pose.name), where)
         loaded = scene.image(path, lenses[pose.camera_id], downscale=factor, mask=scene.find_mask(path, images))
-        views.add(view_name(pose.name), rigid(viewmat, where), loaded)
+        views.add(view, rigid(viewmat, where), loaded)
     unposed = len(set(list_images(images)) - set(paths.values()))
     if unposed:
         notes.append(f"{unposed} images of {images.name} have no pose in the reconstruction and are left out")

@@ -228,6 +228,18 @@ class ViewList:
         self.views: list[View] = []
         self._done: Counter[str] = Counter()
         self._kept: dict[str, float] = {}
+        self._names: set[str] = set()
+
+    def claim(self, name: str, where: str) -> str:
+        """Return the name of a view that is about to be read: its image need not be decoded to know that it is there twice.
+
+        Raises:
+            DataError: A view has this name already.
+        """
+        if name in self._names:
+            raise DataError(f"{where}: the image {name!r} is listed twice; remove one of its cameras")
+        self._names.add(name)
+        return name
 
     def add(self, name: str, viewmat: np.ndarray, loaded: LoadedImage) -> None:
         """Append a view of an image at its final size; ``viewmat`` is camera_from_world [4, 4] in file units, rigid."""

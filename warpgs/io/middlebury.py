@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
 
 from warpgs.errors import DataError
+from warpgs.input_files import read_input, unread_reason
 from warpgs.io.folders import SceneFolder, ViewList, resampling_note, view_name
 from warpgs.io.images import Lens
 from warpgs.io.poses import rigid
 from warpgs.io.readers import Probe, Reader, ReadOptions, register
 from warpgs.scene import Scene
+
+MAX_BYTES = 2**25
+"""Largest file of parameters that is read [bytes]."""
 
 
 def files_of(root: Path) -> list[Path]:
@@ -25,24 +30,31 @@ def read_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
     Raises:
         DataError: The file is malformed; the message names the line.
     """
+    rows, count = [], None
     try:
-        lines = path.read_bytes().decode("utf-8-sig").splitlines()
-        words = [(number, line.split()) for number, line in enumerate(lines, 1) if line.strip()]
-        count = int(words[0][1][0])
-        rows = [(number, w[0], np.array([float(x) for x in w[1:]])) for number, w in words[1:]]
-    except (OSError, ValueError, IndexError) as e:
+        text = read_input(path, MAX_BYTES).decode("utf-8-sig")
+        for number, line in enumerate(io.StringIO(text), 1):
+            words = line.split()
+            if not words:
+                continue
+            if count is None:
+                count = int(words[0])
+                continue
+            values = np.array([float(x) for x in words[1:]])
+            if len(values) != 21 or not np.isfinite(values).all():
+                raise DataError(
+                    f"{path}, line {number}, image {words[0]!r}: needs 21 finite numbers (K, R, t), has "
+                    f"{int(np.isfinite(values).sum())}. Copy the file again"
+                )
+            rows.append((number, words[0], values))
+    except (OSError, ValueError) as e:
+        why = unread_reason(e) if isinstance(e, OSError) else e
         raise DataError(
-            f"{path}: cannot be understood ({e}); its first line is a count, then come a name and 21 numbers a line. "
+            f"{path}: cannot be understood ({why}); its first line is a count, then come a name and 21 numbers a line. "
             "Copy it again"
         ) from e
     if count != len(rows):
-        raise DataError(f"{path}: announces {count} images and lists {len(rows)}; it is truncated. Copy it again")
-    for number, name, values in rows:
-        if len(values) != 21 or not np.isfinite(values).all():
-            raise DataError(
-                f"{path}, line {number}, image {name!r}: needs 21 finite numbers (K, R, t), has "
-                f"{int(np.isfinite(values).sum())}. Copy the file again"
-            )
+        raise DataError(f"{path}: announces {count or 0} images and lists {len(rows)}; it is truncated. Copy it again")
     return rows
 
 
@@ -79,12 +91,12 @@ class MiddleburyReader(Reader):
             K, viewmat = _intrinsics(values[:9].reshape(3, 3).copy(), where), np.eye(4)
             viewmat[:3, :3], viewmat[:3, 3] = values[9:18].reshape(3, 3), values[18:21]
             viewmat = rigid(viewmat, where)
-            file = scene.child(folder, name, where)
+            file, view = scene.child(folder, name, where), views.claim(view_name(name), where)
             loaded = scene.image(
                 file,
                 lambda width, height: Lens(K, width, height).checked(where),  # noqa: B023 - called before the next round
                 mask=scene.find_mask(file, folder, folder / "masks"),
             )
-            views.add(view_name(name), viewmat, loaded)
+            views.add(view, viewmat, loaded)
         notes += resampling_note(options.downscale) + views.notes(options)
         return self.scene(folder, views.views, notes, pixels=scene.pixel_source(by_folder=False))

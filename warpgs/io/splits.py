@@ -23,6 +23,8 @@ DTU_VIEWS = 49
 BLENDER_TRAIN = (2, 16, 26, 55, 73, 76, 86, 93)
 """Training ids of DietNeRF's 8-view Blender protocol; tests are every 8th of the test frames."""
 
+MAX_COMPARED = 200
+"""Longest name for which near ones are looked for."""
 SPECS = "llff:K, mip360:K, dtu:3|6|9, blender:8, every:N, all, or train=NAMES;test=NAMES"
 
 
@@ -80,24 +82,42 @@ def _blender(names: list[str], count: int, spec: str) -> Split:
     return Split(tuple(train[i] for i in BLENDER_TRAIN), tuple(test[::8]))
 
 
-def _find(names: list[str], wanted: str, spec: str) -> str:
-    """Return the view of a name, given whole or by its last parts, with suffix or without; the strictest match decides."""
-    bare = {n: str(PurePosixPath(n).with_suffix("")) for n in names}
-    fits = (
-        lambda n: n == wanted,
-        lambda n: bare[n] == wanted,
-        lambda n: n.endswith("/" + wanted),
-        lambda n: bare[n].endswith("/" + wanted),
-    )
-    for fit in fits:
-        matches = [n for n in names if fit(n)]
-        if len(matches) == 1:
-            return matches[0]
-        if matches:
-            raise DataError(f"split {spec}: {wanted!r} could be any of {', '.join(matches[:5])}; give the whole name")
-    by_form = {form: n for n in names for form in (PurePosixPath(n).stem, PurePosixPath(n).name, bare[n], n)}
-    near = list(dict.fromkeys(by_form[f] for f in difflib.get_close_matches(wanted, by_form, 4, 0.3)))[:3]
-    raise DataError(f"split {spec}: there is no view {wanted!r}; the nearest names are {', '.join(near or names[:3])}")
+class _Names:
+    """Names of views, to be found by their ends."""
+
+    def __init__(self, names: list[str], spec: str):
+        self.names, self.spec = names, spec
+        self.bare = {n: str(PurePosixPath(n).with_suffix("")) for n in names}
+        self._ends: dict[tuple[bool, int], dict[str, list[str]]] = {}
+
+    def find(self, wanted: str) -> str:
+        """Return the view of a name, given whole or by its last parts, with suffix or without; the strictest match decides."""
+        parts = wanted.count("/") + 1
+        for count in (0, parts):
+            for bare in (False, True):
+                matches = self._by_end(bare, count).get(wanted, [])
+                if len(matches) == 1:
+                    return matches[0]
+                if matches:
+                    some = ", ".join(matches[:5])
+                    raise DataError(f"split {self.spec}: {wanted!r} could be any of {some}; give the whole name")
+        forms = {f: n for n in self.names for f in (PurePosixPath(n).stem, PurePosixPath(n).name, self.bare[n], n)}
+        short = [f for f in forms if len(f) <= MAX_COMPARED]  # the comparison takes the product of both lengths
+        near = list(dict.fromkeys(forms[f] for f in difflib.get_close_matches(wanted[:MAX_COMPARED], short, 4, 0.3)))[:3]
+        some = ", ".join(near or self.names[:3])
+        raise DataError(f"split {self.spec}: there is no view {wanted!r}; the nearest names are {some}")
+
+    def _by_end(self, bare: bool, count: int) -> dict[str, list[str]]:
+        """Return the names by their last ``count`` parts, for those that have more; by the whole name for 0."""
+        if (bare, count) not in self._ends:
+            table: dict[str, list[str]] = {}
+            for name in self.names:
+                form = self.bare[name] if bare else name
+                head, *tail = form.rsplit("/", count) if count else (form,)
+                if len(tail) == count:
+                    table.setdefault("/".join(tail) if count else head, []).append(name)
+            self._ends[bare, count] = table
+        return self._ends[bare, count]
 
 
 def check_spec(spec: str) -> None:
@@ -127,14 +147,17 @@ def _named(spec: str) -> dict[str, str]:
 
 def _explicit(names: list[str], spec: str) -> Split:
     parts: dict[str, tuple[str, ...]] = {}
+    known = _Names(names, spec)
     for key, values in _named(spec).items():
-        found = [_find(names, v.strip(), spec) for v in values.split(",") if v.strip()]
+        found = [known.find(v.strip()) for v in values.split(",") if v.strip()]
         twice = sorted(n for n, count in Counter(found).items() if count > 1)
         if twice:
             raise DataError(f"split {spec}: {key} names {twice[0]} twice; name every view once")
         parts[key] = tuple(found)
-    train = parts.get("train", tuple(n for n in names if n not in parts.get("test", ())))
-    test = parts.get("test", tuple(n for n in names if n not in train))
+    held = set(parts.get("test", ()))
+    train = parts.get("train", tuple(n for n in names if n not in held))
+    trained = set(train)
+    test = parts.get("test", tuple(n for n in names if n not in trained))
     return Split(train, test)
 
 
@@ -185,5 +208,6 @@ def coincident_views(scene: Scene, split: Split) -> list[tuple[str, str]]:
     extent = max(camera_extent([v.camera for v in scene.views]), 1e-9)
     unit = np.array([[1, 1, 1, 1 / extent]] * 3 + [[1] * 4])
     poses = {v.name: v.camera.viewmat * unit for v in scene.views}
-    pairs = ((a, b) for a in split.test for b in split.train)
-    return [(a, b) for a, b in pairs if np.abs(poses[a] - poses[b]).max() < 1e-3]
+    trained = np.stack([poses[b] for b in split.train])
+    same = ((a, np.abs(trained - poses[a]).max((1, 2)) < 1e-3) for a in split.test)
+    return [(a, split.train[i]) for a, found in same for i in np.flatnonzero(found)]

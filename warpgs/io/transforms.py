@@ -16,7 +16,7 @@ from warpgs.io.images import BLACK, SUFFIXES, Lens
 from warpgs.io.poses import from_camera_to_world
 from warpgs.io.readers import Probe, Reader, ReadOptions, register
 from warpgs.scene import Scene
-from warpgs.schema import SchemaError, check_depth
+from warpgs.schema import SchemaError, check_depth, check_parts
 
 BLENDER_FILES = tuple(f"transforms_{split}.json" for split in ("train", "val", "test"))
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
@@ -51,7 +51,9 @@ def read_json(path: Path) -> dict:
         DataError: The file is malformed, too large or nested too deep, or holds NaN or Infinity.
     """
     try:
-        values = json.loads(read_input(path, MAX_BYTES).decode("utf-8-sig"), parse_constant=_reject_constant)
+        text = read_input(path, MAX_BYTES).decode("utf-8-sig")
+        check_parts(text)
+        values = json.loads(text, parse_constant=_reject_constant)
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); write it again") from e
     except (ValueError, RecursionError) as e:
@@ -176,7 +178,7 @@ class _Reading:
         if not path.is_file():
             self.missing.append(str(frame["file_path"]))
             return
-        name = view_name_of(path, self.root)
+        name = self.views.claim(view_name_of(path, self.root), where)
         self.outside += name.startswith("outside/")
         where = f"{where} ({name})"
         viewmat = from_camera_to_world(matrix_of(frame, where), where, opengl=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -22,8 +23,7 @@ MAX_ADVICE = 8
 
 def partners(found: Mapping, i: int) -> list[tuple[int, int]]:
     """Return the photographs that one matches, each with the number of matches, the most first."""
-    mine = [(n, a + b - i) for (a, b), n in found.matches.items() if i in (a, b) and n > 0]
-    return [(j, n) for n, j in sorted(mine, key=lambda m: (-m[0], m[1]))]
+    return sorted(found.links.get(i, ()), key=lambda link: (-link[1], link[0]))
 
 
 def reason(found: Mapping, i: int, names: Sequence[str]) -> str:
@@ -51,15 +51,15 @@ def axis_angle(found: Mapping, i: int, j: int) -> float:
 
 def neighbours(found: Mapping) -> list[tuple[int, int, float]]:
     """Return the pairs of views that join all by the smallest angles (a minimum spanning tree), with the angle of each."""
-    left = list(found.views)
-    if not left:
-        return []
-    joined, tree = [left.pop(0)], []
-    while left:
-        angle, i, j = min((axis_angle(found, i, j), i, j) for i in joined for j in left)
-        tree.append((min(i, j), max(i, j), angle))
-        joined.append(j)
-        left.remove(j)
+    last, *left = list(found.views) or [-1]
+    nearest: dict[int, tuple[float, int]] = dict.fromkeys(left, (math.inf, -1))
+    tree = []
+    while nearest:
+        for j, best in nearest.items():
+            nearest[j] = min(best, (axis_angle(found, last, j), last))
+        (angle, i), last = min((best, j) for j, best in nearest.items())
+        del nearest[last]
+        tree.append((min(i, last), max(i, last), angle))
     return sorted(tree)
 
 

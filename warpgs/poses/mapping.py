@@ -6,6 +6,7 @@ import importlib.util
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,16 @@ class Mapping:
     """Version of pycolmap."""
     kept_focal: bool | None = None
     """True where the focal length is EXIF's, since so few photographs do not tell it better; False where they contradict it."""
+
+    @cached_property
+    def links(self) -> dict[int, list[tuple[int, int]]]:
+        """Photographs that each one matches, with the number of matches."""
+        links: dict[int, list[tuple[int, int]]] = {}
+        for (a, b), n in self.matches.items():
+            if n > 0:
+                links.setdefault(a, []).append((b, n))
+                links.setdefault(b, []).append((a, n))
+        return links
 
 
 def check_installed() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -103,7 +104,7 @@ def read_side_file(model: Path) -> dict:
         DataError: The file is no JSON object, or holds a key or a value that means nothing.
     """
     path = side_file(model)
-    if not path.exists():
+    if not os.path.lexists(path):
         return {}
     try:
         values = schema.read(path)

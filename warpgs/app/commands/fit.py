@@ -5,6 +5,7 @@ there are, are looked up first. Parses, calls, prints; no logic.
 """
 
 import dataclasses
+import os
 import re
 import traceback
 from dataclasses import dataclass, field
@@ -278,7 +279,7 @@ def request_of(arguments: list[str], about: str) -> FitRequest:
     config, notes = _chosen(a, arguments, _config(a, base, terms))
     if word_after(arguments, "--preset") is None:
         say(f"preset {base.preset}: {PRESET_NOTES[base.preset]}")
-    masks = None if a.score_masks is None else str(a.score_masks.resolve())
+    masks = None if a.score_masks is None else os.path.realpath(a.score_masks)
     scene = SceneRequest(
         str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.masks, a.mask_keeps, a.black_is_empty, masks, a.reader,
         a.max_pixels, a.max_side,

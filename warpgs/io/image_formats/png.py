@@ -66,24 +66,25 @@ def unpacked_size(pieces: Iterator[memoryview], limit: int) -> int:
 
     Args:
         pieces: The stream, in order.
-        limit: Number of bytes beyond which nothing more is unpacked.
+        limit: Number of bytes that are wanted. A little more is unpacked, in which damage shows, and no whole bomb.
 
     Raises:
         ValueError: The stream is damaged or ends early.
     """
     stream, total = zlib.decompressobj(), 0
+    most = limit + PIECE
     try:
         for piece in pieces:
             for at in range(0, len(piece), INPUT_PIECE):  # zlib copies all that is left of its input each time
                 left: bytes | memoryview = piece[at : at + INPUT_PIECE]
-                while left and total <= limit and not stream.eof:
+                while left and total <= most and not stream.eof:
                     total += len(stream.decompress(left, PIECE))
                     left = stream.unconsumed_tail
-        while not stream.eof and total <= limit and (more := stream.decompress(b"", PIECE)):
+        while not stream.eof and total <= most and (more := stream.decompress(b"", PIECE)):
             total += len(more)
     except zlib.error as e:
         raise ValueError(f"its compressed pixels are damaged ({e})") from e
-    if total <= limit and not stream.eof:
+    if total <= most and not stream.eof:
         raise ValueError("its compressed pixels end early")
     return total
 

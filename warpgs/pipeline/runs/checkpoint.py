@@ -92,12 +92,14 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, An
     from safetensors.torch import load
 
     path = folder / TENSORS
-    if not path.is_file():
-        raise DataError(f"{folder} holds no {TENSORS}: there is nothing to continue or to render from; run `warpgs fit` first")
     try:
         with open_input(path, folder) as file:
             body = file.read(max(0, os.fstat(file.fileno()).st_size - 32))
             digest = file.read(33)
+    except FileNotFoundError as e:
+        raise DataError(
+            f"{folder} holds no {TENSORS}: there is nothing to continue or to render from; run `warpgs fit` first"
+        ) from e
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); restore it, or fit again") from e
     if hashlib.sha256(body).digest() != digest:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -178,4 +179,9 @@ def stack_views(
             alpha = None if stack.alphas is None else stack.alphas[row]
             shared[i] = replace(views[i], image=stack.images[row], mask=mask, maps=maps, alpha=alpha)
         stacks[kind] = stack
-    return shared, stacks, [(k, kinds[:i].count(k)) for i, k in enumerate(kinds)]
+    seen: Counter[object] = Counter()
+    places = []
+    for k in kinds:
+        places.append((k, seen[k]))
+        seen[k] += 1
+    return shared, stacks, places

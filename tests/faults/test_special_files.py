@@ -1,0 +1,287 @@
+"""Every file that a user names, or a scene or a run holds, as a pipe, a device, a socket, a folder, empty, or unreadable.
+
+Each ends in a plain error at once, and two lists are proved complete: no module opens a file past `warpgs.input_files`, and
+each that reads through it is tried here.
+"""
+
+import ast
+import shutil
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import warpgs
+from tests.io import scenes
+from tests.test_input_files import special
+from warpgs.errors import WarpgsError
+from warpgs.export.formats import FORMATS, read_gaussians
+from warpgs.io import camera_files, folders, images
+from warpgs.io.load import load_scene
+from warpgs.io.readers import READERS
+from warpgs.pipeline.farm.listing import list_jobs
+from warpgs.pipeline.farm.record import RECORD, file_digest, read_record
+from warpgs.pipeline.films.keyframes import read_keyframes
+from warpgs.pipeline.metrics.lpips_weights import convert_lpips, read_lpips
+from warpgs.pipeline.model.filters import box_of
+from warpgs.pipeline.runs import folder as run_folder
+from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
+from warpgs.pipeline.runs.failed_step import read_failed_step
+from warpgs.plugins import Registry
+from warpgs.poses import record as poses_record
+from warpgs.poses import video
+from warpgs.poses.find import find_poses, source_digest
+from warpgs.poses.heic import is_heic
+from warpgs.priors import export, flow, preprocess
+from warpgs.priors.cache import MapCache
+from warpgs.priors.session import open_network
+from warpgs.report.events import read_events
+from warpgs.scene import Camera, Normalization, View
+
+KINDS = ("pipe", "device", "socket", "folder", "unreadable", "empty")
+PACKAGE = Path(warpgs.__file__).parent
+CAMERA = Camera(np.eye(4), np.eye(3), 8, 8)
+IMAGE = np.zeros((8, 8, 3), np.float32)
+
+
+def side_file(path):
+    """Read the description of a network, which lies beside it."""
+    path.rename(preprocess.side_file(path))
+    return preprocess.read_side_file(path)
+
+
+def flow_folder(path):
+    """Read the folder of flow files in which the first one is special."""
+    views = [View(f"{n}.png", CAMERA, IMAGE) for n in "ab"]
+    path.rename(path.with_name("a-to-b.flo"))
+    return flow._from_folder(path.parent, views)(0, 1)
+
+
+def cached(path):
+    """Look a map up in a cache whose entry is special: it is made again."""
+    cache = MapCache(path.parent)
+    key = cache._path(IMAGE, ("m",), {})
+    path.rename(key)
+    cache.maps(IMAGE, ("m",), {}, lambda: (np.zeros((8, 8), np.float32),))
+    raise WarpgsError(*cache.notes or [f"{key}: was not there"])
+
+
+def job_record(path):
+    """Read job.json: one that is not whole counts as none, and the job runs again."""
+    if read_record(path.parent) is None:
+        raise WarpgsError("no record")
+
+
+def weights(path):
+    """Read the weights of a network that is exported."""
+    pytest.importorskip("transformers")
+    export._fcn_resnet18(export.ExportRequest("fcn-resnet18", str(path)))
+
+
+DOORS = {
+    **{f"a{suffix}": ("export.formats", read_gaussians) for suffix in FORMATS},
+    "b.ply": ("export.ply", warpgs.read_ply),
+    "cameras.json": ("io.camera_files", camera_files.read_cameras),
+    "transforms.json": ("io.transforms", camera_files.read_cameras),
+    **{f"a{suffix}": ("io.decoding", folders.read_mask) for suffix in images.SUFFIXES},
+    "a.heif": ("io.decoding", lambda p: is_heic(p) or folders.read_mask(p)),
+    "orientation.jpg": ("io.decoding", lambda p: folders.read_mask(p) if images.exif_orientation(p) else None),
+    **{f"a{suffix}": ("poses.find", lambda p: find_poses(p, p.parent / "out")) for suffix in video.SUFFIXES},
+    "b.mp4": ("poses.video", lambda p: video.write_frames(p, p.parent, 3, lambda line: None)),
+    "path.json": ("pipeline.films.keyframes", lambda p: read_keyframes(p, CAMERA, Normalization())),
+    "crop.json": ("pipeline.model.filters", lambda p: box_of(str(p))),
+    "jobs.jsonl": ("pipeline.farm.listing", lambda p: list_jobs(str(p))),
+    RECORD: ("pipeline.farm.record", job_record),
+    "artefact": ("pipeline.farm.record", file_digest),
+    "model.onnx": ("priors.session", open_network),
+    "flow.onnx": ("priors.session", lambda p: flow._network(p, "255")),
+    "side.onnx": ("priors.preprocess", side_file),
+    "a.flo": ("priors.flow", flow.read_flo),
+    "b.flo": ("priors.flow", flow_folder),
+    "map": ("priors.cache", cached),
+    "fcn.safetensors": ("priors.export", weights),
+    "lpips.safetensors": ("pipeline.metrics.lpips_weights", read_lpips),
+    "heads.pth": ("pipeline.metrics.lpips_weights", lambda p: convert_lpips(p, p, p.parent / "out")),
+    "model.safetensors": ("pipeline.model.model_file", warpgs.load),
+    TENSORS: ("pipeline.runs.checkpoint", lambda p: load_checkpoint(p.parent)),
+    "step.safetensors": ("pipeline.runs.failed_step", lambda p: read_failed_step(p, torch.device("cpu"))),
+    run_folder.CONFIG: ("schema", lambda p: run_folder.read_record(p.parent)),
+    poses_record.JSON: ("schema", lambda p: poses_record.read_record(p.parent)),
+    "metrics.jsonl": ("report.events", read_events),
+    "plugin.py": ("plugins", lambda p: Registry("reader", object, None).load(f"{p}:Class")),
+}  # fmt: skip
+"""By the name of a file: the module that opens it, and what reads it."""
+PROBED = {"plugin.py", "b.flo"}
+"""Files that are looked for first, where one of another kind counts as none."""
+EMPTY_IS_FINE = {"metrics.jsonl", "artefact", "plugin.py"}
+"""Files that may be empty: a log of no events, one whose checksum is wanted, code without the class."""
+
+
+@pytest.fixture(autouse=True)
+def no_hang():
+    """End a reader that hangs: nothing here reads more than a few kilobytes."""
+
+    def late(*_):
+        raise AssertionError("the reader hangs")
+
+    if not hasattr(signal, "SIGALRM"):
+        yield
+        return
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(120)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+def plain(call, *names):
+    """Check that a call ends in one sentence that names a file, with the exit code of a usage or data error."""
+    with pytest.raises(WarpgsError) as e:
+        call()
+    text = str(e.value)
+    assert e.value.exit_code in (2, 3, 4, 5) and "Traceback" not in text and "\n" not in text
+    return text
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", DOORS)
+def test_files_that_are_named(name, kind, tmp_path):
+    if kind == "empty" and name in EMPTY_IS_FINE:
+        return
+    path = special(kind, tmp_path / name)
+    text = plain(lambda: DOORS[name][1](path))
+    assert name in text or tmp_path.name in text or text == "no record"
+    if kind in ("pipe", "device", "socket") and text != "no record" and name not in PROBED:
+        assert "is not a regular file" in text
+
+
+def parts_of(kind, root):
+    """Return the files of a scene to try: what holds its cameras, an image, and a mask."""
+    scene = scenes.WRITERS[kind](root)
+    files = [p for p in scene.rglob("*") if p.is_file()]
+    pictures = sorted(p for p in files if p.suffix == ".png")
+    return scene, [p.relative_to(scene) for p in files if p not in pictures] + [pictures[0].relative_to(scene)]
+
+
+@pytest.mark.parametrize("kind", scenes.WRITERS)
+def test_files_of_a_scene(kind, tmp_path):
+    """Frames of an image that is none are skipped by name; all else ends in a plain error, or the scene goes without it."""
+    original, parts = parts_of(kind, tmp_path / "original")
+    for number, part in enumerate(parts):
+        for what in KINDS:
+            scene = tmp_path / f"{number} {what}"
+            shutil.copytree(original, scene)
+            (scene / part).unlink()
+            special(what, scene / part)
+            try:
+                found = load_scene(scene)
+            except WarpgsError as e:
+                assert e.exit_code == 3 and scene.name in str(e)
+            else:
+                assert len(found.views) < scenes.VIEWS or any(part.name.split(".")[0] in n for n in found.notes)
+
+
+@pytest.mark.parametrize("what", KINDS)
+@pytest.mark.parametrize("folder", ["masks", "idrmasks"])
+def test_masks_of_a_scene(folder, what, tmp_path):
+    scene = scenes.write_colmap(tmp_path / "scene")
+    for i in range(scenes.VIEWS):
+        name = f"photo{i}.png" if folder == "masks" else f"{i:03d}.png"
+        scenes.save(scene / folder / name, np.full((12, 16), 255, np.uint8))
+    first = sorted((scene / folder).iterdir())[0]
+    first.unlink()
+    special(what, first)
+    if folder == "masks" and what not in ("empty",):  # no file, so no mask
+        assert len(load_scene(scene).views) == scenes.VIEWS
+    else:
+        assert first.name in plain(lambda: load_scene(scene)) or what != "empty"
+
+
+@pytest.mark.parametrize("what", KINDS)
+def test_photographs(what, tmp_path):
+    """A photograph that is no file is none of the photographs."""
+    for name in "abc":
+        scenes.save(tmp_path / f"{name}.png", scenes.image(0))
+    before = source_digest(tmp_path)
+    special(what, tmp_path / "d.png")
+    if what == "empty":
+        text = plain(lambda: find_poses(tmp_path, tmp_path.parent / f"{tmp_path.name}-out"))
+        assert "d.png" in text or "pycolmap" in text
+    else:
+        assert source_digest(tmp_path) == before
+
+
+# ---- completeness ------------------------------------------------------------------------------------------------------
+
+READS = {
+    "open", "fdopen", "read_bytes", "read_text", "fromfile", "memmap", "imread", "VideoCapture", "safe_open", "loadtxt",
+    "genfromtxt", "load_file", "open_memmap",
+}  # fmt: skip
+"""Names of functions that read a file by its path, in Python and in the libraries in use."""
+ALLOWED = {
+    ("app/cli.py", "open"): "the null device",
+    ("export/ply.py", "open"): "writes a temporary file",
+    ("export/ply.py", "fromfile"): "a file that open_input opened",
+    ("export/sog.py", "open"): "a member of an archive in memory",
+    ("files.py", "open"): "writes temporary files, syncs folders",
+    ("input_files.py", "open"): "the one place",
+    ("input_files.py", "fdopen"): "the one place",
+    ("kernels/native.py", "read_text"): "code of the package",
+    ("pipeline/farm/work.py", "open"): "appends to a log",
+    ("pipeline/farm/worker.py", "fdopen"): "the standard output",
+    ("pipeline/runs/failed_step.py", "safe_open"): "a path that open_input tried",
+    ("poses/find.py", "read_bytes"): "a model that pycolmap has just written",
+    ("poses/heic.py", "read_text"): "a job that the calling process has just written",
+    ("poses/video.py", "VideoCapture"): "a path whose first bytes read_start read",
+    ("poses/worker.py", "open"): "a database that this process makes",
+    ("poses/worker.py", "read_text"): "a job that the calling process has just written",
+    ("priors/export.py", "read_bytes"): "a network that torch has just written",
+    ("report/events.py", "open"): "appends to a log that was replaced before",
+    ("report/film.py", "VideoCapture"): "a temporary film that was just written",
+    ("report/overview.py", "read_bytes"): "an image that a child has just written",
+    ("report/scene_plot.py", "read_bytes"): "an image that a child has just written",
+    ("report/scene_plot.py", "open"): "an image in memory",
+    ("runtime/device_memory.py", "read_text"): "files of the system",
+    ("runtime/folder_lock.py", "open"): "the lock of a folder",
+    ("runtime/folder_lock.py", "fdopen"): "the lock of a folder",
+    ("runtime/load_module.py", "open"): "a lock in the cache of kernels",
+    ("runtime/native_output.py", "open"): "the null device",
+    ("runtime/processor.py", "read_text"): "files of the system",
+    ("runtime/rank_watch.py", "read_text"): "files of the system",
+}
+"""Calls that open no file of others, and why not."""
+
+
+def calls(tree):
+    """Yield the names of the functions that code calls."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            yield node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+
+
+def test_no_module_opens_a_file_past_the_one_place():
+    found = set()
+    for path in PACKAGE.rglob("*.py"):
+        tree = ast.parse(path.read_text("utf-8"))
+        found |= {(path.relative_to(PACKAGE).as_posix(), name) for name in calls(tree) if name in READS}
+    assert found - ALLOWED.keys() == set(), "open these with warpgs.input_files, or say why not"
+    assert ALLOWED.keys() - found == set(), "these are gone"
+
+
+def test_every_module_that_opens_files_is_tried():
+    opening = {"open_input", "read_input", "read_start", "input_digest"}
+    modules = set()
+    for path in PACKAGE.rglob("*.py"):
+        if opening & set(calls(ast.parse(path.read_text("utf-8")))):
+            modules.add(".".join(path.relative_to(PACKAGE).with_suffix("").parts))
+    tried = {module for module, _ in DOORS.values()} | {"input_files"}
+    of_scenes = {"io.colmap", "io.middlebury", "io.dtu", "io.llff"}
+    assert modules - tried == of_scenes, "add what is new to DOORS"
+    assert {f"io.{name}" for name in READERS.names()} == of_scenes | {"io.transforms"}
+    assert {name.split()[0] for name in scenes.WRITERS} - {"instant-ngp", "blender"} == set(READERS.names())
+
+
+def test_formats_are_all_tried():
+    assert {f"a{s}" for s in (*FORMATS, *images.SUFFIXES, *video.SUFFIXES)} <= DOORS.keys()
