@@ -12,11 +12,6 @@ import numpy as np
 
 from tests.faults.mutations import Change
 
-MEMORY = 64 * 2**20
-"""Memory that a reader may take whatever the file [bytes]: buffers of libraries, and images within the limit of pixels."""
-MEMORY_PER_BYTE = 60
-"""Memory that a reader may take per byte of the file: parsed JSON and lists of numbers are the largest."""
-
 
 @dataclass(frozen=True)
 class Target:
@@ -37,6 +32,8 @@ class Target:
     """Says what of a result is nonsense; empty where nothing is."""
     unexplained: Callable[[bytes, bytes, object, object], str] = lambda before, after, good, found: ""
     """Says what of a result plain damage does not explain: bytes before and after, results of both; empty where nothing."""
+    share: float = 1.0
+    """Number of inputs relative to other readers: less than 1 for slow ones."""
 
 
 TARGETS: dict[str, Target] = {}
