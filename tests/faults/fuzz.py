@@ -1,6 +1,6 @@
 """Fuzzer of all readers: changed files are read in processes of their own, with bounded memory and time.
 
-Run it with `python -m tests.faults.fuzz --inputs 200000 --seed 5 --processes 2`; the same seed gives the same inputs everywhere.
+Run it with `python -m tests.faults.fuzz --inputs 200000 --seed 5 --processes 2`; a seed gives the same inputs everywhere.
 One input again: `python -m tests.faults.fuzz --reader png --first 1234 --inputs 1 --keep folder`.
 """
 
@@ -113,17 +113,17 @@ class Worker:
         finally:
             self.tally.lines |= self.reached.lines()
 
-    def _first_checks(self, path: Path) -> tuple[set[Line], bool]:
-        """Return the lines that files without a meaning reach in place of a valid one, and whether such a file is accepted."""
-        lines, accepted = set(), False
+    def _first_checks(self, path: Path) -> set[Line]:
+        """Return the lines that run where files without a meaning, in place of a valid one, are refused."""
+        lines = set()
         for data in [*garbage(), None]:
             path.unlink()
             if data is not None:
                 path.write_bytes(data)
-            accepted |= self._try(path) is not None
-            lines |= self.reached.lines()
+            if self._try(path) is None:  # an empty file means something in some formats
+                lines |= self.reached.lines()
             self.restore(path)
-        return lines, accepted
+        return lines
 
     def put(self, index: int) -> tuple[Path, bytes, bool]:
         """Write an input in place of a valid file."""
@@ -173,13 +173,15 @@ class Worker:
         """Read an input and count what becomes of it; return what was read."""
         from warpgs.errors import ResourceError, WarpgsError
 
-        tally, found, accepted = self.tally, None, False
+        tally, found = self.tally, None
         try:
             with time_limit(self.measured):
                 found = self._read(path)
-            accepted = True
-            tally.accepted += 1
-            self._judge(index, path, data, plain, found)
+            if found is None:  # the file is passed over, as one that is not there
+                tally.refused += 1
+            else:
+                tally.accepted += 1
+                self._judge(index, path, data, plain, found)
         except ResourceError as e:
             tally.fail("memory", index, str(e))
         except WarpgsError as e:
@@ -192,8 +194,7 @@ class Worker:
             last = traceback.extract_tb(e.__traceback__)[-1]
             tally.fail("raw", index, f"{type(e).__name__}: {str(e)[:200]} ({last.filename}, line {last.lineno})")
         if self.measured:
-            lines, meaningless = self.first[path]
-            tally.past += bool(self.reached.lines() - lines) or (accepted and not meaningless)
+            tally.past += found is not None or bool(self.reached.lines() - self.first[path])
         return found
 
     def _judge(self, index: int, path: Path, data: bytes, plain: bool, found: object) -> None:
@@ -255,7 +256,10 @@ def fuzz(name: str, inputs: int, seed: int, first: int = 0) -> Tally:
         process.join()
         # what that process read before is read again, up to the input that ended it
         broken = current.value
-        tally.fail("crash", broken, f"the process ended with {process.exitcode}")
+        if all_targets()[name].own_process and process.exitcode is not None and current.value > first:
+            tally.inputs, tally.refused = tally.inputs + 1, tally.refused + 1
+        else:
+            tally.fail("crash", broken, f"the process ended with {process.exitcode}")
         if broken > first:
             tally.add(fuzz(name, broken - first, seed, first))
         first = broken + 1

@@ -21,7 +21,7 @@ class Target:
     prepare: Callable[[Path], list[Path]]
     """Write valid files to a folder and return those to change, one at a time."""
     read: Callable[[Path, Path], object]
-    """Read, from the folder and the changed file, and return what was read."""
+    """Read, from the folder and the changed file, and return what was read; None where a reader passes a file over."""
     parser: tuple[object, ...]
     """Modules, functions and classes whose lines count as the parser's."""
     changes: tuple[Change, ...] = ()
@@ -32,6 +32,8 @@ class Target:
     """Says what of a result is nonsense; empty where nothing is."""
     unexplained: Callable[[bytes, bytes, object, object], str] = lambda before, after, good, found: ""
     """Says what of a result plain damage does not explain: bytes before and after, results of both; empty where nothing."""
+    own_process: bool = False
+    """Whether a process of its own does the reading in warpgs: then an input that ends the process is refused, not a defect."""
     share: float = 1.0
     """Number of inputs relative to other readers: less than 1 for slow ones."""
 
@@ -48,7 +50,15 @@ def register(target: Target) -> Target:
 
 def all_targets() -> dict[str, Target]:
     """Return every registered reader by name."""
-    from tests.faults import format_targets, image_targets, model_targets, scene_targets  # noqa: F401 - they register
+    from tests.faults import (  # noqa: F401 - they register
+        format_targets,
+        image_targets,
+        model_targets,
+        network_targets,
+        photo_targets,
+        record_targets,
+        scene_targets,
+    )
 
     return TARGETS
 
