@@ -7,6 +7,7 @@ One input again: `python -m tests.faults.fuzz --reader png --first 1234 --inputs
 from __future__ import annotations
 
 import argparse
+import functools
 import multiprocessing
 import os
 import queue
@@ -27,7 +28,7 @@ import numpy as np
 from tests.faults.bounds import ALLOCATOR, LIMIT, MEMORY, WALL, Hang, PeakMemory, bound_process, size_of, spent, time_limit
 from tests.faults.mutations import damage
 from tests.faults.reached import Line, Reached, garbage
-from tests.faults.targets import Target, all_targets, parser_lines
+from tests.faults.targets import MODULES, Target, all_targets, parser_lines
 
 FAILURES_KEPT = 20
 PAST = 0.1
@@ -223,6 +224,17 @@ def work(name: str, seed: int, first: int, last: int, current, results) -> None:
     results.put(worker.tally)
 
 
+@functools.cache
+def _context() -> multiprocessing.context.BaseContext:
+    """Return how processes start: on Linux from one that has imported all readers, in the environment of `ALLOCATOR`."""
+    os.environ.update(ALLOCATOR)
+    if sys.platform != "linux":
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([f"tests.faults.{name}" for name in MODULES])
+    return context
+
+
 def _outcome_of(process, current, results) -> Tally | None:
     """Wait for the tally of a process; None where it ends without one, or stands still."""
     seen, since = current.value, time.monotonic()
@@ -240,9 +252,7 @@ def _outcome_of(process, current, results) -> Tally | None:
 
 def fuzz(name: str, inputs: int, seed: int, first: int = 0) -> Tally:
     """Read inputs of one reader in a process, and in another one after each that ends it."""
-    context = multiprocessing.get_context("spawn")
-    os.environ.update(ALLOCATOR)
-    tally, last = Tally(name), first + inputs
+    context, tally, last = _context(), Tally(name), first + inputs
     while first < last:
         current, results = context.Value("q", first), context.Queue()
         process = context.Process(target=work, args=(name, seed, first, last, current, results))

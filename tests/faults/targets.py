@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import types
 from collections.abc import Callable, Iterator
@@ -38,6 +39,10 @@ class Target:
     """Number of inputs relative to other readers: less than 1 for slow ones."""
 
 
+MODULES = (
+    "format_targets", "image_targets", "model_targets", "network_targets", "photo_targets", "record_targets", "scene_targets",
+)  # fmt: skip
+"""Modules of this folder that register readers."""
 TARGETS: dict[str, Target] = {}
 
 
@@ -50,16 +55,8 @@ def register(target: Target) -> Target:
 
 def all_targets() -> dict[str, Target]:
     """Return every registered reader by name."""
-    from tests.faults import (  # noqa: F401 - they register
-        format_targets,
-        image_targets,
-        model_targets,
-        network_targets,
-        photo_targets,
-        record_targets,
-        scene_targets,
-    )
-
+    for name in MODULES:
+        importlib.import_module(f"tests.faults.{name}")
     return TARGETS
 
 
