@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -30,7 +31,7 @@ class Hang(BaseException):
 def spent() -> float:
     """Return the processor time of this process and of its ended children [s]."""
     t = os.times()
-    return t.user + t.system + t.children_user + t.children_system
+    return time.process_time() + t.children_user + t.children_system
 
 
 @contextlib.contextmanager
@@ -57,11 +58,16 @@ def bound_process() -> None:
 
         limit = psutil.Process().memory_info().vms + ADDRESS_SPACE
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    catch_timers()
+
+
+def catch_timers() -> None:
+    """Have the timers of `time_limit` raise `Hang`, where the system has them."""
+
+    def late(*_: object) -> None:
+        raise Hang
+
     if hasattr(signal, "setitimer"):
-
-        def late(*_):
-            raise Hang
-
         signal.signal(signal.SIGPROF, late)
         signal.signal(signal.SIGALRM, late)
 

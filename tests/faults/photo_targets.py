@@ -136,19 +136,21 @@ def heic_files(root: Path) -> list[Path]:
 def heic_copy(root: Path, path: Path) -> np.ndarray:
     """Decode in this process, and tell an error as the process that does it otherwise."""
     try:
-        heic._copy(path, root / "a.jpg", MAX_PIXELS)
-    except heic.BROKEN as e:
+        copy = heic._coded_again(path, MAX_PIXELS)
+    except Exception as e:  # as its process does, for which the caller names the file
         raise DataError(f"{path}: the image cannot be decoded: {e}") from e
+    (root / "a.jpg").write_bytes(copy)
     return decode(root / "a.jpg", MAX_PIXELS)[0]
 
 
 def heic_in_process(root: Path, path: Path) -> np.ndarray:
     shutil.rmtree(root / "out", ignore_errors=True)
+    heic.is_heic(path)
     return decode(heic.to_jpeg([path], root / "in", root / "out", MAX_PIXELS)[path], MAX_PIXELS)[0]
 
 
 if importlib.util.find_spec("pi_heif"):
-    register(Target("heic", heic_files, heic_copy, (heic._copy,), (box, box, box), own_process=True))
+    register(Target("heic", heic_files, heic_copy, (heic._coded_again,), (box, box, box), own_process=True))
     register(Target("heic by its process", heic_files, heic_in_process, (heic.to_jpeg,), (box, box, box), share=0.01))
 
 # ---- videos ------------------------------------------------------------------------------------------------------------

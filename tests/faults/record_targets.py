@@ -12,8 +12,9 @@ import cv2
 import numpy as np
 import torch
 
+from tests.faults.image_targets import png_checksums, png_rows
 from tests.faults.model_targets import gaussians, in_order, run_files, tensors_body, tensors_header
-from tests.faults.mutations import Change, damage, json_value, text_line, text_number
+from tests.faults.mutations import Change, json_value, text_line, text_number
 from tests.faults.targets import Target, not_finite, register
 from warpgs import schema
 from warpgs.app.commands import farm as farm_command
@@ -252,4 +253,4 @@ def thumbnail(root: Path, path: Path) -> bytes | None:
     return target.read_bytes() if target.is_file() else None
 
 
-register(Target("render of a job", render_files, thumbnail, (work.write_thumbnail,), (damage,)))
+register(Target("render of a job", render_files, thumbnail, (work.write_thumbnail,), (png_rows, png_rows), png_checksums))

@@ -16,8 +16,9 @@ from warpgs.pipeline.metrics import lpips_weights
 
 PACKAGE = Path(warpgs.__file__).parent
 OPENING = {
-    "open", "open_file", "open_input", "read_bytes", "read_file", "read_input", "read_start", "read_text", "input_digest", "fromfile",
-    "imdecode", "imread", "safe_open", "AvifImageFile", "HeifImageFile", "InferenceSession", "VideoCapture", "ZipFile",
+    "open", "open_file", "open_input", "read_bytes", "read_file", "read_input", "read_start", "read_text", "input_digest",
+    "fromfile", "imdecode", "imread", "safe_open", "AvifImageFile", "HeifImageFile", "InferenceSession", "VideoCapture",
+    "ZipFile",
 }  # fmt: skip
 """Names of functions and classes that open a file or decode what one holds."""
 PARSING = {"json.load", "json.loads", "np.load", "schema.parse", "schema.read", "torch.load", "msgspec.msgpack.decode"}
@@ -30,7 +31,7 @@ READERS = {
     "export/sog.py": {"decode": "SOG", "_member": "SOG", "_pixels": "SOG"},
     "io/camera_files.py": {"_json": "cameras"},
     "io/colmap.py": {"_BinaryFile.__init__": "colmap", "_lines": "colmap"},
-    "io/decoding.py": {"_raster": "any image", "read_image_file": "any image", "read_image_start": "photograph"},
+    "io/decoding.py": {"_raster": "any image", "read_image_file": "any image", "read_image_start": "heic by its process"},
     "io/dtu.py": {"_read_matrices": "dtu"},
     "io/image_formats/avif.py": {"open_image": "avif"},
     "io/llff.py": {"read_rows": "llff"},
@@ -47,43 +48,44 @@ READERS = {
     "pipeline/runs/checkpoint.py": {"load_checkpoint": "checkpoint"},
     "pipeline/runs/failed_step.py": {"read_failed_step": "failed step"},
     "pipeline/runs/folder.py": {"read_record": "run record"},
-    "poses/heic.py": {"_copy": "heic", "to_jpeg": "heic by its process"},
+    "poses/heic.py": {"_coded_again": "heic", "to_jpeg": "heic by its process"},
     "poses/record.py": {"read_record": "record of poses"},
-    "poses/video.py": {"_frames": "video"},
+    "poses/video.py": {"_check_container": "video", "_frames": "video"},
     "priors/cache.py": {"MapCache._read": "stored maps"},
     "priors/flow.py": {"_network": "flow network", "read_flo": "flow"},
     "priors/preprocess.py": {"read_side_file": "description of a network"},
-    "priors/session.py": {"_start": "network", "open_network": "network"},
+    "priors/session.py": {"_start": "network", "read_model": "network"},
     "report/events.py": {"read_events": "events"},
-    "report/images.py": {"webp": "image of a report"},
     "runtime/folder_lock.py": {"_signed": "signature of a lock"},
     "schema.py": {"parse": "scores", "read": "scores"},
     "viewer/frames.py": {"read_frame": "frame of a websocket"},
-    "viewer/panel.py": {"Panel._add_importance.show": "sheet of a run"},
 }
 """Name of the fuzzer's reader by file and function."""
 
 OWN = "reads what this process wrote just before"
 PIPE = "reads lines of a process that warpgs started, by a pipe that nobody else writes to"
+PRIVATE = "reads a file of the farm's private folder, which nobody else may enter"
 DIGEST = "reads bytes that it does not look into"
 SYSTEM = "reads what the system says"
 LAYER = "opens for others, which are named here"
 REASONS = {
-    "app/cli.py": {"_run": "opens /dev/null for writing"},
     "export/sog.py": {"encode": "writes"},
     "files.py": {"appending": "writes", "writing": "writes", "read_file": LAYER},
     "input_files.py": {"open_input": LAYER, "read_input": LAYER, "read_start": LAYER, "input_digest": LAYER},
     "kernels/native.py": {"source": "reads a file of the package"},
-    "output_folders.py": {"Folder.open": LAYER, "Folder.open_regular": LAYER, "_opened": LAYER, "open_file": LAYER},
+    "output_folders.py": {"Folder.open": LAYER, "Folder.open_regular": LAYER, "_opened": LAYER},
     "pipeline/farm/ensure_run.py": {"_with_lpips": OWN},
+    "pipeline/farm/batch.py": {"main": PRIVATE},
     "pipeline/farm/job.py": {"job_of": PIPE},
     "pipeline/farm/local.py": {"LocalEngine._compile": PIPE, "LocalEngine.wait": PIPE},
     "pipeline/farm/record.py": {"file_digest": DIGEST},
-    "pipeline/farm/worker.py": {"main": PIPE, "_answers": "writes"},
+    "pipeline/farm/slurm.py": {"SlurmEngine._answered": PRIVATE, "SlurmEngine._output": PRIVATE},
+    "pipeline/farm/worker.py": {"main": PIPE},
     "pipeline/runs/coverage_report.py": {"coverage_section": OWN},
+    "pipeline/runs/commands.py": {"render": "opens a writer of a film"},
     "pipeline/runs/folder.py": {"check_same": "copies a value"},
     "pipeline/runs/sampling_report.py": {"sampling_report_of": "reads images for `webp`, which is named here"},
-    "poses/find.py": {"find_poses": OWN, "source_digest": DIGEST},
+    "poses/find.py": {"find_poses": OWN, "_digest": DIGEST},
     "poses/heic.py": {"main": PIPE},
     "poses/mapping.py": {"_lines": PIPE},
     "poses/worker.py": {"main": PIPE, "extract": OWN, "match": OWN},
@@ -91,12 +93,13 @@ REASONS = {
         "_onnx_bytes": OWN, "_fcn_resnet18": "reads weights of 45 MB with safetensors, as the readers named here do",
     },
     "report/film.py": {"_decoded_sizes": OWN},
+    "report/images.py": {"webp": OWN},
     "report/overview.py": {"render_overview": OWN},
     "report/scene_plot.py": {"_rendered": OWN, "_with_legend": OWN},
     "runtime/device_memory.py": {"_text": SYSTEM},
-    "runtime/folder_lock.py": {"_open": "opens a lock for `_signed`"},
     "runtime/load_module.py": {"exclusive": "opens a lock"},
     "runtime/native_output.py": {"hidden_stderr": "opens /dev/null for writing"},
+    "runtime/output_streams.py": {"_send_to_null": "opens /dev/null for writing"},
     "runtime/processor.py": {"processor_name": SYSTEM},
     "runtime/rank_watch.py": {"machine": SYSTEM},
     "temporary.py": {"_own_file": "writes"},
