@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.faults.bombs import large_webp, many_rows, rarely, spz_bomb, zip_bomb
 from tests.faults.model_targets import gaussians, nonsense, ply_body, ply_header
 from tests.faults.mutations import Change, damage, json_value, number, text_line, text_number
 from tests.faults.targets import Target, not_finite, register
@@ -115,7 +116,7 @@ def spz_streams(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 SPZ = (spz.decode, spz._checked, spz._streams, spz._unpack)
-SPZ_CHANGES = (inside_gzip(header_number), inside_gzip(number), inside_gzip(damage), spz_streams)
+SPZ_CHANGES = (rarely(spz_bomb, inside_gzip(header_number)), inside_gzip(number), inside_gzip(damage), spz_streams)
 add("SPZ", ".spz", SPZ, SPZ_CHANGES, spz_files)
 
 # ---- archives ----------------------------------------------------------------------------------------------------------
@@ -174,8 +175,15 @@ def sog_member(data: bytes, rng: np.random.Generator) -> bytes:
     return archive_of(members, rng.random() < 0.3)
 
 
+def sog_image(data: bytes, rng: np.random.Generator) -> bytes:
+    """Put a large image of one colour in place of another."""
+    members = members_of(data)
+    names = sorted(n for n in members if n.endswith(".webp"))
+    return archive_of(members | {names[int(rng.integers(len(names)))]: large_webp()}) if names else data
+
+
 SOG = (sog.decode, sog._member, sog._pixels, sog._book, sog._palette_rows, sog._within)
-add("SOG", ".sog", SOG, (sog_member, sog_member, sog_member))
+add("SOG", ".sog", SOG, (sog_member, sog_member, rarely(sog_image, rarely(zip_bomb, sog_member))))
 
 # ---- glTF --------------------------------------------------------------------------------------------------------------
 
@@ -255,7 +263,7 @@ def camera_nonsense(found: dict) -> str:
 
 
 CAMERAS = (camera_files, read_cameras, read_poses)
-CAMERA_CHANGES = (json_value, json_value, text_number, text_line)
+CAMERA_CHANGES = (rarely(many_rows, json_value), json_value, text_number, text_line)
 register(Target("cameras", camera_paths, read_any, CAMERAS, CAMERA_CHANGES, nonsense=camera_nonsense))
 
 

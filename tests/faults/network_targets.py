@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from tests.faults.bombs import rarely, zip_bomb
 from tests.faults.format_targets import zip_member
 from tests.faults.model_targets import SMALL, onnx_field, tensors_body, tensors_header
 from tests.faults.targets import Target, register
@@ -32,7 +33,7 @@ def converted(root: Path, path: Path) -> object:
 
 
 STATES = (lpips_weights._read_state, lpips_weights._net_of, lpips_weights.convert_lpips)
-register(Target("LPIPS state dict", state_files, converted, STATES, (zip_member, zip_member)))
+register(Target("LPIPS state dict", state_files, converted, STATES, (zip_member, rarely(zip_bomb, zip_member))))
 
 # ---- maps on disk ------------------------------------------------------------------------------------------------------
 

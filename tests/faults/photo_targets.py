@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 from tests.faults import image_targets
+from tests.faults.bombs import png_bomb, rarely
 from tests.faults.image_targets import encoded, jpeg_segments, photo, png_checksums, tiff_tag
 from tests.faults.mutations import Change, damage, number
 from tests.faults.targets import Target, register
@@ -114,8 +115,8 @@ def photo_nonsense(found: tuple[photographs.Photograph, np.ndarray]) -> str:
 PHOTOGRAPHS = (photographs.prepare, photographs.write_copy, metadata)
 register(
     Target(
-        "photograph", photo_files, read_photograph, PHOTOGRAPHS, (exif_tag, exif_tag, jpeg_segments), png_checksums,
-        photo_nonsense, share=0.7,
+        "photograph", photo_files, read_photograph, PHOTOGRAPHS, (exif_tag, rarely(png_bomb, exif_tag), jpeg_segments),
+        png_checksums, photo_nonsense, share=0.7,
     )
 )  # fmt: skip
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import torch
 
+from tests.faults.bombs import many_rows, rarely
 from tests.faults.image_targets import png_checksums, png_rows
 from tests.faults.model_targets import gaussians, in_order, run_files, tensors_body, tensors_header
 from tests.faults.mutations import Change, json_value, text_line, text_number
@@ -29,7 +30,7 @@ from warpgs.report import events
 from warpgs.runtime import folder_lock
 from warpgs.scene import Camera, Normalization
 
-JSON_CHANGES: tuple[Change, ...] = (json_value, json_value, json_value, text_number)
+JSON_CHANGES: tuple[Change, ...] = (json_value, json_value, rarely(many_rows, json_value), text_number)
 
 
 def add(name: str, file: str, values: object, read, parser: tuple, **more) -> None:
