@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.faults.bombs import large_webp, many_rows, rarely, spz_bomb, zip_bomb
 from tests.faults.model_targets import gaussians, nonsense, ply_body, ply_header
 from tests.faults.mutations import Change, damage, json_value, number, text_line, text_number
 from tests.faults.targets import Target, not_finite, register
@@ -115,19 +116,51 @@ def spz_streams(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 SPZ = (spz.decode, spz._checked, spz._streams, spz._unpack)
-SPZ_CHANGES = (inside_gzip(header_number), inside_gzip(number), inside_gzip(damage), spz_streams)
+SPZ_CHANGES = (rarely(spz_bomb, inside_gzip(header_number)), inside_gzip(number), inside_gzip(damage), spz_streams)
 add("SPZ", ".spz", SPZ, SPZ_CHANGES, spz_files)
+
+# ---- archives ----------------------------------------------------------------------------------------------------------
+
+
+def members_of(data: bytes) -> dict[str, bytes]:
+    """Return the files of an archive by name; none where it is broken."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            return {n: archive.read(n) for n in archive.namelist()}
+    except (zipfile.BadZipFile, OSError, RuntimeError, NotImplementedError, ValueError, EOFError, zlib.error):
+        return {}
+
+
+def archive_of(members: dict[str, bytes], packed: bool = False) -> bytes:
+    """Return an archive with right lengths and checksums."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED if packed else zipfile.ZIP_STORED) as archive:
+        for n, content in members.items():
+            archive.writestr(zipfile.ZipInfo(n), content)
+    return out.getvalue()
+
+
+def zip_member(data: bytes, rng: np.random.Generator) -> bytes:
+    """Change, remove or rename a file of an archive."""
+    members = members_of(data)
+    if not members:
+        return damage(data, rng)
+    name, kind = sorted(members)[int(rng.integers(len(members)))], int(rng.integers(8))
+    if kind == 0:
+        del members[name]
+    elif kind == 1:
+        members[f"{name}x"] = members.pop(name)
+    else:
+        members[name] = (number if kind < 5 else damage)(members[name], rng)
+    return archive_of(members)
+
 
 # ---- SOG ---------------------------------------------------------------------------------------------------------------
 
 
 def sog_member(data: bytes, rng: np.random.Generator) -> bytes:
     """Change a file of the archive: values of meta.json, or an image's pixels, bytes or size."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            members = {n: archive.read(n) for n in archive.namelist()}
-    except (zipfile.BadZipFile, OSError, RuntimeError, NotImplementedError, ValueError, EOFError):
-        return data
+    members = members_of(data)
     names = sorted(members)
     if not names:
         return data
@@ -139,15 +172,18 @@ def sog_member(data: bytes, rng: np.random.Generator) -> bytes:
         members[name] = (json_value if name == "meta.json" else damage)(members[name], rng)
     if rng.random() < 0.1:
         members.pop(name)
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED if rng.random() < 0.3 else zipfile.ZIP_STORED) as archive:
-        for n, content in members.items():
-            archive.writestr(zipfile.ZipInfo(n), content)
-    return out.getvalue()
+    return archive_of(members, rng.random() < 0.3)
+
+
+def sog_image(data: bytes, rng: np.random.Generator) -> bytes:
+    """Put a large image of one colour in place of another."""
+    members = members_of(data)
+    names = sorted(n for n in members if n.endswith(".webp"))
+    return archive_of(members | {names[int(rng.integers(len(names)))]: large_webp()}) if names else data
 
 
 SOG = (sog.decode, sog._member, sog._pixels, sog._book, sog._palette_rows, sog._within)
-add("SOG", ".sog", SOG, (sog_member, sog_member, sog_member))
+add("SOG", ".sog", SOG, (sog_member, sog_member, rarely(sog_image, rarely(zip_bomb, sog_member))))
 
 # ---- glTF --------------------------------------------------------------------------------------------------------------
 
@@ -227,7 +263,7 @@ def camera_nonsense(found: dict) -> str:
 
 
 CAMERAS = (camera_files, read_cameras, read_poses)
-CAMERA_CHANGES = (json_value, json_value, text_number, text_line)
+CAMERA_CHANGES = (rarely(many_rows, json_value), json_value, text_number, text_line)
 register(Target("cameras", camera_paths, read_any, CAMERAS, CAMERA_CHANGES, nonsense=camera_nonsense))
 
 

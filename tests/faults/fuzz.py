@@ -1,51 +1,57 @@
 """Fuzzer of all readers: changed files are read in processes of their own, with bounded memory and time.
 
-Run it with `python -m tests.faults.fuzz --inputs 100000`; the same seed gives the same inputs on every machine.
+Run it with `python -m tests.faults.fuzz --inputs 200000 --seed 5 --processes 2`; a seed gives the same inputs everywhere.
 One input again: `python -m tests.faults.fuzz --reader png --first 1234 --inputs 1 --keep folder`.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
+import functools
 import multiprocessing
 import os
+import queue
 import shutil
-import signal
 import sys
 import tempfile
 import time
 import traceback
 import zlib
 from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from tests.faults.bounds import ALLOCATOR, LIMIT, MEMORY, WALL, Hang, PeakMemory, bound_process, size_of, spent, time_limit
 from tests.faults.mutations import damage
-from tests.faults.targets import MEMORY, MEMORY_PER_BYTE, Target, all_targets, parser_lines
+from tests.faults.reached import Line, Reached, garbage
+from tests.faults.targets import MODULES, Target, all_targets, parser_lines
 
-LIMIT = 20
-"""Time that one input may take [s]; the slowest real one takes a hundredth of it."""
-ADDRESS_SPACE = 4 * 2**30
-"""Address space that a process may take beyond what it has when it begins [bytes]."""
 FAILURES_KEPT = 20
+PAST = 0.1
+"""Smallest share of inputs that must get past the first check of a reader."""
+ATTEMPTS = 8
+"""Number of changes that are tried until one changes the file."""
 
 
 @dataclass
 class Tally:
-    """What became of the inputs of one reader."""
+    """Outcomes of the inputs of one reader."""
 
     name: str
     inputs: int = 0
     accepted: int = 0
     refused: int = 0
-    unseen: int = 0
-    """Accepted with another result than the undamaged file, after plain damage."""
+    past: int = 0
+    """Inputs that were accepted, or reached a line that no file of random bytes reaches."""
     slowest: float = 0.0
+    """Processor time [s]."""
     memory: int = 0
-    lines: set[tuple[str, int]] = field(default_factory=set)
+    """Peak beyond the result [bytes]."""
+    lines: set[Line] = field(default_factory=set)
     failures: list[str] = field(default_factory=list)
     kinds: Counter[str] = field(default_factory=Counter)
 
@@ -56,48 +62,11 @@ class Tally:
 
     def add(self, other: Tally) -> None:
         self.inputs, self.accepted = self.inputs + other.inputs, self.accepted + other.accepted
-        self.refused, self.unseen = self.refused + other.refused, self.unseen + other.unseen
+        self.refused, self.past = self.refused + other.refused, self.past + other.past
         self.slowest, self.memory = max(self.slowest, other.slowest), max(self.memory, other.memory)
         self.lines |= other.lines
         self.failures = (self.failures + other.failures)[:FAILURES_KEPT]
         self.kinds += other.kinds
-
-
-class Hang(BaseException):
-    """An input takes longer than `LIMIT`."""
-
-
-def _memory(key: str) -> int:
-    """Return a size of this process by its name in Linux [bytes]; 0 on other systems."""
-    if sys.platform != "linux":
-        return 0
-    line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(key))
-    return 1024 * int(line.split()[1])
-
-
-def _reset_peak() -> None:
-    if sys.platform == "linux":
-        with contextlib.suppress(OSError):  # then growth beyond the largest before is seen, and no other
-            Path("/proc/self/clear_refs").write_text("5")
-
-
-def _bound_process() -> None:
-    """Bound memory and silence decoders, where the system can."""
-    with open(os.devnull, "w") as nothing:
-        os.dup2(nothing.fileno(), 2)
-    if sys.platform == "linux":
-        import resource
-
-        import psutil
-
-        limit = psutil.Process().memory_info().vms + ADDRESS_SPACE
-        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    if hasattr(signal, "setitimer"):
-
-        def late(*_):
-            raise Hang
-
-        signal.signal(signal.SIGALRM, late)
 
 
 def changed(target: Target, data: bytes, rng: np.random.Generator) -> tuple[bytes, bool]:
@@ -113,47 +82,58 @@ def changed(target: Target, data: bytes, rng: np.random.Generator) -> tuple[byte
     return data, False
 
 
-def _alarm(seconds: float) -> None:
-    if hasattr(signal, "setitimer"):
-        signal.setitimer(signal.ITIMER_REAL, seconds)
-
-
-def _differ(a: object, b: object) -> bool:
-    pairs = zip(a, b) if isinstance(a, tuple) else ()
-    return any(isinstance(x, np.ndarray) and not np.array_equal(x, y) for x, y in pairs)
-
-
 class Worker:
-    """One reader with its valid files, in a process of its own."""
+    """One reader with its valid files."""
 
-    def __init__(self, target: Target, seed: int, folder: Path, limit: float = 0):
-        """Write the valid files; ``limit`` bounds the time of an input [s] after `_bound_process`, 0 does not."""
-        self.target, self.seed, self.folder, self.limit = target, seed, folder, limit
+    def __init__(self, target: Target, seed: int, folder: Path, measured: bool = False):
+        """Write the valid files; ``measured`` bounds the time of an input, after `bound_process`, and traces its lines."""
+        self.target, self.seed, self.folder, self.measured = target, seed, folder, measured
+        self.tally = Tally(target.name)
+        self.reached = Reached(parser_lines(target) if measured else {})
         self.paths = target.prepare(folder)
         self.bytes = {p: p.read_bytes() for p in self.paths}
-        self.good = {p: self._read_valid(p) for p in self.paths}
-        self.tally = Tally(target.name)
+        self.good = {p: self._try(p) for p in self.paths}
         assert any(g is not None for g in self.good.values()), f"{target.name}: every valid file is refused"
+        self.first = {p: self._first_checks(p) for p in self.paths} if measured else {}
 
-    @classmethod
-    def check(cls, target: Target, seed: int) -> None:
-        """Prepare once in this process, so that a mistake in a target itself is seen as one."""
-        with tempfile.TemporaryDirectory() as folder:
-            cls(target, seed, Path(folder))
-
-    def _read_valid(self, path: Path) -> object:
+    def _try(self, path: Path) -> object:
+        """Return what is read of a file; None where it is refused."""
         from warpgs.errors import WarpgsError
 
         try:
-            return self.target.read(self.folder, path)
-        except WarpgsError:  # a sample of what is refused
+            return self._read(path)
+        except WarpgsError:
             return None
+
+    def _read(self, path: Path) -> object:
+        if not self.measured:
+            return self.target.read(self.folder, path)
+        try:
+            with self.reached:
+                return self.target.read(self.folder, path)
+        finally:
+            self.tally.lines |= self.reached.lines()
+
+    def _first_checks(self, path: Path) -> set[Line]:
+        """Return the lines that run where files without a meaning, in place of a valid one, are refused."""
+        lines = set()
+        for data in [*garbage(), None]:
+            path.unlink()
+            if data is not None:
+                path.write_bytes(data)
+            if self._try(path) is None:  # an empty file means something in some formats
+                lines |= self.reached.lines()
+            self.restore(path)
+        return lines
 
     def put(self, index: int) -> tuple[Path, bytes, bool]:
         """Write an input in place of a valid file."""
         rng = np.random.default_rng([self.seed, zlib.crc32(self.target.name.encode()), index])
         path = self.paths[int(rng.integers(len(self.paths)))]
-        data, plain = changed(self.target, self.bytes[path], rng)
+        for _ in range(ATTEMPTS):
+            data, plain = changed(self.target, self.bytes[path], rng)
+            if data != self.bytes[path]:
+                break
         if rng.random() < 0.01:  # no file at all
             path.unlink()
             if rng.random() < 0.5:
@@ -163,28 +143,46 @@ class Worker:
         return path, data, plain
 
     def restore(self, path: Path) -> None:
+        """Write the valid file back, where the input or its reader changed or removed it."""
         if path.is_dir():
             shutil.rmtree(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(self.bytes[path])
 
     def run(self, index: int) -> None:
-        from warpgs.errors import ResourceError, WarpgsError
-
         tally = self.tally
         try:
             path, data, plain = self.put(index)
         except Exception as e:  # of the fuzzer itself: nothing was read
             tally.fail("no input", index, repr(e))
             return
-        _reset_peak()
-        before, began = _memory("VmHWM"), time.perf_counter()
+        peak, began = PeakMemory(), spent()
         tally.inputs += 1
         try:
-            _alarm(self.limit)
-            found = self.target.read(self.folder, path)
-            _alarm(0)
-            tally.accepted += 1
-            self._judge(index, path, data, plain, found)
+            found = self._outcome(index, path, data, plain)
+            grown, seconds = peak.grown(), spent() - began
+            grown -= size_of(found) if grown > MEMORY else 0
+        finally:
+            self.restore(path)
+        tally.slowest, tally.memory = max(tally.slowest, seconds), max(tally.memory, grown)
+        if seconds > LIMIT:  # where a library swallows the exception, or the system has no timer
+            tally.fail("hang", index, f"takes {seconds:.1f} s of processor time")
+        if grown > MEMORY:
+            tally.fail("memory", index, f"takes {grown / 2**20:.0f} MiB beyond its result, for a file of {len(data):,} bytes")
+
+    def _outcome(self, index: int, path: Path, data: bytes, plain: bool) -> object:
+        """Read an input and count what becomes of it; return what was read."""
+        from warpgs.errors import ResourceError, WarpgsError
+
+        tally, found = self.tally, None
+        try:
+            with time_limit(self.measured):
+                found = self._read(path)
+            if found is None:  # the file is passed over, as one that is not there
+                tally.refused += 1
+            else:
+                tally.accepted += 1
+                self._judge(index, path, data, plain, found)
         except ResourceError as e:
             tally.fail("memory", index, str(e))
         except WarpgsError as e:
@@ -192,71 +190,74 @@ class Worker:
             if str(self.folder) not in str(e) or len(str(e)) < len(str(self.folder)) + 20:
                 tally.fail("message", index, str(e))
         except Hang:
-            tally.fail("hang", index, f"takes more than {LIMIT} s")
+            tally.fail("hang", index, f"takes more than {LIMIT:.0f} s of processor time, or {WALL:.0f} s of wall time")
         except Exception as e:
             last = traceback.extract_tb(e.__traceback__)[-1]
             tally.fail("raw", index, f"{type(e).__name__}: {str(e)[:200]} ({last.filename}, line {last.lineno})")
-        finally:
-            _alarm(0)
-            tally.slowest = max(tally.slowest, time.perf_counter() - began)
-            self.restore(path)
-        grown = _memory("VmHWM") - before
-        tally.memory = max(tally.memory, grown)
-        if grown > MEMORY + MEMORY_PER_BYTE * len(data):
-            tally.fail("memory", index, f"takes {grown / 2**20:.0f} MiB for a file of {len(data):,} bytes")
+        if self.measured:
+            tally.past += found is not None or bool(self.reached.lines() - self.first[path])
+        return found
 
     def _judge(self, index: int, path: Path, data: bytes, plain: bool, found: object) -> None:
         if bad := self.target.nonsense(found):
             self.tally.fail("nonsense", index, bad)
         good = self.good[path]
-        if not plain or good is None or not path.is_file():
-            return
-        self.tally.unseen += _differ(good, found)
-        if bad := self.target.unexplained(self.bytes[path], data, good, found):
-            self.tally.fail("nonsense", index, bad)
+        if plain and good is not None and path.is_file():
+            if bad := self.target.unexplained(self.bytes[path], data, good, found):
+                self.tally.fail("nonsense", index, bad)
 
 
 def work(name: str, seed: int, first: int, last: int, current, results) -> None:
     """Read the inputs ``first`` to ``last`` of a reader and send a `Tally` at the end; ``current`` tells which one runs."""
-    import coverage
-
-    target = all_targets()[name]
-    _bound_process()
-    lines = parser_lines(target)
-    cover = coverage.Coverage(data_file=None, include=list(lines), config_file=False)
+    target, broken = all_targets()[name], Tally(name)
+    bound_process()
     with tempfile.TemporaryDirectory() as folder:
-        cover.start()
-        worker = Worker(target, seed, Path(os.path.realpath(folder)), LIMIT)
+        try:
+            worker = Worker(target, seed, Path(os.path.realpath(folder)), measured=True)
+        except Exception:  # a mistake in the target itself
+            broken.fail("no target", first, traceback.format_exc())
+            results.put(broken)
+            return
         for index in range(first, last):
             current.value = index
             worker.run(index)
-        cover.stop()
-    for file, numbers in lines.items():
-        worker.tally.lines |= {(file, n) for n in set(cover.get_data().lines(file) or ()) & numbers}
     results.put(worker.tally)
+
+
+@functools.cache
+def _context() -> multiprocessing.context.BaseContext:
+    """Return how processes start: on Linux from one that has imported all readers, in the environment of `ALLOCATOR`."""
+    os.environ.update(ALLOCATOR)
+    if sys.platform != "linux":
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([f"tests.faults.{name}" for name in MODULES])
+    return context
+
+
+def _outcome_of(process, current, results) -> Tally | None:
+    """Wait for the tally of a process; None where it ends without one, or stands still."""
+    seen, since = current.value, time.monotonic()
+    while process.is_alive() and time.monotonic() - since < 3 * WALL:
+        try:
+            return results.get(timeout=0.5)
+        except queue.Empty:
+            if current.value != seen:
+                seen, since = current.value, time.monotonic()
+    try:
+        return results.get(timeout=1)
+    except queue.Empty:
+        return None
 
 
 def fuzz(name: str, inputs: int, seed: int, first: int = 0) -> Tally:
     """Read inputs of one reader in a process, and in another one after each that ends it."""
-    context = multiprocessing.get_context("spawn")
-    tally, last = Tally(name), first + inputs
-    Worker.check(all_targets()[name], seed)
+    context, tally, last = _context(), Tally(name), first + inputs
     while first < last:
         current, results = context.Value("q", first), context.Queue()
         process = context.Process(target=work, args=(name, seed, first, last, current, results))
         process.start()
-        part, seen, since = None, first, time.monotonic()
-        while part is None and process.is_alive() and time.monotonic() - since < 5 * LIMIT:
-            try:
-                part = results.get(timeout=0.5)
-            except Exception:  # nothing yet
-                if current.value != seen:
-                    seen, since = current.value, time.monotonic()
-        if part is None and not process.is_alive():
-            try:
-                part = results.get(timeout=1)
-            except Exception:
-                part = None
+        part = _outcome_of(process, current, results)
         if part is not None:
             process.join()
             tally.add(part)
@@ -265,7 +266,10 @@ def fuzz(name: str, inputs: int, seed: int, first: int = 0) -> Tally:
         process.join()
         # what that process read before is read again, up to the input that ended it
         broken = current.value
-        tally.fail("crash", broken, f"the process ended with {process.exitcode}")
+        if all_targets()[name].own_process and process.exitcode is not None and current.value > first:
+            tally.inputs, tally.refused = tally.inputs + 1, tally.refused + 1
+        else:
+            tally.fail("crash", broken, f"the process ended with {process.exitcode}")
         if broken > first:
             tally.add(fuzz(name, broken - first, seed, first))
         first = broken + 1
@@ -274,16 +278,31 @@ def fuzz(name: str, inputs: int, seed: int, first: int = 0) -> Tally:
     return tally
 
 
+def shares(names: list[str], inputs: int) -> dict[str, int]:
+    """Return the number of inputs of each reader: slow ones get less."""
+    weights = {n: all_targets()[n].share for n in names}
+    return {n: -int(-inputs * w // sum(weights.values())) for n, w in weights.items()}
+
+
 def table(tallies: list[Tally]) -> str:
     """Return one row per reader."""
-    rows = [f"{'reader':<26}{'inputs':>8}{'accepted':>10}{'refused':>9}{'changed':>9}{'slowest':>10}{'memory':>10}{'lines':>8}"]
+    rows = [f"{'reader':<26}{'inputs':>8}{'accepted':>10}{'refused':>9}{'past':>8}{'slowest':>10}{'memory':>10}{'lines':>8}"]
     for t in tallies:
-        wanted = sum(map(len, parser_lines(all_targets()[t.name]).values()))
+        wanted, of = sum(map(len, parser_lines(all_targets()[t.name]).values())), max(t.inputs, 1)
         rows.append(
-            f"{t.name:<26}{t.inputs:>8}{t.accepted / max(t.inputs, 1):>10.1%}{t.refused / max(t.inputs, 1):>9.1%}"
-            f"{t.unseen:>9}{1e3 * t.slowest:>7.0f} ms{t.memory / 2**20:>6.0f} MiB{len(t.lines) / wanted:>8.1%}"
+            f"{t.name:<26}{t.inputs:>8}{t.accepted / of:>10.1%}{t.refused / of:>9.1%}{t.past / of:>8.1%}"
+            f"{t.slowest:>8.2f} s{max(t.memory, 0) / 2**20:>6.0f} MiB{len(t.lines) / wanted:>8.1%}"
         )
     return "\n".join(rows)
+
+
+def shallow(tally: Tally) -> str:
+    """Say where too few inputs get past the first check of a reader; empty where enough do."""
+    return (
+        ""
+        if tally.past >= PAST * tally.inputs
+        else f"{tally.name}: {tally.past} of {tally.inputs} inputs get past the first check"
+    )
 
 
 def missed(tally: Tally) -> dict[str, list[int]]:
@@ -293,6 +312,18 @@ def missed(tally: Tally) -> dict[str, list[int]]:
     return {f: numbers for f, numbers in found.items() if numbers}
 
 
+def fuzz_all(inputs: dict[str, int], seed: int, first: int, processes: int, tell: Callable[[Tally], object]) -> list[Tally]:
+    """Fuzz readers, several at a time; ``tell`` is given each tally as it is there."""
+
+    def one(name: str) -> Tally:
+        tally = fuzz(name, inputs[name], seed, first)
+        tell(tally)
+        return tally
+
+    with ThreadPoolExecutor(processes) as pool:
+        return list(pool.map(one, inputs))
+
+
 def main() -> int:
     """Fuzz the named readers, all without a name; print a table and every failure."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -300,6 +331,7 @@ def main() -> int:
     parser.add_argument("--reader", action="append")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--keep", type=Path, help="write the first input of the first reader to this folder, and stop")
     a = parser.parse_args()
     names = a.reader or list(all_targets())
@@ -307,18 +339,14 @@ def main() -> int:
         a.keep.mkdir(parents=True)
         print(Worker(all_targets()[names[0]], a.seed, a.keep).put(a.first)[0])
         return 0
-    tallies = []
-    for name in names:
-        tallies.append(fuzz(name, -(-a.inputs // len(names)), a.seed, a.first))
-        print(
-            table(tallies[-1:]).splitlines()[len(tallies) > 1 :][-1],
-            *tallies[-1].failures,
-            missed(tallies[-1]),
-            sep="\n",
-            flush=True,
-        )
-    print(table(tallies))
-    return 1 if any(t.failures for t in tallies) else 0
+
+    def tell(t: Tally) -> None:
+        print(table([t]).splitlines()[1], *t.failures, f"    lines not reached: {missed(t)}", sep="\n", flush=True)
+
+    tallies = fuzz_all(shares(names, a.inputs), a.seed, a.first, a.processes, tell)
+    print(table(tallies), *filter(None, map(shallow, tallies)), sep="\n")
+    print(f"{sum(t.inputs for t in tallies):,} inputs, {sum(sum(t.kinds.values()) for t in tallies)} failures")
+    return 1 if any(t.failures or shallow(t) for t in tallies) else 0
 
 
 if __name__ == "__main__":

@@ -134,15 +134,11 @@ def _places(value, found: list) -> list:
     return found
 
 
-def json_value(data: bytes, rng: np.random.Generator) -> bytes:
-    """Replace, remove, repeat, move a little or wrap a value of a JSON text."""
-    try:
-        whole = json.loads(data)
-    except ValueError:
-        return data
+def changed_value(whole, rng: np.random.Generator):
+    """Replace, remove, repeat, move a little or wrap one value of nested lists and objects, in place; return the whole."""
     places = _places(whole, [])
     if not places:
-        return data
+        return whole
     container, key = _pick(rng, places)
     kind = int(rng.integers(6))
     value = container[key]
@@ -159,7 +155,12 @@ def json_value(data: bytes, rng: np.random.Generator) -> bytes:
     else:
         other, name = _pick(rng, places)
         container[key] = _pick(rng, (*VALUES, other[name]))
+    return whole
+
+
+def json_value(data: bytes, rng: np.random.Generator) -> bytes:
+    """Change a value of a JSON text."""
     try:
-        return json.dumps(whole).encode()
-    except (ValueError, RecursionError):  # the value was put into itself
+        return json.dumps(changed_value(json.loads(data), rng)).encode()
+    except (ValueError, RecursionError):  # no JSON; or the value was put into itself
         return data

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.faults.bombs import many_rows, rarely
 from tests.faults.mutations import Change, json_value, text_line, text_number
 from tests.faults.targets import Target, not_finite, register
 from tests.io import scenes
@@ -124,7 +125,7 @@ COLMAP = {
 }  # fmt: skip
 FRAMES = {"own": write_frames, "ngp": scenes.write_ngp, "blender": scenes.write_blender}
 add("colmap", COLMAP, (colmap,), TEXT)
-add("transforms", FRAMES, (transforms,), (json_value, json_value, text_number))
+add("transforms", FRAMES, (transforms,), (rarely(many_rows, json_value), json_value, text_number))
 add("llff", {"a": scenes.write_llff}, (llff,), (matrices_changed,))
 add("dtu", {"a": write_dtu}, (dtu,), (matrices_changed,))
 add("middlebury", {"a": scenes.write_middlebury}, (middlebury,), TEXT)

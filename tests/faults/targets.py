@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import types
 from collections.abc import Callable, Iterator
@@ -12,11 +13,6 @@ import numpy as np
 
 from tests.faults.mutations import Change
 
-MEMORY = 64 * 2**20
-"""Memory that a reader may take whatever the file [bytes]: buffers of libraries, and images within the limit of pixels."""
-MEMORY_PER_BYTE = 60
-"""Memory that a reader may take per byte of the file: parsed JSON and lists of numbers are the largest."""
-
 
 @dataclass(frozen=True)
 class Target:
@@ -26,7 +22,7 @@ class Target:
     prepare: Callable[[Path], list[Path]]
     """Write valid files to a folder and return those to change, one at a time."""
     read: Callable[[Path, Path], object]
-    """Read, from the folder and the changed file, and return what was read."""
+    """Read, from the folder and the changed file, and return what was read; None where a reader passes a file over."""
     parser: tuple[object, ...]
     """Modules, functions and classes whose lines count as the parser's."""
     changes: tuple[Change, ...] = ()
@@ -37,8 +33,17 @@ class Target:
     """Says what of a result is nonsense; empty where nothing is."""
     unexplained: Callable[[bytes, bytes, object, object], str] = lambda before, after, good, found: ""
     """Says what of a result plain damage does not explain: bytes before and after, results of both; empty where nothing."""
+    own_process: bool = False
+    """Whether a process of its own does the reading in warpgs: then an input that ends the process is refused, not a defect."""
+    share: float = 1.0
+    """Number of inputs relative to other readers: less than 1 for slow ones."""
 
 
+MODULES = (
+    "format_targets", "image_targets", "model_targets", "network_targets", "photo_targets", "record_targets", "scene_targets",
+    "viewer_targets",
+)  # fmt: skip
+"""Modules of this folder that register readers."""
 TARGETS: dict[str, Target] = {}
 
 
@@ -51,8 +56,8 @@ def register(target: Target) -> Target:
 
 def all_targets() -> dict[str, Target]:
     """Return every registered reader by name."""
-    from tests.faults import format_targets, image_targets, model_targets, scene_targets  # noqa: F401 - they register
-
+    for name in MODULES:
+        importlib.import_module(f"tests.faults.{name}")
     return TARGETS
 
 

@@ -59,9 +59,11 @@ def list_jobs(jobs: str) -> list[ListedJob]:
     taken: dict[str, ListedJob] = {}
     for job in found:
         if not NAME.fullmatch(job.name) or job.name.endswith((".", " ")) or job.name in OWN_FILES:
-            raise DataError(f"{job.name[:100]!r} cannot be the name of a job, and so of a folder; name it in a .jsonl file")
+            raise DataError(
+                f"{jobs}: {job.name[:100]!r} cannot be the name of a job, and so of a folder; name it in a .jsonl file"
+            )
         if job.name.casefold() in taken:
-            raise UsageError(f"two jobs have the name {job.name!r}; give each line of a .jsonl file a name of its own")
+            raise UsageError(f"{jobs}: two jobs have the name {job.name!r}; give each line of a .jsonl file its own name")
         taken[job.name.casefold()] = job
     return found
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 
@@ -100,6 +101,7 @@ def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); give a .pth file with a state dict") from e
     with file:
         try:
+            _check_unpacked(file)
             # weights_only: tensors and plain containers, nothing that could run
             state = torch.load(file, map_location="cpu", weights_only=True)
         except Exception as e:  # torch, pickle and zipfile raise a dozen types on foreign bytes
@@ -112,6 +114,16 @@ def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
     if not isinstance(state, dict):
         raise DataError(f"{path}: holds a {type(state).__name__}, not a state dict of named tensors; give the weights alone")
     return state, digest
+
+
+def _check_unpacked(file: BinaryIO) -> None:
+    """Raise a ValueError where an archive unpacks to more than its own size; torch packs nothing."""
+    if zipfile.is_zipfile(file):
+        with zipfile.ZipFile(file) as archive:
+            unpacked = sum(member.file_size for member in archive.infolist())
+        if unpacked > file.seek(0, os.SEEK_END):
+            raise ValueError(f"it unpacks to {unpacked:,} bytes, more than its size")
+    file.seek(0)
 
 
 def _net_of(heads: dict[str, torch.Tensor], path: Path) -> Net:

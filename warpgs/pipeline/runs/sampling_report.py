@@ -203,7 +203,7 @@ def sampling_report_of(fit: Trainer, out: Path) -> SamplingReport | None:
         ["sampling events", "Gaussians added", "evicted", "coarse at the end", "fine at the end"],
         [f"{n:,}" for n in (events["count"], events["added"], events["evicted"], layers["coarse"], layers["fine"])],
     ]
-    files = sorted((out / FOLDER).glob("*.png"))
+    files = sorted(p for p in (out / FOLDER).glob("*.png") if p.stem.isdecimal())  # others are not ours
     images = [
         (f"sampling after step {int(p.stem):,}", webp(decode(p, data=read_file(p, out))[0], SHEET_WIDTH, 70)) for p in files
     ]

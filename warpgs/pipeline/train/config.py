@@ -158,6 +158,8 @@ def _term(values: dict[str, Any]) -> LossTerm:
 
 def _compose(kind: type, values: dict[str, Any]) -> Any:
     """Return a settings dataclass from nested plain values; its fields that are dataclasses are composed in turn."""
+    if not isinstance(values, dict):
+        raise TypeError(f"{kind.__name__} takes an object, not {str(values)[:60]}")
     kinds = typing.get_type_hints(kind)
     return kind(**{k: _compose(kinds[k], v) if dataclasses.is_dataclass(kinds[k]) else v for k, v in values.items()})
 

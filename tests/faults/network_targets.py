@@ -1,0 +1,98 @@
+"""Networks, their weights and the maps that they made, for the fuzzer: what runs, and what is kept on disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tests.faults.bombs import rarely, zip_bomb
+from tests.faults.format_targets import zip_member
+from tests.faults.model_targets import SMALL, onnx_field, tensors_body, tensors_header
+from tests.faults.targets import Target, register
+from tests.priors import networks as nw
+from warpgs.pipeline.metrics import lpips_weights
+from warpgs.priors import cache, flow, session
+
+# ---- weights of LPIPS as others publish them ---------------------------------------------------------------------------
+
+
+def state_files(root: Path) -> list[Path]:
+    lpips_weights.NETS["small"] = SMALL  # the real ones have millions of weights
+    for name in ("heads", "backbone"):
+        state = {n: torch.ones(s) for n, s in SMALL.shapes().items() if n.startswith("lin") == (name == "heads")}
+        torch.save(state, root / f"{name}.pth")
+    return [root / "backbone.pth", root / "heads.pth"]
+
+
+def converted(root: Path, path: Path) -> object:
+    (root / "out.safetensors").unlink(missing_ok=True)
+    lpips_weights.convert_lpips(root / "backbone.pth", root / "heads.pth", root / "out.safetensors")
+    return lpips_weights.read_lpips(root / "out.safetensors")
+
+
+STATES = (lpips_weights._read_state, lpips_weights._net_of, lpips_weights.convert_lpips)
+register(Target("LPIPS state dict", state_files, converted, STATES, (zip_member, rarely(zip_bomb, zip_member))))
+
+# ---- maps on disk ------------------------------------------------------------------------------------------------------
+
+IMAGE = np.random.default_rng(0).random((6, 9, 3), np.float32)
+NAMES = ("a", "b")
+
+
+def map_files(root: Path) -> list[Path]:
+    maps = tuple(np.full((6, 9), v, np.float32) for v in (0.25, 1.0))
+    cache.MapCache(root).maps(IMAGE, NAMES, {"model": "x"}, lambda: maps)
+    return list(root.glob("*.safetensors"))
+
+
+def maps_of(root: Path, path: Path) -> tuple[np.ndarray, ...] | None:
+    store = cache.MapCache(root)
+    found = store._read(path, NAMES, IMAGE.shape[:2])
+    assert found is not None or not path.exists() or str(path) in store.notes[0]
+    return found
+
+
+def map_nonsense(found: tuple[np.ndarray, ...]) -> str:
+    return "" if all(m.shape == (6, 9) and m.min() >= 0 and m.max() <= 1 for m in found) else "a map is none"
+
+
+register(
+    Target(
+        "stored maps", map_files, maps_of, (cache.MapCache._read,), (tensors_header, tensors_body), nonsense=map_nonsense
+    )
+)  # fmt: skip
+
+# ---- networks in onnxruntime -------------------------------------------------------------------------------------------
+
+
+def network_files(root: Path) -> list[Path]:
+    for layout in ("nchw", "nhwc"):
+        (root / f"{layout}.onnx").write_bytes(nw.linear(np.eye(3), np.zeros(3), layout=layout))
+    return sorted(root.glob("*.onnx"))
+
+
+NETWORK = (session.open_network, session._start, session._input_axes)
+register(
+    Target(
+        "network", network_files, lambda root, path: session.open_network(path, threads=1), NETWORK,
+        (onnx_field, onnx_field, onnx_field), share=0.3,
+    )
+)  # fmt: skip
+
+
+def flow_networks(root: Path) -> list[Path]:
+    shape = (1, 3, 8, 8)
+    nodes = [nw.node("Add", ["a", "b"], ["y"])]
+    graph = nw.graph(nodes, [], [nw.value("a", shape), nw.value("b", shape)], [nw.value("y", shape)])
+    (root / "flow.onnx").write_bytes(nw.model(graph))
+    return [root / "flow.onnx"]
+
+
+register(
+    Target(
+        "flow network", flow_networks, lambda root, path: flow._network(path, "255"), (flow._network,),
+        (onnx_field, onnx_field, onnx_field), share=0.3,
+    )
+)  # fmt: skip

@@ -1,0 +1,257 @@
+"""JSON records and lists for the fuzzer: keyframes, scores, jobs of a farm, found poses, events, locks, failed steps."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from tests.faults.bombs import many_rows, rarely
+from tests.faults.image_targets import png_checksums, png_rows
+from tests.faults.model_targets import gaussians, in_order, run_files, tensors_body, tensors_header
+from tests.faults.mutations import Change, json_value, text_line, text_number
+from tests.faults.targets import Target, not_finite, register
+from warpgs import schema
+from warpgs.app.commands import farm as farm_command
+from warpgs.errors import DataError, UsageError
+from warpgs.files import write_json
+from warpgs.pipeline.farm import ensure_run, listing, record, work
+from warpgs.pipeline.films import keyframes
+from warpgs.pipeline.runs import failed_step, folder, schemas
+from warpgs.pipeline.train.config import PRESETS, FitConfig
+from warpgs.poses import record as poses_record
+from warpgs.report import events
+from warpgs.runtime import folder_lock
+from warpgs.scene import Camera, Normalization
+
+JSON_CHANGES: tuple[Change, ...] = (json_value, json_value, rarely(many_rows, json_value), text_number)
+
+
+def add(name: str, file: str, values: object, read, parser: tuple, **more) -> None:
+    """Register the reader of one JSON file."""
+
+    def prepare(root: Path) -> list[Path]:
+        write_json(root / file, values)
+        return [root / file]
+
+    register(Target(name, prepare, read, parser, **({"changes": JSON_CHANGES} | more)))
+
+
+# ---- camera paths ------------------------------------------------------------------------------------------------------
+
+TEMPLATE = Camera(np.eye(4), np.array([[40.0, 0, 32], [0, 40, 24], [0, 0, 1]]), 64, 48)
+
+
+def turned(angle: float) -> list[list[float]]:
+    c, s = float(np.cos(angle)), float(np.sin(angle))
+    return [[c, 0.0, s, angle], [0.0, 1.0, 0.0, 0.5], [-s, 0.0, c, -2.0], [0.0, 0.0, 0.0, 1.0]]
+
+
+def cameras_of_path(root: Path, path: Path) -> list[Camera]:
+    found = keyframes.read_keyframes(path, TEMPLATE, Normalization(np.array([1.0, 2, 3]), 0.5))
+    return keyframes.through(found, 5)
+
+
+def path_nonsense(cameras: list[Camera]) -> str:
+    return "".join(not_finite(viewmat=c.viewmat, K=c.K) for c in cameras)
+
+
+PATH = [{"c2w": turned(0.3 * i), "fov_y": 0.8 + 0.1 * i, "seconds": 2.0 * i} for i in range(4)]
+KEYFRAMES = (keyframes.read_keyframes, keyframes.through)
+add("keyframes", "path.json", PATH, cameras_of_path, KEYFRAMES, nonsense=path_nonsense)
+
+# ---- scores of a run ---------------------------------------------------------------------------------------------------
+
+CLASSES = {
+    k: {"pixels": 10, "share_of_pixels": 0.2, "share_of_error": 0.3, "psnr": 20.5, "ssim": None, "expected_psnr": 21.0}
+    for k in ("0", "1")
+}
+SCORES = {
+    "test": {"psnr": 24.5, "ssim": 0.8}, "train": {"psnr": 30.25, "ssim": None}, "views": [{"name": "a.png", "psnr": 24.5}],
+    "variants": {"lpips": "vgg 0.1"}, "config_hash": "ab12", "steps": 500, "gaussians": 7, "batch": 1, "ranks": 1,
+    "seconds": {"total": 12.5},
+    "protocol": {"split": "llff:8", "training_views": 3, "held_out_views": 1, "ground_truth": "as stored",
+        "resolution": ["16 x 12"], "score_masks": 0},
+    "photographs": [{"name": "a.png", "compared_with": 2, "sharpness": 1.5, "brightness": None,
+         "channels": [1.0, 0.5, 2.0], "moved": 0.25}],
+    "poses": {"views": [{"name": "a.png", "degrees": 0.5, "units": 0.25}], "summary": "moved a little"},
+    "coverage": {"classes": CLASSES, "views": [{"name": "a.png", "classes": CLASSES}], "tolerance": 0.01,
+        "depth_differences": [0.5], "photo_psnr": [None, 20.5], "summary": "all seen"},
+}  # fmt: skip
+add("scores", "metrics.json", SCORES, lambda root, path: ensure_run._scores(path), (ensure_run._scores, schema, schemas))
+
+# ---- farms -------------------------------------------------------------------------------------------------------------
+
+JOB = record.JobRecord("a", "ab12", "done", "fitted", seconds=1.5, psnr=24.5, files=dict.fromkeys(record.CHECKED, "ab12"))
+add(
+    "record of a job", record.RECORD, dataclasses.asdict(JOB), lambda root, path: record.read_record(root),
+    (record.read_record, schema.fields, schema.mapping, schema.one_of),
+)  # fmt: skip
+
+LINES = (
+    {"scene": "a", "steps": 500, "strategy": "mcmc"}, {"scene": "b", "name": "second", "strict": True, "split": "llff:8"},
+    {"scene": "c", "optimizer.pose_rotation_lr": 0.5},
+)  # fmt: skip
+
+
+def job_files(root: Path) -> list[Path]:
+    (root / "jobs.jsonl").write_text("".join(json.dumps(line) + "\n" for line in LINES), "utf-8")
+    return [root / "jobs.jsonl"]
+
+
+def one_line(change: Change) -> Change:
+    """Return the change of one line of a text."""
+
+    def changed(data: bytes, rng: np.random.Generator) -> bytes:
+        lines = data.split(b"\n")
+        i = int(rng.integers(len(lines)))
+        lines[i] = change(lines[i], rng)
+        return b"\n".join(lines)
+
+    return changed
+
+
+LINE_CHANGES = (one_line(json_value), one_line(json_value), one_line(text_number), text_line)
+LISTING = (listing.list_jobs, listing._read, listing._job, listing._flag)
+register(Target("list of jobs", job_files, lambda root, path: listing.list_jobs(str(path)), LISTING, LINE_CHANGES))
+
+
+def jobs_with_flags(root: Path, path: Path) -> list:
+    """Read the flags of each job, too, as the command does."""
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            return farm_command._jobs(listing.list_jobs(str(path)), [], root / "out")
+    except UsageError as e:  # a wrong flag is told by its job, and the file is named on the command line
+        raise UsageError(f"{path}: {e}") from e
+
+
+register(Target("flags of jobs", job_files, jobs_with_flags, (farm_command._jobs,), LINE_CHANGES, share=0.01))
+
+# ---- found poses, events, locks ----------------------------------------------------------------------------------------
+
+FOUND = {
+    "format": 1, "source_sha256": "ab12", "notes": ["a note"], "advice": ["more photographs"],
+    "mean_reprojection_error_px": 0.5,
+    "points": 40, "method": "incremental", "pairs_tried": 3, "pairs_matched": 2, "pycolmap": "3.12",
+    "cameras": [{"focal": 50.5, "distortion": 0.01, "width": 64, "height": 48}],
+    "photographs": [
+        {"name": "a.jpg", "sha256": "ab", "registered": True, "keypoints": 90, "points": 40, "matches": {"b.jpg": 30},
+         "reason": None},
+        {"name": "b.jpg", "sha256": "cd", "registered": False, "keypoints": 9, "points": 0, "matches": {},
+         "reason": "has few keypoints"},
+    ],
+}  # fmt: skip
+
+
+def pose_lines(root: Path, path: Path) -> list[str]:
+    return poses_record.report_lines(poses_record.read_record(root))
+
+
+add(
+    "record of poses", poses_record.JSON, FOUND, pose_lines, (poses_record.read_record, poses_record.report_lines, schema.items)
+)
+
+
+def event_files(root: Path) -> list[Path]:
+    log = events.EventLog(root / "metrics.jsonl")
+    for step in range(1, 5):
+        log.write(step=step, loss=0.5 / step, psnr=None if step == 2 else 20.0 + step)
+    log.close()
+    return [root / "metrics.jsonl"]
+
+
+def events_of(root: Path, path: Path) -> list[dict] | None:
+    """Read a log; None where no line is whole. A fit that goes on drops later events."""
+    if not path.is_file():
+        raise DataError(f"{path}: there is no log, and nobody reads one that is not there")
+    found = events.read_events(path)
+    log = events.EventLog(path, step=2)
+    log.close()
+    assert [e["step"] for e in events.read_events(path)] == [e["step"] for e in found if e["step"] <= 2]
+    return found or None
+
+
+def events_nonsense(found: list[dict]) -> str:
+    sound = all(isinstance(e["step"], int) and all(isinstance(v, (int, float)) for v in e.values()) for e in found)
+    return "" if sound else "an event holds something else than numbers"
+
+
+register(
+    Target(
+        "events", event_files, events_of, (events.read_events, events.EventLog.rewind), LINE_CHANGES, nonsense=events_nonsense
+    )
+)  # fmt: skip
+
+
+def lock_files(root: Path) -> list[Path]:
+    values = {"process": 7, "host": "machine", "since": "2024-01-01 10:00", "command": "warpgs fit scene"}
+    (root / "lock").write_bytes(b"\n" + json.dumps(values).encode())
+    return [root / "lock"]
+
+
+def holder(root: Path, path: Path) -> str | None:
+    data = path.read_bytes() if path.is_file() else b""
+    return folder_lock._signed(io.BytesIO(data))
+
+
+register(Target("signature of a lock", lock_files, holder, (folder_lock._signed,), (one_line(json_value), text_number)))
+
+# ---- runs --------------------------------------------------------------------------------------------------------------
+
+RESUMED = (folder.stored_request, folder._stored_scene, folder._check_named_again, FitConfig.from_json)
+
+
+def resumed(root: Path, path: Path) -> object:
+    request = folder.stored_request(root)
+    json.dumps(request.config.to_json())
+    return request
+
+
+register(Target("continued run", run_files, resumed, RESUMED, JSON_CHANGES))
+
+
+def failed_steps(root: Path) -> list[Path]:
+    tensors = {"image": torch.rand(4, 5, 3), "viewmat": torch.eye(4), "K": torch.eye(3), "background": torch.zeros(3)}
+    tensors |= {f"params.{n}": t for n, t in gaussians().tensors().items()}
+    plain = {
+        "config": PRESETS["quick"].to_json(), "step": 7, "view": "a.png", "width": 5, "height": 4, "degree": 1,
+        "settings": [1, 0, 0, 0, 0, 0], "dropout_seed": 5,
+    }  # fmt: skip
+    path = root / failed_step.FILE
+    failed_step.save_failed_step(path, (tensors, plain))
+    path.write_bytes(in_order(path.read_bytes()))
+    return [path]
+
+
+register(
+    Target(
+        "failed step", failed_steps, lambda root, path: failed_step.read_failed_step(path, torch.device("cpu")),
+        (failed_step.read_failed_step,), (tensors_header, tensors_header, tensors_body),
+    )
+)  # fmt: skip
+
+# ---- images of a run ---------------------------------------------------------------------------------------------------
+
+
+def render_files(root: Path) -> list[Path]:
+    image = np.random.default_rng(0).integers(0, 256, (12, 48, 3)).astype("u1")
+    (root / "renders").mkdir()
+    cv2.imwrite(str(root / "renders" / "a.png"), image)
+    return [root / "renders" / "a.png"]
+
+
+def thumbnail(root: Path, path: Path) -> bytes | None:
+    """Write a job's thumbnail from a render; None where the render is no image."""
+    target = root / record.THUMBNAIL
+    target.unlink(missing_ok=True)
+    work.write_thumbnail(root / "renders", target)
+    return target.read_bytes() if target.is_file() else None
+
+
+register(Target("render of a job", render_files, thumbnail, (work.write_thumbnail,), (png_rows, png_rows), png_checksums))

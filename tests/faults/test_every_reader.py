@@ -1,0 +1,161 @@
+"""Every function of warpgs that opens input is read by the fuzzer, or a reason stands here why it is not."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import warpgs
+from tests.faults.fuzz import Worker
+from tests.faults.targets import all_targets
+from warpgs.pipeline.metrics import lpips_weights
+
+PACKAGE = Path(warpgs.__file__).parent
+OPENING = {
+    "open", "open_file", "open_input", "read_bytes", "read_file", "read_input", "read_start", "read_text", "input_digest",
+    "fromfile", "imdecode", "imread", "safe_open", "AvifImageFile", "HeifImageFile", "InferenceSession", "VideoCapture",
+    "ZipFile",
+}  # fmt: skip
+"""Names of functions and classes that open a file or decode what one holds."""
+PARSING = {"json.load", "json.loads", "np.load", "schema.parse", "schema.read", "torch.load", "msgspec.msgpack.decode"}
+"""The same with their modules."""
+
+READERS = {
+    "export/formats.py": {"read_gaussians": "splat"},
+    "export/gltf.py": {"_split": "glTF"},
+    "export/ply.py": {"read_ply": "ply"},
+    "export/sog.py": {"decode": "SOG", "_member": "SOG", "_pixels": "SOG"},
+    "io/camera_files.py": {"_json": "cameras"},
+    "io/colmap.py": {"_BinaryFile.__init__": "colmap", "_lines": "colmap"},
+    "io/decoding.py": {"_raster": "any image", "read_image_file": "any image", "read_image_start": "heic by its process"},
+    "io/dtu.py": {"_read_matrices": "dtu"},
+    "io/image_formats/avif.py": {"open_image": "avif"},
+    "io/llff.py": {"read_rows": "llff"},
+    "io/middlebury.py": {"read_rows": "middlebury"},
+    "io/transforms.py": {"read_json": "transforms"},
+    "pipeline/farm/ensure_run.py": {"_scores": "scores"},
+    "pipeline/farm/listing.py": {"_read": "list of jobs"},
+    "pipeline/farm/record.py": {"read_record": "record of a job"},
+    "pipeline/farm/work.py": {"write_thumbnail": "render of a job"},
+    "pipeline/films/keyframes.py": {"read_keyframes": "keyframes"},
+    "pipeline/metrics/lpips_weights.py": {"_read_state": "LPIPS state dict", "read_lpips": "LPIPS weights"},
+    "pipeline/model/filters.py": {"_box_of_file": "crop box", "box_of": "crop box"},
+    "pipeline/model/model_file.py": {"load": "model file"},
+    "pipeline/runs/checkpoint.py": {"load_checkpoint": "checkpoint"},
+    "pipeline/runs/failed_step.py": {"read_failed_step": "failed step"},
+    "pipeline/runs/folder.py": {"read_record": "run record"},
+    "poses/heic.py": {"_coded_again": "heic", "to_jpeg": "heic by its process"},
+    "poses/record.py": {"read_record": "record of poses"},
+    "poses/video.py": {"_check_container": "video", "_frames": "video"},
+    "priors/cache.py": {"MapCache._read": "stored maps"},
+    "priors/flow.py": {"_network": "flow network", "read_flo": "flow"},
+    "priors/preprocess.py": {"read_side_file": "description of a network"},
+    "priors/session.py": {"_start": "network", "read_model": "network"},
+    "report/events.py": {"read_events": "events"},
+    "runtime/folder_lock.py": {"_signed": "signature of a lock"},
+    "schema.py": {"parse": "scores", "read": "scores"},
+    "viewer/frames.py": {"read_frame": "frame of a websocket"},
+}
+"""Name of the fuzzer's reader by file and function."""
+
+OWN = "reads what this process wrote just before"
+PIPE = "reads lines of a process that warpgs started, by a pipe that nobody else writes to"
+PRIVATE = "reads a file of the farm's private folder, which nobody else may enter"
+DIGEST = "reads bytes that it does not look into"
+SYSTEM = "reads what the system says"
+LAYER = "opens for others, which are named here"
+REASONS = {
+    "export/sog.py": {"encode": "writes"},
+    "files.py": {"appending": "writes", "writing": "writes", "read_file": LAYER},
+    "input_files.py": {"open_input": LAYER, "read_input": LAYER, "read_start": LAYER, "input_digest": LAYER},
+    "kernels/native.py": {"source": "reads a file of the package"},
+    "output_folders.py": {"Folder.open": LAYER, "Folder.open_regular": LAYER, "_opened": LAYER},
+    "pipeline/farm/ensure_run.py": {"_with_lpips": OWN},
+    "pipeline/farm/batch.py": {"main": PRIVATE},
+    "pipeline/farm/job.py": {"job_of": PIPE},
+    "pipeline/farm/local.py": {"LocalEngine._compile": PIPE, "LocalEngine.wait": PIPE},
+    "pipeline/farm/record.py": {"file_digest": DIGEST},
+    "pipeline/farm/slurm.py": {"SlurmEngine._answered": PRIVATE, "SlurmEngine._output": PRIVATE},
+    "pipeline/farm/worker.py": {"main": PIPE},
+    "pipeline/runs/coverage_report.py": {"coverage_section": OWN},
+    "pipeline/runs/commands.py": {"render": "opens a writer of a film"},
+    "pipeline/runs/folder.py": {"check_same": "copies a value"},
+    "pipeline/runs/sampling_report.py": {"sampling_report_of": "reads images for `webp`, which is named here"},
+    "poses/find.py": {"find_poses": OWN, "_digest": DIGEST},
+    "poses/heic.py": {"main": PIPE},
+    "poses/mapping.py": {"_lines": PIPE},
+    "poses/worker.py": {"main": PIPE, "extract": OWN, "match": OWN},
+    "priors/export.py": {
+        "_onnx_bytes": OWN, "_fcn_resnet18": "reads weights of 45 MB with safetensors, as the readers named here do",
+    },
+    "report/film.py": {"_decoded_sizes": OWN},
+    "report/images.py": {"webp": OWN},
+    "report/overview.py": {"render_overview": OWN},
+    "report/scene_plot.py": {"_rendered": OWN, "_with_legend": OWN},
+    "runtime/device_memory.py": {"_text": SYSTEM},
+    "runtime/load_module.py": {"exclusive": "opens a lock"},
+    "runtime/native_output.py": {"hidden_stderr": "opens /dev/null for writing"},
+    "runtime/output_streams.py": {"_send_to_null": "opens /dev/null for writing"},
+    "runtime/processor.py": {"processor_name": SYSTEM},
+    "runtime/rank_watch.py": {"machine": SYSTEM},
+    "temporary.py": {"_own_file": "writes"},
+}  # fmt: skip
+"""Why a function that opens something is not read by the fuzzer, by file and function."""
+
+
+def opening(node: ast.AST, where: str = "") -> Iterator[str]:
+    """Yield the name of each function below a node that opens or parses input."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+            yield from opening(child, f"{where}.{child.name}".lstrip("."))
+            continue
+        if isinstance(child, ast.Call):
+            called = ast.unparse(child.func)
+            if called in PARSING or called.rpartition(".")[2] in OPENING:
+                yield where
+        yield from opening(child, where)
+
+
+FOUND = {
+    p.relative_to(PACKAGE).as_posix(): found
+    for p in sorted(PACKAGE.rglob("*.py"))
+    if (found := set(opening(ast.parse(p.read_text("utf-8")))))
+}
+
+
+@pytest.mark.parametrize("file", FOUND)
+def test_every_reader_is_fuzzed_or_has_a_reason(file):
+    named = {**READERS.get(file, {}), **REASONS.get(file, {})}
+    assert not FOUND[file] - set(named), f"{file}: add a reader to a module of tests/faults, and name it here"
+
+
+def test_named_functions_open_something():
+    """A name that is left over hides the next function of that name."""
+    named = {(f, n) for table in (READERS, REASONS) for f, names in table.items() for n in names}
+    assert not named - {(f, n) for f, names in FOUND.items() for n in names}
+    assert {n for names in READERS.values() for n in names.values()} <= set(all_targets())
+
+
+BY_TARGET = {t: [(f, n) for f, names in READERS.items() for n, of in names.items() if of == t] for t in all_targets()}
+
+
+@pytest.mark.parametrize("target", [t for t, functions in BY_TARGET.items() if functions])
+def test_the_fuzzer_calls_the_reader(target, tmp_path, monkeypatch):
+    """The valid files of a target go through the functions that it stands for."""
+    monkeypatch.setattr(lpips_weights, "NETS", dict(lpips_weights.NETS))
+    called = set()
+
+    def note(frame, event, argument):
+        if event == "call":
+            called.add((frame.f_code.co_filename, frame.f_code.co_qualname.replace(".<locals>", "")))
+
+    sys.setprofile(note)
+    try:
+        Worker(all_targets()[target], 0, tmp_path)
+    finally:
+        sys.setprofile(None)
+    assert {(str(PACKAGE / f), n) for f, n in BY_TARGET[target]} <= called
