@@ -16,6 +16,7 @@ HOMES = [ROOT, ROOT / "tests", ROOT / "warpgs", ROOT / "warpgs/pipeline"]
 CODE = " ".join(
     p.read_text("utf-8") for folder in ("warpgs", "bench", "tools", "tests", "examples") for p in (ROOT / folder).rglob("*.py")
 )
+KNOWN = set(re.findall(r"\w+", CODE))
 
 
 def named_files(text: str) -> set[tuple[str, str]]:
@@ -40,10 +41,9 @@ def test_named_files_and_tests_are_there(page):
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
 def test_named_flags_are_there(page):
     """Every flag in code font or in a command has a name that the code knows."""
-    known = set(re.findall(r"\w+", CODE))
     flags = set(re.findall(r"(?<![\w-])--([a-z][a-z0-9.-]*[a-z0-9])", page.read_text("utf-8")))
     parts = {flag: [part.replace("-", "_") for part in flag.split(".")] for flag in flags}
-    missing = sorted(f for f, names in parts.items() if not all(n in known or n.removeprefix("no_") in known for n in names))
+    missing = sorted(f for f, names in parts.items() if not all(n in KNOWN or n.removeprefix("no_") in KNOWN for n in names))
     assert not missing, f"{page.name} names flags that no command has: {', '.join(missing)}"
 
 

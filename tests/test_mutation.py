@@ -101,7 +101,7 @@ def test_every_kernel_file_has_mutants_and_tests(candidates):
     files = {file for files in found.values() for file in files}
     without = {f"warpgs/kernels/{name}.py" for name in ("__init__", "cameras/__init__", "cameras/base")}
     assert files - {c.file for c in candidates} == without
-    tests = {test for c in candidates for cuda in (False, True) for test in rules.tests_of(c.file, cuda)}
+    tests = {test for file in {c.file for c in candidates} for cuda in (False, True) for test in rules.tests_of(file, cuda)}
     assert [t for t in sorted(tests) + [t.split("::")[0] for t in rules.SKIPPED] if not (ROOT / t).is_file()] == []
     for c in candidates[::50]:
         if c.file.endswith(".py"):

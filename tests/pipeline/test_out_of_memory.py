@@ -7,7 +7,6 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-import warp as wp
 
 from tests.pipeline.test_trainer import BUSY, fitted
 from tests.scenes import photos, seeds
@@ -132,21 +131,27 @@ def test_other_errors_pass(monkeypatch):
 
 
 class OtherProgram:
-    """A program beside the fit, which takes memory of the device and gives it back."""
+    """A program beside the fit that takes memory of the device and gives it back, as this process sees it.
 
-    def __init__(self):
-        self.held = []
+    torch is limited to what would be left, and is told so: other tests on the device see nothing of it, and it nothing of them.
+    """
+
+    def __init__(self, monkeypatch):
+        self.held, self.free, self.limit = [], torch.cuda.mem_get_info, 0
+        self.total = torch.cuda.get_device_properties(CUDA).total_memory
+        monkeypatch.setattr(torch.cuda, "mem_get_info", self.left)
+
+    def left(self, device):
+        """Return free and installed bytes, as torch.cuda.mem_get_info does."""
+        if not self.limit:
+            return self.free(device)
+        return max(0, self.limit - torch.cuda.memory_reserved(device)), self.total
 
     def take_all_but(self, mib: int):
-        """Leave at most so many MiB free, beside what torch holds."""
+        """Leave so many MiB free, beside what torch holds."""
         torch.cuda.empty_cache()
-        with wp.ScopedMempool("cuda:0", False):  # memory of a pool would not be given back at once
-            for piece in (2**15, 2**12, 2**9, 2**6, 2**3, 2):  # no device gives all of its memory in one piece
-                while torch.cuda.mem_get_info(CUDA)[0] // 2**20 >= mib + piece:
-                    try:
-                        self.held.append(wp.empty((piece, 2**20), dtype=wp.uint8, device="cuda:0"))
-                    except RuntimeError:
-                        break
+        self.limit = torch.cuda.memory_reserved(CUDA) + mib * 2**20
+        torch.cuda.set_per_process_memory_fraction(self.limit / self.total, CUDA)
 
     def take_what_torch_holds(self):
         """Take what torch keeps for later, too: some of it lies in pieces that it cannot give back."""
@@ -156,13 +161,22 @@ class OtherProgram:
                     self.held.append(torch.empty(mib * 2**20, dtype=torch.uint8, device=CUDA))
 
     def give_back(self):
-        self.held = []
+        self.held, self.limit = [], 0
+        torch.cuda.set_per_process_memory_fraction(1.0, CUDA)
+
+
+@pytest.fixture
+def other(monkeypatch):
+    """Such a program, which ends with the test."""
+    program = OtherProgram(monkeypatch)
+    yield program
+    program.give_back()
 
 
 @pytest.mark.cuda
-def test_a_full_device_is_noticed_and_the_fit_goes_on():
+def test_a_full_device_is_noticed_and_the_fit_goes_on(other):
     """Steps go on in chunks, one by one, and end as they should."""
-    fit, states, other = Trainer(photos(4, 1600, 1200), seeds(), BUSY, CUDA), [], OtherProgram()
+    fit, states = Trainer(photos(4, 1600, 1200), seeds(), BUSY, CUDA), []
     fit.advance()
     other.take_all_but(300)
     seen = finished(fit, states)
@@ -172,9 +186,9 @@ def test_a_full_device_is_noticed_and_the_fit_goes_on():
 
 
 @pytest.mark.cuda
-def test_a_device_without_memory_ends_the_fit_which_goes_on_later():
+def test_a_device_without_memory_ends_the_fit_which_goes_on_later(other):
     """Class 4 with the state saved; once the other program has ended, a fit continued from it comes to its end."""
-    fit, states, other = Trainer(photos(4, 1600, 1200), seeds(), BUSY, CUDA), [], OtherProgram()
+    fit, states = Trainer(photos(4, 1600, 1200), seeds(), BUSY, CUDA), []
     states.append(saved(fit))
     other.take_all_but(2)
     other.take_what_torch_holds()
@@ -189,13 +203,13 @@ def test_a_device_without_memory_ends_the_fit_which_goes_on_later():
 
 
 @pytest.mark.cuda
-def test_2000_steps_beside_a_program_that_comes_and_goes():
+def test_2000_steps_beside_a_program_that_comes_and_goes(other):
     """All but 8 MiB to 1 GiB is taken for half of each 100 steps. The fit goes on, or ends with class 4 and is continued from
     what it saved; each of the 2000 steps is reported, and the end is finite.
     """
     density = dataclasses.replace(BUSY.density, every=25, stop_fraction=0.9)
     config = dataclasses.replace(BUSY, steps=2000, density=density, max_gaussians=30_000)
-    random, other, states, seen, ended, said = np.random.default_rng(0), OtherProgram(), [], set(), 0, []
+    random, states, seen, ended, said = np.random.default_rng(0), [], set(), 0, []
 
     def on_step(report):
         seen.add(report.step)

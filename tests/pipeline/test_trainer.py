@@ -287,7 +287,8 @@ def test_interrupted_fit_saves_the_step_in_progress(tmp_path):
     )
     command = [
         sys.executable, "-c", heeding, "fit", str(tmp_path / "scene"), "--split", split_spec(8), "--steps", "100000",
-        "--device", "cpu", "--out", str(tmp_path / "run"),
+        "--device", "cpu", "--out", str(tmp_path / "run"), "--preset", "3dgs", "--init.source", "random",
+        "--init.random-count", "60",
     ]  # fmt: skip
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     for line in process.stdout:
