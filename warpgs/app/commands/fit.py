@@ -80,7 +80,7 @@ def _request_type() -> type:
         time_budget: float | None = None
         """Choose the number of steps so that the fit is done in this time [s]; not with --steps or --max-error."""
         view: bool = False
-        """Show the model in a browser while it trains, at http://127.0.0.1:PORT; the result is the same to the byte."""
+        """Show the model in a browser while it trains, at the printed address; the result is the same to the byte."""
         view_port: int = 8080
         """PORT of --view; 0 for any free one."""
 
