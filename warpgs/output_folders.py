@@ -99,7 +99,12 @@ class Folder:
             OSError: As for `open`.
             RefusedError: It is a pipe or a device, which is not waited for.
         """
-        descriptor = self.open(name, flags | getattr(os, "O_NONBLOCK", 0))
+        try:
+            descriptor = self.open(name, flags | getattr(os, "O_NONBLOCK", 0))
+        except OSError as e:
+            if e.errno != errno.ENXIO:  # a socket, or a pipe that nobody reads
+                raise
+            raise RefusedError(f"{self.path / name}: is not a regular file; remove it") from e
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             os.close(descriptor)
             raise RefusedError(f"{self.path / name}: is not a regular file; remove it")

@@ -191,7 +191,8 @@ add("SOG", ".sog", SOG, (sog_member, sog_member, rarely(sog_image, rarely(zip_bo
 def gltf_files(root: Path) -> list[Path]:
     """Write both kinds, and one whose opacities and rotations are fractions in integers."""
     paths = [*written(".glb")(root), *written(".gltf")(root), root / "c.glb"]
-    document, body = gltf._split(paths[0], paths[0].read_bytes())
+    document, part = gltf._split(paths[0], paths[0].read_bytes())
+    body = bytes(part)
     values = np.arange(20, dtype="u1") * 12
     for i, (kind, width) in enumerate((("VEC4", 4), ("SCALAR", 1))):
         view = {"buffer": 0, "byteOffset": len(body), "byteLength": len(values)}

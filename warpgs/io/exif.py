@@ -1,4 +1,4 @@
-"""What EXIF says of a photograph and its lens: four tags, read from the first directory and the block of exposure data.
+"""EXIF of a photograph and its lens: five tags, read from the first directory and the block of exposure data.
 
 The layout is that of TIFF (CIPA DC-008). No more is read than the values of these tags, whatever a file announces: libraries
 that read all of EXIF copy overlapping values again and again.
@@ -29,10 +29,10 @@ PREFIX = b"Exif\0\0"
 
 @dataclass(frozen=True)
 class Exif:
-    """What EXIF says of a photograph; the defaults where it says nothing."""
+    """Values of EXIF; the defaults where it has none."""
 
     orientation: int = 1
-    """How the stored raster lies, 1 to 8."""
+    """Orientation of the stored raster, 1 to 8."""
     maker: str = ""
     """Maker of the device."""
     model: str = ""

@@ -26,7 +26,11 @@ MAX_SCANS = 100
 
 
 def segments(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield marker and contents of each segment up to the end of the image; coded data is skipped."""
+    """Yield marker and contents of each segment up to the end of the image; coded data is skipped.
+
+    Raises:
+        ValueError: The file is broken or ends early.
+    """
     at = 2
     while True:
         found = MARKER.match(data, at)

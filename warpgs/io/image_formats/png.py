@@ -37,7 +37,11 @@ def size(data: bytes) -> tuple[int, int]:
 
 
 def chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
-    """Yield kind and contents of each chunk up to the last; each is checked against its checksum."""
+    """Yield kind and contents of each chunk up to the last; each is checked against its checksum.
+
+    Raises:
+        ValueError: A checksum does not match, or the file ends early.
+    """
     at, view, kind = len(SIGNATURE), memoryview(data), b""
     while kind != b"IEND":
         if at + 12 > len(data):

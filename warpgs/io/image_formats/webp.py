@@ -10,7 +10,11 @@ PIXELS = (b"VP8 ", b"VP8L", b"ANMF")
 
 
 def chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
-    """Yield kind and contents of each chunk."""
+    """Yield kind and contents of each chunk.
+
+    Raises:
+        ValueError: It is no WebP file, or ends within a chunk.
+    """
     if len(data) < 20 or data[8:12] != b"WEBP":
         raise ValueError("it is no WebP file")
     view = memoryview(data)
