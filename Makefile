@@ -75,7 +75,7 @@ docs-run: install
 	$(BIN)/python -m tools.run_docs
 
 # Run these before a change is called done: CONTRIBUTING.md says which one when. Properties get more examples here;
-# `make test-fault FUZZ=100000` gives the readers so many damaged files (2000 where nothing is said).
+# `make test-fault FUZZ=200000` gives the readers that many damaged files (2000 where nothing is said).
 test-slow test-fault test-browser test-audit test-cuda: test-%: install
 	$(PYTEST) -m $*
 	$(if $(filter slow,$*),$(PYTEST) -m "not slow and not cuda" --hypothesis-profile=many $(PROPERTIES))

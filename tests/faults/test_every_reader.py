@@ -42,7 +42,11 @@ READERS = {
     "pipeline/farm/record.py": {"read_record": "record of a job"},
     "pipeline/farm/work.py": {"write_thumbnail": "render of a job"},
     "pipeline/films/keyframes.py": {"read_keyframes": "keyframes"},
-    "pipeline/metrics/lpips_weights.py": {"_read_state": "LPIPS state dict", "read_lpips": "LPIPS weights"},
+    "pipeline/metrics/lpips_weights.py": {
+        "_check_unpacked": "LPIPS state dict",
+        "_read_state": "LPIPS state dict",
+        "read_lpips": "LPIPS weights",
+    },
     "pipeline/model/filters.py": {"_box_of_file": "crop box", "box_of": "crop box"},
     "pipeline/model/model_file.py": {"load": "model file"},
     "pipeline/runs/checkpoint.py": {"load_checkpoint": "checkpoint"},

@@ -62,5 +62,5 @@ def test_lines_that_are_no_jobs(tmp_path, line, word):
 def test_two_jobs_need_two_names(tmp_path):
     path = tmp_path / "jobs.jsonl"
     path.write_text('{"scene": "a/x"}\n{"scene": "b/X"}')
-    with pytest.raises(UsageError, match="two jobs have the name 'X'"):
+    with pytest.raises(UsageError, match=r"jobs\.jsonl: two jobs have the name 'X'"):
         list_jobs(str(path))

@@ -15,7 +15,7 @@ from warpgs.pipeline.model.model_file import load as load_model
 from warpgs.pipeline.model.model_file import save as save_model
 from warpgs.pipeline.runs import checkpoint
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
-from warpgs.pipeline.runs.folder import open_run, read_record
+from warpgs.pipeline.runs.folder import open_run, read_record, stored_request
 from warpgs.report.events import read_events
 from warpgs.synthetic.demo import write_demo
 
@@ -39,6 +39,15 @@ def run(made, tmp_path):
     for name in ("config.json", TENSORS, "metrics.jsonl"):
         (tmp_path / name).write_bytes((made[0] / "run" / name).read_bytes())
     return tmp_path
+
+
+@pytest.mark.parametrize("name, value", [("loss", 5), ("init", []), ("optimizer", None), ("steps", "x"), ("more", 1)])
+def test_settings_of_a_continued_run_are_checked(run, name, value):
+    record = json.loads((run / "config.json").read_text())
+    record["config"][name] = value
+    (run / "config.json").write_text(json.dumps(record))
+    with pytest.raises(DataError, match=r"config\.json: its settings are invalid .*; restore it, or fit the scene again"):
+        stored_request(run)
 
 
 def places(value, path=()):

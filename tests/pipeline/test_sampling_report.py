@@ -127,7 +127,9 @@ def test_figures_add_up(run):
 def test_story_follows_the_switches(run, tmp_path):
     """What is said of gate, draw and depth is what was asked for, and a widened gate is told; no events, no story."""
     fit, out, _ = run
+    (out / "sampling" / "own.png").write_bytes(b"an image of the user's own")
     story = sampling_report_of(fit, out)
+    (out / "sampling" / "own.png").unlink()
     assert "sampled at random" in story.words and "above its 0.6 quantile" in story.words and "rendered depth" in story.words
     assert [c for c, _ in story.images] == [f"sampling after step {s}" for s in sorted(shown_steps(fit.phases))]
     assert story.images[0][1] == webp(next(iter(sorted((out / "sampling").iterdir()))).read_bytes(), SHEET_WIDTH, 70)
