@@ -201,7 +201,8 @@ ELSEWHERE = {
     ("runtime/folder_lock.py", "os.open"): "the lock of a folder",
     ("runtime/folder_lock.py", "open r+b"): "the same",
     ("runtime/native_output.py", "os.open"): "the null device",
-    ("app/cli.py", "os.open"): "the null device",
+    ("runtime/output_streams.py", "os.open"): "the same",
+    ("runtime/file_names.py", "os.open"): "a folder or a file, to read it",
     ("files.py", "os.open"): "a folder, to sync it",
 }
 """Every other way of writing in the package, and what is written there: no result of the user's."""

@@ -20,6 +20,8 @@ LOCK = ".warpgs.lock"
 """Name of the file that a process holds while it writes into a folder."""
 OWN_NAMES = re.compile(r"\.warpgs-[0-9a-f]{16}\.tmp(\.(mp4|webm))?")
 """Names of temporary files and folders: short and of ASCII letters, so that they fit wherever the file itself does."""
+UNDECODABLE = re.compile("[\udc80-\udcff]")
+"""Characters that Python puts in the place of bytes that are not UTF-8."""
 WINDOWS = sys.platform == "win32"
 PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Waits before a replacement is tried again on Windows [s]: a virus scanner holds a new file open for about that long."""
@@ -152,8 +154,14 @@ def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Replace a text file (UTF-8) as `write_bytes` does."""
-    write_bytes(path, text.encode())
+    """Replace a text file (UTF-8) as `write_bytes` does; bytes of names that are no text are `readable` in it."""
+    write_bytes(path, readable(text).encode())
+
+
+def readable(text: str) -> str:
+    r"""Return text with the bytes of names that are not UTF-8, and halves of characters, as codes: ``b\xe4r``."""
+    escaped = UNDECODABLE.sub(lambda byte: f"\\x{ord(byte[0]) - 0xDC00:02x}", text)
+    return escaped.encode("utf-8", "backslashreplace").decode()
 
 
 def write_json(path: Path, values: object) -> None:

@@ -46,7 +46,7 @@ def _json(path: Path) -> Any:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise DataError(f"{path}: has more than {MAX_BYTES:,} bytes, which no set of cameras has. Write it again")
-        return json.loads(path.read_bytes().decode("utf-8-sig"))
+        return json.loads(path.read_bytes().decode("utf-8-sig", "surrogateescape"))
     except (OSError, ValueError, RecursionError) as e:
         raise DataError(f"{path}: cannot be read as JSON ({str(e)[:80]}). Check the path, or write it again") from e
 

@@ -53,7 +53,7 @@ def read_json(path: Path) -> dict:
         size = path.stat().st_size
         if size > MAX_BYTES:
             raise DataError(f"{path}: has {size:,} bytes, more than the {MAX_BYTES:,} of any real scene; write it again")
-        values = json.loads(path.read_bytes().decode("utf-8-sig"), parse_constant=_reject_constant)
+        values = json.loads(path.read_bytes().decode("utf-8-sig", "surrogateescape"), parse_constant=_reject_constant)
     except (OSError, ValueError, RecursionError) as e:
         raise DataError(f"{path}: cannot be read as JSON ({e}); write it again") from e
     try:

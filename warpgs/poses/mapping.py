@@ -19,6 +19,8 @@ from warpgs.runtime.subprocesses import ProcessFailed, python_lines
 
 EXHAUSTIVE = 60
 """Most photographs of which all pairs are matched; of more, pairs are chosen."""
+JOB = "job.json"
+"""Name of the file with what the worker is told."""
 LAST_WORDS = 500
 """Letters of pycolmap's last message that are shown where it fails."""
 
@@ -107,17 +109,16 @@ def _job(photographs: list[Photograph], names: list[str], kind: str, folder: Pat
     return {
         "names": names, "camera_of": of, "cameras": cameras, "kind": kind, "threads": threads, "exhaustive": EXHAUSTIVE,
         "sizes": [(p.width, p.height) for p in photographs], "scene_names": [p.name for p in photographs],
-        "images": str(folder / "small"), "database": str(folder / "matches.db"), "pairs": str(folder / "pairs.txt"),
-        "models": str(folder / "models"), "model": str(folder / "model"),
+        # relative to the folder that the worker runs in: pycolmap takes names in UTF-8 alone
+        "images": "small", "database": "matches.db", "pairs": "pairs.txt", "models": "models", "model": "model",
     }  # fmt: skip
 
 
 def _lines(job: dict[str, Any], folder: Path) -> Iterator[dict[str, Any]]:
     """Yield what the worker says, and end it where nobody listens any more."""
-    path = folder / "job.json"
-    write_json(path, job)
+    write_json(folder / JOB, job)
     try:
-        for line in python_lines("warpgs.poses.worker", str(path), folder=folder, environment={"GLOG_logtostderr": "1"}):
+        for line in python_lines("warpgs.poses.worker", JOB, folder=folder, environment={"GLOG_logtostderr": "1"}):
             if line.startswith("{"):
                 yield json.loads(line)
     except ProcessFailed as e:

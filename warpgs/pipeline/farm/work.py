@@ -11,6 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from warpgs.errors import FolderHeldError, UsageError, WarpgsError
 from warpgs.files import make_folder, remove_leftovers, write_bytes
 from warpgs.io.splits import Split
@@ -149,7 +151,7 @@ def write_thumbnail(renders: Path, path: Path) -> None:
     import cv2
 
     first = min(renders.glob("*.png"), default=None)
-    image = None if first is None else cv2.imread(str(first))
+    image = None if first is None else cv2.imdecode(np.fromfile(first, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         return
     pair = image[:, : image.shape[1] * 2 // 3]  # render, photograph, error

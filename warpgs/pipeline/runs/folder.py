@@ -233,7 +233,7 @@ def stored_request(folder: Path) -> FitRequest:
     """Return the request that continues a run, with everything as the run was started.
 
     Raises:
-        DataError: The folder is no run, or its scene was passed from Python.
+        DataError: The folder is no run, its settings are not those of a fit, or its scene was passed from Python.
         UsageError: The run used code from outside warpgs, which must be named again.
     """
     record = read_record(folder)
@@ -242,7 +242,11 @@ def stored_request(folder: Path) -> FitRequest:
         _check_named_again({}, record["config"], folder)
     except UsageError as e:
         raise UsageError(f"{e}, beside the scene and all other flags that the run was started with") from e
-    return FitRequest(scene, folder, FitConfig.from_json(record["config"]), record["device"], resume=True)
+    try:
+        config = FitConfig.from_json(record["config"])
+    except (UsageError, schema.SchemaError) as e:
+        raise DataError(f"{folder / CONFIG}: is not whole, {e}; restore it, or fit the scene again into a new --out") from e
+    return FitRequest(scene, folder, config, record["device"], resume=True)
 
 
 def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredRun:
