@@ -14,6 +14,7 @@ import numpy as np
 from warpgs.errors import ResourceError, UsageError
 from warpgs.files import write_json
 from warpgs.poses.photographs import MATCHING_SIDE, Photograph
+from warpgs.runtime.disk_space import disk_is_full
 from warpgs.runtime.processor import usable_cores
 from warpgs.runtime.subprocesses import ProcessFailed, python_lines
 
@@ -122,6 +123,12 @@ def _lines(job: dict[str, Any], folder: Path) -> Iterator[dict[str, Any]]:
             if line.startswith("{"):
                 yield json.loads(line)
     except ProcessFailed as e:
+        if disk_is_full(folder, e.errors):
+            # the work lies in a temporary folder beside the scene, whose name says nothing to the user
+            raise ResourceError(
+                f"{folder.parents[1]}: its disk is full, so pycolmap cannot write features and matches. Free some disk space, "
+                "or choose another --out"
+            ) from e
         last = e.errors[-LAST_WORDS:].replace("\n", " ")
         raise ResourceError(
             f"pycolmap ended with code {e.code}; it may have had too little memory. Its last words: {last}"
