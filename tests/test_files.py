@@ -199,7 +199,8 @@ ELSEWHERE = {
     ("runtime/load_module.py", "open ab"): "a lock beside compiled kernels",
     ("runtime/folder_lock.py", "open r+b"): "the lock of a folder",
     ("runtime/native_output.py", "os.open"): "the null device",
-    ("runtime/output_streams.py", "os.open"): "the null device",
+    ("runtime/output_streams.py", "os.open"): "the same",
+    ("runtime/file_names.py", "os.open"): "a folder or a file, to read it",
 }
 """Every other way of writing in the package, and what is written there: no result of the user's."""
 

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import json
 import os
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -20,6 +21,8 @@ from warpgs.temporary import TemporaryFile, TemporaryFolder, sweep
 
 LOCK = ".warpgs.lock"
 """Name of the file that a process holds while it writes into a folder."""
+UNDECODABLE = re.compile("[\udc80-\udcff]")
+"""Characters that Python puts in the place of bytes that are not UTF-8."""
 WINDOWS = sys.platform == "win32"
 PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Waits before a replacement is tried again on Windows [s]: a virus scanner holds a new file open for about that long."""
@@ -190,8 +193,14 @@ def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Replace a text file (UTF-8) as `write_bytes` does."""
-    write_bytes(path, text.encode())
+    """Replace a text file (UTF-8) as `write_bytes` does; bytes of names that are no text are `readable` in it."""
+    write_bytes(path, readable(text).encode())
+
+
+def readable(text: str) -> str:
+    r"""Return text with the bytes of names that are not UTF-8, and halves of characters, as codes: ``b\xe4r``."""
+    escaped = UNDECODABLE.sub(lambda byte: f"\\x{ord(byte[0]) - 0xDC00:02x}", text)
+    return escaped.encode("utf-8", "backslashreplace").decode()
 
 
 def write_json(path: Path, values: object) -> None:

@@ -158,7 +158,7 @@ def _import_module(name: str) -> ModuleType:
 def _load_file(path: Path) -> ModuleType:
     """Import a file by its path, once, under a name of its own."""
     path = Path(os.path.realpath(path))  # Path.resolve raises a RuntimeError on links that lead round in circles
-    name = f"_warpgs_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    name = f"_warpgs_{path.stem}_{hashlib.sha256(os.fsencode(path)).hexdigest()[:8]}"
     if name in sys.modules:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, path)

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import json
 import math
+import types
+import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -214,6 +216,21 @@ def fields(needed: Mapping[str, Schema], more: Mapping[str, Schema] | None = Non
                 raise SchemaError(f"{place}.{name[:40]}".lstrip(".") + " is unknown")
 
     return check
+
+
+def of_type(hint: Any) -> Schema:
+    """Return the schema of the plain values of a field by its type hint: bool, int, float, str, None, unions and tuples.
+
+    Every value is allowed for other types.
+    """
+    parts = typing.get_args(hint)
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        kinds = [of_type(p) for p in parts if p is not type(None)]
+        return or_null(kinds[0]) if len(kinds) == 1 and type(None) in parts else anything
+    if typing.get_origin(hint) is tuple:
+        endless = len(parts) == 2 and parts[1] is Ellipsis
+        return items(of_type(parts[0]), None if endless else len(parts))
+    return {bool: flag, int: whole(), float: number(), str: text}.get(hint, anything)
 
 
 def _refuse(value: Any, place: str, wanted: str) -> None:

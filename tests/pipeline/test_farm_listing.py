@@ -48,15 +48,25 @@ def test_lines_are_flags_of_fit(tmp_path):
         ('{"scene": "a", "--steps": 1}', "cannot be set"),
         ('{"scene": "a\\u0000"}', "without a zero byte"),
         ('{"scene": "a", "name": ".b"}', "cannot be the name"),
+        ('{"scene": "a", "name": "%s"}' % (100 * "写"), "has 300 bytes, and the name of a job at most 200"),
+        ('{"scene": "a", "name": "%s"}' % (101 * "x"), "cannot be the name"),
         ("[" * 60 + "]" * 60, "in each other"),
     ],
 )
 def test_lines_that_are_no_jobs(tmp_path, line, word):
     """One sentence, with the number of the line where it is the line's fault."""
     path = tmp_path / "jobs.jsonl"
-    path.write_text(line)
+    path.write_text(line, "utf-8")
     with pytest.raises(DataError, match=word):
         list_jobs(str(path))
+
+
+def test_the_longest_name(tmp_path):
+    """It is a folder, beside which one with a longer name can lie."""
+    path = tmp_path / "jobs.jsonl"
+    path.write_text('{"scene": "a", "name": "%s"}' % (66 * "写"), "utf-8")
+    (job,) = list_jobs(str(path))
+    (tmp_path / f"{job.name}.old1").mkdir()
 
 
 def test_two_jobs_need_two_names(tmp_path):

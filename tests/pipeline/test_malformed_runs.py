@@ -59,6 +59,13 @@ def places(value, path=()):
         yield from places(value[key], (*path, key))
 
 
+def settings(value, path=("config",)):
+    """The path of each value among the settings of the fit."""
+    yield path
+    for key in value if isinstance(value, dict) else ():
+        yield from settings(value[key], (*path, key))
+
+
 def replaced(value, path, new):
     """A copy of a file's contents with another value at a path."""
     if not path:
@@ -96,6 +103,33 @@ def test_a_record_that_is_no_json_object(run, text, words):
     (run / "config.json").write_bytes(text.encode("latin-1"))
     with pytest.raises(DataError, match=words):
         open_run(run, "cpu")
+
+
+def test_settings_of_another_kind(made, run):
+    """Every setting is what `--resume` takes it for, or the record is refused; null may stand where it means a choice."""
+    record, checked = made[1], 0
+    for path in settings(record["config"]):
+        for new in (5, "x", None, [], {}, -1, 1e300, True):
+            (run / "config.json").write_text(json.dumps(replaced(record, path, new)))
+            try:
+                config = stored_request(run).config
+            except DataError as e:
+                assert "config.json" in str(e)
+                checked += 1
+                continue
+            found = config.to_json()
+            for key in path[1:]:
+                found = found[key]
+            empty = new in ([], {}) and isinstance(found, type(new))  # no loss terms, and a group of defaults
+            assert empty or (found == new and not isinstance(new, list | dict)), (path, new)
+    assert checked > 500
+
+
+@pytest.mark.parametrize("value", [5, "x", None, [], -1])
+def test_a_group_of_settings_of_another_kind(made, run, capsys, value):
+    (run / "config.json").write_text(json.dumps(replaced(made[1], ("config", "loss"), value)))
+    assert main(["fit", "--out", str(run), "--resume"]) == 3
+    assert "config.loss must be an object" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

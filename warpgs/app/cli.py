@@ -9,6 +9,7 @@ from warpgs.app.fit_help import help_lines, wants_help
 from warpgs.errors import UsageError, WarpgsError
 from warpgs.report.progress import waiting
 from warpgs.runtime.device_memory import is_out_of_memory
+from warpgs.runtime.file_names import use_utf8_names
 from warpgs.runtime.imports import fast_imports
 from warpgs.runtime.output_streams import careful_output
 from warpgs.runtime.ranks import last_words
@@ -73,6 +74,8 @@ def main(arguments: list[str] | None = None) -> int:
     Raises:
         SystemExit: Help of a command was asked for, or a word is wrong.
     """
+    if arguments is None:
+        use_utf8_names()
     words = sys.argv[1:] if arguments is None else arguments
     prints = words[:1] in ([], *([name] for name in PRINTING)) and "--warm" not in words
     with careful_output(prints or bool(ASKING & {*words})) as output:

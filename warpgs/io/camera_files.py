@@ -46,7 +46,7 @@ def read_cameras(path: Path) -> tuple[dict[str, Camera], list[str]]:
 def _json(path: Path) -> Any:
     """Return the values of a JSON file of bounded size."""
     try:
-        text = read_input(path, MAX_BYTES).decode("utf-8-sig")
+        text = read_input(path, MAX_BYTES).decode("utf-8-sig", "surrogateescape")
         check_parts(text)
         return json.loads(text)
     except OSError as e:

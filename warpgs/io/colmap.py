@@ -86,15 +86,12 @@ class _BinaryFile:
         return count
 
     def text(self) -> str:
-        """Return the next name, which is UTF-8 and ends in a zero byte."""
+        """Return the next name, which ends in a zero byte."""
         end = self.data.find(b"\0", self.at)
         if end < 0:
             raise DataError(f"{self.path}: a name has no end, so the file is truncated; copy it again")
         raw, self.at = self.data[self.at : end], end + 1
-        try:
-            return raw.decode("utf-8")
-        except UnicodeDecodeError as e:
-            raise DataError(f"{self.path}: the name {raw[:80]!r} is not UTF-8; rename the image, run COLMAP again") from e
+        return raw.decode("utf-8", "surrogateescape")
 
     def end(self) -> None:
         """Raise a DataError where bytes follow the last record, which means a wrong count."""
@@ -108,11 +105,9 @@ class _BinaryFile:
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Yield the numbered lines of a text file; only line feeds end a line, since names may hold other separators."""
     try:
-        text = read_input(path).decode("utf-8-sig")
+        text = read_input(path).decode("utf-8-sig", "surrogateescape")
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); fix its permissions or copy it again") from e
-    except UnicodeDecodeError as e:
-        raise DataError(f"{path}: is not UTF-8 text ({e.reason} at byte {e.start}); write it again") from e
     at, number = 0, 1
     while (end := text.find("\n", at)) >= 0:  # one at a time: a list takes a hundred bytes for each empty line
         yield number, text[at:end].removesuffix("\r")

@@ -45,11 +45,11 @@ def child(folder: Path, name: object, where: str, *, root: Path | None = None, a
     usable = isinstance(name, str) and name.strip("/\\. ") and "\0" not in name and len(name) < MAX_NAME_LENGTH
     if usable:
         try:
-            name.encode("utf-8")
+            name.encode("utf-8", "surrogateescape")
         except UnicodeEncodeError:
             usable = False
     if not usable:
-        raise DataError(f"{where}: {str(name)[:80]!r} is no file name; name an image file, in UTF-8")
+        raise DataError(f"{where}: {str(name)[:80]!r} is no file name; name an image file")
     path = folder / name
     if "\\" in name and not path.is_file():
         path = folder / name.replace("\\", "/")  # written on Windows

@@ -51,7 +51,7 @@ def read_json(path: Path) -> dict:
         DataError: The file is malformed, too large or nested too deep, or holds NaN or Infinity.
     """
     try:
-        text = read_input(path, MAX_BYTES).decode("utf-8-sig")
+        text = read_input(path, MAX_BYTES).decode("utf-8-sig", "surrogateescape")
         check_parts(text)
         values = json.loads(text, parse_constant=_reject_constant)
     except OSError as e:

@@ -15,11 +15,14 @@ import numpy as np
 from warpgs.errors import ResourceError, UsageError
 from warpgs.files import write_json
 from warpgs.poses.photographs import MATCHING_SIDE, Photograph
+from warpgs.runtime.disk_space import disk_is_full
 from warpgs.runtime.processor import usable_cores
 from warpgs.runtime.subprocesses import ProcessFailed, python_lines
 
 EXHAUSTIVE = 60
 """Most photographs of which all pairs are matched; of more, pairs are chosen."""
+JOB = "job.json"
+"""Name of the file with what the worker is told."""
 LAST_WORDS = 500
 """Letters of pycolmap's last message that are shown where it fails."""
 
@@ -125,20 +128,25 @@ def _job(photographs: list[Photograph], names: list[str], kind: str, folder: Pat
     return {
         "names": names, "camera_of": of, "cameras": cameras, "kind": kind, "threads": threads, "exhaustive": EXHAUSTIVE,
         "sizes": [(p.width, p.height) for p in photographs], "scene_names": [p.name for p in photographs],
-        "images": str(folder / "small"), "database": str(folder / "matches.db"), "pairs": str(folder / "pairs.txt"),
-        "models": str(folder / "models"), "model": str(folder / "model"),
+        # relative to the folder that the worker runs in: pycolmap takes names in UTF-8 alone
+        "images": "small", "database": "matches.db", "pairs": "pairs.txt", "models": "models", "model": "model",
     }  # fmt: skip
 
 
 def _lines(job: dict[str, Any], folder: Path) -> Iterator[dict[str, Any]]:
     """Yield what the worker says, and end it where nobody listens any more."""
-    path = folder / "job.json"
-    write_json(path, job)
+    write_json(folder / JOB, job)
     try:
-        for line in python_lines("warpgs.poses.worker", str(path), folder=folder, environment={"GLOG_logtostderr": "1"}):
+        for line in python_lines("warpgs.poses.worker", JOB, folder=folder, environment={"GLOG_logtostderr": "1"}):
             if line.startswith("{"):
                 yield json.loads(line)
     except ProcessFailed as e:
+        if disk_is_full(folder, e.errors):
+            # the work lies in a temporary folder beside the scene, whose name says nothing to the user
+            raise ResourceError(
+                f"{folder.parents[1]}: its disk is full, so pycolmap cannot write features and matches. Free some disk space, "
+                "or choose another --out"
+            ) from e
         last = e.errors[-LAST_WORDS:].replace("\n", " ")
         raise ResourceError(
             f"pycolmap ended with code {e.code}; it may have had too little memory. Its last words: {last}"

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.files import make_folder, write_bytes
+from warpgs.files import UNDECODABLE, make_folder, write_bytes
 from warpgs.io.decoding import MAX_PIXELS, decode, read_image_file
 from warpgs.io.exif import read_exif
 from warpgs.io.folders import inside
@@ -75,13 +75,9 @@ def photographs_inside(folder: Path, allow_outside: bool) -> list[Path]:
 def scene_name(name: str, data: bytes) -> str:
     """Return the name of a photograph in the scene: its own, with .png added where the file becomes a PNG.
 
-    Raises:
-        DataError: The name is no UTF-8, which COLMAP's files need.
+    Bytes that are not UTF-8, which COLMAP needs, are written as in addresses: ``b%E4r.jpg``.
     """
-    try:
-        name.encode("utf-8")
-    except UnicodeEncodeError as e:
-        raise DataError(f"{name.encode('utf-8', 'backslashreplace').decode()}: the name is no UTF-8; rename the file") from e
+    name = UNDECODABLE.sub(lambda byte: f"%{ord(byte[0]) - 0xDC00:02X}", name)
     return name if _format(data) in ("JPEG", "PNG") else f"{name}.png"
 
 
@@ -102,7 +98,7 @@ def prepare(path: Path, root: Path, small: Path, max_pixels: int = MAX_PIXELS) -
         max_pixels: Largest number of pixels that the file may have.
 
     Raises:
-        DataError: The file cannot be decoded, or its name is no UTF-8.
+        DataError: The file cannot be decoded.
     """
     import cv2
 

@@ -11,6 +11,7 @@ import numpy as np
 from warpgs.errors import DataError
 from warpgs.files import write_bytes
 from warpgs.input_files import read_start, unread_reason
+from warpgs.runtime.file_names import utf8_name
 from warpgs.runtime.native_output import hidden_stderr
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
@@ -39,8 +40,8 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
     import cv2
 
     _check_container(path)
-    with hidden_stderr():  # of a broken file OpenCV and FFmpeg say the same, in their own words
-        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    with utf8_name(path) as name, hidden_stderr():  # of a broken file OpenCV and FFmpeg say the same, in their own words
+        capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
     try:
         if not capture.isOpened():
             raise DataError(

@@ -44,13 +44,18 @@ class JobCard:
     """Path of its report from the page; empty where there is none."""
 
 
+def _address(path: str) -> str:
+    """Return a path as an address, which holds the bytes of names that are no text, too."""
+    return quote(path, errors="surrogateescape")
+
+
 def _link(path: str, inner: str) -> str:
-    return f'<a href="{quote(path)}">{inner}</a>' if path else inner
+    return f'<a href="{_address(path)}">{inner}</a>' if path else inner
 
 
 def _card(card: JobCard) -> str:
     row, name = card.row, html.escape(card.row.name)
-    image = f'<img loading="lazy" alt="render and photograph of {name}" src="{quote(card.thumbnail)}">'
+    image = f'<img loading="lazy" alt="render and photograph of {name}" src="{_address(card.thumbnail)}">'
     if not card.thumbnail:
         image = f'<div class="none">{html.escape(row.state)}</div>'
     failed = row.state == "failed"

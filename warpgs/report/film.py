@@ -11,6 +11,7 @@ import numpy as np
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.files import replacing
 from warpgs.report.animation import ANIMATIONS, write_animation
+from warpgs.runtime.file_names import utf8_name
 from warpgs.runtime.native_output import hidden_stderr
 
 VIDEOS = (".mp4", ".webm")
@@ -49,12 +50,12 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
                 "write elsewhere"
             )
 
-    with replacing(path, check, suffix=suffix) as temporary:
-        _encode(path, temporary, frames, fps, sizes)
+    with replacing(path, check, suffix=suffix) as temporary, utf8_name(temporary) as name:
+        _encode(path, name, frames, fps, sizes)
     return len(sizes)
 
 
-def _encode(path: Path, temporary: Path, frames: Iterable[np.ndarray], fps: int, sizes: list[tuple[int, int]]) -> None:
+def _encode(path: Path, temporary: str, frames: Iterable[np.ndarray], fps: int, sizes: list[tuple[int, int]]) -> None:
     """Write frames to a temporary file, and the size of each, [width, height], to a list."""
     import cv2
 
@@ -65,7 +66,7 @@ def _encode(path: Path, temporary: Path, frames: Iterable[np.ndarray], fps: int,
             if writer is None:
                 # for .webm OpenCV says on stderr that there is no such tag, and takes VP9 all the same
                 with hidden_stderr() if path.suffix.lower() == ".webm" else contextlib.nullcontext():
-                    writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter_fourcc(*"vp09"), fps, (width, height))
+                    writer = cv2.VideoWriter(temporary, cv2.VideoWriter_fourcc(*"vp09"), fps, (width, height))
                 if not writer.isOpened():
                     raise ResourceError(f"{path}: cannot be written; the folder is not writable, or OpenCV lacks a VP9 encoder")
             sizes.append((width, height))
@@ -86,10 +87,11 @@ def _decoded_sizes(path: Path) -> list[tuple[int, int]]:
     """Return the size of each frame, [width, height], that can be decoded."""
     import cv2
 
-    film, sizes = cv2.VideoCapture(str(path)), []
-    try:
-        while (read := film.read())[0]:
-            sizes.append((read[1].shape[1], read[1].shape[0]))
-    finally:
-        film.release()
+    with utf8_name(path) as name:
+        film, sizes = cv2.VideoCapture(name), []
+        try:
+            while (read := film.read())[0]:
+                sizes.append((read[1].shape[1], read[1].shape[0]))
+        finally:
+            film.release()
     return sizes

@@ -11,8 +11,10 @@ from pathlib import PurePosixPath
 
 MOST_BYTES = 100
 """Longest name that stays as it is, without suffix: any file system takes it."""
-NOT_EVERYWHERE = re.compile(r'^\.|[<>:"\\|?*\x00-\x1f\x7f]|^(con|prn|aux|nul|com\d|lpt\d)(\.|$)|^$', re.IGNORECASE)
-"""Names that hide a file, or that Windows does not take."""
+NOT_EVERYWHERE = re.compile(
+    r'^\.|[<>:"\\|?*\x00-\x1f\x7f]|^(con|prn|aux|nul|com\d|lpt\d)(\.|$)|^$|[\ud800-\udfff]', re.IGNORECASE
+)
+"""Names that hide a file, that are not UTF-8, or that Windows does not take."""
 
 
 def image_names(views: Iterable[str]) -> dict[str, str]:

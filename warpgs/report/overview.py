@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import subprocess
+import tempfile
+from pathlib import Path
 
 import numpy as np
 
+from warpgs.runtime.disk_space import disk_is_full
 from warpgs.runtime.subprocesses import run_python
 from warpgs.scene import Camera
 from warpgs.temporary import temporary_folder
@@ -36,6 +39,8 @@ def run_pyvista(code: str, *arguments: str) -> tuple[bool, str]:
 
 def remedy_for(why: str) -> str:
     """Return how to help against the reason that `run_pyvista` gave."""
+    if disk_is_full(folder := Path(tempfile.gettempdir()), why):
+        return f"free some disk space for temporary files in {folder}, or name another folder by the variable TMPDIR"
     return "`pip install pyvista`" if "No module named" in why else REMEDY
 
 

@@ -7,6 +7,7 @@ import unicodedata
 from collections.abc import Callable, Iterator, Sequence
 from typing import TypeVar
 
+from warpgs.files import readable
 from warpgs.runtime.output_streams import say_lost
 
 T = TypeVar("T")
@@ -24,9 +25,10 @@ class Detail(str):
 
 
 def printable(text: object) -> str:
-    """Return text with every character that a terminal would obey, such as ESC, written as its code."""
+    """Return text with every character that a terminal would obey, such as ESC, and bytes that are no text, as codes."""
     return "".join(
-        c.encode("unicode_escape").decode() if unicodedata.category(c) in HIDDEN and c not in JOINERS else c for c in str(text)
+        c.encode("unicode_escape").decode() if unicodedata.category(c) in HIDDEN and c not in JOINERS else c
+        for c in readable(str(text))
     )
 
 

@@ -14,8 +14,10 @@ from warpgs.errors import DataError, UsageError
 from warpgs.input_files import read_input, unread_reason
 from warpgs.io.readers import all_readers
 
-NAME = re.compile(r"[^\W_][^/\\:*?\"<>|\x00-\x1f]{0,99}")
-"""Names of jobs: those of a folder below the results on any system."""
+NAME = re.compile(r"(?:[^\W_]|[\udc80-\udcff])[^/\\:*?\"<>|\x00-\x1f]{0,99}")
+"""Names of jobs: those of a folder below the results on any system, and bytes that are no text where a folder has them."""
+MOST_BYTES = 200
+"""Longest name of a job: file systems take 255 bytes, and names that begin with it, such as NAME.old1, must fit too."""
 OWN_FILES = ("index.html", "results.csv")
 """Names in a results folder that are no job's."""
 PLUGINS = ("strategy", "loss-terms", "reader")
@@ -61,6 +63,11 @@ def list_jobs(jobs: str) -> list[ListedJob]:
         if not NAME.fullmatch(job.name) or job.name.endswith((".", " ")) or job.name in OWN_FILES:
             raise DataError(
                 f"{jobs}: {job.name[:100]!r} cannot be the name of a job, and so of a folder; name it in a .jsonl file"
+            )
+        if (size := len(os.fsencode(job.name))) > MOST_BYTES:
+            raise DataError(
+                f"{jobs}: {job.name[:100]!r} has {size} bytes, and the name of a job at most {MOST_BYTES}; name it in a .jsonl "
+                "file"
             )
         if job.name.casefold() in taken:
             raise UsageError(f"{jobs}: two jobs have the name {job.name!r}; give each line of a .jsonl file its own name")

@@ -244,7 +244,7 @@ def stored_request(folder: Path) -> FitRequest:
         raise UsageError(f"{e}, beside the scene and all other flags that the run was started with") from e
     try:
         config = FitConfig.from_json(record["config"])
-    except UsageError as e:
+    except (UsageError, schema.SchemaError) as e:
         raise DataError(f"{folder / CONFIG}: its settings are invalid ({e}); restore it, or fit the scene again") from e
     return FitRequest(scene, folder, config, record["device"], resume=True)
 

@@ -22,6 +22,7 @@ from warpgs.pipeline.train.strategies.holdout_blocks import HoldoutConfig
 from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig
 from warpgs.priors.view_prior import PriorConfig
+from warpgs.schema import SchemaError, anything, mapping, of_type
 
 
 @dataclass(frozen=True)
@@ -134,15 +135,19 @@ class FitConfig:
         """Return the configuration that `to_json` stored.
 
         Raises:
-            UsageError: A field is unknown, or a class of the user's own was not loaded in this process.
+            SchemaError: A value is of another kind than its field.
+            UsageError: A field is unknown, a value is out of range, or a class of the user's own was not loaded here.
         """
+        mapping(anything)(values, "config")
         try:
             values = dict(values)
             terms = tuple(_term(dict(t)) for t in values.pop("loss_terms"))
             own = values.pop("strategy_config")
             kind = find_strategy(values["strategy"]).Config
-            own = own if own is None or kind is None else kind(**own)
-            config: FitConfig = _compose(FitConfig, values | {"loss_terms": terms, "strategy_config": own})
+            if own is not None and kind is None:
+                raise SchemaError(f"strategy_config must be null for strategy {values['strategy']}")
+            own = own if kind is None or own is None else _compose(kind, own, "strategy_config")
+            config: FitConfig = _compose(FitConfig, values | {"loss_terms": terms, "strategy_config": own}, "config")
             return config
         except (TypeError, KeyError) as e:
             raise UsageError(f"the stored configuration is of another version of warpgs ({e})") from e
@@ -153,15 +158,29 @@ class FitConfig:
 
 
 def _term(values: dict[str, Any]) -> LossTerm:
-    return LOSS_TERMS.find(values.pop("name"))(**values)
+    term: LossTerm = _compose(LOSS_TERMS.find(values.pop("name")), values, "loss_terms")
+    return term
 
 
-def _compose(kind: type, values: dict[str, Any]) -> Any:
-    """Return a settings dataclass from nested plain values; its fields that are dataclasses are composed in turn."""
-    if not isinstance(values, dict):
-        raise TypeError(f"{kind.__name__} takes an object, not {str(values)[:60]}")
-    kinds = typing.get_type_hints(kind)
-    return kind(**{k: _compose(kinds[k], v) if dataclasses.is_dataclass(kinds[k]) else v for k, v in values.items()})
+def _compose(kind: type, values: dict[str, Any], place: str) -> Any:
+    """Return a settings dataclass from nested plain values; its fields that are dataclasses are composed in turn.
+
+    Raises:
+        SchemaError: A value is of another kind than its field.
+    """
+    mapping(anything)(values, place)
+    kinds, composed = typing.get_type_hints(kind), {}
+    for name, value in values.items():
+        where, of = f"{place}.{name}", kinds.get(name, Any)
+        if isinstance(of, type) and dataclasses.is_dataclass(of):
+            composed[name] = _compose(of, value, where)
+        elif name not in ("loss_terms", "strategy_config"):  # these two are composed before
+            of_type(of)(list(value) if isinstance(value, tuple) else value, where)
+            listed = any(typing.get_origin(part) is tuple for part in (of, *typing.get_args(of)))
+            composed[name] = tuple(value) if listed and isinstance(value, list) else value
+        else:
+            composed[name] = value
+    return kind(**composed)
 
 
 _DEFAULT = FitConfig(

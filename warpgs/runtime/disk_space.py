@@ -1,0 +1,30 @@
+"""Full disks, told by what another process said before it failed, or by the room that is left."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from pathlib import Path
+
+from warpgs.files import FULL
+
+WORDS = (*map(os.strerror, FULL), "disk is full", f"[Errno {errno.ENOSPC}]", f"[Errno {errno.EDQUOT}]")
+"""Words of systems, of SQLite and of Python on a full disk."""
+MIN_FREE = 2**16
+"""Room on a disk below which it is full [bytes]: some libraries fail without such words."""
+
+
+def disk_is_full(folder: Path, said: str) -> bool:
+    """Return whether a process failed because the disk of a folder that it wrote into is full.
+
+    Args:
+        folder: The folder.
+        said: What the process wrote to stderr.
+    """
+    if any(words in said for words in WORDS):
+        return True
+    try:
+        return shutil.disk_usage(folder).free < MIN_FREE
+    except OSError:
+        return False

@@ -1,0 +1,66 @@
+"""Names of files that are not UTF-8: any bytes are a name on Linux, and Python holds those that are no text as surrogates.
+
+Python opens such files. Libraries that take names as UTF-8 do not, and some end the process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from warpgs.errors import UsageError
+from warpgs.files import readable
+from warpgs.runtime.terminal import say
+
+DESCRIPTORS = Path("/proc/self/fd")
+"""Folder in which Linux has the open files of a process by their numbers."""
+
+
+def is_utf8(text: str) -> bool:
+    """Return whether text can be written as UTF-8."""
+    try:
+        text.encode("utf-8")
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def use_utf8_names() -> None:
+    """Start this program again in Python's UTF-8 mode where Python takes names for another encoding, and print that.
+
+    Names in files are UTF-8. Under LC_ALL=C with PYTHONUTF8=0, or in a locale of another encoding, Python cannot open them.
+    """
+    encoding = sys.getfilesystemencoding()
+    if sys.platform == "win32" or sys.flags.utf8_mode or encoding.lower().replace("-", "") == "utf8":
+        return
+    say(f"warpgs: this locale takes file names for {encoding}; started again in Python's UTF-8 mode (PYTHONUTF8=1)", error=True)
+    os.environ["PYTHONUTF8"] = "1"  # for processes that this one starts
+    if sys.stdout is not None:  # letters that the terminal lacks are still printed as codes
+        os.environ.setdefault("PYTHONIOENCODING", f"{sys.stdout.encoding}:backslashreplace")
+    os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])
+
+
+@contextlib.contextmanager
+def utf8_name(path: Path) -> Iterator[str]:
+    """Give a name of a file that a library can take: its own where that is UTF-8, else one by way of an open folder or file.
+
+    Args:
+        path: The file. One to be written must have a name in UTF-8, in whatever folder.
+
+    Raises:
+        UsageError: This system has no such other name.
+    """
+    if is_utf8(str(path)):
+        yield str(path)
+        return
+    by_folder = is_utf8(path.name)
+    if not DESCRIPTORS.is_dir():
+        raise UsageError(f"{readable(str(path))}: the name is not UTF-8, which is needed here; rename the file or its folder")
+    descriptor = os.open(path.parent if by_folder else path, os.O_RDONLY)
+    try:
+        yield f"{DESCRIPTORS}/{descriptor}/{path.name}" if by_folder else f"{DESCRIPTORS}/{descriptor}"
+    finally:
+        os.close(descriptor)
