@@ -10,7 +10,7 @@ from pathlib import Path
 import warp as wp
 
 from warpgs.kernels import blend_cuda
-from warpgs.kernels.native import source
+from warpgs.runtime.cuda_source import source
 
 VALUES = 10
 """Sums of an instance."""
@@ -40,7 +40,7 @@ def make_backward(tile_size: int, with_depth: bool, size: int, skip: bool):
         "PER": size // 32, "SKIP": str(skip).lower(), "WITH_DEPTH": str(with_depth).lower(),
     }  # fmt: skip
 
-    @wp.func_native(source("blend_common.cu", file, **numbers))
+    @wp.func_native(source(file, **numbers))
     def bucket_body(
         item: int, projected: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
         gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,

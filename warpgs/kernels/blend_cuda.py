@@ -13,10 +13,10 @@ import warp as wp
 
 from warpgs.constants import SMALLEST_WEIGHT
 from warpgs.kernels.blend_settings import BlendSettings
-from warpgs.kernels.native import source
 from warpgs.kernels.tiles import Tiles
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
+from warpgs.runtime.cuda_source import source
 
 CHUNKS = (64, 128)
 """Instances that one warp of the backward pass takes: the first number in images of up to MAX_SMALL_TILES tiles, to have enough
@@ -39,10 +39,10 @@ SCALE = "0.84932180028801904272f"  # sqrt(log2(e) / 2)
 
 
 def _source(name: str, tile_size: int, **numbers) -> str:
-    """Return the CUDA text of one body, after the text that all bodies share."""
+    """Return the CUDA text of one body."""
     numbers |= {"SIDE": tile_size, "STATE": STATE, "SCALE": SCALE, "WARPS": WARPS, "STRIDE": STRIDE}
     numbers["SMALLEST_WEIGHT"] = f"{SMALLEST_WEIGHT}f"
-    return source("blend_common.cu", f"blend_{name}.cu", **numbers)
+    return source(f"blend_{name}.cu", **numbers)
 
 
 @functools.cache

@@ -15,9 +15,9 @@ from warpgs.kernels.blend_cuda import SCALE
 from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.compiler import ROLLED
 from warpgs.kernels.falloff import STRIP, make_functions
-from warpgs.kernels.native import source
 from warpgs.kernels.tiles import Tiles
 from warpgs.runtime import interop
+from warpgs.runtime.cuda_source import source
 
 
 @functools.cache
@@ -95,7 +95,7 @@ def make_kernel(real, tile_size: int):
 def make_native(tile_size: int):
     """Make the CUDA kernel in float32 for one tile size, a thread block per tile."""
 
-    @wp.func_native(source("blend_common.cu", "median_depth.cu", SIDE=tile_size, SCALE=SCALE))
+    @wp.func_native(source("median_depth.cu", SIDE=tile_size, SCALE=SCALE))
     def body(
         tile: int, projected: wp.array(dtype=float), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int),
         origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
