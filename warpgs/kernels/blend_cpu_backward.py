@@ -38,10 +38,8 @@ def make_backward(real, tile_size: int):
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def backward(
-        begin: int, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), gaussian_ids: wp.array(dtype=int),
-        slots: wp.array(dtype=int), backgrounds: wp.array2d(dtype=real),
-        origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
-        alpha_cut: real, alpha_max: real, whole_tiles: int,
+        begin: int, settings: f.Blending, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int),
+        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), backgrounds: wp.array2d(dtype=real),
         transmittances: wp.array(dtype=real), weights: wp.array(dtype=real), depth: wp.array(dtype=real),
         ends: wp.array(dtype=int),
         v_rgb: wp.array2d(dtype=real), v_alpha: wp.array(dtype=real), v_depth: wp.array(dtype=real),
@@ -49,10 +47,10 @@ def make_backward(real, tile_size: int):
         v_slots: wp.array2d(dtype=real),
     ):  # fmt: skip
         tile = begin + wp.tid()
-        camera = tile // tiles
-        in_camera = tile - camera * tiles
-        top = (in_camera // columns) * side
-        left = (in_camera - (in_camera // columns) * columns) * side
+        place = f.place_of(tile, side, settings)
+        camera = place[0]
+        left = place[1]
+        top = place[2]
 
         # A Gaussian's whole effect on a pixel is one number d = c . v_rgb + z v_z + v_w (docs/blend.md, section 3).
         t = tile_reals()  # transmittance behind the current instance, then before it
@@ -65,11 +63,11 @@ def make_backward(real, tile_size: int):
         end = tile_ints()
         strip_end = list_ints()
         instance = int(0)
-        for row in range(wp.min(side, height - top)):
-            for column in range(wp.min(side, width - left)):
+        for row in range(wp.min(side, settings.height - top)):
+            for column in range(wp.min(side, settings.width - left)):
                 part = column // strip
                 p = (part * side + row) * strip + column - part * strip
-                o = (camera * height + top + row) * width + left + column
+                o = (camera * settings.height + top + row) * settings.width + left + column
                 t[p] = transmittances[o]
                 g0[p] = v_rgb[o, 0]
                 g1[p] = v_rgb[o, 1]
@@ -133,15 +131,15 @@ def make_backward(real, tile_size: int):
             c1 = projected[i, 7]
             c2 = projected[i, 8]
             distance = projected[i, 9]
-            bounds = f.bounds_of(mx, my, u11, u22, projected[i, 10], projected[i, 11], whole_tiles)
+            bounds = f.bounds_of(mx, my, u11, u22, projected[i, 10], projected[i, 11], settings.whole_tiles)
             for row in range(side):
-                dy = real(origin_y + top + row) + real(0.5) - my
+                dy = real(settings.origin_y + top + row) + real(0.5) - my
                 e2 = u22 * dy
                 row_dy[row] = dy
                 row_e12[row] = f.apart(u12 * dy)
                 row_e22[row] = f.apart(e2 * e2)
             for part in range(parts):
-                dx = real(origin_x + left + part * strip) + real(0.5) - mx
+                dx = real(settings.origin_x + left + part * strip) + real(0.5) - mx
                 at = f.apart(u11 * dx)
                 for row in range(side):
                     o = part * side + row
@@ -181,13 +179,13 @@ def make_backward(real, tile_size: int):
                     for n in range(abreast):
                         q = (base + n) * strip + lane
                         raw = opacity * g[n]
-                        alpha = wp.where(alpha_max < raw, alpha_max, raw)
+                        alpha = wp.where(settings.alpha_max < raw, settings.alpha_max, raw)
                         until = end[(list[base + n] & bits) * strip + lane]
-                        blended = alpha >= alpha_cut and instance < until
+                        blended = alpha >= settings.alpha_cut and instance < until
                         alpha = wp.where(blended, alpha, real(0.0))
                         alphas[q] = alpha
                         inverses[q] = real(1.0) / (real(1.0) - alpha)
-                        slopes[q] = wp.where(blended and raw <= alpha_max, g[n], real(0.0))
+                        slopes[q] = wp.where(blended and raw <= settings.alpha_max, g[n], real(0.0))
             k = int(0)
             while k < reaching:
                 base = wp.max(k, 0) * strip
