@@ -83,7 +83,7 @@ def everything():
     moved = torch.rand(3 * 4096, 3, generator=torch.Generator().manual_seed(1))
     state = [moved, moved.flip(0).contiguous(), moved * 0, moved * 0]
     adam_step(*state, lr=0.1, step=1)
-    factors = opacity_dropout(53, torch.tensor([0.3, 1.0]), 5)
+    factors = opacity_dropout(53, torch.tensor([0.3, 1.0, 0.0, 0.0, 0.0, 0.0]), 5)
     lists = [t for tiled in (tiles, capped) for t in (tiled.ranges, tiled.counts, tiled.gaussian_ids[: len(tiles.slots)])]
     weights = (*contributions(projected, tiles, **size, rule=rule), median_depth(projected, tiles, **size, rule=rule))
     near = mean_square_distances(moved[:91])

@@ -198,7 +198,7 @@ class Holdout(ImportanceSampling):
         yield from super().refine(step, growing, protected)
 
     def after_step(self, phase, settings, going):
-        """Apply the bounds of each Gaussian, and raise the opacities of protected ones; ``settings`` [3], ``going`` [1]."""
+        """Apply the bounds of each Gaussian, and raise the opacities of protected ones; ``settings`` [6], ``going`` [1]."""
         if self.trainer.config.holdout.bounds or self.shrinks(self.trainer.config):
             enforce_bounds(self.trainer.table)
         super().after_step(phase, settings, going)
