@@ -10,11 +10,11 @@ from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference
 from tests.tolerances import close
+from warpgs.colors import C0
 from warpgs.constants import ALPHA_CUT, ALPHA_MAX, RULES, TRANSMITTANCE_STOP
 from warpgs.kernels.blend import blend, contributions
 from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.project import project
-from warpgs.kernels.sh import C0
 from warpgs.kernels.tiles import Tiles, bin_tiles
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from warpgs.colors import base_coefficients, base_colors
 from warpgs.export.arrays import (
-    C0,
     SH_SIZES,
     SQRT2,
     Arrays,
@@ -39,7 +39,7 @@ def encode(arrays: Arrays) -> list[bytes]:
     """Return the bytes of a file; harmonics beyond 4 are clamped."""
     n, k = arrays["sh"].shape[:2]
     chunks = np.arange(n) // CHUNK
-    colors = 0.5 + C0 * arrays["sh"][:, 0].astype(np.float64)
+    colors = base_colors(arrays["sh"].astype(np.float64))
     bounds, fractions = [], []
     for values in (arrays["means"], arrays["log_scales"], colors):
         starts = np.arange(0, n, CHUNK)
@@ -101,7 +101,7 @@ def decode(path: Path, data: bytes) -> Arrays:
         )
         values[i] = low * (1 - values[i]) + high * values[i]
     others = (_unpack(rotation & (2**30 - 1), (10, 10, 10)) - 0.5) * SQRT2
-    harmonics = [((values[2] - 0.5) / C0)[:, None]]
+    harmonics = [base_coefficients(values[2])[:, None]]
     if sh is not None:
         harmonics.append(_harmonics(path, sh, n))
     return {

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgs.export.arrays import C0, Arrays, logits, malformed, rounded, sigmoid, unit_quats
+from warpgs.colors import base_coefficients, base_colors
+from warpgs.export.arrays import Arrays, logits, malformed, rounded, sigmoid, unit_quats
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 _TINY = 1e-37
@@ -21,7 +22,7 @@ def encode(arrays: Arrays) -> list[bytes]:
     rows = np.empty(len(arrays["means"]), _ROW)
     rows["mean"] = arrays["means"]
     rows["scale"] = np.clip(np.exp(arrays["log_scales"].astype(np.float64)), _TINY, 3e38)
-    rows["rgba"][:, :3] = rounded(255 * (0.5 + C0 * arrays["sh"][:, 0].astype(np.float64)), 255)
+    rows["rgba"][:, :3] = rounded(255 * base_colors(arrays["sh"].astype(np.float64)), 255)
     rows["rgba"][:, 3] = rounded(255 * sigmoid(arrays["logit_opacities"]), 255)
     rows["quat"] = rounded(128 * unit_quats(arrays["quats"]) + 128, 255)
     return [rows.tobytes()]
@@ -45,5 +46,5 @@ def decode(path: Path, data: bytes) -> Arrays:
         "quats": (rows["quat"].astype(np.float64) - 128) / 128,
         "log_scales": np.log(np.maximum(scales, _TINY)),
         "logit_opacities": logits(rows["rgba"][:, 3] / 255, 1 / 255),
-        "sh": ((colors - 0.5) / C0)[:, None, :],
+        "sh": base_coefficients(colors)[:, None, :],
     }

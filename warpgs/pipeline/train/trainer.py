@@ -313,10 +313,7 @@ class Trainer:
         return c.optimizer.lrs(self.progress(step), self.extent, stable_start)
 
     def settings(self, step: int, slot: int | None = None) -> tuple[float, ...]:
-        """Return the settings of a step, as `StepBuffers` takes them, or those of one of its slots.
-
-        A slot has the number of its view among all that the fit has rendered, from 1: its random numbers are its own.
-        """
+        """Return the settings of a step (`Setting`), or of one of its slots, which has its own number and random numbers."""
         number = step if slot is None else (step - 1) * self.batch + slot + 1
         shifted = self.cutout and self.config.loss.random_background
         shift = random_shift(self.config.seed, number, self.scene_background) if shifted else (0.0, 0.0, 0.0)

@@ -393,6 +393,6 @@ class Holdout(ImportanceSampling):
             return {}
         last = self.levels[-1] if self.levels else None
         return {
-            "adaptive": True, "why": self.why, "marginal_db": last and last.gain, "closed": self.closed,
+            "holdout": True, "why": self.why, "marginal_db": last and last.gain, "closed": self.closed,
             "levels": [asdict(x) for x in self.levels], "trims": self.trims,
         }  # fmt: skip

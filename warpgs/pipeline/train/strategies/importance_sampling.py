@@ -78,7 +78,7 @@ class MethodConfig:
     """Weight of the semantic score in the importance."""
     s_geometry: bool = True
     """Weight of the geometric score in the importance. A gate with gate_quantile above 0 (paper-literal) uses the map even when
-    this is off; with 0 (paper, quick, balanced) no gate uses it."""
+    this is off; with 0 (default, quick) no gate uses it."""
     ra: bool = True
     """Reliability gate: only pixels above gate_quantile of the geometric score (0: no such gate) and, with sampler.depth
     consistent, only pixels with consistent depth in views that have some."""
