@@ -10,13 +10,11 @@ from torch.autograd.function import once_differentiable
 
 from warpgs.constants import Rule
 from warpgs.kernels import blend_cpu, blend_cuda
+from warpgs.kernels.blend_records import VALUES
 from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.tiles import Tiles, grid
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
-
-VALUES = 10
-"""Gradient values of an instance: those of a projected Gaussian but for its last two, which are the box."""
 
 
 @functools.cache
