@@ -26,8 +26,9 @@ import torch
 
 from bench import result_file
 from bench.formats import Scorer
+from warpgs.colors import C0
 from warpgs.export import spz
-from warpgs.export.arrays import C0, arrays_of, gaussians_of, half_turn, unit_quats
+from warpgs.export.arrays import arrays_of, gaussians_of, half_turn, unit_quats
 from warpgs.export.formats import FORMATS, read_gaussians
 from warpgs.geometry import rotation_matrices
 from warpgs.pipeline.runs.share import export

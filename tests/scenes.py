@@ -5,8 +5,8 @@ import math
 import numpy as np
 import torch
 
+from warpgs.colors import C0
 from warpgs.geometry import look_at
-from warpgs.kernels.sh import C0
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians, PointCloud, Prior, View
 

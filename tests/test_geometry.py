@@ -45,6 +45,14 @@ def test_logit_is_the_inverse_of_the_sigmoid(probability):
     assert 1 / (1 + math.exp(-geometry.logit(probability))) == pytest.approx(probability, rel=1e-12)
 
 
+def test_logits_of_both_ends_are_infinite():
+    """No opacity is below 0, and none is above 1; beyond them there is no logit."""
+    assert (geometry.logit(0), geometry.logit(1.0)) == (-math.inf, math.inf)
+    for probability in (-0.1, 1.1):
+        with pytest.raises(ValueError):
+            geometry.logit(probability)
+
+
 def test_points_come_back_from_pixels_and_depths():
     """Projection and both back-projections are inverse to each other."""
     cam = camera(40, 30, cameras=4)

@@ -10,7 +10,7 @@ PRODUCT = sorted((ROOT / "warpgs").rglob("*.py"))
 SHARED = {
     "__init__", "functions", "native", "compiler", "falloff",
     "project_backward", "ssim_cpu", "ssim_cuda", "blend_cpu", "blend_cpu_backward",
-    "blend_cuda", "blend_settings", "scanlines_cpu", "sh",
+    "blend_cuda", "blend_records", "blend_settings", "scanlines_cpu", "sh",
 }  # fmt: skip
 
 

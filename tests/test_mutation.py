@@ -24,16 +24,14 @@ def kernel(a: wp.array(dtype=3), n: int = 2):
     if n < 1:
         raise ValueError(f"{n + 1} is below 1")
     launch(total, cost=7)
-    return _native("""
-        x[i] += a * 2.0f;
-        return -x[0] < 1;
-    """) if n else n
+    x[i] += a * 2.0
+    return -x[0] < 1
 '''
 
 WANTED = {
     "2 to 3", "0.0 to 1.0", "range one shorter", "2 to 1", ">= to >", ">= to <=", "- dropped", "0.5 to 0.505", "and to or",
     "not dropped", "== to !=", "statement dropped", "+= to -=", "min to max", "1.5 to 1.515", "* to /", "0.01 to 0.0101",
-    "< to <=", "< to >", "1 to 2", "2.0f to 2.02f", "0 to 1",
+    "< to <=", "< to >", "1 to 2", "2.0 to 2.02", "0 to 1",
 }  # fmt: skip
 
 
@@ -54,7 +52,7 @@ def test_mutants_of_a_small_source():
         lines = [i for i, (old, new) in enumerate(zip(before, after.splitlines(), strict=True), 1) if old != new]
         assert len(lines) == 1, e
         changed |= set(lines)
-    assert changed == {5, 6, 7, 8, 9, 10, 14, 15}
+    assert changed == {5, 6, 7, 8, 9, 10, 13, 14}
 
 
 def test_mutants_of_a_cuda_body():
@@ -78,7 +76,7 @@ def test_mutants_of_a_cuda_body():
 
 
 def test_what_only_cuda_runs():
-    """Branches, arguments, files and native bodies."""
+    """Branches, arguments and files."""
     source = (
         b'def launch(a=1, *, block_dim=2, deterministic=True, keep=False):\n    if device.type == "cuda":\n        a = 11\n'
         b"    else:\n        a = 12\n    b = 13 if native else 14\n    launch(a, 15, block_dim=16, keep=17)\n"
@@ -86,7 +84,6 @@ def test_what_only_cuda_runs():
     cuda = {e.change for e in python_edits(source, "some.py") if e.place.cuda}
     assert cuda == {"2 to 3", "True to False", "11 to 12", "13 to 14", "16 to 17"}
     assert all(e.place.cuda for e in python_edits(source, "warpgs/kernels/blend_cuda.py"))
-    assert {e.place.cuda for e in python_edits(PYTHON.encode(), "some.py") if "2.0f" in e.change} == {True}
     source = b"def step(t):\n    if {}:\n        run(t, 3)\n        return\n    run(t, 4)\n\ndef other():\n    run(5)\n"
     for test, cuda in {b"t.device.type == 'cpu'": {"4 to 5"}, b"not t.type == 'cpu'": set(), b"t": set()}.items():
         edits = python_edits(source.replace(b"{}", test), "some.py")
@@ -94,12 +91,13 @@ def test_what_only_cuda_runs():
 
 
 def test_every_kernel_file_has_mutants_and_tests(candidates):
-    """All files but two packages and an interface; mutants have numbers of their own, samples are nested, with some of each."""
+    """All files but packages, an interface, a call and names; mutants have numbers of their own; samples nest."""
     assert len(candidates) > 4000 and len({c.key for c in candidates}) == len({c.id for c in candidates}) == len(candidates)
     found = {pattern: [p.relative_to(ROOT).as_posix() for p in ROOT.glob(pattern)] for pattern in rules.MUTATED}
     assert all(found.values())
     files = {file for files in found.values() for file in files}
     without = {f"warpgs/kernels/{name}.py" for name in ("__init__", "cameras/__init__", "cameras/base")}
+    without |= {f"warpgs/kernels/cuda/{name}.cu" for name in ("native_broadcast", "blend_settings")}
     assert files - {c.file for c in candidates} == without
     tests = {test for file in {c.file for c in candidates} for cuda in (False, True) for test in rules.tests_of(file, cuda)}
     assert [t for t in sorted(tests) + [t.split("::")[0] for t in rules.SKIPPED] if not (ROOT / t).is_file()] == []

@@ -16,6 +16,9 @@ ALPHA_MAX = 0.99
 LOW_PASS = 0.3
 """Variance added to both image axes [px^2]: about the box filter of one pixel (1/12) plus margin against aliasing."""
 
+TILE_SIZE = 16
+"""Side of a tile [px] where no other is asked for, in fits too."""
+
 NEAR = 0.01
 """Nearest depth that is rendered [u]."""
 

@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 
 
 def logit(probability: float) -> float:
-    """Return log(p / (1 - p)), the inverse of the sigmoid, for p in (0, 1)."""
+    """Return log(p / (1 - p)), the inverse of the sigmoid, for p in [0, 1]; infinite at both ends."""
+    if probability in (0, 1):
+        return math.copysign(math.inf, probability - 0.5)
     return math.log(probability / (1 - probability))
 
 

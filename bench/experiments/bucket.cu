@@ -1,3 +1,5 @@
+#include "blend_common.cu"
+#include "blend_settings.cu"
 // One warp takes a bucket of 32 * PER instances. A lane keeps PER of them with their sums, and the pixels pass through the
 // lanes: lane l works on the pixel that lane l - 1 had a step before, and takes over what changes on its way. The order is
 // back to front, the last instance in lane 0, so that arithmetic and inputs are those of the kernel that this is held against

@@ -10,7 +10,8 @@ from pathlib import Path
 import warp as wp
 
 from warpgs.kernels import blend_cuda
-from warpgs.kernels.native import source
+from warpgs.kernels.blend_settings import make_struct
+from warpgs.runtime.cuda_source import source
 
 VALUES = 10
 """Sums of an instance."""
@@ -33,6 +34,7 @@ def make_backward(tile_size: int, with_depth: bool, size: int, skip: bool):
     """
     if size % 32 != 0 or size <= 0:
         raise ValueError(f"size must be a multiple of 32, not {size}")
+    Blending = make_struct(wp.float32)
     file = str(Path(__file__).with_name("bucket.cu"))  # an absolute path stands for itself
     numbers = {
         "SIDE": tile_size, "STATE": blend_cuda.STATE, "SCALE": blend_cuda.SCALE, "WARPS": blend_cuda.WARPS,
@@ -40,13 +42,11 @@ def make_backward(tile_size: int, with_depth: bool, size: int, skip: bool):
         "PER": size // 32, "SKIP": str(skip).lower(), "WITH_DEPTH": str(with_depth).lower(),
     }  # fmt: skip
 
-    @wp.func_native(source("blend_common.cu", file, **numbers))
+    @wp.func_native(source(file, **numbers))
     def bucket_body(
-        item: int, projected: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
-        backgrounds: wp.array(dtype=float),
-        origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int, no_tile: int,
-        alpha_cut: float, alpha_max: float, whole_tiles: int,
+        item: int, settings: Blending, capacity: int, no_tile: int, projected: wp.array(dtype=float),
+        keys: wp.array(dtype=int), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int),
+        totals: wp.array(dtype=wp.int64), backgrounds: wp.array(dtype=float),
         rgb: wp.array(dtype=float), depth: wp.array(dtype=float), transmittances: wp.array(dtype=float),
         weights: wp.array(dtype=float), ends: wp.array(dtype=int), states: wp.array2d(dtype=float),
         v_rgb: wp.array(dtype=float), v_alpha: wp.array(dtype=float), v_depth: wp.array(dtype=float),
@@ -57,11 +57,9 @@ def make_backward(tile_size: int, with_depth: bool, size: int, skip: bool):
 
     @wp.kernel(enable_backward=False, grid_stride=False, module=name, launch_bounds=32 * blend_cuda.WARPS)
     def bucket(
-        begin: int, projected: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
-        backgrounds: wp.array(dtype=float),
-        origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int, no_tile: int,
-        alpha_cut: float, alpha_max: float, whole_tiles: int,
+        begin: int, settings: Blending, capacity: int, no_tile: int, projected: wp.array(dtype=float),
+        keys: wp.array(dtype=int), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int),
+        totals: wp.array(dtype=wp.int64), backgrounds: wp.array(dtype=float),
         rgb: wp.array(dtype=float), depth: wp.array(dtype=float), transmittances: wp.array(dtype=float),
         weights: wp.array(dtype=float), ends: wp.array(dtype=int), states: wp.array2d(dtype=float),
         v_rgb: wp.array(dtype=float), v_alpha: wp.array(dtype=float), v_depth: wp.array(dtype=float),
@@ -69,8 +67,7 @@ def make_backward(tile_size: int, with_depth: bool, size: int, skip: bool):
         v_slots: wp.array2d(dtype=float),
     ):  # fmt: skip
         bucket_body(
-            wp.tid() // 32, projected, keys, ranges, gaussian_ids, slots, totals, capacity, backgrounds,
-            origin_x, origin_y, width, height, columns, tiles, no_tile, alpha_cut, alpha_max, whole_tiles,
+            wp.tid() // 32, settings, capacity, no_tile, projected, keys, ranges, gaussian_ids, slots, totals, backgrounds,
             rgb, depth, transmittances, weights, ends, states, v_rgb, v_alpha, v_depth, v_slots,
         )  # fmt: skip
 

@@ -4,15 +4,17 @@ import dataclasses
 
 import pytest
 import torch
+import warp as wp
 
 from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference
 from tests.tolerances import close
-from warpgs.constants import RULES
+from warpgs.colors import C0
+from warpgs.constants import ALPHA_CUT, ALPHA_MAX, RULES, TRANSMITTANCE_STOP
 from warpgs.kernels.blend import blend, contributions
+from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.project import project
-from warpgs.kernels.sh import C0
 from warpgs.kernels.tiles import Tiles, bin_tiles
 
 
@@ -26,7 +28,7 @@ def drawn(gaussians, cam, background, rule, tile_size=16, degree=1):
     return *blend(projected, tiles, background, **size, rule=rule), projected, tiles
 
 
-def coincident_views(tensors, cam, background, rule, tile_size=16, degree=1):
+def reference_images(tensors, cam, background, rule, tile_size=16, degree=1):
     """Return the same images by the references, stacked over cameras, and the weights [C, N, H, W]."""
     *gaussians, viewmats, Ks = tensors
     means, covs, colors, depths, opacities = project_reference(
@@ -63,15 +65,15 @@ def test_pictures_and_gradients_equal_reference(device, dtype, rule, tile_size):
     other = doubles(gaussians, cam)
     other_background = background.detach().cpu().double().requires_grad_()
     rgb, alpha, depth, _, _ = drawn(gaussians, cam, background, rule, tile_size, degree=3)
-    wanted = coincident_views(other, cam, other_background, rule, tile_size, degree=3)
-    for found, reference_result in zip((rgb, alpha, depth), wanted):
-        close("image", found, reference_result)
+    wanted = reference_images(other, cam, other_background, rule, tile_size, degree=3)
+    for found, reference in zip((rgb, alpha, depth), wanted):
+        close("image", found, reference)
     upstream = [torch.randn(t.shape, generator=torch.Generator().manual_seed(7), dtype=torch.float64) for t in wanted[:3]]
     sum((a * u.to(a)).sum() for a, u in zip((rgb, alpha, depth), upstream)).backward()
     sum((a * u).sum() for a, u in zip(wanted, upstream)).backward()
-    for t, reference_result in zip((*gaussians.tensors().values(), background), (*other[:5], other_background)):
+    for t, reference_leaf in zip((*gaussians.tensors().values(), background), (*other[:5], other_background)):
         assert bool(t.grad.any())
-        close("gradient", t.grad, reference_result.grad)
+        close("gradient", t.grad, reference_leaf.grad)
 
 
 @pytest.mark.parametrize("cameras", [1, pytest.param(2, marks=pytest.mark.slow)])
@@ -97,7 +99,7 @@ def test_odd_image_sizes(device, dtype, width, height):
     gaussians, cam = cloud(40, dtype, device), camera(width, height, cameras=1, dtype=dtype, device=device)
     background = backgrounds(1, dtype, device)
     rgb, alpha, _, _, _ = drawn(gaussians, cam, background, SMOOTH)
-    wanted = coincident_views(doubles(gaussians, cam), cam, background.cpu().double(), SMOOTH)
+    wanted = reference_images(doubles(gaussians, cam), cam, background.cpu().double(), SMOOTH)
     close("image", rgb, wanted[0])
     close("image", alpha, wanted[1])
 
@@ -178,7 +180,7 @@ def test_contributions_are_the_weights(device, dtype):
     background = backgrounds(2, dtype, device)
     *_, projected, tiles = drawn(gaussians, cam, background, rule)
     sums, maxima = contributions(projected, tiles, width=40, height=30, rule=rule)
-    weights = coincident_views(doubles(gaussians, cam), cam, background.cpu().double(), rule)[3]
+    weights = reference_images(doubles(gaussians, cam), cam, background.cpu().double(), rule)[3]
     close("gradient", sums, weights.sum((2, 3)))
     close("gradient", maxima, weights.amax((2, 3)))
 
@@ -275,3 +277,14 @@ def test_both_passes_see_the_same_alpha(device):
     forward, backward = rgb[..., 0].detach().double().sum((1, 2)), projected.grad[:, 0, 6].double()
     assert bool((forward > 0).sum() > count / 2)
     assert float((forward - backward).abs().max()) < 0.5 * rule.alpha_cut
+
+
+def test_settings_of_kernels_are_made_once():
+    """Equal settings give one struct for each tile size and scalar type: numbers of the rule, tiles of the window."""
+    made = [BlendSettings((16, 32), 40, 20, RULES["inria"]).struct(16, wp.float64) for _ in range(2)]
+    assert made[0] is made[1] and made[0] is not BlendSettings((16, 32), 40, 20, RULES["inria"]).struct(8, wp.float64)
+    found = {name: getattr(made[0], name) for name in made[0]._cls.vars}
+    assert found == {
+        "origin_x": 16, "origin_y": 32, "width": 40, "height": 20, "columns": 3, "tiles": 6, "alpha_cut": ALPHA_CUT,
+        "alpha_max": ALPHA_MAX, "stop": TRANSMITTANCE_STOP, "inclusive": 0, "whole_tiles": 1,
+    }  # fmt: skip

@@ -6,12 +6,14 @@ from scipy.stats import chisquare
 
 from tests.reference.dropout import expected_factors
 from warpgs.kernels.dropout import opacity_dropout
+from warpgs.kernels.step_buffers import Setting
 
 COUNT = 20_000
 
 
 def factors(device, p: float, step: int = 1, seed: int = 0) -> torch.Tensor:
-    return opacity_dropout(COUNT, torch.tensor([p, step], dtype=torch.float32, device=device), seed)
+    settings = Setting.row(dropout=p, number=step, means_lr=0.1, shift=(0.2, 0.3, 0.4))
+    return opacity_dropout(COUNT, torch.tensor(settings, dtype=torch.float32, device=device), seed)
 
 
 def test_frequencies(device):

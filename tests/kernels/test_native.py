@@ -11,6 +11,7 @@ import warp as wp
 from warpgs.constants import ALPHA_CUT
 from warpgs.kernels import blend_cuda, native
 from warpgs.runtime import interop
+from warpgs.runtime.cuda_source import source
 
 pytestmark = pytest.mark.cuda
 CUDA = torch.device("cuda", 0)
@@ -45,7 +46,7 @@ def small_kernels() -> SimpleNamespace:
     numbers = {"SIDE": 16, "STATE": 5, "WARPS": 2, "STRIDE": 12, "SCALE": blend_cuda.SCALE}
 
     @wp.func_native(
-        native.source("blend_common.cu", **numbers)
+        source("blend_common.cu", **numbers)
         + """
         Splat s;
         s.load(projected.data, i);

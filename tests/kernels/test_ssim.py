@@ -20,13 +20,13 @@ def images(height, width, dtype=torch.float64, device="cpu"):
 def test_map_and_gradient_equal_the_convolution(device, dtype, height, width):
     """Every pixel, border included, equals the dense computation; so does the gradient."""
     image, target = images(height, width, dtype, device)
-    leaf, reference_result = image.requires_grad_(), image.detach().cpu().double().requires_grad_()
+    leaf, image64 = image.requires_grad_(), image.detach().cpu().double().requires_grad_()
     weights = images(height, width)[1]
-    found, wanted = ssim(leaf, target), ssim_reference(reference_result, target.cpu().double())
+    found, wanted = ssim(leaf, target), ssim_reference(image64, target.cpu().double())
     close("ssim", found, wanted)
     (found * weights.to(found)).sum().backward()
     (wanted * weights).sum().backward()
-    close("gradient", leaf.grad, reference_result.grad)
+    close("gradient", leaf.grad, image64.grad)
 
 
 def test_gradcheck(device):
@@ -40,16 +40,16 @@ def test_summed_differences_equal_the_maps(device, dtype, height, width):
     """The two sums and their gradient are those of the dense maps; some pixels are equal, where |a - b| has no slope."""
     image, target = images(height, width, dtype, device)
     image[:2] = target[:2]
-    leaf, reference_result = image.requires_grad_(), image.detach().cpu().double().requires_grad_()
+    leaf, image64 = image.requires_grad_(), image.detach().cpu().double().requires_grad_()
     target64 = target.cpu().double()
     found = differences(leaf, target)
-    wanted = torch.stack([(1 - ssim_reference(reference_result, target64)).sum(), (reference_result - target64).abs().sum()])
+    wanted = torch.stack([(1 - ssim_reference(image64, target64)).sum(), (image64 - target64).abs().sum()])
     if bool(wanted.detach().any()):
         close("ssim", found, wanted)
     (0.2 * found[0] + 0.8 * found[1]).backward()
     (0.2 * wanted[0] + 0.8 * wanted[1]).backward()
-    if bool((reference_result.grad.abs() > 1e-12).any()):
-        close("gradient", leaf.grad, reference_result.grad)
+    if bool((image64.grad.abs() > 1e-12).any()):
+        close("gradient", leaf.grad, image64.grad)
 
 
 def test_gradcheck_of_the_sums(device):

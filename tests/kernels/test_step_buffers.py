@@ -7,7 +7,7 @@ import torch
 
 from tests.kernels.test_guard_bytes import Guarded
 from tests.reference import step_buffers as reference
-from warpgs.kernels.step_buffers import NOT_FINITE, begin_step, end_step
+from warpgs.kernels.step_buffers import NOT_FINITE, SHIFT, Setting, begin_step, end_step
 
 
 def rows(device, height=5, width=7, views=3, steps=4) -> list[torch.Tensor]:
@@ -51,3 +51,10 @@ def test_a_step_is_written_down_and_counted_if_it_counts(device, value, stopped)
         ends.append([going.tolist(), counter.tolist(), stop.tolist(), str(history.tolist())])
     assert ends[0] == ends[1]
     assert ends[0][0] == [stopped == 0 and math.isfinite(value)]
+
+
+def test_settings_stand_in_their_columns():
+    """A row holds each setting where its column says."""
+    row = Setting.row(dropout=0.2, number=7, means_lr=1e-4, shift=(0.1, 0.5, 0.9))
+    assert (row[Setting.DROPOUT], row[Setting.NUMBER], row[Setting.MEANS_LR], row[SHIFT]) == (0.2, 7, 1e-4, (0.1, 0.5, 0.9))
+    assert (row[Setting.RED], row[Setting.GREEN], row[Setting.BLUE]) == row[SHIFT] and len(row) == len(Setting)

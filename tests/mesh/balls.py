@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
+from warpgs.colors import C0
 from warpgs.geometry import look_at
-from warpgs.kernels.sh import C0
 from warpgs.scene import Camera, Gaussians
 
 RADIUS = 1.0

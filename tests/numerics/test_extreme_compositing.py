@@ -15,9 +15,9 @@ from tests.reference.blend import blend_reference
 from warpgs.constants import ALPHA_CUT, RULES
 from warpgs.kernels import blend_cuda
 from warpgs.kernels.falloff import make_falloff
-from warpgs.kernels.native import source
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.runtime import interop
+from warpgs.runtime.cuda_source import source
 from warpgs.scene import Gaussians
 
 EXACT = RULES["exact"]

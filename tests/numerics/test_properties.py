@@ -14,11 +14,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.gaussians import SMOOTH, camera, cloud, leaves
+from warpgs.colors import C0
 from warpgs.constants import RULES
 from warpgs.export.ply import read_ply, write_ply
 from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
-from warpgs.kernels.sh import C0
 from warpgs.kernels.tiles import bin_tiles
 from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.render.rasterize import RasterizeOptions, rasterize

@@ -10,6 +10,7 @@ from tests.pipeline.test_importance_sampling import CONFIG as METHOD
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import NotFiniteError
 from warpgs.kernels.adam import scheduled_lrs
+from warpgs.kernels.step_buffers import Setting
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.train.batch import BatchSteps
 from warpgs.pipeline.train.by_views import settings_by_views
@@ -63,8 +64,8 @@ def test_rates_follow_the_square_root_of_the_batch():
     fit = Trainer(photos(2), seeds(), dataclasses.replace(PLAIN, batch=4), CPU)
     row, lrs = fit._lr_row(3), fit.lrs(3)
     assert row[:3] == scheduled_lrs(2 * lrs["means"], 3, (0.9**4, 0.999**4))
-    assert fit.settings(3)[1:3] == (3, 2 * lrs["means"])
-    assert [fit.settings(3, slot)[1] for slot in range(4)] == [9, 10, 11, 12]
+    assert (fit.settings(3)[Setting.NUMBER], fit.settings(3)[Setting.MEANS_LR]) == (3, 2 * lrs["means"])
+    assert [fit.settings(3, slot)[Setting.NUMBER] for slot in range(4)] == [9, 10, 11, 12]
 
 
 def test_a_fit_with_batches_continues_with_the_same_bits():

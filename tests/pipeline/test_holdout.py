@@ -186,7 +186,7 @@ def test_without_evidence_it_is_the_plain_fit():
     for _ in range(20):
         fit.advance()
         plain.advance()
-    assert any("nothing is held out" in n for n in fit.notes) and not complexity(fit)["adaptive"]
+    assert any("nothing is held out" in n for n in fit.notes) and not complexity(fit)["holdout"]
     assert all(torch.equal(t, plain.gaussians.tensors()[n]) for n, t in fit.gaussians.tensors().items())
 
 
@@ -271,7 +271,7 @@ def test_command_line_says_what_the_model_takes(tmp_path, capsys):
     words = capsys.readouterr().out
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     c = metrics["complexity"]
-    assert c["adaptive"] and c["cap"] == 900 and c["count"] == metrics["gaussians"] <= 900
+    assert c["holdout"] and c["cap"] == 900 and c["count"] == metrics["gaussians"] <= 900
     assert f"{c['count']:,} Gaussians, " in words
     page = (tmp_path / "run" / "report.html").read_text()
     assert "mean SH degree" in page and "growth ended at step" in page and "growth stopped because" in page

@@ -9,6 +9,7 @@ import torch
 
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import UsageError
+from warpgs.kernels.step_buffers import Setting
 from warpgs.pipeline.model.init import InitConfig, initial_points
 from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
@@ -96,7 +97,7 @@ def test_protected_gaussian_survives_its_protection_and_no_step_longer():
     logits, going = fit.table.params["logit_opacities"].detach(), torch.ones(1, dtype=torch.bool)
     for step in range(8, 16):
         logits[:] = -10.0
-        settings = torch.tensor([0.0, step, 0.0])
+        settings = torch.tensor(Setting.row(dropout=0.0, number=step, means_lr=0.0, shift=(0.0, 0.0, 0.0)))
         fit.strategy.after_step(fit.strategy.phase(step), settings, ~going)
         assert logits.tolist() == [-10.0] * 3
         fit.strategy.after_step(fit.strategy.phase(step), settings, going)

@@ -61,7 +61,7 @@ def test_noise_has_each_gaussians_covariance_and_spares_the_opaque(device):
     g.quats[:] = torch.tensor([math.cos(math.pi / 6), 0, 0, math.sin(math.pi / 6)], device=device)
     g.log_scales[:] = torch.log(torch.tensor([0.5, 0.1, 0.2], device=device))
     g.logit_opacities[:] = torch.where(torch.arange(20_000, device=device) < 10_000, -20.0, 3.0)
-    settings = torch.tensor([0.0, 7.0, 0.1], device=device)
+    settings = torch.tensor([0.0, 7.0, 0.1, 0.0, 0.0, 0.0], device=device)
     still = torch.zeros(1, dtype=torch.bool, device=device)
     perturb(g, settings, still, seed=0, noise_lr=10.0)
     assert not bool(g.means.any())

@@ -7,8 +7,8 @@ from scipy.stats import chisquare
 
 from tests.scenes import ring
 from warpgs import geometry
+from warpgs.colors import C0
 from warpgs.errors import UsageError
-from warpgs.kernels.sh import C0
 from warpgs.pipeline.train.strategies.sampler import (
     SUPPORT,
     SamplerConfig,

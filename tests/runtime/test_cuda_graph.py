@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from warpgs.kernels.dropout import opacity_dropout
+from warpgs.kernels.step_buffers import Setting
 from warpgs.runtime.allocator import Arena
 from warpgs.runtime.cuda_graph import (
     FREE_CAPTURES,
@@ -123,7 +124,7 @@ def test_a_failed_capture_warns_once_and_the_function_still_runs():
 def test_a_captured_graph_replays_torch_and_warp():
     """Kernels of both read new inputs at each replay, the result stays alive, and a second graph shares the memory."""
     cuda = torch.device("cuda", 0)
-    settings, stream = torch.tensor([0.5, 1.0], device=cuda), torch.cuda.Stream()
+    settings, stream = torch.tensor([0.5, 1.0, 0.0, 0.0, 0.0, 0.0], device=cuda), torch.cuda.Stream()
 
     def work():
         return 2 * opacity_dropout(1000, settings, 7)
@@ -134,7 +135,7 @@ def test_a_captured_graph_replays_torch_and_warp():
     second = CapturedGraph(work, stream, graph.pool())
     torch.cuda.current_stream().wait_stream(stream)
     for step in (1.0, 2.0, 3.0):
-        settings[1] = step
+        settings[Setting.NUMBER] = step
         for each in (graph, second):
             each.replay()
             assert torch.equal(each.result, work())

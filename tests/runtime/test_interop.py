@@ -83,7 +83,7 @@ def everything():
     moved = torch.rand(3 * 4096, 3, generator=torch.Generator().manual_seed(1))
     state = [moved, moved.flip(0).contiguous(), moved * 0, moved * 0]
     adam_step(*state, lr=0.1, step=1)
-    factors = opacity_dropout(53, torch.tensor([0.3, 1.0]), 5)
+    factors = opacity_dropout(53, torch.tensor([0.3, 1.0, 0.0, 0.0, 0.0, 0.0]), 5)
     lists = [t for tiled in (tiles, capped) for t in (tiled.ranges, tiled.counts, tiled.gaussian_ids[: len(tiles.slots)])]
     weights = (*contributions(projected, tiles, **size, rule=rule), median_depth(projected, tiles, **size, rule=rule))
     near = mean_square_distances(moved[:91])
@@ -173,6 +173,40 @@ def test_the_device_that_is_current_stays_so(monkeypatch, several):
         events.append("sort")
     guarded = [[("enter", device), *body, "exit"] if several else body for body in (["launch"], ["ours", "sort", "before"])]
     assert events == guarded[0] + guarded[1]
+
+
+@wp.struct
+class Pair:
+    """Two numbers."""
+
+    count: wp.int32
+    step: wp.float64
+
+
+@wp.kernel(enable_backward=False)
+def add_pair(begin: int, pair: Pair, found: wp.array(dtype=wp.float64)):
+    i = begin + wp.tid()
+    found[i] = found[i] + wp.float64(pair.count) * pair.step
+
+
+def test_a_recorded_launch_takes_structs_by_value():
+    """Each launch sees the struct that it is given, and none is changed: callers keep them."""
+
+    def pair(count, step):
+        made = Pair()
+        made.count, made.step = count, step
+        return made
+
+    first, second = pair(1, 0.5), pair(3, 2.0)
+    found = torch.zeros(4, dtype=torch.float64)
+    recorded = interop._Recorded(add_pair, torch.device("cpu"), 1)
+    totals = []
+    for given in (first, second, second, first):
+        recorded.launch(4, [given, interop.view(found, wp.float64)], None)
+        totals.append(found.tolist())
+    assert totals == [[n] * 4 for n in (0.5, 6.5, 12.5, 13.0)]
+    assert (first.count, first.step, second.count, second.step) == (1, 0.5, 3, 2.0)
+    assert first.__ctype__().count == 1 and second.__ctype__().count == 3
 
 
 def test_items_are_numbered_in_31_bits():

@@ -10,7 +10,6 @@ from dataclasses import replace
 
 from tools.mutation import rules
 from tools.mutation.edit import NAMES, Edit, Place, fingerprint, other_number, swaps
-from tools.mutation.native import native_edits
 
 COMPARISONS = {
     ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=", ast.Is: "is", ast.IsNot: "is not",
@@ -76,8 +75,6 @@ class _Walker:
         if rules.left_out(node):
             return
         self.edits += [Edit(*edit, place) for edit in self.of(node)]
-        if isinstance(node, ast.Constant) and rules.is_native(node):
-            self.native(node, place)
         if isinstance(node, ast.Dict):
             for key, value in zip(node.keys, node.values):
                 if not rules.is_hint(key):
@@ -95,23 +92,11 @@ class _Walker:
         for field, child in ast.iter_fields(node):
             children = [c for c in (child if isinstance(child, list) else [child]) if isinstance(c, ast.AST)]
             if field in ("annotation", "returns", "decorator_list", "type_params"):
-                # of annotations and compile options nothing is mutated but CUDA bodies
-                for part in itertools.chain.from_iterable(map(ast.walk, children)):
-                    if isinstance(part, ast.Constant) and rules.is_native(part):
-                        self.native(part, place)
                 continue
             side = cuda or (field == "body" and body_cuda) or (field == "orelse" and else_cuda)
             for part in children:
                 self.walk(part, replace(place, cuda=side))
                 side = side or rules.ends_cpu(part)
-
-    def native(self, node: ast.Constant, place: Place) -> None:
-        begin, end = self.begin(node), self.end(node)
-        quotes = 3 if self.source[begin : begin + 3] == b'"""' else 1
-        body = place.below("Body", self.counts)
-        for e in native_edits(self.source[begin + quotes : end - quotes]):
-            inner = replace(e.place, function=place.inside(e.place.function).function, path=f"{body.path}.{e.place.path}")
-            self.edits.append(replace(e, start=e.start + begin + quotes, end=e.end + begin + quotes, place=inner))
 
     def between(self, left, right, operator: str) -> tuple[int, int]:
         """Return where an operator stands between two operands."""

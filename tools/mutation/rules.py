@@ -134,11 +134,6 @@ def native_number_left_out(line: str) -> bool:
     return bool(declared) and declared[1] in SLACK | SPEED
 
 
-def is_native(node: ast.Constant) -> bool:
-    """Return whether a string is a CUDA body: it has a statement, or more, of its own."""
-    return isinstance(node.value, str) and ";" in node.value and ("return " in node.value or ";\n" in node.value)
-
-
 def sides(node: ast.AST) -> tuple[bool, bool]:
     """Return whether only CUDA runs the body of an ``if`` (or conditional expression), and the same of its ``else``."""
     if not isinstance(node, ast.If | ast.IfExp):

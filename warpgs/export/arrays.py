@@ -17,8 +17,6 @@ Arrays = dict[str, np.ndarray]
 
 SH_SIZES = (1, 4, 9, 16)
 """Numbers of spherical-harmonics coefficients of degrees 0 to 3."""
-C0 = 0.28209479177387814
-"""Harmonic of degree 0, 1/2 sqrt(1/pi): a colour is 1/2 + C0 times its coefficient."""
 SQRT2 = 1.4142135623730951
 _AXES = ("", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 """Axes whose signs each harmonic changes with, in the order of docs/sh.md."""

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from warpgs.colors import base_coefficients, base_colors
 from warpgs.export.arrays import (
-    C0,
     SH_SIZES,
     SQRT2,
     Arrays,
@@ -41,7 +41,7 @@ def encode(arrays: Arrays) -> list[bytes]:
     """Return the bytes of a file; harmonics beyond 4 are clamped."""
     n, k = arrays["sh"].shape[:2]
     chunks = np.arange(n) // CHUNK
-    colors = 0.5 + C0 * arrays["sh"][:, 0].astype(np.float64)
+    colors = base_colors(arrays["sh"].astype(np.float64))
     bounds, fractions = [], []
     for values in (arrays["means"], arrays["log_scales"], colors):
         starts = np.arange(0, n, CHUNK)
@@ -106,7 +106,7 @@ def decode(path: Path, data: bytes) -> Arrays:
         return from_smallest_three(packed >> 30, (_unpack(packed & (2**30 - 1), (10, 10, 10)) - 0.5) * SQRT2)
 
     def harmonics(part: slice) -> np.ndarray:
-        first = ((values(2, color, (8, 8, 8, 8), part) - 0.5) / C0)[:, None]
+        first = base_coefficients(values(2, color, (8, 8, 8, 8), part))[:, None]
         return first if rest is None else np.concatenate([first, rest(part)], 1)
 
     rest, k = (None, 1) if sh is None else _harmonics(path, sh, n)

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgs.export.arrays import C0, Arrays, by_rows, logits, malformed, parts, rounded, sigmoid, unit_quats
+from warpgs.colors import base_coefficients, base_colors
+from warpgs.export.arrays import Arrays, by_rows, logits, malformed, parts, rounded, sigmoid, unit_quats
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 _TINY = 1e-37
@@ -21,7 +22,7 @@ def encode(arrays: Arrays) -> list[bytes]:
     rows = np.empty(len(arrays["means"]), _ROW)
     rows["mean"] = arrays["means"]
     rows["scale"] = np.clip(np.exp(arrays["log_scales"].astype(np.float64)), _TINY, 3e38)
-    rows["rgba"][:, :3] = rounded(255 * (0.5 + C0 * arrays["sh"][:, 0].astype(np.float64)), 255)
+    rows["rgba"][:, :3] = rounded(255 * base_colors(arrays["sh"].astype(np.float64)), 255)
     rows["rgba"][:, 3] = rounded(255 * sigmoid(arrays["logit_opacities"]), 255)
     rows["quat"] = rounded(128 * unit_quats(arrays["quats"]) + 128, 255)
     return [rows.tobytes()]
@@ -48,5 +49,5 @@ def decode(path: Path, data: bytes) -> Arrays:
         "quats": by_rows(n, (4,), lambda p: (rows["quat"][p].astype(np.float64) - 128) / 128),
         "log_scales": by_rows(n, (3,), lambda p: np.log(np.maximum(rows["scale"][p].astype(np.float64), _TINY))),
         "logit_opacities": by_rows(n, (), lambda p: logits(rows["rgba"][p, 3] / 255, 1 / 255)),
-        "sh": by_rows(n, (1, 3), lambda p: (rows["rgba"][p, None, :3].astype(np.float64) / 255 - 0.5) / C0),
+        "sh": by_rows(n, (1, 3), lambda p: base_coefficients(rows["rgba"][p, None, :3].astype(np.float64) / 255)),
     }

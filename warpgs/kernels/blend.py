@@ -10,13 +10,11 @@ from torch.autograd.function import once_differentiable
 
 from warpgs.constants import Rule
 from warpgs.kernels import blend_cpu, blend_cuda
+from warpgs.kernels.blend_records import VALUES
 from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.tiles import Tiles, grid
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
-
-VALUES = 10
-"""Gradient values of an instance: those of a projected Gaussian but for its last two, which are the box."""
 
 
 @functools.cache
@@ -67,7 +65,7 @@ def _launch(kernel, tiles: int, inputs: list, device: torch.device) -> None:
 
 
 def tile_inputs(projected: torch.Tensor, tiles: Tiles, real) -> list[interop.View]:
-    """Return what the generic kernels take first: projected Gaussians [C, N, 12], and the instances of each tile."""
+    """Return what the generic kernels take: projected Gaussians [C, N, 12], and the instances of each tile."""
     return [
         interop.view(projected.view(-1, projected.shape[-1]), real),
         interop.view(tiles.ranges, wp.int32),
@@ -100,14 +98,13 @@ def composite(
     """
     if _native(projected):
         return blend_cuda.forward(projected, tiles, backgrounds, settings, save=save, allocator=allocator)
-    real, device, rule = interop.real_of(projected), projected.device, settings.rule
+    real, device = interop.real_of(projected), projected.device
     shape = (len(backgrounds), settings.height, settings.width)
     rgb, alpha, depth = (allocator.output(s, projected.dtype, device) for s in ((*shape, 3), shape, shape))
     transmittances, weights = (allocator.saved(shape, projected.dtype, device) for _ in range(2))
     ends = allocator.saved(shape, torch.int32, device)
     inputs = [
-        *tile_inputs(projected, tiles, real), interop.view(backgrounds, real), *settings.window_inputs(tiles.size),
-        rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), rule.transmittance_stop, int(rule.inclusive_stop),
+        settings.struct(tiles.size, real), *tile_inputs(projected, tiles, real), interop.view(backgrounds, real),
         interop.view(rgb.view(-1, 3), real),
         *(interop.view(t.view(-1), real) for t in (alpha, depth, transmittances, weights)),
         interop.view(ends.view(-1), wp.int32),
@@ -120,15 +117,15 @@ def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_i
     """Return what `blend_cuda.backward` returns, by the generic kernels."""
     _, depth, transmittances, weights, ends, _ = saved
     v_rgb, v_alpha, v_depth = v_images
-    real, device, rule = interop.real_of(projected), projected.device, settings.rule
+    real, device = interop.real_of(projected), projected.device
     v_projected = allocator.output(projected.shape, projected.dtype, device).zero_()
     v_slots = allocator.workspace((len(tiles.slots), VALUES), projected.dtype, device).zero_()
     upstream = [interop.view(v_rgb.contiguous().view(-1, 3), real)]
     for v in (v_alpha, v_depth):
         upstream.append(interop.view((torch.zeros_like(depth) if v is None else v.contiguous()).view(-1), real))
     inputs = [
-        *tile_inputs(projected, tiles, real), interop.view(tiles.slots, wp.int32), interop.view(backgrounds, real),
-        *settings.window_inputs(tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
+        settings.struct(tiles.size, real), *tile_inputs(projected, tiles, real), interop.view(tiles.slots, wp.int32),
+        interop.view(backgrounds, real),
         *(interop.view(t.view(-1), real) for t in (transmittances, weights, depth)), interop.view(ends.view(-1), wp.int32),
         *upstream, interop.view(v_slots, real),
     ]  # fmt: skip
@@ -283,10 +280,8 @@ def contributions(
     else:
         weights = projected.new_zeros(len(tiles.slots), 2)
         inputs = [
-            *tile_inputs(projected, tiles, real), interop.view(tiles.slots, wp.int32),
-            *settings.window_inputs(tiles.size),
-            rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), interop.view(ends.view(-1), wp.int32),
-            interop.view(weights, real),
+            settings.struct(tiles.size, real), *tile_inputs(projected, tiles, real), interop.view(tiles.slots, wp.int32),
+            interop.view(ends.view(-1), wp.int32), interop.view(weights, real),
         ]  # fmt: skip
         _launch(blend_cpu.make_kernels(real, tiles.size).contributions, len(tiles.ranges), inputs, device)
     sums, maxima = projected.new_empty(projected.shape[:2]), projected.new_empty(projected.shape[:2])

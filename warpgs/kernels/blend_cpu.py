@@ -43,18 +43,17 @@ def make_kernels(real, tile_size: int):
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def forward(
-        begin: int, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), gaussian_ids: wp.array(dtype=int),
-        backgrounds: wp.array2d(dtype=real), origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
-        alpha_cut: real, alpha_max: real, whole_tiles: int, stop: real, inclusive: int,
+        begin: int, settings: f.Blending, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int),
+        gaussian_ids: wp.array(dtype=int), backgrounds: wp.array2d(dtype=real),
         # outputs
         rgb: wp.array2d(dtype=real), alpha_out: wp.array(dtype=real), depth: wp.array(dtype=real),
         transmittances: wp.array(dtype=real), weights: wp.array(dtype=real), ends: wp.array(dtype=int),
     ):  # fmt: skip
         tile = begin + wp.tid()
-        camera = tile // tiles
-        in_camera = tile - camera * tiles
-        top = (in_camera // columns) * side
-        left = (in_camera - (in_camera // columns) * columns) * side
+        place = f.place_of(tile, side, settings)
+        camera = place[0]
+        left = place[1]
+        top = place[2]
 
         # The state of the tile: transmittance; the least that a Gaussian must leave of it to be blended, above 1 once the
         # pixel is finished; sums; one past the last instance blended.
@@ -68,10 +67,10 @@ def make_kernels(real, tile_size: int):
         end = tile_ints()
         for p in range(pixels):
             # pixels outside the image are finished before they begin
-            inside = top + p // side < height and left + p - (p // side) * side < width
+            inside = top + p // side < settings.height and left + p - (p // side) * side < settings.width
             t[p] = real(1.0)
             # inclusive: blend, then stop; exclusive: stop instead of blending
-            floor[p] = wp.where(inside, wp.where(inclusive != 0, real(-1.0), stop), finished)
+            floor[p] = wp.where(inside, wp.where(settings.inclusive != 0, real(-1.0), settings.stop), finished)
         # The same for one strip, in registers.
         strip_t = strip_reals()
         strip_floor = strip_reals()
@@ -126,7 +125,7 @@ def make_kernels(real, tile_size: int):
                 c1[j] = projected[i, 7]
                 c2[j] = projected[i, 8]
                 distance[j] = projected[i, 9]
-                bounds = f.bounds_of(mx[j], my[j], u11[j], u22[j], projected[i, 10], projected[i, 11], whole_tiles)
+                bounds = f.bounds_of(mx[j], my[j], u11[j], u22[j], projected[i, 10], projected[i, 11], settings.whole_tiles)
                 aside[j] = bounds[0]
                 limit[j] = bounds[1]
                 j += 1
@@ -135,7 +134,7 @@ def make_kernels(real, tile_size: int):
                     ramp[j * strip + lane] = f.apart(u11[j] * real(lane))
             left_open = int(0)
             for row in range(side):
-                y = real(origin_y + top + row) + real(0.5)
+                y = real(settings.origin_y + top + row) + real(0.5)
                 for j in range(batch):
                     dy = y - my[j]
                     e2 = u22[j] * dy
@@ -148,7 +147,7 @@ def make_kernels(real, tile_size: int):
                         strip_floor[lane] = floor[base + lane]
                         strip_open += wp.where(strip_floor[lane] < finished, 1, 0)
                     if strip_open > 0:
-                        x = real(origin_x + left + part * strip) + real(0.5)
+                        x = real(settings.origin_x + left + part * strip) + real(0.5)
                         for j in range(batch):
                             start[j] = f.apart(u11[j] * (x - mx[j])) + e12[j]
                             hits[j] = wp.where(f.reaches(start[j], u11[j], e22[j], aside[j], limit[j]), 1, 0)
@@ -168,8 +167,8 @@ def make_kernels(real, tile_size: int):
                                 g = f.falloffs(wp.cw_mul(e1, e1) + e2_squared)
                                 for n in range(abreast):
                                     raw = opacity[list[o + n] & bits] * g[n]
-                                    alpha = wp.where(alpha_max < raw, alpha_max, raw)
-                                    alphas[(o + n) * strip + lane] = wp.where(alpha >= alpha_cut, alpha, real(0.0))
+                                    alpha = wp.where(settings.alpha_max < raw, settings.alpha_max, raw)
+                                    alphas[(o + n) * strip + lane] = wp.where(alpha >= settings.alpha_cut, alpha, real(0.0))
                         for lane in range(strip):
                             strip_t[lane] = t[base + lane]
                             strip_red[lane] = red[base + lane]
@@ -191,7 +190,7 @@ def make_kernels(real, tile_size: int):
                                 blended = after >= strip_floor[lane]
                                 w = wp.where(blended, alpha, real(0.0)) * before
                                 strip_t[lane] = wp.where(blended, after, before)
-                                strip_floor[lane] = wp.where(after < stop, finished, strip_floor[lane])
+                                strip_floor[lane] = wp.where(after < settings.stop, finished, strip_floor[lane])
                                 strip_end[lane] = wp.where(w > real(0.0), number, strip_end[lane])
                                 strip_red[lane] = strip_red[lane] + w * c0[j]
                                 strip_green[lane] = strip_green[lane] + w * c1[j]
@@ -212,10 +211,10 @@ def make_kernels(real, tile_size: int):
             if left_open == 0:
                 first = last
 
-        for row in range(wp.min(side, height - top)):
-            for lane in range(wp.min(side, width - left)):
+        for row in range(wp.min(side, settings.height - top)):
+            for lane in range(wp.min(side, settings.width - left)):
                 p = row * side + lane
-                o = (camera * height + top + row) * width + left + lane
+                o = (camera * settings.height + top + row) * settings.width + left + lane
                 rgb[o, 0] = red[p] + t[p] * backgrounds[camera, 0]
                 rgb[o, 1] = green[p] + t[p] * backgrounds[camera, 1]
                 rgb[o, 2] = blue[p] + t[p] * backgrounds[camera, 2]
@@ -227,51 +226,50 @@ def make_kernels(real, tile_size: int):
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def contributions(
-        begin: int, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), gaussian_ids: wp.array(dtype=int),
-        slots: wp.array(dtype=int), origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
-        alpha_cut: real, alpha_max: real, whole_tiles: int, ends: wp.array(dtype=int),
+        begin: int, settings: f.Blending, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int),
+        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), ends: wp.array(dtype=int),
         # outputs, zero on entry: sum and maximum of the weight of each instance
         weights: wp.array2d(dtype=real),
     ):  # fmt: skip
         tile = begin + wp.tid()
-        camera = tile // tiles
-        in_camera = tile - camera * tiles
-        top = (in_camera // columns) * side
-        left = (in_camera - (in_camera // columns) * columns) * side
+        place = f.place_of(tile, side, settings)
+        camera = place[0]
+        left = place[1]
+        top = place[2]
         ramp = strip_reals()
         t = tile_reals()
         end = tile_ints()
         last = int(0)
-        for row in range(wp.min(side, height - top)):
-            for lane in range(wp.min(side, width - left)):
+        for row in range(wp.min(side, settings.height - top)):
+            for lane in range(wp.min(side, settings.width - left)):
                 p = row * side + lane
                 t[p] = real(1.0)
-                end[p] = ends[(camera * height + top + row) * width + left + lane]
+                end[p] = ends[(camera * settings.height + top + row) * settings.width + left + lane]
                 last = wp.max(last, end[p])
         for instance in range(ranges[tile, 0], last):
             i = gaussian_ids[instance]
             u11 = projected[i, 2]
             bounds = f.bounds_of(
-                projected[i, 0], projected[i, 1], u11, projected[i, 4], projected[i, 10], projected[i, 11], whole_tiles
+                projected[i, 0], projected[i, 1], u11, projected[i, 4], projected[i, 10], projected[i, 11], settings.whole_tiles
             )
             for lane in range(strip):
                 ramp[lane] = f.apart(u11 * real(lane))
             weight_sum = real(0.0)
             weight_max = real(0.0)
             for row in range(side):
-                dy = real(origin_y + top + row) + real(0.5) - projected[i, 1]
+                dy = real(settings.origin_y + top + row) + real(0.5) - projected[i, 1]
                 e2 = projected[i, 4] * dy
                 e12 = f.apart(projected[i, 3] * dy)
                 e22 = f.apart(e2 * e2)
                 for part in range(parts):
-                    x = real(origin_x + left + part * strip) + real(0.5)
+                    x = real(settings.origin_x + left + part * strip) + real(0.5)
                     start = f.apart(u11 * (x - projected[i, 0])) + e12
                     if f.reaches(start, u11, e22, bounds[0], bounds[1]):
                         for lane in range(strip):
                             p = row * side + part * strip + lane
                             e1 = start + ramp[lane]
-                            alpha = wp.min(alpha_max, projected[i, 5] * f.falloff(e1 * e1 + e22))
-                            if alpha >= alpha_cut and instance < end[p]:
+                            alpha = wp.min(settings.alpha_max, projected[i, 5] * f.falloff(e1 * e1 + e22))
+                            if alpha >= settings.alpha_cut and instance < end[p]:
                                 w = alpha * t[p]
                                 t[p] = t[p] * (real(1.0) - alpha)
                                 weight_sum += w

@@ -1,47 +1,284 @@
-"""The backward blending kernel in plain Warp, one task per tile: that of the CPU, and of float64 on every device."""
+"""The backward blending kernel in plain Warp, one task per tile: that of the CPU, and of float64 on every device.
+
+The kernel walks the Gaussians of its tile back to front. A Gaussian's whole effect on a pixel is one number
+d = c . v_rgb + z v_z + v_w (docs/blend.md, section 3). Each step of the walk is a function over the records of `blend_records`.
+"""
 
 import functools
+from types import SimpleNamespace
 
 import warp as wp
 
 from warpgs.constants import SMALLEST_WEIGHT
+from warpgs.kernels.blend_records import VALUES, make_records
 from warpgs.kernels.compiler import ROLLED
 from warpgs.kernels.falloff import ABREAST, STRIP, make_functions
 
-VALUES = 10
-"""Number of gradient values of an instance."""
+
+@functools.cache
+def make_walk(real, tile_size: int):
+    """Make the functions that load the pixels of a tile and walk past a Gaussian."""
+    f = make_functions(real)
+    r = make_records(real, tile_size)
+    side = wp.constant(tile_size)
+    strip = wp.constant(STRIP)
+    parts = wp.constant(tile_size // STRIP)
+    strips = wp.constant(tile_size * (tile_size // STRIP))
+    bits = wp.constant(tile_size * (tile_size // STRIP) - 1)
+    abreast = wp.constant(ABREAST)
+    smallest = wp.constant(real(SMALLEST_WEIGHT))
+    row_reals = wp.types.vector(tile_size, real)
+    at = r.at
+    at_int = r.at_int
+
+    @wp.func(inline=True)
+    def load_pixels(
+        place: wp.vec3i, settings: f.Blending, backgrounds: wp.array2d(dtype=real), transmittances: wp.array(dtype=real),
+        weights: wp.array(dtype=real), depth: wp.array(dtype=real), ends: wp.array(dtype=int),
+        v_rgb: wp.array2d(dtype=real), v_alpha: wp.array(dtype=real), v_depth: wp.array(dtype=real),
+        pixels: wp.ref[r.Pixels],
+    ) -> wp.int32:  # fmt: skip
+        """Load what is known of the pixels; return one past the last instance that any of them blended."""
+        camera = place[0]
+        left = place[1]
+        top = place[2]
+        last = int(0)
+        for row in range(wp.min(side, settings.height - top)):
+            for column in range(wp.min(side, settings.width - left)):
+                part = column // strip
+                p = (part * side + row) * strip + column - part * strip
+                o = (camera * settings.height + top + row) * settings.width + left + column
+                t = transmittances[o]
+                pixels.t[p] = t
+                pixels.g0[p] = v_rgb[o, 0]
+                pixels.g1[p] = v_rgb[o, 1]
+                pixels.g2[p] = v_rgb[o, 2]
+                v_w = real(0.0)
+                if weights[o] >= smallest:
+                    v_z = v_depth[o] / weights[o]
+                    pixels.v_z[p] = v_z
+                    v_w = -v_z * depth[o]
+                pixels.v_w[p] = v_w + v_alpha[o]
+                pixels.behind[p] = t * (
+                    backgrounds[camera, 0] * v_rgb[o, 0] + backgrounds[camera, 1] * v_rgb[o, 1]
+                    + backgrounds[camera, 2] * v_rgb[o, 2]
+                )  # fmt: skip
+                pixels.end[p] = ends[o]
+                pixels.strip_end[part * side + row] = wp.max(at_int(pixels.strip_end[part * side + row]), ends[o])
+                last = wp.max(last, ends[o])
+        return last
+
+    @wp.func(inline=True)
+    def find_strips(
+        g: r.Projected, instance: wp.int32, place: wp.vec3i, settings: f.Blending, pixels: wp.ref[r.Pixels],
+        reach: wp.ref[r.Reach],
+    ) -> wp.int32:  # fmt: skip
+        """List the strips that a Gaussian reaches; return their number."""
+        row_dy = row_reals()
+        row_e12 = row_reals()
+        row_e22 = row_reals()
+        for row in range(side):
+            dy = real(settings.origin_y + place[2] + row) + real(0.5) - g.y
+            e2 = g.u22 * dy
+            row_dy[row] = dy
+            row_e12[row] = f.apart(g.u12 * dy)
+            row_e22[row] = f.apart(e2 * e2)
+        for part in range(parts):
+            dx = real(settings.origin_x + place[1] + part * strip) + real(0.5) - g.x
+            at_left = f.apart(g.u11 * dx)
+            for row in range(side):
+                o = part * side + row
+                start = at_left + row_e12[row]
+                reach.dx[o] = dx
+                reach.dy[o] = row_dy[row]
+                reach.e22[o] = row_e22[row]
+                reach.start[o] = start
+                hit = f.reaches(start, g.u11, row_e22[row], g.aside, g.limit) and instance < at_int(pixels.strip_end[o])
+                reach.hits[o] = wp.where(hit, 1, 0)
+        for lane in range(strip):
+            reach.ramp[lane] = f.apart(g.u11 * real(lane))
+        reaching = int(0)
+        for o in range(strips):  # without a branch, which would be mispredicted once for each row or so
+            reach.order[reaching & bits] = o
+            reaching += at_int(reach.hits[o])
+        return reaching
+
+    @wp.func(inline=True)
+    def find_shades(
+        g: r.Projected, instance: wp.int32, reaching: wp.int32, settings: f.Blending, pixels: wp.ref[r.Pixels],
+        reach: wp.ref[r.Reach], shades: wp.ref[r.Shades],
+    ):  # fmt: skip
+        """Compute the alphas of the pixels of the strips that are reached."""
+        e1 = f.abreast()
+        e2_squared = f.abreast()
+        k = int(0)
+        while k < reaching:
+            base = wp.max(k, 0)
+            k += abreast  # the last few may not be reached; their values are not read
+            for lane in range(strip):
+                ramp = at(reach.ramp[lane])
+                for n in range(abreast):
+                    o = at_int(reach.order[base + n]) & bits
+                    e1[n] = at(reach.start[o]) + ramp
+                    e2_squared[n] = at(reach.e22[o])
+                falloffs = f.falloffs(wp.cw_mul(e1, e1) + e2_squared)
+                for n in range(abreast):
+                    q = (base + n) * strip + lane
+                    raw = g.opacity * falloffs[n]
+                    alpha = wp.where(settings.alpha_max < raw, settings.alpha_max, raw)
+                    until = at_int(pixels.end[(at_int(reach.order[base + n]) & bits) * strip + lane])
+                    blended = alpha >= settings.alpha_cut and instance < until
+                    alpha = wp.where(blended, alpha, real(0.0))
+                    shades.alpha[q] = alpha
+                    shades.inverse[q] = real(1.0) / (real(1.0) - alpha)
+                    shades.slope[q] = wp.where(blended and raw <= settings.alpha_max, falloffs[n], real(0.0))
+
+    @wp.func(inline=True)
+    def step_back(
+        g: r.Projected, reaching: wp.int32, pixels: wp.ref[r.Pixels], reach: wp.ref[r.Reach], shades: wp.ref[r.Shades]
+    ):
+        """Walk past a Gaussian: find its weights and the gradients of its falloff, and what lies before it."""
+        k = int(0)
+        while k < reaching:
+            base = wp.max(k, 0) * strip
+            o = at_int(reach.order[wp.max(k, 0)]) & bits
+            k += 1
+            for lane in range(strip):
+                p = o * strip + lane
+                q = base + lane
+                d = (
+                    g.c0 * at(pixels.g0[p]) + g.c1 * at(pixels.g1[p]) + g.c2 * at(pixels.g2[p]) + g.z * at(pixels.v_z[p])
+                    + at(pixels.v_w[p])
+                )  # fmt: skip
+                before = at(pixels.t[p]) * at(shades.inverse[q])
+                w = at(shades.alpha[q]) * before
+                shades.v[q] = (at(pixels.t[p]) * d - at(pixels.behind[p])) * at(shades.inverse[q]) * at(shades.slope[q])
+                shades.w[q] = w
+                pixels.t[p] = before
+                pixels.behind[p] = at(pixels.behind[p]) + w * d
+
+    return SimpleNamespace(load_pixels=load_pixels, find_strips=find_strips, find_shades=find_shades, step_back=step_back)
+
+
+@functools.cache
+def make_gradient(real, tile_size: int):
+    """Make the functions that sum the gradient of one instance."""
+    r = make_records(real, tile_size)
+    at = r.at
+    at_int = r.at_int
+    half_sums = wp.types.vector(VALUES * (STRIP // 2), real)
+    strip_sums = wp.types.vector(VALUES * STRIP, real)
+    value_reals = wp.types.vector(VALUES, real)
+    bits = wp.constant(tile_size * (tile_size // STRIP) - 1)
+    strip = wp.constant(STRIP)
+    half = wp.constant(STRIP // 2)
+
+    @wp.func(inline=True)
+    def sum_up(
+        g: r.Projected, reaching: wp.int32, pixels: wp.ref[r.Pixels], reach: wp.ref[r.Reach], shades: wp.ref[r.Shades]
+    ) -> r.Gradient:
+        """Return the sums over the strips that are reached."""
+        s = r.Gradient()
+        k = int(0)
+        while k < reaching:
+            base = wp.max(k, 0) * strip
+            o = at_int(reach.order[wp.max(k, 0)]) & bits
+            k += 1
+            dx = at(reach.dx[o])
+            dy = at(reach.dy[o])
+            start = at(reach.start[o])
+            for lane in range(strip):
+                p = o * strip + lane
+                v = at(shades.v[base + lane])
+                w = at(shades.w[base + lane])
+                v_e1 = v * (start + at(reach.ramp[lane]))
+                v_y = v * dy
+                s.e1[lane] = at(s.e1[lane]) + v_e1
+                s.y[lane] = at(s.y[lane]) + v_y
+                s.xx[lane] = at(s.xx[lane]) + v_e1 * (dx + real(lane))
+                s.xy[lane] = at(s.xy[lane]) + v_e1 * dy
+                s.yy[lane] = at(s.yy[lane]) + v_y * dy
+                s.opacity[lane] = at(s.opacity[lane]) + v
+                s.c0[lane] = at(s.c0[lane]) + w * at(pixels.g0[p])
+                s.c1[lane] = at(s.c1[lane]) + w * at(pixels.g1[p])
+                s.c2[lane] = at(s.c2[lane]) + w * at(pixels.g2[p])
+                s.z[lane] = at(s.z[lane]) + w * at(pixels.v_z[p])
+        return s
+
+    @wp.func(inline=True)
+    def totals_of(s: wp.ref[r.Gradient]) -> value_reals:
+        """Return the sums over the places in a strip, always in one order."""
+        # Into one array per width, because additions vectorise only where nothing may overlap.
+        sums = strip_sums()
+        for lane in range(strip):
+            sums[0 * strip + lane] = at(s.e1[lane])
+            sums[1 * strip + lane] = at(s.y[lane])
+            sums[2 * strip + lane] = at(s.xx[lane])
+            sums[3 * strip + lane] = at(s.xy[lane])
+            sums[4 * strip + lane] = at(s.yy[lane])
+            sums[5 * strip + lane] = at(s.opacity[lane])
+            sums[6 * strip + lane] = at(s.c0[lane])
+            sums[7 * strip + lane] = at(s.c1[lane])
+            sums[8 * strip + lane] = at(s.c2[lane])
+            sums[9 * strip + lane] = at(s.z[lane])
+        halves = half_sums()
+        for k in range(VALUES):
+            for lane in range(half):
+                halves[k * half + lane] = sums[k * strip + lane] + sums[k * strip + half + lane]
+        totals = value_reals()
+        for k in range(VALUES):
+            o = k * half
+            totals[k] = (halves[o] + halves[o + 2]) + (halves[o + 1] + halves[o + 3])
+        return totals
+
+    @wp.func(inline=True)
+    def store(g: r.Projected, totals: value_reals, slot: wp.int32, v_slots: wp.array2d(dtype=real)):
+        """Store the gradient of an instance, which the sums are but for factors that they share."""
+        v_e1 = g.opacity * totals[0]
+        v_e2 = g.opacity * g.u22 * totals[1]
+        v_slots[slot, 0] = g.u11 * v_e1
+        v_slots[slot, 1] = g.u12 * v_e1 + g.u22 * v_e2
+        v_slots[slot, 2] = -g.opacity * totals[2]
+        v_slots[slot, 3] = -g.opacity * totals[3]
+        v_slots[slot, 4] = -g.opacity * g.u22 * totals[4]
+        for k in range(5, VALUES):
+            v_slots[slot, k] = totals[k]
+
+    return SimpleNamespace(sum_up=sum_up, totals_of=totals_of, store=store)
 
 
 @functools.cache
 def make_backward(real, tile_size: int):
     """Make the kernel for one scalar type and tile size."""
     f = make_functions(real)
-    # The tile lies in columns as wide as a strip, one beside the other. One row longer than it: see `make_kernels`.
-    count = tile_size * (tile_size // STRIP)
-    tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
-    tile_ints = wp.types.vector(tile_size * (tile_size + 1), wp.int32)
-    list_reals = wp.types.vector(count, real)
-    list_ints = wp.types.vector(count, wp.int32)
-    row_reals = wp.types.vector(tile_size, real)
-    strip_reals = wp.types.vector(STRIP, real)
-    strip_sums = wp.types.vector(VALUES * STRIP, real)
-    half_sums = wp.types.vector(VALUES * (STRIP // 2), real)
-    value_reals = wp.types.vector(VALUES, real)
+    r = make_records(real, tile_size)
+    m = make_walk(real, tile_size)
+    n = make_gradient(real, tile_size)
     side = wp.constant(tile_size)
-    strips = wp.constant(count)
-    bits = wp.constant(count - 1)
-    strip = wp.constant(STRIP)
-    half = wp.constant(STRIP // 2)
-    parts = wp.constant(tile_size // STRIP)
-    abreast = wp.constant(ABREAST)
-    smallest = wp.constant(real(SMALLEST_WEIGHT))
+
+    @wp.func(inline=True)
+    def projected_at(projected: wp.array2d(dtype=real), i: int, x: real, whole_tiles: int) -> r.Projected:
+        """Return a projected Gaussian whose ``x`` was loaded before."""
+        g = r.Projected()
+        g.x = x
+        g.y = projected[i, 1]
+        g.u11 = projected[i, 2]
+        g.u12 = projected[i, 3]
+        g.u22 = projected[i, 4]
+        g.opacity = projected[i, 5]
+        g.c0 = projected[i, 6]
+        g.c1 = projected[i, 7]
+        g.c2 = projected[i, 8]
+        g.z = projected[i, 9]
+        bounds = f.bounds_of(g.x, g.y, g.u11, g.u22, projected[i, 10], projected[i, 11], whole_tiles)
+        g.aside = bounds[0]
+        g.limit = bounds[1]
+        return g
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def backward(
-        begin: int, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), gaussian_ids: wp.array(dtype=int),
-        slots: wp.array(dtype=int), backgrounds: wp.array2d(dtype=real),
-        origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
-        alpha_cut: real, alpha_max: real, whole_tiles: int,
+        begin: int, settings: f.Blending, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int),
+        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), backgrounds: wp.array2d(dtype=real),
         transmittances: wp.array(dtype=real), weights: wp.array(dtype=real), depth: wp.array(dtype=real),
         ends: wp.array(dtype=int),
         v_rgb: wp.array2d(dtype=real), v_alpha: wp.array(dtype=real), v_depth: wp.array(dtype=real),
@@ -49,211 +286,25 @@ def make_backward(real, tile_size: int):
         v_slots: wp.array2d(dtype=real),
     ):  # fmt: skip
         tile = begin + wp.tid()
-        camera = tile // tiles
-        in_camera = tile - camera * tiles
-        top = (in_camera // columns) * side
-        left = (in_camera - (in_camera // columns) * columns) * side
-
-        # A Gaussian's whole effect on a pixel is one number d = c . v_rgb + z v_z + v_w (docs/blend.md, section 3).
-        t = tile_reals()  # transmittance behind the current instance, then before it
-        behind = tile_reals()  # sum of w d over what lies behind, background included
-        g0 = tile_reals()
-        g1 = tile_reals()
-        g2 = tile_reals()
-        v_z = tile_reals()
-        v_w = tile_reals()
-        end = tile_ints()
-        strip_end = list_ints()
-        instance = int(0)
-        for row in range(wp.min(side, height - top)):
-            for column in range(wp.min(side, width - left)):
-                part = column // strip
-                p = (part * side + row) * strip + column - part * strip
-                o = (camera * height + top + row) * width + left + column
-                t[p] = transmittances[o]
-                g0[p] = v_rgb[o, 0]
-                g1[p] = v_rgb[o, 1]
-                g2[p] = v_rgb[o, 2]
-                if weights[o] >= smallest:
-                    v_z[p] = v_depth[o] / weights[o]
-                    v_w[p] = -v_z[p] * depth[o]
-                v_w[p] = v_w[p] + v_alpha[o]
-                behind[p] = t[p] * (
-                    backgrounds[camera, 0] * g0[p] + backgrounds[camera, 1] * g1[p] + backgrounds[camera, 2] * g2[p]
-                )
-                end[p] = ends[o]
-                strip_end[part * side + row] = wp.max(strip_end[part * side + row], ends[o])
-                instance = wp.max(instance, ends[o])
-
-        # of a Gaussian, by strip; and the strips that it reaches
-        dxs = list_reals()
-        dys = list_reals()
-        e22 = list_reals()
-        start = list_reals()
-        hits = list_ints()
-        list = list_ints()
-        alphas = tile_reals()
-        inverses = tile_reals()
-        slopes = tile_reals()
-        vs = tile_reals()
-        ws = tile_reals()
-        row_dy = row_reals()
-        row_e12 = row_reals()
-        row_e22 = row_reals()
-        e1 = f.abreast()
-        e2_squared = f.abreast()
-        ramp = strip_reals()
-        s1 = strip_reals()
-        s2 = strip_reals()
-        s11 = strip_reals()
-        s12 = strip_reals()
-        s22 = strip_reals()
-        so = strip_reals()
-        s_c0 = strip_reals()
-        s_c1 = strip_reals()
-        s_c2 = strip_reals()
-        sz = strip_reals()
-        sums = strip_sums()
-        halves = half_sums()
-        totals = value_reals()
+        place = f.place_of(tile, side, settings)
+        pixels = r.Pixels()
+        reach = r.Reach()
+        shades = r.Shades()
+        instance = m.load_pixels(
+            place, settings, backgrounds, transmittances, weights, depth, ends, v_rgb, v_alpha, v_depth, pixels
+        )
         ahead = real(0.0)
         if instance > ranges[tile, 0]:
             ahead = projected[gaussian_ids[instance - 1], 0]
         while instance > ranges[tile, 0]:
             instance -= 1
-            i = gaussian_ids[instance]
-            mx = ahead
+            g = projected_at(projected, gaussian_ids[instance], ahead, settings.whole_tiles)
             ahead = projected[gaussian_ids[wp.max(instance - 1, 0)], 0]  # loaded early, as it may be far away
-            my = projected[i, 1]
-            u11 = projected[i, 2]
-            u12 = projected[i, 3]
-            u22 = projected[i, 4]
-            opacity = projected[i, 5]
-            c0 = projected[i, 6]
-            c1 = projected[i, 7]
-            c2 = projected[i, 8]
-            distance = projected[i, 9]
-            bounds = f.bounds_of(mx, my, u11, u22, projected[i, 10], projected[i, 11], whole_tiles)
-            for row in range(side):
-                dy = real(origin_y + top + row) + real(0.5) - my
-                e2 = u22 * dy
-                row_dy[row] = dy
-                row_e12[row] = f.apart(u12 * dy)
-                row_e22[row] = f.apart(e2 * e2)
-            for part in range(parts):
-                dx = real(origin_x + left + part * strip) + real(0.5) - mx
-                at = f.apart(u11 * dx)
-                for row in range(side):
-                    o = part * side + row
-                    dxs[o] = dx
-                    dys[o] = row_dy[row]
-                    e22[o] = row_e22[row]
-                    start[o] = at + row_e12[row]
-                    until = strip_end[o]
-                    hit = f.reaches(start[o], u11, e22[o], bounds[0], bounds[1]) and instance < until
-                    hits[o] = wp.where(hit, 1, 0)
-            reaching = int(0)
-            for o in range(strips):  # without a branch, which would be mispredicted once for each row or so
-                list[reaching & bits] = o
-                reaching += hits[o]
-            for lane in range(strip):
-                ramp[lane] = f.apart(u11 * real(lane))
-                s1[lane] = real(0.0)
-                s2[lane] = real(0.0)
-                s11[lane] = real(0.0)
-                s12[lane] = real(0.0)
-                s22[lane] = real(0.0)
-                so[lane] = real(0.0)
-                s_c0[lane] = real(0.0)
-                s_c1[lane] = real(0.0)
-                s_c2[lane] = real(0.0)
-                sz[lane] = real(0.0)
-            k = int(0)
-            while k < reaching:
-                base = wp.max(k, 0)
-                k += abreast  # the last few may not be reached; their values are not read
-                for lane in range(strip):
-                    for n in range(abreast):
-                        o = list[base + n] & bits
-                        e1[n] = start[o] + ramp[lane]
-                        e2_squared[n] = e22[o]
-                    g = f.falloffs(wp.cw_mul(e1, e1) + e2_squared)
-                    for n in range(abreast):
-                        q = (base + n) * strip + lane
-                        raw = opacity * g[n]
-                        alpha = wp.where(alpha_max < raw, alpha_max, raw)
-                        until = end[(list[base + n] & bits) * strip + lane]
-                        blended = alpha >= alpha_cut and instance < until
-                        alpha = wp.where(blended, alpha, real(0.0))
-                        alphas[q] = alpha
-                        inverses[q] = real(1.0) / (real(1.0) - alpha)
-                        slopes[q] = wp.where(blended and raw <= alpha_max, g[n], real(0.0))
-            k = int(0)
-            while k < reaching:
-                base = wp.max(k, 0) * strip
-                o = list[wp.max(k, 0)] & bits
-                k += 1
-                for lane in range(strip):
-                    p = o * strip + lane
-                    q = base + lane
-                    d = c0 * g0[p] + c1 * g1[p] + c2 * g2[p] + distance * v_z[p] + v_w[p]
-                    before = t[p] * inverses[q]
-                    w = alphas[q] * before
-                    vs[q] = (t[p] * d - behind[p]) * inverses[q] * slopes[q]
-                    ws[q] = w
-                    t[p] = before
-                    behind[p] = behind[p] + w * d
-            # Apart from the loop above, because what both need does not fit into 16 registers.
-            k = int(0)
-            while k < reaching:
-                base = wp.max(k, 0) * strip
-                o = list[wp.max(k, 0)] & bits
-                k += 1
-                dx = dxs[o]
-                dy = dys[o]
-                for lane in range(strip):
-                    p = o * strip + lane
-                    v = vs[base + lane]
-                    w = ws[base + lane]
-                    v_e1 = v * (start[o] + ramp[lane])
-                    v_y = v * dy
-                    s1[lane] = s1[lane] + v_e1
-                    s2[lane] = s2[lane] + v_y
-                    s11[lane] = s11[lane] + v_e1 * (dx + real(lane))
-                    s12[lane] = s12[lane] + v_e1 * dy
-                    s22[lane] = s22[lane] + v_y * dy
-                    so[lane] = so[lane] + v
-                    s_c0[lane] = s_c0[lane] + w * g0[p]
-                    s_c1[lane] = s_c1[lane] + w * g1[p]
-                    s_c2[lane] = s_c2[lane] + w * g2[p]
-                    sz[lane] = sz[lane] + w * v_z[p]
-            # Into one array per width, because additions vectorise only where nothing may overlap.
-            for lane in range(strip):
-                sums[0 * strip + lane] = s1[lane]
-                sums[1 * strip + lane] = s2[lane]
-                sums[2 * strip + lane] = s11[lane]
-                sums[3 * strip + lane] = s12[lane]
-                sums[4 * strip + lane] = s22[lane]
-                sums[5 * strip + lane] = so[lane]
-                sums[6 * strip + lane] = s_c0[lane]
-                sums[7 * strip + lane] = s_c1[lane]
-                sums[8 * strip + lane] = s_c2[lane]
-                sums[9 * strip + lane] = sz[lane]
-            for k in range(VALUES):
-                for lane in range(half):
-                    halves[k * half + lane] = sums[k * strip + lane] + sums[k * strip + half + lane]
-            for k in range(VALUES):
-                o = k * half
-                totals[k] = (halves[o] + halves[o + 2]) + (halves[o + 1] + halves[o + 3])
-            slot = slots[instance]
-            v_e1 = opacity * totals[0]
-            v_e2 = opacity * u22 * totals[1]
-            v_slots[slot, 0] = u11 * v_e1
-            v_slots[slot, 1] = u12 * v_e1 + u22 * v_e2
-            v_slots[slot, 2] = -opacity * totals[2]
-            v_slots[slot, 3] = -opacity * totals[3]
-            v_slots[slot, 4] = -opacity * u22 * totals[4]
-            for k in range(5, VALUES):
-                v_slots[slot, k] = totals[k]
+            reaching = m.find_strips(g, instance, place, settings, pixels, reach)
+            m.find_shades(g, instance, reaching, settings, pixels, reach, shades)
+            m.step_back(g, reaching, pixels, reach, shades)
+            # Apart from the walk, because what both need does not fit into 16 registers.
+            sums = n.sum_up(g, reaching, pixels, reach, shades)
+            n.store(g, n.totals_of(sums), slots[instance], v_slots)
 
     return backward

@@ -12,11 +12,11 @@ import torch
 import warp as wp
 
 from warpgs.constants import SMALLEST_WEIGHT
-from warpgs.kernels.blend_settings import BlendSettings
-from warpgs.kernels.native import source
+from warpgs.kernels.blend_settings import BlendSettings, make_struct
 from warpgs.kernels.tiles import Tiles
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
+from warpgs.runtime.cuda_source import source
 
 CHUNKS = (64, 128)
 """Instances that one warp of the backward pass takes: the first number in images of up to MAX_SMALL_TILES tiles, to have enough
@@ -39,10 +39,10 @@ SCALE = "0.84932180028801904272f"  # sqrt(log2(e) / 2)
 
 
 def _source(name: str, tile_size: int, **numbers) -> str:
-    """Return the CUDA text of one body, after the text that all bodies share."""
+    """Return the CUDA text of one body."""
     numbers |= {"SIDE": tile_size, "STATE": STATE, "SCALE": SCALE, "WARPS": WARPS, "STRIDE": STRIDE}
     numbers["SMALLEST_WEIGHT"] = f"{SMALLEST_WEIGHT}f"
-    return source("blend_common.cu", f"blend_{name}.cu", **numbers)
+    return source(f"blend_{name}.cu", **numbers)
 
 
 @functools.cache
@@ -52,13 +52,12 @@ def make_kernels(tile_size: int):
     Images and projected Gaussians are flat arrays. Arrays with a row per instance have two axes, since a flat one could be too
     long for 32-bit sizes.
     """
+    Blending = make_struct(wp.float32)
 
     @wp.func_native(_source("forward", tile_size))
     def forward_body(
-        item: int, projected: wp.array(dtype=float), order: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        gaussian_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
-        origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
-        alpha_cut: float, alpha_max: float, whole_tiles: int, stop: float, inclusive: int, chunk: int,
+        item: int, settings: Blending, chunk: int, projected: wp.array(dtype=float), order: wp.array(dtype=int),
+        ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
         rgb: wp.array(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
         transmittances: wp.array(dtype=float), weights: wp.array(dtype=float), ends: wp.array(dtype=int),
         states: wp.array2d(dtype=float),
@@ -69,9 +68,9 @@ def make_kernels(tile_size: int):
 
     @wp.func_native(_source("contributions", tile_size))
     def contributions_body(
-        tile: int, projected: wp.array(dtype=float), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int),
-        slots: wp.array(dtype=int), origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
-        alpha_cut: float, alpha_max: float, ends: wp.array(dtype=int), instance_weights: wp.array(dtype=float),
+        tile: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
+        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), ends: wp.array(dtype=int),
+        instance_weights: wp.array(dtype=float),
     ): ...  # fmt: skip
 
     threads = wp.constant(tile_size * tile_size)
@@ -79,19 +78,15 @@ def make_kernels(tile_size: int):
 
     @wp.kernel(**options)
     def forward(
-        begin: int, projected: wp.array(dtype=float), order: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        gaussian_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
-        origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
-        alpha_cut: float, alpha_max: float, whole_tiles: int, stop: float, inclusive: int, chunk: int,
+        begin: int, settings: Blending, chunk: int, projected: wp.array(dtype=float), order: wp.array(dtype=int),
+        ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
         # outputs
         rgb: wp.array(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
         transmittances: wp.array(dtype=float), weights: wp.array(dtype=float), ends: wp.array(dtype=int),
         states: wp.array2d(dtype=float),
     ):  # fmt: skip
         forward_body(
-            wp.tid() // 32, projected, order, ranges, gaussian_ids, backgrounds,
-            origin_x, origin_y, width, height, columns, tiles,
-            alpha_cut, alpha_max, whole_tiles, stop, inclusive, chunk,
+            wp.tid() // 32, settings, chunk, projected, order, ranges, gaussian_ids, backgrounds,
             rgb, alpha_out, depth, transmittances, weights, ends, states,
         )  # fmt: skip
 
@@ -105,15 +100,13 @@ def make_kernels(tile_size: int):
 
     @wp.kernel(**options)
     def contributions(
-        begin: int, projected: wp.array(dtype=float), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int),
-        slots: wp.array(dtype=int), origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
-        alpha_cut: float, alpha_max: float, ends: wp.array(dtype=int),
+        begin: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
+        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), ends: wp.array(dtype=int),
         # outputs, zero on entry
         weights: wp.array(dtype=float),
     ):  # fmt: skip
         contributions_body(
-            wp.tid() // threads, projected, ranges, gaussian_ids, slots, origin_x, origin_y, width, height, columns, tiles,
-            alpha_cut, alpha_max, ends, weights,
+            wp.tid() // threads, settings, projected, ranges, gaussian_ids, slots, ends, weights
         )  # fmt: skip
 
     return SimpleNamespace(forward=forward, order_tiles=order_tiles, contributions=contributions)
@@ -129,15 +122,14 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
         chunk: Instances per warp.
         atomic: True to add each sum to its Gaussian's at once, in no fixed order, instead of by slots.
     """
+    Blending = make_struct(wp.float32)
     numbers = {"CHUNK": chunk, "WITH_DEPTH": str(with_depth).lower(), "ATOMIC": str(atomic).lower()}
 
     @wp.func_native(_source("backward", tile_size, **numbers))
     def backward_body(
-        item: int, projected: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
-        backgrounds: wp.array(dtype=float),
-        origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int, no_tile: int,
-        alpha_cut: float, alpha_max: float, whole_tiles: int,
+        item: int, settings: Blending, capacity: int, no_tile: int, projected: wp.array(dtype=float),
+        keys: wp.array(dtype=int), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int),
+        totals: wp.array(dtype=wp.int64), backgrounds: wp.array(dtype=float),
         rgb: wp.array(dtype=float), depth: wp.array(dtype=float), transmittances: wp.array(dtype=float),
         weights: wp.array(dtype=float), ends: wp.array(dtype=int), states: wp.array2d(dtype=float),
         v_rgb: wp.array(dtype=float), v_alpha: wp.array(dtype=float), v_depth: wp.array(dtype=float),
@@ -157,11 +149,9 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
 
     @wp.kernel(**registers, **options)
     def backward(
-        begin: int, projected: wp.array(dtype=float), keys: wp.array(dtype=int), ranges: wp.array(dtype=int),
-        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), totals: wp.array(dtype=wp.int64), capacity: int,
-        backgrounds: wp.array(dtype=float),
-        origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int, no_tile: int,
-        alpha_cut: float, alpha_max: float, whole_tiles: int,
+        begin: int, settings: Blending, capacity: int, no_tile: int, projected: wp.array(dtype=float),
+        keys: wp.array(dtype=int), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int),
+        totals: wp.array(dtype=wp.int64), backgrounds: wp.array(dtype=float),
         rgb: wp.array(dtype=float), depth: wp.array(dtype=float), transmittances: wp.array(dtype=float),
         weights: wp.array(dtype=float), ends: wp.array(dtype=int), states: wp.array2d(dtype=float),
         v_rgb: wp.array(dtype=float), v_alpha: wp.array(dtype=float), v_depth: wp.array(dtype=float),
@@ -169,8 +159,7 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
         v_slots: wp.array2d(dtype=float),
     ):  # fmt: skip
         backward_body(
-            wp.tid() // 32, projected, keys, ranges, gaussian_ids, slots, totals, capacity, backgrounds,
-            origin_x, origin_y, width, height, columns, tiles, no_tile, alpha_cut, alpha_max, whole_tiles,
+            wp.tid() // 32, settings, capacity, no_tile, projected, keys, ranges, gaussian_ids, slots, totals, backgrounds,
             rgb, depth, transmittances, weights, ends, states, v_rgb, v_alpha, v_depth, v_slots,
         )  # fmt: skip
 
@@ -214,7 +203,7 @@ def forward(
         rgb [C, H, W, 3]; alpha, depth, transmittances, weights and ends [C, H, W]; and states [S, P], with a row for each chunk
         of instances and `STATE` numbers for each pixel of a tile.
     """
-    device, rule = projected.device, settings.rule
+    device = projected.device
     shape = (backgrounds.shape[0], settings.height, settings.width)
     rgb, alpha, depth = (allocator.output(s, torch.float32, device) for s in ((*shape, 3), shape, shape))
     transmittances, weights = allocator.saved((2, *shape), torch.float32, device).unbind()
@@ -227,9 +216,8 @@ def forward(
     order = allocator.workspace((count,), torch.int32, device)
     interop.launch(k.order_tiles, THREADS, [*_ints(tiles.ranges), count, *_ints(order)], device, block_dim=THREADS)
     inputs = [
-        *_floats(projected), *_ints(order, tiles.ranges, tiles.gaussian_ids), *_floats(backgrounds),
-        *settings.window_inputs(tiles.size), rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
-        rule.transmittance_stop, int(rule.inclusive_stop), chunk,
+        settings.struct(tiles.size, wp.float32), chunk, *_floats(projected),
+        *_ints(order, tiles.ranges, tiles.gaussian_ids), *_floats(backgrounds),
         *_floats(rgb, alpha, depth, transmittances, weights), *_ints(ends), interop.view(states, wp.float32),
     ]  # fmt: skip
     interop.launch(k.forward, count * pixels, inputs, device, block_dim=32 * WARPS)
@@ -258,7 +246,7 @@ def backward(
     """
     rgb, depth, transmittances, weights, ends, states = saved
     v_rgb, v_alpha, v_depth = v_images
-    device, count, rule, deterministic = projected.device, tiles.slots.shape[0], settings.rule, settings.deterministic
+    device, count, deterministic = projected.device, tiles.slots.shape[0], settings.deterministic
     with_depth = v_alpha is not None or v_depth is not None
     chunk = chunk_of(tiles, deterministic)
     k = make_backward(tiles.size, with_depth, chunk, not deterministic)
@@ -272,9 +260,9 @@ def backward(
     else:
         v_slots = v_projected.zero_().view(-1, STRIDE)
     inputs = [
-        *_floats(projected), *_ints(tiles.tile_ids, tiles.ranges, tiles.gaussian_ids, tiles.slots),
-        interop.view(tiles.total, wp.int64), count, *_floats(backgrounds), *settings.window_inputs(tiles.size),
-        tiles.ranges.shape[0], rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0),
+        settings.struct(tiles.size, wp.float32), count, tiles.ranges.shape[0], *_floats(projected),
+        *_ints(tiles.tile_ids, tiles.ranges, tiles.gaussian_ids, tiles.slots), interop.view(tiles.total, wp.int64),
+        *_floats(backgrounds),
         *_floats(rgb, depth, transmittances, weights), *_ints(ends), interop.view(states, wp.float32),
         *_floats(v_rgb.contiguous(), v_alpha, v_depth), interop.view(v_slots, wp.float32),
     ]  # fmt: skip
@@ -293,10 +281,10 @@ def instance_weights(projected: torch.Tensor, tiles: Tiles, settings: BlendSetti
         settings: Settings as given to `forward`.
         ends: One past the last instance that was blended into each pixel, as `forward` returns it, int32, shape [C, H, W].
     """
-    rule, weights = settings.rule, projected.new_zeros(tiles.slots.shape[0], 2)
+    weights = projected.new_zeros(tiles.slots.shape[0], 2)
     inputs = [
-        *_floats(projected), *_ints(tiles.ranges, tiles.gaussian_ids, tiles.slots), *settings.window_inputs(tiles.size),
-        rule.alpha_cut, rule.alpha_max, *_ints(ends), *_floats(weights),
+        settings.struct(tiles.size, wp.float32), *_floats(projected), *_ints(tiles.ranges, tiles.gaussian_ids, tiles.slots),
+        *_ints(ends), *_floats(weights),
     ]  # fmt: skip
     pixels = tiles.size * tiles.size
     interop.launch(

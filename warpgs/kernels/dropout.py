@@ -5,6 +5,7 @@ import functools
 import torch
 import warp as wp
 
+from warpgs.kernels.step_buffers import Setting
 from warpgs.runtime import interop
 
 
@@ -19,9 +20,9 @@ def make_kernel():
         factors: wp.array(dtype=float),
     ):  # fmt: skip
         i = begin + wp.tid()
-        p = settings[0]
+        p = settings[Setting.DROPOUT]
         # one stream of numbers for each seed and step, one number of it for each Gaussian
-        state = wp.rand_init(wp.randi(wp.rand_init(seed, int(settings[1]))), i)
+        state = wp.rand_init(wp.randi(wp.rand_init(seed, int(settings[Setting.NUMBER]))), i)
         factors[i] = wp.where(wp.randf(state) >= p, 1.0 / (1.0 - p), 0.0)
 
     return sample
@@ -35,16 +36,16 @@ def opacity_dropout(count: int, settings: torch.Tensor, seed: int) -> torch.Tens
 
     Args:
         count: Number of Gaussians N.
-        settings: p in [0, 1) and the number of the step (a whole number below 2^24), float32, shape [2].
+        settings: Settings of the step (`Setting`), of which p and the number are read, float32, shape [6].
         seed: Any 32-bit integer.
 
     Returns:
         Factors, float32, shape [N], on the device of ``settings``.
 
     Raises:
-        ValueError: ``settings`` is not of shape [2].
+        ValueError: ``settings`` is not of shape [6].
     """
-    interop.check(settings=(settings, "2"))
+    interop.check(settings=(settings, str(len(Setting))))
     factors = torch.empty(count, dtype=torch.float32, device=settings.device)
     inputs = [interop.view(settings, wp.float32), seed, interop.view(factors, wp.float32)]
     interop.launch(make_kernel(), count, inputs, settings.device)

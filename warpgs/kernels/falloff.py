@@ -1,9 +1,11 @@
-"""Functions that all blending passes of the CPU share, to the bit: the pixels that a Gaussian reaches, and its falloff."""
+"""Functions that all blending passes of the CPU share, to the bit: tiles, the pixels that a Gaussian reaches, its falloff."""
 
 import functools
 from types import SimpleNamespace
 
 import warp as wp
+
+from warpgs.kernels.blend_settings import make_struct
 
 STRIP = 8
 """Pixels of a row that are processed together. With more, the sums of a strip would not fit the 16 registers of AVX2."""
@@ -67,6 +69,15 @@ def make_functions(real):
     """Make the functions for one scalar type."""
     vec2 = wp.types.vector(2, real)
     half_strip = wp.constant(real((STRIP - 1) / 2))
+    Blending = make_struct(real)
+
+    @wp.func
+    def place_of(tile: wp.int32, side: wp.int32, settings: Blending) -> wp.vec3i:
+        """Return the number of a tile's image, and left and top of the tile in the window [px]."""
+        image = tile // settings.tiles
+        in_image = tile - image * settings.tiles
+        row = in_image // settings.columns
+        return wp.vec3i(image, (in_image - row * settings.columns) * side, row * side)
 
     @wp.func
     def apart(product: real) -> real:
@@ -91,6 +102,6 @@ def make_functions(real):
         return least * least + e22 <= limit
 
     return SimpleNamespace(
-        apart=apart, bounds_of=bounds_of, reaches=reaches,
+        Blending=Blending, place_of=place_of, apart=apart, bounds_of=bounds_of, reaches=reaches,
         falloff=make_falloff(real), falloffs=make_falloffs(real, ABREAST), abreast=wp.types.vector(ABREAST, real),
     )  # fmt: skip

@@ -12,12 +12,12 @@ import warp as wp
 from warpgs.constants import Rule
 from warpgs.kernels.blend import check_tiles, tile_inputs
 from warpgs.kernels.blend_cuda import SCALE
-from warpgs.kernels.blend_settings import BlendSettings
+from warpgs.kernels.blend_settings import BlendSettings, make_struct
 from warpgs.kernels.compiler import ROLLED
 from warpgs.kernels.falloff import STRIP, make_functions
-from warpgs.kernels.native import source
 from warpgs.kernels.tiles import Tiles
 from warpgs.runtime import interop
+from warpgs.runtime.cuda_source import source
 
 
 @functools.cache
@@ -33,19 +33,18 @@ def make_kernel(real, tile_size: int):
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def median(
-        begin: int, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int), gaussian_ids: wp.array(dtype=int),
-        origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
-        alpha_cut: real, alpha_max: real, whole_tiles: int, stop: real, inclusive: int,
+        begin: int, settings: f.Blending, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int),
+        gaussian_ids: wp.array(dtype=int),
         # outputs
         depths: wp.array(dtype=real),
     ):  # fmt: skip
         tile = begin + wp.tid()
-        camera = tile // tiles
-        in_camera = tile - camera * tiles
-        top = (in_camera // columns) * side
-        left = (in_camera - (in_camera // columns) * columns) * side
-        rows = wp.min(side, height - top)
-        lanes = wp.min(side, width - left)
+        place = f.place_of(tile, side, settings)
+        camera = place[0]
+        left = place[1]
+        top = place[2]
+        rows = wp.min(side, settings.height - top)
+        lanes = wp.min(side, settings.width - left)
         ramp = strip_reals()
         found = tile_reals()
         t = tile_reals()  # transmittance; 0 once a pixel is finished, and outside the image
@@ -59,34 +58,34 @@ def make_kernel(real, tile_size: int):
             instance += 1
             u11 = projected[i, 2]
             bounds = f.bounds_of(
-                projected[i, 0], projected[i, 1], u11, projected[i, 4], projected[i, 10], projected[i, 11], whole_tiles
+                projected[i, 0], projected[i, 1], u11, projected[i, 4], projected[i, 10], projected[i, 11], settings.whole_tiles
             )
             for lane in range(strip):
                 ramp[lane] = f.apart(u11 * real(lane))
             for row in range(side):
-                dy = real(origin_y + top + row) + real(0.5) - projected[i, 1]
+                dy = real(settings.origin_y + top + row) + real(0.5) - projected[i, 1]
                 e2 = projected[i, 4] * dy
                 e12 = f.apart(projected[i, 3] * dy)
                 e22 = f.apart(e2 * e2)
                 for part in range(parts):
-                    x = real(origin_x + left + part * strip) + real(0.5)
+                    x = real(settings.origin_x + left + part * strip) + real(0.5)
                     start = f.apart(u11 * (x - projected[i, 0])) + e12
                     if f.reaches(start, u11, e22, bounds[0], bounds[1]):
                         for lane in range(strip):
                             p = row * side + part * strip + lane
                             e1 = start + ramp[lane]
-                            alpha = wp.min(alpha_max, projected[i, 5] * f.falloff(e1 * e1 + e22))
-                            if alpha >= alpha_cut and t[p] > real(0.0):
+                            alpha = wp.min(settings.alpha_max, projected[i, 5] * f.falloff(e1 * e1 + e22))
+                            if alpha >= settings.alpha_cut and t[p] > real(0.0):
                                 after = t[p] * (real(1.0) - alpha)
-                                blended = inclusive != 0 or after >= stop
+                                blended = settings.inclusive != 0 or after >= settings.stop
                                 if blended and after <= half:
                                     found[p] = projected[i, 9]
-                                finished = after <= half or after < stop
+                                finished = after <= half or after < settings.stop
                                 t[p] = wp.where(finished, real(0.0), after)
                                 unfinished -= wp.where(finished, 1, 0)
         for row in range(rows):
             for lane in range(lanes):
-                depths[(camera * height + top + row) * width + left + lane] = found[row * side + lane]
+                depths[(camera * settings.height + top + row) * settings.width + left + lane] = found[row * side + lane]
 
     return median
 
@@ -94,27 +93,25 @@ def make_kernel(real, tile_size: int):
 @functools.cache
 def make_native(tile_size: int):
     """Make the CUDA kernel in float32 for one tile size, a thread block per tile."""
+    Blending = make_struct(wp.float32)
 
-    @wp.func_native(source("blend_common.cu", "median_depth.cu", SIDE=tile_size, SCALE=SCALE))
+    @wp.func_native(source("median_depth.cu", SIDE=tile_size, SCALE=SCALE))
     def body(
-        tile: int, projected: wp.array(dtype=float), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int),
-        origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
-        alpha_cut: float, alpha_max: float, stop: float, inclusive: int, depths: wp.array(dtype=float),
+        tile: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
+        gaussian_ids: wp.array(dtype=int), depths: wp.array(dtype=float),
     ): ...  # fmt: skip
 
     threads = wp.constant(tile_size * tile_size)
 
     @wp.kernel(enable_backward=False, grid_stride=False, module=f"warpgs.kernels.median_depth.{tile_size}")
     def median(
-        begin: int, projected: wp.array(dtype=float), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int),
-        origin_x: int, origin_y: int, width: int, height: int, columns: int, tiles: int,
-        alpha_cut: float, alpha_max: float, stop: float, inclusive: int,
+        begin: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
+        gaussian_ids: wp.array(dtype=int),
         # outputs
         depths: wp.array(dtype=float),
     ):  # fmt: skip
         body(
-            wp.tid() // threads, projected, ranges, gaussian_ids, origin_x, origin_y, width, height, columns, tiles,
-            alpha_cut, alpha_max, stop, inclusive, depths,
+            wp.tid() // threads, settings, projected, ranges, gaussian_ids, depths,
         )  # fmt: skip
 
     return median
@@ -149,18 +146,13 @@ def median_depth(
     real, device = interop.real_of(projected), projected.device
     settings, count = BlendSettings(origin, width, height, rule), len(tiles.ranges)
     depths = projected.new_empty(len(projected), height, width)
-    stop, output = (rule.transmittance_stop, int(rule.inclusive_stop)), interop.view(depths.view(-1), real)
+    own, output = settings.struct(tiles.size, real), interop.view(depths.view(-1), real)
     native = projected.is_cuda and projected.dtype == torch.float32
     if native:
         lists = [interop.view(t.view(-1), wp.int32) for t in (tiles.ranges, tiles.gaussian_ids)]
-        inputs = [interop.view(projected.view(-1), real), *lists, *settings.window_inputs(tiles.size)]
-        pixels = tiles.size * tiles.size
-        kernel, inputs = make_native(tiles.size), [*inputs, rule.alpha_cut, rule.alpha_max, *stop, output]
-        interop.launch(kernel, count * pixels, inputs, device, block_dim=pixels)
+        inputs, pixels = [own, interop.view(projected.view(-1), real), *lists, output], tiles.size * tiles.size
+        interop.launch(make_native(tiles.size), count * pixels, inputs, device, block_dim=pixels)
         return depths
-    inputs = [
-        *tile_inputs(projected, tiles, real), *settings.window_inputs(tiles.size),
-        rule.alpha_cut, rule.alpha_max, int(rule.square_sigma > 0), *stop, output,
-    ]  # fmt: skip
+    inputs = [own, *tile_inputs(projected, tiles, real), output]
     interop.launch(make_kernel(real, tiles.size), count, inputs, device, cost=10_000, block_dim=32)
     return depths

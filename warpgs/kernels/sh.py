@@ -6,11 +6,12 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
+from warpgs.colors import C0
+
 MAX_DEGREE = 3
 """Highest degree of the basis."""
 
 # Normalisations of the real basis: sqrt((2l+1)/(4 pi) (l-|m|)!/(l+|m|)!) times the factor of each polynomial below.
-C0 = 0.28209479177387814  # 1/2 sqrt(1/pi)
 C1 = 0.4886025119029199  # 1/2 sqrt(3/pi)
 C2 = 1.0925484305920792  # 1/2 sqrt(15/pi)
 C20 = 0.31539156525252005  # 1/4 sqrt(5/pi)

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from warpgs.kernels.native import source
 from warpgs.kernels.ssim_cpu import C1, C2, WINDOW
 from warpgs.runtime import interop
+from warpgs.runtime.cuda_source import source
 
 SIDE = 16
 """Side [px] of the square that a thread block works on."""

@@ -4,6 +4,7 @@ In torch these are some twenty kernels on a handful of numbers each, a tenth of 
 """
 
 import functools
+from enum import IntEnum
 from types import SimpleNamespace
 
 import torch
@@ -13,6 +14,30 @@ from warpgs.runtime import interop
 
 NOT_FINITE = 2
 """Value of the stop flag after a loss that is not finite; 1 after more instances than the capacity."""
+
+
+class Setting(IntEnum):
+    """Columns of the settings of a step, float32 of shape [6]: host and kernels read a setting by its column."""
+
+    DROPOUT = 0
+    """Probability that opacity dropout hides a Gaussian, in [0, 1)."""
+    NUMBER = 1
+    """Number of the step, or of its view where a step has several; a whole number from 1, below 2^24."""
+    MEANS_LR = 2
+    """Learning rate of the means [u]."""
+    RED = 3
+    """Red of the colour behind the view, less that behind the scene; green and blue follow (`SHIFT`)."""
+    GREEN = 4
+    BLUE = 5
+
+    @classmethod
+    def row(cls, *, dropout: float, number: int, means_lr: float, shift: tuple[float, float, float]) -> tuple[float, ...]:
+        """Return the settings of one step in the order of the columns, 6 numbers."""
+        return dropout, number, means_lr, *shift
+
+
+SHIFT = slice(Setting.RED, Setting.BLUE + 1)
+"""Columns of the colour."""
 
 
 @functools.cache
@@ -71,7 +96,7 @@ def begin_step(
         counter: The step's number in its batch, int64, shape [1].
         view_rows: Number of each step's view, int64, shape [B].
         lr_rows: Learning rates of each step, shape [B, R].
-        setting_rows: Settings of each step, shape [B, S].
+        setting_rows: Settings of each step (`Setting`), shape [B, S].
         viewmats: camera_from_world of each view, shape [V, 4, 4].
         Ks: Intrinsics [px], shape [V, 3, 3].
         targets: Images, shape [V, H, W, 3].

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from warpgs.constants import Rule
+from warpgs.constants import TILE_SIZE, Rule
 from warpgs.errors import ResourceError
 from warpgs.kernels.functions import make_spans
 from warpgs.kernels.native import make_functions as make_native
@@ -318,7 +318,7 @@ def bin_tiles(
     *,
     width: int,
     height: int,
-    tile_size: int = 16,
+    tile_size: int = TILE_SIZE,
     rule: Rule,
     budget_bytes: int | None = None,
     capacity: int | None = None,

@@ -12,6 +12,7 @@ import torch
 import warp as wp
 
 from warpgs.runtime import interop
+from warpgs.runtime.cuda_source import source
 
 ALIGNMENT = 256
 """Alignment of the parts of a block [bytes]: enough for sorts and 16-byte loads, and whole cache lines."""
@@ -124,14 +125,7 @@ def part(block: torch.Tensor, begin: int, shape: tuple[int, ...], dtype: torch.d
 
 @functools.cache
 def _make_fetch():
-    @wp.func_native(
-        """
-        // volatile: the host has written since the last replay
-        const volatile unsigned long long* addresses = reinterpret_cast<const volatile unsigned long long*>(table);
-        const float* from = reinterpret_cast<const float*>(addresses[item < first ? 0 : 1]);
-        out.data[item] = from[item < first ? item : item - first];
-        """
-    )
+    @wp.func_native(source("allocator_fetch.cu"))
     def body(item: int, table: wp.uint64, first: int, out: wp.array(dtype=float)): ...
 
     @wp.kernel(enable_backward=False, module="warpgs.runtime.allocator.fetch")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import functools
 import threading
 from collections.abc import Sequence
@@ -128,6 +129,11 @@ def warp_stream(device: torch.device) -> wp.Stream:
     return _warp_stream(device, torch._C._cuda_getCurrentRawStream(index))
 
 
+def _is_struct(value) -> bool:
+    """Return whether a kernel argument is an instance of a Warp struct."""
+    return hasattr(value, "__ctype__") and not isinstance(value, wp.array)
+
+
 _LOADING = threading.Lock()
 """Lock held while a CPU module is loaded, since it is not safe to compile one from several threads at once; and in debug mode,
 in which kernels are not safe either, while one runs."""
@@ -154,6 +160,12 @@ def stream_of(device: torch.device):
             where.set_stream(before, sync=False)
 
 
+def _copied(struct):
+    """Return another instance of a Warp struct with the same numbers."""
+    packed = struct.__ctype__()
+    return type(struct)(type(packed).from_buffer_copy(packed))
+
+
 class _Recorded:
     """A CUDA kernel whose launch is recorded once and then only patched.
 
@@ -170,9 +182,9 @@ class _Recorded:
         with self.lock:
             if self.command is None:
                 load_module(self.kernel.module, self.device, self.block_dim)
-                arrays = [a.array() if isinstance(a, View) else a for a in inputs]
+                own = [a.array() if isinstance(a, View) else _copied(a) if _is_struct(a) else a for a in inputs]
                 self.command = wp.launch(
-                    self.kernel, count, inputs=[0, *arrays], device=self.device, block_dim=self.block_dim, record_cmd=True
+                    self.kernel, count, inputs=[0, *own], device=self.device, block_dim=self.block_dim, record_cmd=True
                 )
                 self.command.fwd_args = None  # else the first call's arrays would stay in memory
                 self.known = [None] * len(inputs)
@@ -202,7 +214,10 @@ class _Recorded:
                     packed.strides[0] = tensor.stride(0) * tensor.element_size()
                 known[i] = now
             elif known[i] != value:
-                command.params[i + 2].value = value
+                if _is_struct(value):
+                    ctypes.pointer(command.params[i + 2])[0] = value.__ctype__()  # copies its numbers
+                else:
+                    command.params[i + 2].value = value
                 known[i] = value
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from warpgs.colors import base_colors
 from warpgs.geometry import rotation_matrices
-from warpgs.kernels.sh import C0
 from warpgs.scene import Gaussians
 
 LARGEST_HALF = 65504.0
@@ -55,7 +55,7 @@ def packed(gaussians: Gaussians) -> Packed:
     axes = np.exp(np.minimum(relative, longest))
     rotations = rotation_matrices(quats / np.linalg.norm(quats, axis=1, keepdims=True))
     covariances = np.einsum("nij,nj,nkj->nik", rotations, axes**2, rotations)
-    colors = np.clip(0.5 + C0 * sh[:, 0], 0, 1)
+    colors = np.clip(base_colors(sh), 0, 1)
     opacities = torch.sigmoid(torch.from_numpy(logits)).numpy()[:, None]
     return Packed(
         (means / scale).astype(np.float32), covariances.astype(np.float32), _bytes(colors), _bytes(opacities), scale,

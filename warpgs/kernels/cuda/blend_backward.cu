@@ -1,3 +1,5 @@
+#include "blend_common.cu"
+#include "blend_settings.cu"
 // One warp takes CHUNK instances back to front, for all pixels of their tiles: item = number of the chunk. The sums of an
 // instance go to its slot; if ATOMIC, they are added to its Gaussian's at once, in whatever order warps get there.
 __shared__ float4 s_a[WARPS][32], s_b[WARPS][32], s_c[WARPS][32];

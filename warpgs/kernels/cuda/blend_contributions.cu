@@ -1,3 +1,5 @@
+#include "blend_common.cu"
+#include "blend_settings.cu"
 // Sum and maximum of each instance's weight over the pixels of its tile; a thread block per tile.
 constexpr int BATCH = 32;
 __shared__ float s_sum[BLOCKS][BATCH], s_max[BLOCKS][BATCH];

@@ -1,3 +1,5 @@
+#include "blend_common.cu"
+#include "blend_settings.cu"
 // One warp composites one block of 8 x 4 pixels: item = place of the tile in the order * BLOCKS + block.
 constexpr int AHEAD = 4;  // alphas computed before they are blended: they do not wait for each other
 __shared__ float4 s_a[WARPS][32 + AHEAD], s_b[WARPS][32 + AHEAD], s_c[WARPS][32 + AHEAD];

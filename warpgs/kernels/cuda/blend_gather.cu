@@ -1,3 +1,4 @@
+#include "blend_common.cu"
 // Gradient of one projected Gaussian from the sums of its instances. Their slots are neighbours: a thread sums a short list, the warp
 // shares a long one. The factors common to all pixels are applied here, once.
 constexpr int SHORT = 32;

@@ -1,3 +1,5 @@
+#include "blend_common.cu"
+#include "blend_settings.cu"
 // Depth of the Gaussian that leaves a pixel half of its light or less; a thread block per tile, a thread per pixel.
 constexpr int BATCH = 32;
 __shared__ float4 s_a[BATCH], s_b[BATCH];

@@ -11,9 +11,10 @@ import numpy as np
 import torch
 
 from warpgs import geometry
+from warpgs.colors import base_coefficients
 from warpgs.errors import DataError, UsageError
 from warpgs.kernels.knn import mean_square_distances
-from warpgs.kernels.sh import C0, MAX_DEGREE, coefficient_count
+from warpgs.kernels.sh import MAX_DEGREE, coefficient_count
 from warpgs.pipeline.metrics.region import fitted_region
 from warpgs.pipeline.model.depth_points import NOTHING, coarse_points, depth_bounds
 from warpgs.pipeline.model.hull import hull_points, in_empty_region, silhouettes
@@ -139,7 +140,7 @@ class _Depths:
         seen = geometry.in_image(view.camera, matched.points)
         pixels, self.known = geometry.project_points(view.camera, matched.points)
         self.pixels, self.known, self.bounds = pixels[seen], self.known[seen], bounds
-        self.depth_supervised = len(self.known) >= MIN_MATCHES
+        self.has_matches = len(self.known) >= MIN_MATCHES
 
     def sample(self, pixels: np.ndarray, wanted: int, generator: np.random.Generator) -> np.ndarray:
         """Return depths [u] of the first ``wanted`` pixels, shape [wanted].
@@ -147,7 +148,7 @@ class _Depths:
         Random numbers are sampled for all pixels [N, 2], so that a depth does not depend on how many are wanted.
         """
         count = len(pixels)
-        if not self.depth_supervised:
+        if not self.has_matches:
             near, far = self.bounds
             return 1 / generator.uniform(1 / far, 1 / near, size=count)[:wanted]
         which, spread = generator.integers(NEIGHBORS, size=count), generator.normal(0, DEPTH_SPREAD, count)
@@ -191,7 +192,7 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
         chosen = generator.integers(len(rows), size=8 * wanted)
         rows, columns = rows[chosen], columns[chosen]
         pixels = np.stack([columns, rows], 1) + 0.5
-        elsewhere = not source.depth_supervised and len(views) > 1
+        elsewhere = not source.has_matches and len(views) > 1
         # where none is better than another, the first are taken, and the others need no depth
         useful = len(pixels) if elsewhere or any(name in OBJECTS for _, name in regions) else wanted
         candidates = geometry.back_project(view.camera, pixels[:useful], source.sample(pixels, useful, generator))
@@ -204,8 +205,8 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
         colors.append(view.image[rows[:wanted], columns[:wanted]])
     if not points:
         raise DataError("no random start: every pixel of the training views is masked out; check the masks' polarity")
-    depth_supervised = sum(s.depth_supervised for s in sources)
-    how = f"{count:,} random points, {depth_supervised} of {len(views)} views with depths from {len(matched):,} matched points"
+    with_matches = sum(s.has_matches for s in sources)
+    how = f"{count:,} random points, {with_matches} of {len(views)} views with depths from {len(matched):,} matched points"
     objects, cut_out = (sum(name == of for _, name in regions) for of in OBJECTS)
     if objects:
         how += f", on the object that {objects} views show on black"
@@ -380,7 +381,7 @@ def initial_gaussians(cloud: PointCloud, config: InitConfig, extent: float, devi
     scales = config.scale_factor * distances.clamp(1e-6 * extent, 0.1 * extent)
     assert config.max_sh_degree is not None  # `settings_by_views` has chosen
     sh = points.new_zeros(count, coefficient_count(config.max_sh_degree), 3)
-    sh[:, 0] = (colors - 0.5) / C0
+    sh[:, 0] = base_coefficients(colors)
     quats = points.new_zeros(count, 4)
     quats[:, 0] = 1
     return Gaussians(

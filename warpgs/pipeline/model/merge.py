@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import torch
 
+from warpgs.colors import C0
 from warpgs.geometry import quaternions, rotation_matrices
 from warpgs.kernels.knn import morton_codes
-from warpgs.kernels.sh import C0
 from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.scene import Gaussians
 

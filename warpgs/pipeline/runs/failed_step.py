@@ -13,6 +13,7 @@ from warpgs.errors import DataError
 from warpgs.files import write_bytes
 from warpgs.input_files import open_input
 from warpgs.kernels.dropout import opacity_dropout
+from warpgs.kernels.step_buffers import SHIFT
 from warpgs.pipeline.runs.checkpoint import safetensors_chunks
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.exposure import EXPOSURE, exposed, exposure_of
@@ -47,7 +48,7 @@ def failed_step(trainer: Trainer, view: int, name: str, slot: int = 0) -> Bundle
     camera, settings = shown.camera, list(trainer.settings(number, slot))
     image, background = shown.image, trainer.background
     if shown.alpha is not None:  # over the colour that the step had behind it
-        shift = torch.tensor(settings[3:], dtype=torch.float32, device=image.device)
+        shift = torch.tensor(settings[SHIFT], dtype=torch.float32, device=image.device)
         image, background = over(image, shown.alpha, shift), background + shift
     tensors = {"image": image, "viewmat": camera.viewmat, "K": camera.K, "background": background}
     tensors |= {f"params.{n}": t for n, t in trainer.gaussians.tensors().items()}
@@ -133,7 +134,7 @@ def _rendered(gaussians: Gaussians, bundle: Bundle, config: FitConfig) -> Render
     factors = None
     if plain["dropout_seed"] is not None:
         settings = torch.tensor(plain["settings"], dtype=torch.float32, device=gaussians.means.device)
-        factors = opacity_dropout(len(gaussians), settings[:2], plain["dropout_seed"])
+        factors = opacity_dropout(len(gaussians), settings, plain["dropout_seed"])
     options = RasterizeOptions(
         rule=config.rule, sh_degree=plain["degree"], background=tensors["background"], opacity_factors=factors
     )

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from warpgs.colors import base_colors
 from warpgs.errors import DataError, UsageError
 from warpgs.files import write_bytes
 from warpgs.geometry import rotation_matrices
-from warpgs.kernels.sh import C0
 from warpgs.pipeline.films.plan import depth_and_coverage
 from warpgs.pipeline.films.rig import Rig, rig_of
 from warpgs.pipeline.model.coverage import coverage
@@ -73,7 +73,7 @@ def _gaussians(stored: StoredRun, train: list[Camera], by_coverage: bool) -> tup
     gaussians = stored.gaussians()
     shown = (torch.sigmoid(gaussians.logit_opacities) >= MIN_OPACITY).cpu()
     if not by_coverage:
-        colors = np.clip(C0 * gaussians.sh[:, 0].cpu().numpy() + 0.5, 0, 1)
+        colors = np.clip(base_colors(gaussians.sh.cpu().numpy()), 0, 1)
     else:
         tensors = [replace(c, viewmat=gaussians.means.new_tensor(c.viewmat), K=gaussians.means.new_tensor(c.K)) for c in train]
         views = coverage(gaussians, tensors, stored.options()).views.cpu().numpy()

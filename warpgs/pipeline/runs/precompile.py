@@ -13,6 +13,7 @@ from pathlib import Path
 import torch
 import warp as wp
 
+from warpgs.constants import TILE_SIZE
 from warpgs.kernels import (
     adam,
     blend,
@@ -35,8 +36,6 @@ from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.load_module import load_module
 from warpgs.runtime.terminal import say
 
-TILE = 16
-"""Side of a tile in a fit [px]."""
 THREADS = 256
 """Threads of a block where a launch does not say otherwise."""
 CAMERA_MODEL = "pinhole"
@@ -58,7 +57,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     ]  # fmt: skip
     if not cuda:
         blending, scoring = (
-            blend_cpu.make_kernels(real, TILE),
+            blend_cpu.make_kernels(real, TILE_SIZE),
             [ssim_cpu.make_kernels(real, summed) for summed in (True, False)],
         )
         updates = [adam.make_kernel(real, split, adam.LANES) for split in (True, False)]
@@ -67,11 +66,11 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
             *(k for s in scoring for k in (s.forward, s.backward)), *updates,
         ]  # fmt: skip
         return [(kernel, 1) for kernel in [*(k for k, _ in common), *own]]
-    blending, warps = blend_cuda.make_kernels(TILE), 32 * blend_cuda.WARPS
-    own = [(blending.forward, warps), (blending.order_tiles, 1024), (blending.contributions, TILE * TILE)]
+    blending, warps = blend_cuda.make_kernels(TILE_SIZE), 32 * blend_cuda.WARPS
+    own = [(blending.forward, warps), (blending.order_tiles, 1024), (blending.contributions, TILE_SIZE * TILE_SIZE)]
     own += [(blend.make_segments(real).gather_weights, THREADS), (scanlines.make_kernel(), scanlines.BLOCK)]
     for depth, chunk in itertools.product((False, True), blend_cuda.CHUNKS):  # with a depth term, and without
-        passes = blend_cuda.make_backward(TILE, depth, chunk, False)
+        passes = blend_cuda.make_backward(TILE_SIZE, depth, chunk, False)
         own += [(passes.backward, warps), (passes.gather, THREADS)]
     own += [(ssim_cuda.make_kernels().forward, ssim_cuda.THREADS), (adam.make_scheduled_kernel(), THREADS)]
     return common + own

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from warpgs.colors import base_colors
 from warpgs.files import make_folder, write_bytes
 from warpgs.io.splits import Split
-from warpgs.kernels.sh import C0
 from warpgs.pipeline.films.rig import up_of
 from warpgs.pipeline.metrics.evaluate import (
     ALPHA_VARIANTS,
@@ -208,7 +208,7 @@ def _images(
 def overview_of(gaussians: Gaussians, train: list[View], test: list[View]) -> Callable[[], Overview]:
     """Return a function that draws the 3D overview, in a process of its own: it may be called from another thread."""
     means = gaussians.means.detach().cpu().numpy()
-    colors = np.clip(C0 * gaussians.sh[:, 0].detach().cpu().numpy() + 0.5, 0, 1)
+    colors = np.clip(base_colors(gaussians.sh.detach().cpu().numpy()), 0, 1)
     sample = np.random.default_rng(0).permutation(len(means))[:OVERVIEW_POINTS]
     points, cameras = means[sample].astype(np.float64), ([v.camera for v in train], [v.camera for v in test])
     up = up_of(cameras[0], points)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from warpgs.constants import TILE_SIZE
 from warpgs.pipeline.metrics.psnr import psnr_of
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.render.reference import reference_image
@@ -20,15 +21,13 @@ VIEWS = 3
 """Number of training views that are compared, sampled at random."""
 SIDE = 64
 """Side of the part of each that is compared [px], a multiple of the tile's."""
-TILE = 16
-"""Side of a tile [px]."""
 
 
 def _window(camera: Camera, generator: np.random.Generator) -> tuple[int, int, int, int]:
     """Sample a part of an image, [left, top, width, height], whose edges are tile edges or the image's."""
     sides = []
     for length in (camera.width, camera.height):
-        first = TILE * int(generator.integers(max(0, length - SIDE) // TILE + 1))
+        first = TILE_SIZE * int(generator.integers(max(0, length - SIDE) // TILE_SIZE + 1))
         sides.append((first, min(SIDE, length - first)))
     (x, width), (y, height) = sides
     return x, y, width, height

@@ -14,7 +14,7 @@ def complexity_figures(trainer: Trainer) -> dict:
     degrees = stored_degrees(trainer.gaussians.sh) if degrees is None else degrees
     figures = {
         "count": len(degrees), "mean_degree": float(degrees.double().mean()), "bytes": model_bytes(degrees),
-        "cap": trainer.config.max_gaussians, "adaptive": False, "why": "growth ended by schedule", "marginal_db": None,
+        "cap": trainer.config.max_gaussians, "holdout": False, "why": "growth ended by schedule", "marginal_db": None,
     }  # fmt: skip
     return {"complexity": figures | trainer.strategy.figures()}
 
@@ -25,4 +25,4 @@ def complexity_summary(figures: dict) -> str:
     text = f"{f['count']:,} Gaussians of mean SH degree {f['mean_degree']:.2f}, {format_bytes(f['bytes'])} uncompressed"
     if f["marginal_db"] is not None:
         text += f"; the last level gained {f['marginal_db']:+.3f} dB on held-out blocks"
-    return f"{text}; growth stopped because {f['why']}" if f["adaptive"] else f"{text}; {f['why']}"
+    return f"{text}; growth stopped because {f['why']}" if f["holdout"] else f"{text}; {f['why']}"

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 
 import torch
 
-from warpgs.constants import RULES
+from warpgs.constants import RULES, TILE_SIZE
 from warpgs.errors import UsageError
 from warpgs.kernels import blend, blend_cuda
 from warpgs.kernels.project import PROJECTED_SIZE, project
@@ -31,8 +31,6 @@ SAMPLED = 8
 """Largest number of views that a sampling event samples in (`importance_sampling.MAX_VIEWS`)."""
 SUMMED = 2
 """Statistics of each Gaussian that are summed with the gradients of several views: sum of its gradients, number of renders."""
-TILE = 16
-"""Side of a tile in a fit [px]."""
 
 
 def instance_bytes(cuda: bool, tiles: int) -> tuple[int, int]:
@@ -44,7 +42,7 @@ def instance_bytes(cuda: bool, tiles: int) -> tuple[int, int]:
     if not cuda:
         return LIST_BYTES, kept + FLOAT * blend.VALUES
     chunk = blend_cuda.CHUNKS[int(tiles > blend_cuda.MAX_SMALL_TILES)]
-    return LIST_BYTES, kept + FLOAT * blend_cuda.STRIDE + FLOAT * blend_cuda.STATE * TILE * TILE // chunk
+    return LIST_BYTES, kept + FLOAT * blend_cuda.STRIDE + FLOAT * blend_cuda.STATE * TILE_SIZE * TILE_SIZE // chunk
 
 
 @dataclass(frozen=True)
@@ -100,7 +98,7 @@ class Layout:
         ``instances`` is the number in the image or, if ``chunked``, in its heaviest chunk.
         """
         pixels = self.width * self.height
-        columns, rows = grid(self.width, self.height, TILE)
+        columns, rows = grid(self.width, self.height, TILE_SIZE)
         listing, backward = (b * instances for b in instance_bytes(self.cuda, 0 if chunked else columns * rows))
         waiting = backward - FLOAT * (blend_cuda.STRIDE if self.cuda else blend.VALUES) * instances
         one = FLOAT * PROJECTED_SIZE * count  # projected Gaussians, or their gradient

@@ -141,10 +141,6 @@ class SlotSums:
         self.rows = torch.zeros(tree.rows, -(-sum(sizes) // unit) * unit, device=device)
         """The sums, shape [R, L]."""
 
-    def fits(self, shapes: Sequence[tuple[int, ...]]) -> bool:
-        """Return whether tensors have the shapes that these sums are of."""
-        return self.shapes == [tuple(s) for s in shapes]
-
     def parts(self, row: int = 0) -> list[torch.Tensor]:
         """Return the tensors of a sum, parts of its memory, in their shapes [...]."""
         sized = zip(self.starts, self.shapes, strict=True)

@@ -18,7 +18,7 @@ from warpgs.errors import ResourceError
 from warpgs.kernels.blend import blend
 from warpgs.kernels.dropout import opacity_dropout
 from warpgs.kernels.project import project
-from warpgs.kernels.step_buffers import NOT_FINITE, begin_step, end_step
+from warpgs.kernels.step_buffers import NOT_FINITE, SHIFT, Setting, begin_step, end_step
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, bin_tiles
 from warpgs.pipeline.metrics.psnr import masked_mse
 from warpgs.pipeline.model.scale_limits import NO_LIMITS, Limits
@@ -69,9 +69,8 @@ class StepBuffers:
         """Row of each step's view in its stack."""
         self.lr_rows = torch.ones(rows, lrs, device=device)
         """Learning rates of each step (`Table.lr_row` of all tables)."""
-        self.setting_rows = torch.zeros(rows, 6, device=device)
-        """Dropout probability, number, and learning rate of the means [u] of each step; and the colour behind its view, less
-        the scene's."""
+        self.setting_rows = torch.zeros(rows, len(Setting), device=device)
+        """Settings of each step, by `Setting`."""
         self.counter = torch.zeros(1, dtype=torch.int64, device=device)
         """Number of the current step in its series. It stays once a step stops, and so do all Gaussians."""
         self.stop = torch.zeros(1, dtype=torch.int32, device=device)
@@ -222,12 +221,12 @@ def view_gradients(learned: Learned, views: ViewStack, buffers: StepBuffers, pla
         own[EXPOSURE] = exposure_of(learned.views.params[EXPOSURE], own[EXPOSURE])
     alpha = shift = None
     if views.alphas is not None:
-        alpha, shift = buffers.of_view(views.alphas), settings[3:]
+        alpha, shift = buffers.of_view(views.alphas), settings[SHIFT]
         image = over(image, alpha, shift)
     target = Target(image, mask, {n: buffers.of_view(t) for n, t in views.maps.items()}, own, alpha)
     factors = None
     if learned.dropout_seed is not None:
-        factors = opacity_dropout(len(table), settings[:2], learned.dropout_seed)
+        factors = opacity_dropout(len(table), settings, learned.dropout_seed)
     rendered = render(table.gaussians, Camera(viewmat, K, **views.size), plan.degree, factors, shift)
     if EXPOSURE in own:
         rendered = replace(rendered, rgb=exposed(rendered.rgb, own[EXPOSURE]))
@@ -251,7 +250,7 @@ def update(learned: Learned, plan: StepPlan, found: ViewGradients, stop: torch.T
     own, of_views = found.gradients[:count], found.gradients[count:]
     table.adam_step(dict(zip(table.params, own)), found.lrs[:split], stop, strategy.lr_factors(plan.phase))
     learned.views.adam_step(dict(zip(learned.views.params, of_views)), found.lrs[split:], stop)
-    strategy.after_step(plan.phase, found.settings[:3], found.going)
+    strategy.after_step(plan.phase, found.settings, found.going)
     plan.limits.apply(table.params, learned.centers, found.going)
     for name, value in found.statistics.items():
         table.columns[name] += value

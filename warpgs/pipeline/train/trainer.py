@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from warpgs.errors import DataError, NotFiniteError, OutOfMemoryError, ResourceError, UsageError
-from warpgs.kernels.step_buffers import NOT_FINITE
+from warpgs.kernels.step_buffers import NOT_FINITE, Setting
 from warpgs.pipeline.metrics.psnr import psnr_of
 from warpgs.pipeline.model.init import initial_gaussians, scene_extent
 from warpgs.pipeline.model.scale_limits import camera_centers, scene_radius
@@ -313,14 +313,12 @@ class Trainer:
         return c.optimizer.lrs(self.progress(step), self.extent, stable_start)
 
     def settings(self, step: int, slot: int | None = None) -> tuple[float, ...]:
-        """Return the six settings of a step, as `StepBuffers` takes them, or those of one of its slots.
-
-        A slot has the number of its view among all that the fit has rendered, from 1: its random numbers are its own.
-        """
+        """Return the settings of a step (`Setting`), or of one of its slots, which has its own number and random numbers."""
         number = step if slot is None else (step - 1) * self.batch + slot + 1
         shifted = self.cutout and self.config.loss.random_background
         shift = random_shift(self.config.seed, number, self.scene_background) if shifted else (0.0, 0.0, 0.0)
-        return self.strategy.dropout(step), number, math.sqrt(self.batch) * self.lrs(step)["means"], *shift
+        means_lr = math.sqrt(self.batch) * self.lrs(step)["means"]
+        return Setting.row(dropout=self.strategy.dropout(step), number=number, means_lr=means_lr, shift=shift)
 
     def _update(self) -> None:
         """Have the strategy change the set of Gaussians after the step that was just taken, where that is due."""

@@ -108,7 +108,7 @@ class Strategy:
 
         Args:
             phase: Value of `phase` for the step.
-            settings: Dropout probability, number of the step, and learning rate of the means [u], float32, shape [3].
+            settings: Settings of the step, by the columns of `warpgs.kernels.step_buffers.Setting`, float32, shape [6].
             going: Whether the step is taken, bool, shape [1]; where it is not, nothing may change.
         """
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from warpgs import schema
+from warpgs import geometry, schema
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.table import Column, DensityUpdate
 from warpgs.pipeline.train.strategies.base import Strategy, register
@@ -66,11 +66,6 @@ class DensityConfig:
         start, every, _ = self.times(steps)
         refines = start < step <= until and step % every == 0
         return refines, self.reset_every > 0 and step <= until - RESET_FREE_STEPS and step % self.reset_every == 0
-
-
-def _logit(p: float) -> float:
-    """Return the inverse sigmoid of a number in [0, 1]; infinite at both ends."""
-    return math.log(p / (1 - p)) if 0 < p < 1 else math.copysign(math.inf, p - 0.5)
 
 
 def _exp(x: torch.Tensor) -> torch.Tensor:
@@ -132,7 +127,7 @@ def refine(
             strongest = torch.topk(pull, free).indices
             grows = torch.zeros_like(grows).index_fill(0, strongest, True) & grows
         small = scales <= config.clone_size * extent
-        faint = ~(logits >= _logit(config.prune_opacity))
+        faint = ~(logits >= geometry.logit(config.prune_opacity))
         if after_reset and config.prune_size > 0:
             huge = scales > config.prune_size * extent
             if 2 * int(huge.sum()) <= len(gaussians):  # else it is the extent that is small: the cameras stand close together

@@ -198,7 +198,7 @@ class Holdout(ImportanceSampling):
         yield from super().refine(step, growing, protected)
 
     def after_step(self, phase, settings, going):
-        """Apply the bounds of each Gaussian, and raise the opacities of protected ones; ``settings`` [3], ``going`` [1]."""
+        """Apply the bounds of each Gaussian, and raise the opacities of protected ones; ``settings`` [6], ``going`` [1]."""
         if self.trainer.config.holdout.bounds or self.shrinks(self.trainer.config):
             enforce_bounds(self.trainer.table)
         super().after_step(phase, settings, going)
@@ -393,6 +393,6 @@ class Holdout(ImportanceSampling):
             return {}
         last = self.levels[-1] if self.levels else None
         return {
-            "adaptive": True, "why": self.why, "marginal_db": last and last.gain, "closed": self.closed,
+            "holdout": True, "why": self.why, "marginal_db": last and last.gain, "closed": self.closed,
             "levels": [asdict(x) for x in self.levels], "trims": self.trims,
         }  # fmt: skip

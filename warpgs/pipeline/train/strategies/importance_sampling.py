@@ -14,6 +14,7 @@ import torch
 
 from warpgs import geometry, schema
 from warpgs.errors import UsageError
+from warpgs.kernels.step_buffers import Setting
 from warpgs.pipeline.model.table import Column, DensityUpdate
 from warpgs.pipeline.train.exposure import seen_in
 from warpgs.pipeline.train.strategies import importance as scoring
@@ -77,7 +78,7 @@ class MethodConfig:
     """Weight of the semantic score in the importance."""
     s_geometry: bool = True
     """Weight of the geometric score in the importance. A gate with gate_quantile above 0 (paper-literal) uses the map even when
-    this is off; with 0 (paper, quick, balanced) no gate uses it."""
+    this is off; with 0 (default, quick) no gate uses it."""
     ra: bool = True
     """Reliability gate: only pixels above gate_quantile of the geometric score (0: no such gate) and, with sampler.depth
     consistent, only pixels with consistent depth in views that have some."""
@@ -301,10 +302,10 @@ class ImportanceSampling(CloneSplit):
         return torch.where(self.fine, 1.0, self.method.coarse_lr_factor)
 
     def after_step(self, phase, settings, going):
-        """Raise the opacities of protected Gaussians to alpha_minimum; ``settings`` [3] holds the step, ``going`` [1] if so."""
+        """Raise the opacities of protected Gaussians to alpha_minimum; ``settings`` [6], ``going`` [1]."""
         if self.protects:
             logits = self.trainer.table.params["logit_opacities"].detach()
-            held = self.is_protected(settings[1]) & going
+            held = self.is_protected(settings[Setting.NUMBER]) & going
             logits.copy_(torch.where(held, logits.clamp_min(self.method.protect.logit), logits))
 
     def statistics(self, phase, v_projected, visible, size):

@@ -15,6 +15,7 @@ import torch
 import warp as wp
 
 from warpgs.errors import UsageError
+from warpgs.kernels.step_buffers import Setting
 from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.pipeline.train.strategies.base import Strategy, register
 from warpgs.runtime import interop
@@ -101,7 +102,7 @@ def make_kernel() -> wp.Kernel:
         if not going[0]:
             return
         # one stream of numbers for each seed and step, one part of it for each Gaussian
-        state = wp.rand_init(wp.randi(wp.rand_init(seed, int(settings[1]))), i)
+        state = wp.rand_init(wp.randi(wp.rand_init(seed, int(settings[Setting.NUMBER]))), i)
         noise = wp.vec3(wp.randn(state), wp.randn(state), wp.randn(state))
         q = quats[i]
         rotation = wp.quat_to_matrix(wp.normalize(wp.quat(q[1], q[2], q[3], q[0])))
@@ -110,7 +111,7 @@ def make_kernel() -> wp.Kernel:
         opacity = 1.0 / (1.0 + wp.exp(-logits[i]))
         gate = 1.0 / (1.0 + wp.exp(wp.static(GATE_SLOPE) * (opacity - wp.static(GATE_OPACITY))))
         moved = rotation * wp.cw_mul(variances, wp.transpose(rotation) * noise)
-        means[i] = means[i] + moved * (gate * noise_lr * settings[2])
+        means[i] = means[i] + moved * (gate * noise_lr * settings[Setting.MEANS_LR])
 
     return perturb
 
@@ -124,7 +125,7 @@ def perturb(
 
     Args:
         gaussians: N Gaussians, float32.
-        settings: Anything, number of the step, learning rate of the means [u], float32, shape [3].
+        settings: Settings of the step (`Setting`), of which number and learning rate are read, float32, shape [6].
         going: Nothing changes where this is False, bool, shape [1].
         seed: Any 32-bit integer.
         noise_lr: Factor of the learning rate.
@@ -157,7 +158,7 @@ class MCMC(Strategy):
         return (c.opacity_weight * opacity + c.scale_weight * scale).to(gaussians.log_scales.dtype)
 
     def after_step(self, phase, settings, going):
-        """Perturb the means; ``settings`` [3] holds step and learning rate, nothing changes where ``going`` [1] is False."""
+        """Perturb the means; nothing changes where ``going`` [1] is False. ``settings`` has shape [6]."""
         t = self.trainer
         perturb(t.table.gaussians, settings, going, seed=t.config.seed ^ NOISE_STREAM, noise_lr=self.config.noise_lr)
 

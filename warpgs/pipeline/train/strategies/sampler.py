@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import torch
 
+from warpgs.colors import base_coefficients
 from warpgs.errors import UsageError
 from warpgs.geometry import back_project_tensors, logit
-from warpgs.kernels.sh import C0
 from warpgs.pipeline.metrics.quantiles import quantiles
 from warpgs.scene import Camera
 
@@ -139,7 +139,7 @@ def fine_gaussians(
     count = len(means)
     focal = 0.5 * (camera.K[0, 0] + camera.K[1, 1])
     sh = means.new_zeros(count, coefficients, 3)
-    sh[:, 0] = (image[rows, columns] - 0.5) / C0
+    sh[:, 0] = base_coefficients(image[rows, columns])
     quats = means.new_zeros(count, 4)
     quats[:, 0] = 1
     return {

@@ -1,0 +1,47 @@
+"""CUDA text: it lies in files of one folder, is read by one function, and is part of what is installed."""
+
+import ast
+import zipfile
+from pathlib import Path
+
+from warpgs.runtime.cuda_source import FOLDER, source
+
+ROOT = Path(__file__).parents[2]
+FILES = {p.name for p in (ROOT / "warpgs/kernels/cuda").iterdir()}
+
+
+def native_bodies():
+    """Return file and expression of the CUDA body of each native function of the package."""
+    for path in sorted((ROOT / "warpgs").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "wp.func_native":
+                yield path.name, node.args[0]
+
+
+def test_no_cuda_text_stands_in_python():
+    """Every body comes from a file, and every file is read by name or included."""
+    bodies = list(native_bodies())
+    assert len(bodies) >= 20
+    assert [f"{file}: {ast.unparse(body)}" for file, body in bodies if not isinstance(body, ast.Call)] == []
+    assert {ast.unparse(body.func) for _, body in bodies} == {"source", "_source"}
+    named = {body.args[0].value for _, body in bodies if ast.unparse(body.func) == "source"}
+    named |= {f"blend_{body.args[0].value}.cu" for _, body in bodies if ast.unparse(body.func) == "_source"}
+    text = "".join((FOLDER / name).read_text("utf-8") for name in named)
+    assert {name for name in FILES if name in named or f'#include "{name}"' in text} == FILES
+
+
+def test_names_are_replaced_and_files_included(tmp_path):
+    """Whole words alone become numbers, also in a file that is included."""
+    (tmp_path / "body.cu").write_text('#include "blend_common.cu"\nint SIDES = SIDE;\n')
+    text = source(str(tmp_path / "body.cu"), SIDE=8)
+    assert text.startswith("// Declarations") and "WIDE = 8 / 8" in text and text.endswith("int SIDES = 8;\n")
+    assert "#include" not in text
+
+
+def test_a_wheel_holds_all_cuda_text(tmp_path):
+    """A wheel is built as `pip install` builds it."""
+    from hatchling.builders.wheel import WheelBuilder
+
+    (built,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
+    held = set(zipfile.ZipFile(built).namelist())
+    assert held >= {f"warpgs/kernels/cuda/{name}" for name in FILES}

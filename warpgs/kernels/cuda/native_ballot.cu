@@ -1,0 +1,1 @@
+return (int)__ballot_sync(0xffffffffu, wanted != 0);

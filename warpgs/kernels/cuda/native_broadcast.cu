@@ -1,0 +1,1 @@
+return __shfl_sync(0xffffffffu, value, lane);

@@ -1,0 +1,1 @@
+return __ffs(mask) - 1;
