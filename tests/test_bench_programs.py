@@ -28,7 +28,7 @@ def test_everything_that_can_be_run_is_listed(capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["bench", "--help"])
     assert bench_main.main() == 0
     text = capsys.readouterr().out
-    for name in ("ops", "against_gsplat", "fits", "mcmc", "shape", "determinism", "experiments.tradeoff"):
+    for name in ("ops", "against_gsplat", "mcmc", "determinism", "experiments.tradeoff"):
         assert f"\n  {name} " in text
     assert all(line.endswith((".", ":")) or line[:2] != "  " for line in text.splitlines()), text
     monkeypatch.setattr(sys, "argv", ["bench", "nothing"])
