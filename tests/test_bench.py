@@ -7,10 +7,10 @@ from xml.etree import ElementTree
 import pytest
 import torch
 
-from bench import document, harness, inputs, measured, peers, predict, result_file
-from bench.ops import OPS, Bench, run
-from bench.points import Point, growth, points
-from bench.series import exponent
+from bench.lib import accuracy_page, inputs, measured_page, peers, performance_page, predict, result_file, timing
+from bench.lib.ops import OPS, Bench, run
+from bench.lib.points import Point, growth, points
+from bench.lib.series import exponent
 from warpgs import rasterize
 from warpgs.kernels.ssim import ssim
 
@@ -135,8 +135,8 @@ def test_disturbed_rows_are_known_and_give_way_to_faster_ones():
 def test_work_beyond_the_limit_is_left_after_the_warm_up(monkeypatch):
     """Two calls and no more."""
     calls = []
-    monkeypatch.setattr(harness, "_timed", lambda work, device: (calls.append(1) or 3000.0, None))
-    (row,) = harness.measure_in_turn([lambda: None], CPU, limit_ms=2000.0)
+    monkeypatch.setattr(timing, "_timed", lambda work, device: (calls.append(1) or 3000.0, None))
+    (row,) = timing.measure_in_turn([lambda: None], CPU, limit_ms=2000.0)
     assert row["warm_up_ms"] == 3000.0 and "median_ms" not in row and len(calls) == 2
 
 
@@ -195,8 +195,8 @@ def hand_made(device: str) -> dict:
 def test_the_document_says_what_the_results_say():
     """Tables, ratios, exponents, reasons; charts are well-formed; the same results give the same bytes."""
     results = {"b": hand_made("cuda"), "a": hand_made("cpu")}
-    files = document.generate(results)
-    assert files == document.generate(json.loads(json.dumps(dict(reversed(results.items())))))
+    files = performance_page.files(results)
+    assert files == performance_page.files(json.loads(json.dumps(dict(reversed(results.items())))))
     text = files["performance.md"]
     assert text.index("(a)\n") < text.index("(b)\n")
     assert all(f"| render | warpgs | both | {cell} |  | 1.00 |  |" in text for cell in ("100", "100 / 1"))
@@ -211,14 +211,16 @@ def test_the_document_says_what_the_results_say():
 
 def test_the_document_is_that_of_the_committed_results():
     """docs/performance.md and its charts are what `python -m bench.document` writes, and nothing else lies there."""
-    files = document.generate(document.committed())
+    files = performance_page.files(result_file.stored("ops"))
     docs = result_file.ROOT / "docs"
     for path, text in files.items():
         assert (docs / path).read_text("utf-8") == text, f"{path} is stale: run python -m bench.document"
     assert {f"plots/{p.name}" for p in (docs / "plots").glob("*.svg")} == set(files) - {"performance.md"}
 
 
-def test_the_page_of_measured_figures_is_that_of_the_committed_results():
-    """docs/measured.md is what `python -m bench.measured` writes."""
-    text = (result_file.ROOT / measured.PAGE).read_text("utf-8")
-    assert text == measured.page(), "stale: run python -m bench.measured"
+def test_the_other_pages_are_those_of_the_committed_results():
+    """docs/measured.md and the tables of docs/accuracy.md are what `python -m bench.document` writes."""
+    docs = result_file.ROOT / "docs"
+    assert (docs / "measured.md").read_text("utf-8") == measured_page.page(), "stale: run python -m bench.document"
+    page = (docs / "accuracy.md").read_text("utf-8")
+    assert accuracy_page.filled(page) == page, "stale: run python -m bench.document"
