@@ -2,22 +2,22 @@
 
 import json
 import math
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import pytest
 import torch
 
-from bench.lib import accuracy_page, inputs, measured_page, peers, performance_page, predict, result_file, timing
+from bench.lib import accuracy_page, inputs, measured_page, ops, peers, performance_page, result_file, timing
 from bench.lib.ops import OPS, Bench, run
-from bench.lib.points import Point, growth, points
-from bench.lib.series import exponent
+from bench.lib.points import Point, exponent, growth, points
 from warpgs import rasterize
 from warpgs.kernels.ssim import ssim
 
 CPU = torch.device("cpu")
 
 
-def tiny(ops: tuple[str, ...]) -> dict:
+def tiny(names: tuple[str, ...]) -> dict:
     """A run over tiny sizes, as JSON, on a machine that is never too slow or busy: neither is what these tests are about.
 
     One thread: torch's spin where cores are shared, and that takes longer than the work.
@@ -25,8 +25,8 @@ def tiny(ops: tuple[str, ...]) -> dict:
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(predict, "LIMIT_MS", math.inf)
-        made = run(CPU, tiny=True, ops=ops, echo=lambda line: None)
+        patch.setattr(ops, "LIMIT_MS", math.inf)
+        made = run(CPU, tiny=True, ops=names, echo=lambda line: None)
     torch.set_num_threads(before)
     made["rows"] = [r | {"others_cores": 0.0} for r in made["rows"]]
     return json.loads(json.dumps(made))
@@ -57,7 +57,7 @@ def test_a_budget_of_nothing_skips_everything():
     """All tasks are listed with the reason, none is measured."""
     result = run(CPU, tiny=True, ops=("adam", "knn"), budget=0, echo=lambda line: None)
     assert not result["rows"] and {s["op"] for s in result["skipped"]} == {"adam", "knn"}
-    assert all("left of the time given" in s["reason"] for s in result["skipped"])
+    assert all("no time is left" in s["reason"] for s in result["skipped"])
 
 
 def test_a_second_run_measures_only_what_the_first_lacks_or_what_was_disturbed(result):
@@ -75,36 +75,6 @@ def test_a_second_run_measures_only_what_the_first_lacks_or_what_was_disturbed(r
 def row(count: int, milliseconds: float, **more) -> dict:
     """A measured row of one op."""
     return {"op": "adam", "program": "warpgs", "direction": "forward", "N": count, "median_ms": milliseconds, **more}
-
-
-def test_predictions_grow_linearly_at_least():
-    """Flat growth counts as linear, steeper growth goes on, and nothing is foretold for smaller sizes."""
-    task = ("adam", "warpgs", "forward")
-    flat, steep = [row(100, 1.0), row(1000, 1.1)], [row(100, 1.0), row(1000, 30.0)]
-    assert predict.time_ms(flat, *task, {"N": 10_000}) == pytest.approx(11.0)
-    assert predict.time_ms(steep, *task, {"N": 10_000}) == pytest.approx(900.0)
-    assert predict.time_ms(flat, *task, {"N": 50}) is None
-    assert predict.time_ms(flat, "knn", "warpgs", "forward", {"N": 10_000}) is None
-    assert predict.time_ms([row(1000, 1.0), row(1000, 9.0, threads=1)], *task, {"N": 2000}) == pytest.approx(2.0)
-
-
-def test_predictions_start_from_the_nearest_rows():
-    """Where Gaussians and pixels both grow, the row between counts, not the one before it, and the lower estimate holds."""
-    task, small, large = ("adam", "warpgs", "forward"), {"width": 10, "height": 10}, {"width": 10, "height": 100}
-    rows = [row(100, 1.0, **small), row(1000, 5.0, **small)]
-    assert predict.time_ms(rows, *task, {"N": 1000, **large}) == pytest.approx(50.0)
-    assert predict.time_ms([*rows, row(100, 2.0, **large)], *task, {"N": 1000, **large}) == pytest.approx(20.0)
-
-
-def test_hopeless_tasks_are_skipped():
-    """Too long, or too large for the free memory; anything else runs."""
-    task, point = ("adam", "warpgs", "forward"), Point(1_000_000)
-    sizes = point.sizes(("count",))
-    rows = [row(100_000, 150.0, peak_bytes=10_000_000)]
-    assert predict.reason_to_skip(rows, *task, point, sizes, free=1e12) is None
-    assert "a repeat" in predict.reason_to_skip([row(100_000, 250.0)], *task, point, sizes, free=1e12)
-    assert "GiB" in predict.reason_to_skip(rows, *task, point, sizes, free=5e7)
-    assert "GiB" in predict.reason_to_skip([], *task, point, sizes, free=5e7)
 
 
 def test_points_vary_one_axis_at_a_time_and_along_the_diagonal():
@@ -130,6 +100,14 @@ def test_disturbed_rows_are_known_and_give_way_to_faster_ones():
     bench._keep([row(100, 2.1, others_cores=0.0), row(100, 4.0, **peer, others_cores=0.0)])
     bench._keep([row(1000, 9.0, others_cores=0.0)])
     assert [r["median_ms"] for r in bench.rows] == [2.1, 4.0, 3.0, 4.0] and not bench.open("adam", {"N": 100})
+
+
+def test_what_took_too_long_is_not_tried_at_larger_sizes():
+    """Nor is anything where two sizes cannot be compared left out."""
+    bench, module = Bench(CPU, 3, None, lambda line: None), SimpleNamespace(PROGRAMS={"warpgs": ("forward",)})
+    bench._stop("adam", "warpgs", "forward", {"N": 1000}, "took 3 s a repeat")
+    found = [bench._chosen("adam", module, Point(n), {"N": n}) for n in (100, 1000, 10_000)]
+    assert found == [{("warpgs", "forward")}, set(), set()] and len(bench.skipped) == 3
 
 
 def test_work_beyond_the_limit_is_left_after_the_warm_up(monkeypatch):

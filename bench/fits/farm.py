@@ -1,8 +1,5 @@
 """Farms of small fits: equal bytes and time by engine, and fits per hour by scenes that share a GPU and by GPUs.
 
-usage: python -m bench.fits.farm engines [--scenes 20] [--steps 100] [--slots 2] [--work FOLDER] --out FILE.json
-       python -m bench.fits.farm packing [SCENE --split SPEC] [--per-gpu 1 2 4 8 12] [--gpus 1 2 4 8] [--fits 4] --out FILE.json
-
 `engines` fits demo scenes one by one with `warpgs fit`, and then by each engine; it also kills a worker in mid-job, and starts
 two farms on one folder. `packing` needs CUDA: every slot of a GPU gets --fits fits of one scene, with a seed each, after a tiny
 one that starts its process; first on one GPU with several numbers of slots, then with the best one on several GPUs.

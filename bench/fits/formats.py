@@ -1,7 +1,5 @@
 """Size of each file format, and its cost in PSNR on the held-out views of runs, whole and cleaned.
 
-usage: python -m bench.fits.formats RUN ... [--out bench/results/formats_fern_cpu2.json]
-
 A run is written in each format, read back and rendered at its held-out views; what the PSNR is lower than that of the model in
 memory is what the format costs. The last rows are SPZ in each version.
 """

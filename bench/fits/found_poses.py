@@ -1,6 +1,5 @@
 """Fits with found poses beside fits with given ones: held-out PSNR of the same photographs, and how far the poses are apart.
 
-usage: python -m bench.fits.found_poses SCENE [--train 17 6 3] [--seeds 0 1 2] [--preset quick] [--downscale 4] --out FILE.json
 SCENE is a COLMAP folder whose poses count as given, such as colmap/fern. Every eighth photograph is held out; of the others
 so many train, evenly spaced. Poses are found twice: jointly, of training and held-out photographs, as the given ones were; and
 of the training photographs alone, where held-out cameras are the given ones, brought over by the similarity of the training
@@ -24,6 +23,7 @@ from bench.lib.arguments import SCENE, parse
 from bench.lib.refined_views import refined
 from bench.lib.tables import mean_sd
 from warpgs.io.images import Lens, load_image
+from warpgs.pipeline.runs.refined_poses import similar_cameras
 from warpgs.pipeline.runs.request import choose_device
 from warpgs.poses.find import find_poses
 from warpgs.scene import Camera, Scene, View
@@ -49,39 +49,24 @@ def found_scene(images: Path, names: list[str], downscale: int) -> tuple[Scene, 
         return warpgs.load_scene(Path(folder) / "scene", downscale=downscale), record
 
 
-def similarity(of: dict[str, View], to: dict[str, View]) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return scale, rotation [3, 3] and translation [3] that bring cameras of one scene to those of the same name elsewhere."""
-    names = sorted(of.keys() & to.keys())
-    turns = sum(to[n].camera.viewmat[:3, :3].T @ of[n].camera.viewmat[:3, :3] for n in names)
-    u, _, vt = np.linalg.svd(turns)
-    R = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    a, b = (np.array([views[n].camera.center for n in names]) for views in (of, to))
-    s = float(((b - b.mean(0)) * ((a - a.mean(0)) @ R.T)).sum() / ((a - a.mean(0)) ** 2).sum())
-    return s, R, b.mean(0) - s * R @ a.mean(0)
+def brought_over(of: dict[str, View], to: dict[str, View], train: list[str], names: list[str]) -> dict[str, Camera]:
+    """Return the named cameras of one scene after the similarity of its training cameras to those of another."""
+    cameras, goal = {n: v.camera for n, v in of.items()}, [to[n].camera for n in train]
+    return similar_cameras(cameras, [cameras[n] for n in train], goal, names)
 
 
-def moved(camera: Camera, transform: tuple[float, np.ndarray, np.ndarray]) -> Camera:
-    """Return a camera after a similarity."""
-    s, R, t = transform
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = camera.viewmat[:3, :3] @ R.T
-    viewmat[:3, 3] = -viewmat[:3, :3] @ (s * R @ camera.center + t)
-    return replace(camera, viewmat=viewmat)
-
-
-def held_out(view: View, image: Path, found: dict, transform: tuple[float, np.ndarray, np.ndarray], downscale: int) -> View:
-    """Return a held-out view after a similarity, seen through the lens that was found: poses and focal length go together."""
+def held_out(view: View, camera: Camera, image: Path, found: dict, downscale: int) -> View:
+    """Return a held-out view from a camera, seen through the lens that was found: poses and focal length go together."""
     f, width, height = found["focal"], found["width"], found["height"]
     K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
     loaded = load_image(image, Lens(K, width, height, (found["distortion"], 0.0, 0.0, 0.0)), downscale=downscale)
-    camera = replace(moved(view.camera, transform), K=loaded.K)
-    return View(view.name, camera, loaded.image, loaded.mask)
+    return View(view.name, replace(camera, K=loaded.K), loaded.image, loaded.mask)
 
 
 def errors(of: dict[str, View], to: dict[str, View]) -> dict[str, float]:
     """Return how far cameras are from those of another scene after the similarity: degrees, and parts of the mean distance."""
-    names, transform = sorted(of.keys() & to.keys()), similarity(of, to)
-    cameras = {n: moved(of[n].camera, transform) for n in names}
+    names = sorted(of.keys() & to.keys())
+    cameras = brought_over(of, to, names, names)
     centers = np.array([to[n].camera.center for n in names])
     spread = np.linalg.norm(centers - centers.mean(0), axis=1).mean()
     cosines = [(np.trace(to[n].camera.viewmat[:3, :3] @ cameras[n].viewmat[:3, :3].T) - 1) / 2 for n in names]
@@ -113,9 +98,9 @@ def main() -> None:
         joint, joint_record = found_scene(a.scene / "images", [*train, *test], a.downscale)
         alone, alone_record = found_scene(a.scene / "images", train, a.downscale)
         mine = {v.name: v for v in alone.views}
-        over = similarity({n: reference[n] for n in train}, mine)
+        over = brought_over(reference, mine, [n for n in train if n in mine], test)
         (lens,) = alone_record["cameras"]
-        tests = [held_out(reference[n], a.scene / "images" / n, lens, over, a.downscale) for n in test]
+        tests = [held_out(reference[n], over[n], a.scene / "images" / n, lens, a.downscale) for n in test]
         aligned = replace(alone, views=(*alone.views, *tests))
         for poses, scene, record in (
             ("given", given, None),

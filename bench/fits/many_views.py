@@ -1,7 +1,5 @@
 """A fit of many photographs: the demo with 300 views, its time, steps, PSNR and peak memory.
 
-usage: python -m bench.fits.many_views [--views 300] [--width 320] [--height 240] [--split every:8] [--preset default]
-           [--seeds 1] [--work FOLDER] --out FILE.json
 Each fit has a process of its own, so that its peak memory is its own; reading the scene counts as part of it.
 """
 

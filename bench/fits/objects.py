@@ -1,10 +1,8 @@
 """Objects cut out of their surroundings: held-out scores over white, rendered opacity, and the PLY over other backgrounds.
 
-usage: python -m bench.fits.objects [--objects 10] [--first 100] [--formats transforms colmap] [--presets default] [--seeds 1]
-           [--views 24] [--size 400] [--jobs 1] [--seconds S] --out FILE.json
 Each object is that of `warpgs demo --object --seed N` with eight training views, for N from --first on; choose settings on
 other objects than those reported. Both formats hold the same views: transforms.json with RGBA images, COLMAP with cut-out
-masks. Rows that FILE.json holds are kept when the command is given again, those that failed are tried again.
+masks. Rows that --out holds are kept when the command is given again, those that failed are tried again.
 """
 
 from __future__ import annotations

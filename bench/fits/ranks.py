@@ -1,12 +1,11 @@
 """Steps of several views on several GPUs: their time, the time in collectives, memory, and the SHA-256 of the model.
 
-usage: torchrun --nproc-per-node N -m bench.fits.ranks CASE PATH [--batch 8] [--steps 60] [--device auto] [--out FILE.json]
-
 CASE is horns or garden. horns: PATH is a scene folder, split every:8, fitted from 112,000 random points; the set of Gaussians
 changes in the first half of the steps. garden: PATH is test_garden.npz; 2.8 million Gaussians on its points, 1920 x 1080 px, 8
-views, no growth. The time of a step is that of the last third, each step waited for. A row is put into FILE, in place of one of
-the same case, batch, steps and ranks; `same_model` says whether all rows of a case have one SHA-256 of parameters, moments and
-statistics. Time in collectives is that of the first rank, between events around them: it has in it the wait for slower ranks.
+views, no growth. Started by `torchrun --nproc-per-node N -m bench.fits.ranks`. The time of a step is that of the last third,
+each step waited for. A row is put into --out, in place of one of the same case, batch, steps and ranks; `same_model` says
+whether all rows of a case have one SHA-256 of parameters, moments and statistics. Time in collectives is that of the first
+rank, between events around them: it has in it the wait for slower ranks.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
 """What poses that are a little off cost, and what `--refine-poses` regains: the same fits with given, noisy and refined poses.
 
-usage: python -m bench.fits.refine_poses SCENE [--split every:8] [--downscale 16] [--degrees 0.5] [--shift 0.01]
-       [--preset quick] [--steps N] [--seeds 0 1 2] --out FILE.json
-
 Each training camera is turned about its centre by an angle and moved by a fraction of the cameras' extent, in random
 directions; the points of the scene stay. A model whose training cameras moved is turned and moved as a whole, too: "psnr" is of
 held-out cameras that the similarity of the true training cameras to the model's takes there, with noisy and refined poses

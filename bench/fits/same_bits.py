@@ -1,7 +1,5 @@
 """The bits that a fit gives on this processor: the SHA-256 of every stage from photographs to PLY, beside other processors.
 
-usage: python -m bench.fits.same_bits [--out bench/results/same_bits.json] [--threads N] [--avx2] [--label WORDS]
-
 Prints a line for each stage of `bench.lib.same_bits` with the first 12 digits of its SHA-256, puts a row into the result
 ``--out`` (in place of one of the same label, processor and arguments), and names the stages that differ from the first row of
 the same arguments and kind of device. ``--avx2``: every library takes the code that it has for processors without AVX-512, and

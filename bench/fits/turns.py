@@ -1,7 +1,5 @@
 """Two checkouts in turn on one machine: wall time, start, and held-out PSNR of the whole command `warpgs fit`.
 
-usage: python -m bench.fits.turns OLD NEW SCENE [--split llff:3] [--downscale 1] [--rounds 5] [--cores 0,1] [--device cpu]
-           [--old-flags="--preset quick"] [--new-flags="..."] --out FILE.json
 OLD and NEW are folders of the two checkouts; each keeps a kernel cache of its own, filled by a short fit before the first
 round. The order changes from round to round. Everything from the start of the process to its end counts as wall time.
 """

@@ -1,7 +1,5 @@
 """The price of determinism: ordered against atomic sums of gradients, time and memory, and how far atomic ones spread.
 
-usage: python -m bench.kernels.determinism [--gaussians 20000 300000] [--size 1920 1080] [--repeats 50] [--out FILE.json]
-
 On a CPU both modes are the same code, and so is what they measure; the program then runs and says so.
 """
 

@@ -7,8 +7,6 @@ finished: what was evaluated while boxes were clipped by rows alone, and what a 
 The naive kernels have no box: a thread walks its tile's list. All times are those of the whole op, its memory included.
 Interleaved, and the minimum of each, because other work on the machine only ever adds; one thread by its CPU time, two by
 the clock on the wall.
-
-usage: python -m bench.kernels.lanes [--repeats 15] [--gaussians 20000]
 """
 
 from __future__ import annotations

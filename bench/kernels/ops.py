@@ -1,7 +1,5 @@
 """Time of all ops, of the whole image and of a training step over sizes, beside peers and a roofline of the machine.
 
-usage: python -m bench.kernels.ops --out bench/results/ops_MACHINE.json [--device cuda] [--op NAME ...] [--budget SECONDS]
-
 Points are measured from the lightest to the heaviest, all ops at each, so that what a time budget [s] cuts off is the far end
 of every series; it is skipped and listed. ``--again`` measures only what --out lacks, or what other programs disturbed.
 ``--tiny``: sizes that only show that it runs. `python -m bench.document` turns the results into docs/performance.md.

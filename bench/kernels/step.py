@@ -1,6 +1,5 @@
 """Time of one training step, stage by stage, on a real or synthetic scene.
 
-usage: python -m bench.kernels.step SCENE [--split llff:3] [--downscale 1] [--gaussians 100000] [--out FILE.json]
 --warm-steps are taken before anything is timed.
 """
 
@@ -29,11 +28,11 @@ from warpgs.pipeline.train.loss import photometric_loss
 
 def stages(trainer: Trainer) -> tuple[list[dict], int]:
     """Time each stage on the first training view, with SH degree 3, and the whole step; a row each, and the instances."""
-    device, parts = trainer.device, step_parts(trainer)
-    camera, target, rule = parts.camera, parts.target, RULES[parts.rule]
+    device, (view, parameters, optimize) = trainer.device, step_parts(trainer)
+    camera, target, rule = view.camera, view.image, RULES[trainer.config.rule]
     size = {"width": camera.width, "height": camera.height}
-    inputs = [*parts.parameters.values(), camera.viewmat[None], camera.K[None]]
-    background = parts.background[None]
+    inputs = [*parameters.values(), camera.viewmat[None], camera.K[None]]
+    background = trainer.background[None]
 
     def run_project():
         return project(*inputs, **size, degree=3, rule=rule)
@@ -56,8 +55,8 @@ def stages(trainer: Trainer) -> tuple[list[dict], int]:
         "loss forward": measure(lambda: photometric_loss(image, target, None), device),
         "loss backward": measure(backward_of(value, [image]), device),
         "blend backward": measure(backward_of(rgb, [leaf], v_rgb), device),
-        "project backward": measure(backward_of(projected, list(parts.parameters.values()), v_projected), device),
-        "adam": measure(parts.optimize, device),
+        "project backward": measure(backward_of(projected, list(parameters.values()), v_projected), device),
+        "adam": measure(optimize, device),
         "whole step": measure(lambda: one_step(trainer), device),
     }
     return [{"stage": name} | row for name, row in result.items()], len(tiles.slots)

@@ -1,7 +1,5 @@
 """Time of sweeping planes for 3 to 54 views, and the fraction of pixels whose depth other views confirm.
 
-usage: python -m bench.kernels.sweep [--scene FOLDER] [--views 3 6 12 24 54] [--device cuda] [--repeats 3] [--out FILE]
-
 Views are those of the demo scene at 320 x 240 px, or as many of a scene's photographs, evenly chosen. Seconds are those of
 `sweep_depths` alone, wall time and processor time (the sum over threads, which other programs disturb less).
 """

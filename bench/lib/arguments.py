@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 WORDS = {
@@ -41,7 +42,9 @@ def parse(
         **flags: Default of each flag by name. A type takes one word and is None where not given; False makes a switch; a
             list takes several words, a list of one type is empty where not given.
     """
-    parser = argparse.ArgumentParser(description=doc, formatter_class=_Help)
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    program = f"python -m {spec.name}" if spec else None
+    parser = argparse.ArgumentParser(program, description=doc, formatter_class=_Help)
     for name, kind in (places or {}).items():
         many = {"nargs": "+"} if isinstance(kind, list) else {"nargs": "?"} if name.endswith("?") else {}
         kind = kind[0] if isinstance(kind, list) else kind

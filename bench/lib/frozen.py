@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from bench.lib import inputs
+from warpgs.export.arrays import C0
 from warpgs.pipeline.runs.folder import open_run
 from warpgs.scene import Camera, Gaussians
 
@@ -37,7 +38,7 @@ def _uniform(generator: torch.Generator, *shape: int) -> torch.Tensor:
 
 def _make(means, log_scales, logits, colors, quats=None) -> Gaussians:
     sh = torch.zeros(len(means), 1, 3, dtype=torch.float64)
-    sh[:, 0] = (colors - 0.5) / 0.28209479177387814
+    sh[:, 0] = (colors - 0.5) / C0
     quats = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(len(means), 4) if quats is None else quats
     return Gaussians(means, quats, log_scales, logits, sh)
 

@@ -17,11 +17,9 @@ import torch
 
 from bench.lib.peers import torch_ssim
 from warpgs.errors import UsageError
+from warpgs.export.arrays import C0
 from warpgs.kernels.knn import mean_square_distances
 from warpgs.scene import Camera, Gaussians, Normalization, Scene, View
-
-C0 = 0.28209479177387814
-"""Spherical-harmonics basis of degree 0: 1 / (2 sqrt(pi))."""
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from warpgs.export.arrays import C0
 from warpgs.scene import Camera, Gaussians
 
 
@@ -68,7 +69,7 @@ def garden_inputs(
     count, coefficients = len(points), (sh_degree + 1) ** 2
     sh = torch.randn(count, coefficients, 3, generator=generator) * 0.1
     # Colours keep half a step of 8 bits from 0: exactly there the clamp of colours at 0 has no gradient to compare.
-    sh[:, 0] = (torch.from_numpy(colors).clamp_min(0.5 / 255) - 0.5) / 0.28209479177387814
+    sh[:, 0] = (torch.from_numpy(colors).clamp_min(0.5 / 255) - 0.5) / C0
     tensors = {
         "means": torch.from_numpy(points),
         "quats": torch.randn(count, 4, generator=generator),

@@ -100,24 +100,15 @@ def weight_errors(length: float, device: torch.device) -> dict[str, dict[str, fl
     inputs = needles(length, ANGLES)
     exact_projection = projected_of(inputs.to(torch.float64), _frame(), FREE)
     plain = projected_of(inputs.to(torch.float32), _frame(), FREE)
-    inverse = torch.stack(
-        [
-            exact_projection.conics[:, 0],
-            exact_projection.conics[:, 1],
-            exact_projection.conics[:, 1],
-            exact_projection.conics[:, 2],
-        ],
-        -1,
-    ).view(-1, 2, 2)
+    xx, xy, yy = exact_projection.conics.unbind(1)
+    inverse = torch.stack([xx, xy, xy, yy], -1).view(-1, 2, 2)
     strengths, axes = torch.linalg.eigh(inverse.detach())  # the long axis first
     sigmas = strengths.rsqrt()
     along = torch.tensor([-2.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 2.0], dtype=torch.float64)
     across = torch.tensor([-1.0, -0.5, 0.0, 0.5, 1.0], dtype=torch.float64)
     t, s = (g.flatten() for g in torch.meshgrid(along, across, indexing="ij"))
-    d = (
-        t[None, :, None] * (sigmas[:, :1] * axes[:, :, 0])[:, None]
-        + s[None, :, None] * (sigmas[:, 1:] * axes[:, :, 1])[:, None]
-    )
+    long, short = ((sigmas[:, k, None] * axes[:, :, k])[:, None] for k in range(2))
+    d = t[None, :, None] * long + s[None, :, None] * short
     dx, dy = d.float().unbind(-1)
     exact = _weight(_plain_power(exact_projection, dx.double(), dy.double()).detach())
     record = _record(inputs, device)[exact_projection.ids.to(device)]

@@ -9,17 +9,17 @@ from collections.abc import Callable
 
 import torch
 
-from bench.lib import peers, predict, result_file, roofline
+from bench.lib import peers, result_file, roofline
 from bench.lib.pairs import instances_and_pairs
-from bench.lib.points import Point, growth, load, points
-from bench.lib.series import SIZES
+from bench.lib.points import SIZES, Point, growth, load, points
 from bench.lib.timing import DISTURBED, OURS, REPEATS, Task, measure_in_turn, peak_bytes
 from warpgs.errors import ResourceError
 from warpgs.runtime import interop
-from warpgs.runtime.device_memory import available_bytes
 
 WHAT = "every op, the whole image and a training step, forward and backward, over sizes"
 OPS = ("project", "tiles", "blend", "ssim", "adam", "step_buffers", "dropout", "knn", "scanlines", "render", "step")
+LIMIT_MS = 2000.0
+"""Longest time of one repeat that is measured [ms]."""
 FAILURES = (ResourceError, RuntimeError, MemoryError)
 """Errors of running out of memory, in our code, torch's and Warp's; one failure must not cost the other results."""
 
@@ -44,30 +44,19 @@ class Bench:
         self._skip({"op": op, "program": program, "direction": direction, **sizes}, reason)
 
     def _chosen(self, op: str, module, point: Point, sizes: dict) -> set[tuple[str, str]]:
-        """The tasks of an op at a point that can be expected to fit into time and memory; the others are noted."""
-        chosen, predicted, free = set(), 0.0, available_bytes(self.device)
+        """Return the tasks of an op at a point that are worth a try; the others are noted."""
+        chosen, late = set(), self.deadline is not None and time.monotonic() >= self.deadline
         for program, directions in module.PROGRAMS.items():
             largest = getattr(module, "LARGEST", {}).get(program, point.count)
             if program in peers.absent(self.device) or point.count > largest:
                 continue
             for direction in directions:
-                head = {"op": op, "program": program, "direction": direction, **sizes}
-                reason = predict.reason_to_skip(self.rows, op, program, direction, point, sizes, free)
-                stopped = [s for o, p, d, s in self.stopped if (o, p, d) == (op, program, direction)]
-                if reason is None and any(growth(s, sizes) is not None for s in stopped):
-                    reason = "did not get through at a smaller size"
-                if reason:
-                    self._skip(head, reason)
-                    continue
-                chosen.add((program, direction))
-                predicted += predict.time_ms(self.rows, op, program, direction, sizes) or 0.0
-        if self.deadline is not None and chosen:
-            needed, left = predicted / 1000 * (self.repeats + 5), self.deadline - time.monotonic()
-            if left <= 0 or needed > left:
-                for program, direction in sorted(chosen):
+                vain = (s for *task, s in self.stopped if task == [op, program, direction])
+                if late or any(growth(s, sizes) is not None for s in vain):
                     head = {"op": op, "program": program, "direction": direction, **sizes}
-                    self._skip(head, f"predicted {needed:.2g} s in all, {max(left, 0):.2g} s left of the time given")
-                return set()
+                    self._skip(head, "no time is left" if late else "did not get through at a smaller size")
+                else:
+                    chosen.add((program, direction))
         return chosen
 
     def measure(self, op: str, module, point: Point, roof: dict | None) -> None:
@@ -92,7 +81,7 @@ class Bench:
         tasks: list[Task] = []
         try:
             tasks += module.tasks(point, self.device, lambda p, d: (p, d) in chosen)
-            timings = measure_in_turn([t.run for t in tasks], self.device, self.repeats, predict.LIMIT_MS)
+            timings = measure_in_turn([t.run for t in tasks], self.device, self.repeats, LIMIT_MS)
             rows = [self._row(op, task, sizes, timing, roof) for task, timing in zip(tasks, timings)]
         except FAILURES as e:
             return " ".join(str(e).split())[:200] or type(e).__name__
@@ -161,7 +150,7 @@ def run(
         device: Where to measure.
         tiny: Sizes and repeats that only show that it runs.
         ops: Names out of `OPS`.
-        budget: Time for all of it [s]; what is predicted not to fit is skipped. None for no limit.
+        budget: Time for all of it [s]; what is left then is skipped. None for no limit.
         note: Words about the machine that belong in the results.
         earlier: Results of the same code on the same machine; only what they lack or what was disturbed is measured.
         echo: Takes a line per task.

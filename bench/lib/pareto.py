@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from bench.lib.plot import PALETTE, _text, spread
+from bench.lib.plot import PALETTE, PLOT_WIDTH, SMALL, grid, spread, svg, text
 
-PLOT_WIDTH, PLOT_HEIGHT = 330, 250
+PLOT_HEIGHT = 250
 LEFT, RIGHT, TOP, BOTTOM = 66, 150, 76, 66
 FAR = 5.0
 """Costs this many times the least are named below the plot instead of shown, if they are few: they would squeeze the rest. So
@@ -111,21 +111,16 @@ def _panel(panel: Panel, left: float, top: float, colors: dict[str, str]) -> lis
         return top + PLOT_HEIGHT * (1 - fraction)
 
     bottom = top + PLOT_HEIGHT
-    out.append(_text(left, top - 41, panel.title, size=13, bold=True))
-    out.append(_text(left, top - 25, panel.what, size=11, color="#666666"))
-    out.append(_text(left, top - 9, panel.y_label, size=11, color="#666666"))
-    for y in _ticks(y_low, y_high, panel.log_y):
-        out.append(f'<path d="M{left:.1f} {py(y):.1f}h{PLOT_WIDTH}" stroke="#e6e6e6"/>')
-        out.append(_text(left - 8, py(y) + 4, f"{y:.3g}", size=11, anchor="end", color="#666666"))
-    for x in _ticks(x_low, x_high, x_high > 12 * x_low):
-        out.append(f'<path d="M{px(x):.1f} {top}v{PLOT_HEIGHT}" stroke="#f0f0f0"/>')
-        out.append(_text(px(x), bottom + 18, f"{x:.3g}", size=11, anchor="middle", color="#666666"))
-    out.append(f'<path d="M{left:.1f} {bottom}h{PLOT_WIDTH}" stroke="#999999"/>')
-    out.append(_text(left + PLOT_WIDTH / 2, bottom + 38, panel.x_label, anchor="middle", size=11, color="#666666"))
+    out.append(text(left, top - 41, panel.title, size=13, bold=True))
+    out.append(text(left, top - 25, panel.what, size=11, color="#666666"))
+    out.append(text(left, top - 9, panel.y_label, size=11, color="#666666"))
+    ys = [(py(y), f"{y:.3g}") for y in _ticks(y_low, y_high, panel.log_y)]
+    xs = [(px(x), f"{x:.3g}") for x in _ticks(x_low, x_high, x_high > 12 * x_low)]
+    out += [*grid(left, top, bottom, xs, ys), text(left + PLOT_WIDTH / 2, bottom + 38, panel.x_label, **SMALL)]
 
     if far:
         words = "; ".join(f"{p.name}: {p.cost:.3g}, {p.value:.3g}" for p in far)
-        out.append(_text(left, bottom + 54, f"outside: {words}", size=10, color="#666666"))
+        out.append(text(left, bottom + 54, f"outside: {words}", size=10, color="#666666"))
 
     path, at = "", None
     best = [p for p in best if p not in far]
@@ -144,7 +139,7 @@ def _panel(panel: Panel, left: float, top: float, colors: dict[str, str]) -> lis
     for p, y in zip(labelled, spread([py(p.value) for p in labelled], 12, top, bottom)):
         thread = f"M{px(p.cost) + 6:.1f} {py(p.value):.1f}L{edge - 2:.1f} {y:.1f}"
         out.append(f'<path d="{thread}" stroke="{colors[p.knob]}" stroke-opacity="0.25"/>')
-        out.append(_text(edge, y + 4, p.name, size=10, color=colors[p.knob], bold=p.preset))
+        out.append(text(edge, y + 4, p.name, size=10, color=colors[p.knob], bold=p.preset))
     return out
 
 
@@ -155,18 +150,13 @@ def chart(title: str, panels: Sequence[Panel], columns: int = 3) -> str:
     wide, high = LEFT + PLOT_WIDTH + RIGHT, TOP + PLOT_HEIGHT + BOTTOM
     columns = min(columns, len(panels))
     width, height = columns * wide, HEAD + LEGEND + high * math.ceil(len(panels) / columns)
-    out = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
-        'font-family="system-ui, -apple-system, Segoe UI, Helvetica, Arial, sans-serif">',
-        f'<rect width="{width}" height="{height}" fill="#ffffff"/>',
-        _text(16, 28, title, size=16, color="#111111", bold=True),
-    ]
+    out: list[str] = []
     x = 16.0
     for knob in knobs:
         out.append(f'<circle cx="{x + 4:.1f}" cy="{HEAD + 6}" r="4" fill="{colors[knob]}"/>')
-        out.append(_text(x + 13, HEAD + 10, knob, size=11, color=colors[knob]))
+        out.append(text(x + 13, HEAD + 10, knob, size=11, color=colors[knob]))
         x += 30 + 6.2 * len(knob)
     for i, panel in enumerate(panels):
         left, top = (i % columns) * wide + LEFT, HEAD + LEGEND + (i // columns) * high + TOP - 16
         out += _panel(panel, left, top, colors)
-    return "\n".join([*out, "</svg>"]) + "\n"
+    return svg(title, width, height, out)

@@ -10,6 +10,8 @@ from torch.utils.checkpoint import checkpoint
 
 from bench.lib import inputs, naive
 from warpgs.constants import RULES
+from warpgs.geometry import rotation_matrices
+from warpgs.kernels.sh import basis
 from warpgs.scene import Camera, Gaussians
 
 TORCH_SSIM = "torch conv2d"
@@ -41,21 +43,6 @@ def torch_ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     return similarity[0].permute(1, 2, 0)
 
 
-def _colors(sh: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
-    """Colours from coefficients [N, K, 3] and unit directions [N, 3], clamped at 0, shape [N, 3]."""
-    x, y, z = d.unbind(-1)
-    one, xx, yy, zz = torch.ones_like(x), x * x, y * y, z * z
-    basis = [
-        0.28209479 * one,
-        -0.48860251 * y, 0.48860251 * z, -0.48860251 * x,
-        1.09254843 * x * y, -1.09254843 * y * z, 0.31539157 * (2 * zz - xx - yy), -1.09254843 * x * z, 0.54627422 * (xx - yy),
-        -0.59004359 * y * (3 * xx - yy), 2.89061144 * x * y * z, -0.45704580 * y * (4 * zz - xx - yy),
-        0.37317633 * z * (2 * zz - 3 * xx - 3 * yy), -0.45704580 * x * (4 * zz - xx - yy), 1.44530572 * z * (xx - yy),
-        -0.59004359 * x * (xx - 3 * yy),
-    ]  # fmt: skip
-    return (torch.einsum("nk,nkc->nc", torch.stack(basis[: sh.shape[1]], -1), sh) + 0.5).clamp_min(0)
-
-
 def _projected(g: Gaussians, view: torch.Tensor, K: torch.Tensor, width: int, height: int) -> tuple[torch.Tensor, ...]:
     """Means [px] [N, 2], inverse covariances [N, 2, 2], opacities [N], colours [N, 3] of what is visible, by depth."""
     rule, R, t = RULES["exact"], view[:3, :3], view[:3, 3]
@@ -63,12 +50,7 @@ def _projected(g: Gaussians, view: torch.Tensor, K: torch.Tensor, width: int, he
     order = torch.argsort(p[:, 2])
     order = order[p[order, 2] >= rule.near]
     p, log_scales = p[order], g.log_scales[order]
-    w, x, y, z = F.normalize(g.quats[order], dim=1).unbind(-1)
-    rotation = torch.stack([
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ], -1).view(-1, 3, 3)  # fmt: skip
+    rotation = rotation_matrices(F.normalize(g.quats[order], dim=1))
     f, c = torch.stack([K[0, 0], K[1, 1]]), K[:2, 2]
     means = f * p[:, :2] / p[:, 2:] + c
     margin = 0.15 * torch.tensor([width, height], device=p.device)
@@ -77,7 +59,8 @@ def _projected(g: Gaussians, view: torch.Tensor, K: torch.Tensor, width: int, he
     axes = jacobian @ R @ rotation * log_scales.exp()[:, None]
     covariance = axes @ axes.mT + rule.low_pass * torch.eye(2, device=p.device)
     directions = F.normalize(g.means[order] + R.T @ t, dim=1)
-    return means, torch.linalg.inv(covariance), g.logit_opacities[order].sigmoid(), _colors(g.sh[order], directions)
+    colors = torch.einsum("nk,nkc->nc", basis(directions)[:, : g.sh.shape[1]], g.sh[order])
+    return means, torch.linalg.inv(covariance), g.logit_opacities[order].sigmoid(), (colors + 0.5).clamp_min(0)
 
 
 def _composite(pixels, means, inverses, opacities, colors):

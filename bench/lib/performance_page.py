@@ -6,8 +6,7 @@ import re
 from collections import Counter
 
 from bench.lib.plot import Line, Panel, chart
-from bench.lib.points import BASE, DIAGONAL, Point
-from bench.lib.series import SIZES, Series, along, diagonal, exponent, tasks
+from bench.lib.points import BASE, DIAGONAL, SIZES, Point, Series, along, diagonal, exponent, tasks
 from bench.lib.tables import figure, markdown
 from bench.lib.timing import DISTURBED, OURS
 

@@ -72,7 +72,7 @@ def gradient_errors(found: dict[str, torch.Tensor], wanted: dict[str, torch.Tens
 
 def _works(s: Setting, leaves: Gaussians, camera: Camera, upstream: torch.Tensor) -> list[Callable[[], object]]:
     """An image, and an image with its gradients; on CUDA recorded, as fits take them: at these sizes the host is slower."""
-    inputs, cuda = list(leaves.tensors().values()), leaves.means.is_cuda and not s.simulated
+    inputs, cuda = list(leaves.tensors().values()), leaves.means.is_cuda
     bounds = {}
     if cuda:  # nothing that is recorded may look at the device or copy from the host
         matrices = (torch.as_tensor(t, dtype=torch.float32, device=leaves.means.device) for t in (camera.viewmat, camera.K))
@@ -104,7 +104,7 @@ def measure_scene(scene: Frozen, repeats: int, chosen: list[Setting] | None = No
         off = (rgb.detach() - exact).abs()
         errors |= {"max_to_exact": float(off.max()), "mean_to_exact": float(off.mean())}
         rows.append({
-            "scene": scene.name, "setting": s.name, "knob": s.knob, "preset": s.preset, "simulated": s.simulated,
+            "scene": scene.name, "setting": s.name, "knob": s.knob, "preset": s.preset,
             "alpha_cut": s.rule.alpha_cut, "transmittance_stop": s.rule.transmittance_stop, **errors,
         })  # fmt: skip
         del rgb, gradients
@@ -113,7 +113,7 @@ def measure_scene(scene: Frozen, repeats: int, chosen: list[Setting] | None = No
     gc.collect()
     times = times_in_turn(works, device, repeats)
     for row, forward, both in zip(rows, times[::2], times[1::2]):
-        if row["simulated"] or "median_ms" not in forward or "median_ms" not in both:
+        if "median_ms" not in forward or "median_ms" not in both:
             continue
         for name, timing in (("forward", forward), ("both", both)):
             low, high = timing["quartiles_ms"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 
@@ -94,50 +93,20 @@ def with_cap(config: FitConfig, most: int) -> FitConfig:
     return dataclasses.replace(config, max_gaussians=most)
 
 
-def with_strategy(config: FitConfig, name: str) -> FitConfig:
-    """Return the settings with another density strategy."""
-    return dataclasses.replace(config, strategy=name, strategy_config=None)
-
-
-def with_holdout(config: FitConfig) -> FitConfig:
-    """Return the settings with the size of the model decided by held-out blocks."""
-    own = dataclasses.replace(config.holdout, bounds=True, degrees=True, trim_db=0.1, stop_db=0)
-    return dataclasses.replace(with_strategy(config, "holdout"), holdout=own)
-
-
 def without_density(config: FitConfig) -> FitConfig:
     """Return the settings with the set of Gaussians left as it starts."""
     return dataclasses.replace(config, density=dataclasses.replace(config.density, start=10**9))
 
 
-@dataclass(frozen=True)
-class StepParts:
-    """Inputs of the stages of a trainer's step."""
-
-    camera: Camera
-    target: torch.Tensor
-    """Image of the first training view, shape [H, W, 3]."""
-    parameters: dict[str, torch.Tensor]
-    """Parameters by name, in the order in which `project` takes them."""
-    background: torch.Tensor
-    """Colour, shape [3]."""
-    rule: str
-    optimize: Callable[[], None]
-    """Adam over all parameters, with gradients of zero."""
-
-
-def step_parts(trainer: Trainer) -> StepParts:
-    """Return the inputs of a step on the first training view."""
-    view, table, device = trainer.views[0], trainer.table, trainer.device
+def step_parts(trainer: Trainer) -> tuple[View, dict[str, torch.Tensor], Callable[[], None]]:
+    """Return the first training view, the parameters as `project` takes them, and Adam over all with gradients of zero."""
+    table, device = trainer.table, trainer.device
     row = table.lr_row(trainer.lrs(trainer.step + 1), trainer.step + 1, trainer.config.optimizer.head_lrs)
     lrs, going = torch.tensor(row, device=device), torch.zeros(1, dtype=torch.int32, device=device)
     gradients = {name: torch.zeros_like(p) for name, p in table.params.items()}
     # leaves of their own: a live graph of the table's parameters would tie a captured step to this stream
     parameters = {name: p.detach().requires_grad_() for name, p in table.gaussians.tensors().items()}
-    return StepParts(
-        view.camera, view.image, parameters, trainer.background, trainer.config.rule,
-        lambda: table.adam_step(gradients, lrs, going),
-    )  # fmt: skip
+    return trainer.views[0], parameters, lambda: table.adam_step(gradients, lrs, going)
 
 
 class _Settings:
@@ -191,22 +160,3 @@ class Steps:
         graph = self._graph()
         self.buffers.counter.zero_()
         graph.replay()
-
-    def train(self, steps: int) -> list[float]:
-        """Take steps one after the other as CUDA graphs and return their losses.
-
-        Raises:
-            RuntimeError: A loss is not finite, or the instances outgrew the capacity.
-        """
-        losses: list[float] = []
-        while len(losses) < steps:
-            count = min(MAX_STEPS, steps - len(losses))
-            graph = self._graph()
-            self._load(range(len(losses) + 1, len(losses) + count + 1))
-            for _ in range(count):
-                graph.replay()
-            done, stop, history = self.buffers.result()
-            if stop:
-                raise RuntimeError(f"training stopped after {len(losses) + done} steps with code {stop}; use fewer Gaussians")
-            losses += [loss for loss, _ in history[:done]]
-        return losses

@@ -1,6 +1,5 @@
 """Rendering and its gradients, and a whole training step, beside gsplat 1.5.3 on the same inputs in the same run.
 
-usage: python -m bench.peers.against_gsplat GARDEN.npz [--out FILE.json] [--only NAME] [--kernels]
 --kernels lists our kernels by GPU time.
 Needs a CUDA device and gsplat 1.5.3 (`pip install gsplat==1.5.3`, which builds itself on first use).
 """
@@ -9,7 +8,6 @@ from __future__ import annotations
 
 import gc
 import statistics
-import time
 from collections import Counter
 from pathlib import Path
 
@@ -20,7 +18,7 @@ from bench.lib import result_file
 from bench.lib.arguments import parse
 from bench.lib.inputs import first_camera, garden_inputs
 from bench.lib.peers import gsplat_rasterize, torch_ssim
-from bench.lib.timing import recorded
+from bench.lib.timing import measure_in_turn, recorded
 from bench.lib.training import Steps
 from warpgs import RasterizeOptions, clear_graph_cache, rasterize
 from warpgs.constants import RULES
@@ -99,24 +97,10 @@ def peer_step(gaussians: Gaussians, camera: Camera, target: torch.Tensor):
     return work
 
 
-def wall_times(works: dict, repeats: int = REPEATS) -> dict[str, dict]:
-    """Wall time of each work [ms], repeat by repeat in turn, the device drained around each."""
-    samples = {name: [] for name in works}
-    for i in range(WARM_UP + repeats):
-        for name, work in works.items():
-            torch.cuda.synchronize()
-            begin = time.perf_counter()
-            work()
-            torch.cuda.synchronize()
-            if i >= WARM_UP:
-                samples[name].append(1000 * (time.perf_counter() - begin))
-    return {name: quartiles(values) for name, values in samples.items()}
-
-
-def quartiles(values: list[float]) -> dict:
-    """Median and quartiles."""
-    low, middle, high = statistics.quantiles(values, n=4)
-    return {"median": round(middle, 4), "quartiles": [round(low, 4), round(high, 4)], "repeats": len(values)}
+def wall_times(works: dict) -> dict[str, dict]:
+    """Return the wall time of each work [ms], repeat by repeat in turn, the device drained around each."""
+    rows = measure_in_turn(list(works.values()), torch.device("cuda"), REPEATS)
+    return {n: {"median": r["median_ms"], "quartiles": r["quartiles_ms"], "repeats": REPEATS} for n, r in zip(works, rows)}
 
 
 def gpu_times(work, repeats: int = REPEATS) -> tuple[dict, Counter]:

@@ -1,11 +1,9 @@
 """Preset `mcmc` beside preset `3dgs` and gsplat's own MCMC: held-out PSNR from the same images, cameras, split and points.
 
-usage: python -m bench.peers.mcmc SCENE [--seeds 3] [--steps 7000] [--split every:8] [--downscale 1] --out FILE.json
-
 For each seed preset `3dgs` is fitted first; the number of Gaussians that it ends with is the cap of the others. gsplat is
 trained with the settings of its example trainer (bench/lib/gsplat_trainer.py), once in our normalisation and once with the
 world scaled as its own parser does: its noise and its regularizer of scales depend on the unit. All start from the points of
-the first fit, and all images are scored by the same code. Rows that FILE.json holds are not measured again.
+the first fit, and all images are scored by the same code. Rows that --out holds are not measured again.
 """
 
 from __future__ import annotations

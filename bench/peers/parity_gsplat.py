@@ -1,6 +1,5 @@
 """Images and gradients of rule `gsplat` against those of gsplat, on the garden cloud, on a CUDA device.
 
-usage: python -m bench.peers.parity_gsplat GARDEN.npz [--out FILE.json]
 Needs gsplat 1.5.3 (`pip install gsplat==1.5.3`, which builds itself on first use).
 """
 

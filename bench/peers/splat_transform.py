@@ -1,7 +1,5 @@
 """Files exchanged with npm's splat-transform: what it reads of ours, and what is read here of its own.
 
-usage: python -m bench.peers.splat_transform RUN --command "node PATH/cli.mjs" [--out FILE.json]
-
 CLI is that of @playcanvas/splat-transform, version 3. It needs Node 22, which npm has, too: after `npm install node@22
 @playcanvas/splat-transform@3` in any folder, the command is "node_modules/.bin/node
 node_modules/@playcanvas/splat-transform/bin/cli.mjs".

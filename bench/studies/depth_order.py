@@ -1,7 +1,5 @@
 """Order of near and far in a run: rendered depth of held-out views against a reconstruction's points.
 
-usage: python -m bench.studies.depth_order RUN SCENE [--device cpu]
-
 SCENE is a COLMAP folder of the same photographs, usually the one that was fitted. For each held-out view of the run the points
 that the reconstruction saw in it are looked up in the rendering, and Spearman's rank correlation of the two depths is printed:
 1 where all pairs of points are in the right order, 0 where the order is chance. Ranks know no unit, so the run may have been

@@ -1,6 +1,5 @@
 """Errors of needles in the form of a triangular factor, in that of an inverse covariance ("conic") and in textbook form.
 
-usage: python -m bench.studies.needles [--device cuda] [--out bench/results/needles_cpu.json]
 `bench/lib/needles.py` says what is measured.
 """
 

@@ -1,8 +1,4 @@
-"""Time of a training step with Gaussians in the order in which they came, and along a Morton curve, in turns.
-
-usage: python -m bench.order SCENE [--split llff:3] [--gaussians 20000 300000] [--threads 1]
-           [--out FILE.json]
-"""
+"""Time of a training step with Gaussians in the order in which they came, and along a Morton curve, in turns."""
 
 from __future__ import annotations
 

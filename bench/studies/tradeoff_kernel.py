@@ -1,10 +1,7 @@
 """Time of an image with its gradients against its error, for every setting of the rasterizer, on frozen scenes, with a chart.
 
-usage: python -m bench.studies.tradeoff_kernel --device cpu|cuda --out FILE.json [--run FOLDER] [--width 252] [--count 8000]
-       python -m bench.studies.tradeoff_kernel --plot --out FILE.json    (draws again, prints the table)
-
-RUN is a fit, for the trained scene. An interrupted run goes on where it stopped: scenes that FILE.json holds are not measured
-again. FILE.svg follows.
+RUN is a fit, for the trained scene. An interrupted run goes on where it stopped: scenes that --out holds are not measured
+again. A chart as SVG stands beside it.
 """
 
 from __future__ import annotations

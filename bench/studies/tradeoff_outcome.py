@@ -1,10 +1,6 @@
 """Time of whole fits against scores of held-out views, for every setting of a fit, with several seeds and a chart.
 
-usage: python -m bench.studies.tradeoff_outcome SCENE --split llff:3 --out FILE.json [--downscale 1] [--seeds 0 1 2]
-           [--threads N] [--only NAME ...]
-       python -m bench.studies.tradeoff_outcome SCENE --plot --out FILE.json    (draws again, prints the table)
-
-An interrupted run goes on where it stopped: what FILE.json holds is not measured again. FILE.svg follows.
+An interrupted run goes on where it stopped: what --out holds is not measured again. A chart as SVG stands beside it.
 """
 
 from __future__ import annotations
