@@ -96,6 +96,8 @@ def rivals_table(rows: list[dict], base: str) -> str:
             continue
         worst = min(worst, (d.mean, name))
         lines.append([name, d.count, ", ".join(names), f"{d.mean:+.2f}", f"[{d.low:+.2f}, {d.high:+.2f}]"])
+    if not lines:
+        return ""
     text = markdown(["row", "seeds", "best of the others", f"{base} - best [dB]", "95 % interval"], lines)
     kept = "within" if worst[0] >= -LIMIT else "beyond"
     return text + (f"\nWorst row: {worst[1]}, {worst[0]:+.2f} dB, {kept} the {LIMIT} dB that are allowed." if worst[1] else "")
@@ -139,4 +141,4 @@ def tables(rows: list[dict], base: str, fixed: str | None = None) -> str:
     """Return the tables, that of sizes where a preset is named for it, and a line for each fit that failed."""
     failed = [f"- failed: {r['row']}, `{r['preset']}`, seed {r['seed']}: {r['error']}" for r in rows if "error" in r]
     sizes = [] if fixed is None else [sizes_table(rows, fixed)]
-    return "\n\n".join([means_table(rows), rivals_table(rows, base), *sizes, "\n".join(failed)]).rstrip()
+    return "\n\n".join(filter(None, [means_table(rows), rivals_table(rows, base), *sizes, "\n".join(failed)]))
