@@ -2,22 +2,22 @@
 
 import json
 import math
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import pytest
 import torch
 
-from bench import document, harness, inputs, measured, peers, predict, result_file
-from bench.ops import OPS, Bench, run
-from bench.points import Point, growth, points
-from bench.series import exponent
+from bench.lib import accuracy_page, inputs, measured_page, ops, peers, performance_page, result_file, timing
+from bench.lib.ops import OPS, Bench, run
+from bench.lib.points import Point, exponent, growth, points
 from warpgs import rasterize
 from warpgs.kernels.ssim import ssim
 
 CPU = torch.device("cpu")
 
 
-def tiny(ops: tuple[str, ...]) -> dict:
+def tiny(names: tuple[str, ...]) -> dict:
     """A run over tiny sizes, as JSON, on a machine that is never too slow or busy: neither is what these tests are about.
 
     One thread: torch's spin where cores are shared, and that takes longer than the work.
@@ -25,8 +25,8 @@ def tiny(ops: tuple[str, ...]) -> dict:
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(predict, "LIMIT_MS", math.inf)
-        made = run(CPU, tiny=True, ops=ops, echo=lambda line: None)
+        patch.setattr(ops, "LIMIT_MS", math.inf)
+        made = run(CPU, tiny=True, ops=names, echo=lambda line: None)
     torch.set_num_threads(before)
     made["rows"] = [r | {"others_cores": 0.0} for r in made["rows"]]
     return json.loads(json.dumps(made))
@@ -57,7 +57,7 @@ def test_a_budget_of_nothing_skips_everything():
     """All tasks are listed with the reason, none is measured."""
     result = run(CPU, tiny=True, ops=("adam", "knn"), budget=0, echo=lambda line: None)
     assert not result["rows"] and {s["op"] for s in result["skipped"]} == {"adam", "knn"}
-    assert all("left of the time given" in s["reason"] for s in result["skipped"])
+    assert all("no time is left" in s["reason"] for s in result["skipped"])
 
 
 def test_a_second_run_measures_only_what_the_first_lacks_or_what_was_disturbed(result):
@@ -75,36 +75,6 @@ def test_a_second_run_measures_only_what_the_first_lacks_or_what_was_disturbed(r
 def row(count: int, milliseconds: float, **more) -> dict:
     """A measured row of one op."""
     return {"op": "adam", "program": "warpgs", "direction": "forward", "N": count, "median_ms": milliseconds, **more}
-
-
-def test_predictions_grow_linearly_at_least():
-    """Flat growth counts as linear, steeper growth goes on, and nothing is foretold for smaller sizes."""
-    task = ("adam", "warpgs", "forward")
-    flat, steep = [row(100, 1.0), row(1000, 1.1)], [row(100, 1.0), row(1000, 30.0)]
-    assert predict.time_ms(flat, *task, {"N": 10_000}) == pytest.approx(11.0)
-    assert predict.time_ms(steep, *task, {"N": 10_000}) == pytest.approx(900.0)
-    assert predict.time_ms(flat, *task, {"N": 50}) is None
-    assert predict.time_ms(flat, "knn", "warpgs", "forward", {"N": 10_000}) is None
-    assert predict.time_ms([row(1000, 1.0), row(1000, 9.0, threads=1)], *task, {"N": 2000}) == pytest.approx(2.0)
-
-
-def test_predictions_start_from_the_nearest_rows():
-    """Where Gaussians and pixels both grow, the row between counts, not the one before it, and the lower estimate holds."""
-    task, small, large = ("adam", "warpgs", "forward"), {"width": 10, "height": 10}, {"width": 10, "height": 100}
-    rows = [row(100, 1.0, **small), row(1000, 5.0, **small)]
-    assert predict.time_ms(rows, *task, {"N": 1000, **large}) == pytest.approx(50.0)
-    assert predict.time_ms([*rows, row(100, 2.0, **large)], *task, {"N": 1000, **large}) == pytest.approx(20.0)
-
-
-def test_hopeless_tasks_are_skipped():
-    """Too long, or too large for the free memory; anything else runs."""
-    task, point = ("adam", "warpgs", "forward"), Point(1_000_000)
-    sizes = point.sizes(("count",))
-    rows = [row(100_000, 150.0, peak_bytes=10_000_000)]
-    assert predict.reason_to_skip(rows, *task, point, sizes, free=1e12) is None
-    assert "a repeat" in predict.reason_to_skip([row(100_000, 250.0)], *task, point, sizes, free=1e12)
-    assert "GiB" in predict.reason_to_skip(rows, *task, point, sizes, free=5e7)
-    assert "GiB" in predict.reason_to_skip([], *task, point, sizes, free=5e7)
 
 
 def test_points_vary_one_axis_at_a_time_and_along_the_diagonal():
@@ -132,11 +102,19 @@ def test_disturbed_rows_are_known_and_give_way_to_faster_ones():
     assert [r["median_ms"] for r in bench.rows] == [2.1, 4.0, 3.0, 4.0] and not bench.open("adam", {"N": 100})
 
 
+def test_what_took_too_long_is_not_tried_at_larger_sizes():
+    """Nor is anything where two sizes cannot be compared left out."""
+    bench, module = Bench(CPU, 3, None, lambda line: None), SimpleNamespace(PROGRAMS={"warpgs": ("forward",)})
+    bench._stop("adam", "warpgs", "forward", {"N": 1000}, "took 3 s a repeat")
+    found = [bench._chosen("adam", module, Point(n), {"N": n}) for n in (100, 1000, 10_000)]
+    assert found == [{("warpgs", "forward")}, set(), set()] and len(bench.skipped) == 3
+
+
 def test_work_beyond_the_limit_is_left_after_the_warm_up(monkeypatch):
     """Two calls and no more."""
     calls = []
-    monkeypatch.setattr(harness, "_timed", lambda work, device: (calls.append(1) or 3000.0, None))
-    (row,) = harness.measure_in_turn([lambda: None], CPU, limit_ms=2000.0)
+    monkeypatch.setattr(timing, "_timed", lambda work, device: (calls.append(1) or 3000.0, None))
+    (row,) = timing.measure_in_turn([lambda: None], CPU, limit_ms=2000.0)
     assert row["warm_up_ms"] == 3000.0 and "median_ms" not in row and len(calls) == 2
 
 
@@ -195,8 +173,8 @@ def hand_made(device: str) -> dict:
 def test_the_document_says_what_the_results_say():
     """Tables, ratios, exponents, reasons; charts are well-formed; the same results give the same bytes."""
     results = {"b": hand_made("cuda"), "a": hand_made("cpu")}
-    files = document.generate(results)
-    assert files == document.generate(json.loads(json.dumps(dict(reversed(results.items())))))
+    files = performance_page.files(results)
+    assert files == performance_page.files(json.loads(json.dumps(dict(reversed(results.items())))))
     text = files["performance.md"]
     assert text.index("(a)\n") < text.index("(b)\n")
     assert all(f"| render | warpgs | both | {cell} |  | 1.00 |  |" in text for cell in ("100", "100 / 1"))
@@ -211,14 +189,16 @@ def test_the_document_says_what_the_results_say():
 
 def test_the_document_is_that_of_the_committed_results():
     """docs/performance.md and its charts are what `python -m bench.document` writes, and nothing else lies there."""
-    files = document.generate(document.committed())
+    files = performance_page.files(result_file.stored("ops"))
     docs = result_file.ROOT / "docs"
     for path, text in files.items():
         assert (docs / path).read_text("utf-8") == text, f"{path} is stale: run python -m bench.document"
     assert {f"plots/{p.name}" for p in (docs / "plots").glob("*.svg")} == set(files) - {"performance.md"}
 
 
-def test_the_page_of_measured_figures_is_that_of_the_committed_results():
-    """docs/measured.md is what `python -m bench.measured` writes."""
-    text = (result_file.ROOT / measured.PAGE).read_text("utf-8")
-    assert text == measured.page(), "stale: run python -m bench.measured"
+def test_the_other_pages_are_those_of_the_committed_results():
+    """docs/measured.md and the tables of docs/accuracy.md are what `python -m bench.document` writes."""
+    docs = result_file.ROOT / "docs"
+    assert (docs / "measured.md").read_text("utf-8") == measured_page.page(), "stale: run python -m bench.document"
+    page = (docs / "accuracy.md").read_text("utf-8")
+    assert accuracy_page.filled(page) == page, "stale: run python -m bench.document"

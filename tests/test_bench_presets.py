@@ -2,20 +2,22 @@
 
 import math
 import sys
-from pathlib import Path
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import pytest
+import torch
 
-from bench import many_views, one_fit, presets, result_file, sizes, turns
-from bench.gsplat_trainer import default_settings, strategy_of
-from bench.one_fit import Fit
-from bench.pool import finished
-from bench.preset_table import rival, tables
-from bench.rows import ROWS, Row, folds, left_out, row_of, scene_at
-from tests.test_bench_mcmc import first, gsplat  # noqa: F401
+from bench.lib import one_fit, pool, result_file
+from bench.lib.gsplat_trainer import default_settings, strategy_of
+from bench.lib.one_fit import Fit
+from bench.lib.pool import finished
+from bench.lib.preset_table import rival, sizes_table, tables
+from bench.lib.scenes import ROWS, Row, folds, left_out, row_of, scene_at
+from tests.test_bench_gsplat import gsplat  # noqa: F401
 from warpgs.errors import UsageError
 from warpgs.io.splits import split_views
+from warpgs.pipeline.train.config import PRESETS
 from warpgs.synthetic.demo import split_spec, write_demo
 
 
@@ -121,52 +123,57 @@ def test_tables_say_worst_seed_times_and_failures():
     assert "Worst row: a, -0.20 dB, beyond" in text and "- failed: b, `default`, seed 0: E: no" in text
 
 
-def test_a_stopped_comparison_goes_on(tmp_path, monkeypatch, demo, capsys):
-    """Finished rows are kept, failed ones are tried again, the longest of a seed comes first; another commit is refused."""
+@dataclass(frozen=True)
+class Task:
+    """A task as `measure_all` takes it."""
+
+    seed: int
+
+    @property
+    def key(self) -> dict:
+        """What tells its row from others."""
+        return {"seed": self.seed}
+
+
+def test_a_stopped_comparison_goes_on(tmp_path, monkeypatch, capsys):
+    """Finished rows are kept, failed ones are tried again, and other facts or another commit are refused."""
     calls = []
 
     def ran(work, tasks, *_):
-        calls.append([(t.preset, t.seed) for t in tasks])
-        figures = {k: v for k, v in results("r", "p", [20.0])[0].items() if k not in ("row", "preset", "seed", "left_out")}
-        return [(t, {"error": "E: no"} if len(calls) == 1 and t.seed else figures) for t in tasks]
+        calls.append([t.seed for t in tasks])
+        return [(t, {"error": "E: no"} if len(calls) == 1 and t.seed else {"psnr": 20.0}) for t in tasks]
 
-    monkeypatch.setattr(presets, "finished", ran)
-    words = [str(Path(demo).parent), "--rows", f"scene@{split_spec(8)}", "--presets", "quick:steps=2", "quick:steps=9"]
-    words += ["--seeds", "2", "--device", "cpu", "--base", "quick:steps=2", "--out", str(tmp_path / "p.json")]
-    assert presets.main(words) == 1 and presets.main(words) == 0
-    assert calls == [[("quick:steps=9", 0), ("quick:steps=2", 0), ("quick:steps=9", 1), ("quick:steps=2", 1)], calls[0][2:]]
-    assert presets.main(["--table", str(tmp_path / "p.json"), "--base", "quick:steps=2"]) == 0
-    stored = result_file.read(tmp_path / "p.json")
-    result_file.write(tmp_path / "p.json", stored | {"commit": "other"})
-    assert presets.main(words) == 2 and "choose another --out" in capsys.readouterr().err
+    monkeypatch.setattr(pool, "finished", ran)
+    out = tmp_path / "p.json"
+    a = SimpleNamespace(out=out, jobs=1, seconds=math.inf)
+    for _ in range(2):
+        rows = pool.measure_all(None, [Task(0), Task(1)], None, a, "w", torch.device("cpu"), lambda r: f"{r['psnr']:.1f}")
+    assert calls == [[0, 1], [1]] and [r["psnr"] for r in rows] == [20.0, 20.0]
+    assert "failed: E: no" in capsys.readouterr().out and pool.stored_rows(out) == rows
+    with pytest.raises(UsageError, match="steps None, now it is 8"):
+        pool.stored_rows(out, steps=8)
+    result_file.write(out, result_file.read(out) | {"commit": "other"})
+    with pytest.raises(UsageError, match="choose another --out"):
+        pool.stored_rows(out)
+
+
+def test_a_preset_changes_what_it_names_and_nothing_else():
+    """Values by name in the preset's settings; what sets nothing is refused."""
+    made = one_fit.config_of("quick:optimizer.scales_decay=0.5,init.source=flow,steps=7", 3).to_json()
+    base = PRESETS["quick"].to_json() | {"seed": 3}
+    base["optimizer"]["scales_decay"], base["init"]["source"], base["steps"] = 0.5, "flow", 7
+    assert made == base and one_fit.config_of("pruned/quick") == PRESETS["quick"]
+    for bad in ("slow", "quick:steps", "quick:optimizer.speed=1", "quick:steps.x=1", "quick:steps=0"):
+        with pytest.raises(UsageError):
+            one_fit.config_of(bad)
 
 
 def test_sizes_are_paired_with_the_fixed_fit():
     """Half the bytes at 0.04 dB less is within the limits; SSIM that is not measured is left out."""
-    kinds = sizes.kinds("default", "paper")
-    assert kinds["fixed, SH 0"] == "paper:init.max_sh_degree=0"
-    assert sizes.kinds("d", "paper:steps=2")["fixed, SH 0"] == "paper:steps=2,init.max_sh_degree=0"
     rows = []
     for row in ("a", "b"):
-        rows += results(row, "paper", [20.0, 21.0]) + results(row, kinds["default"], [19.96, 20.96], bytes=1000)
-        rows += results(row, kinds["pruned"], [19.9, 20.9], ssim=None)
-    text = sizes.table(rows, "default", "paper")
-    assert "- default: 0.50 of the bytes, -0.0400 dB [-0.0400, -0.0400], +0.0000 SSIM" in text
-    assert "- pruned: 1.00 of the bytes, -0.1000 dB [-0.1000, -0.1000] over 2 scenes; beyond limits" in text
-
-
-def test_checkouts_run_their_own_package_and_are_paired_by_round(tmp_path):
-    """The command on two cores with two threads; the ratio is of rounds, not of medians."""
-    words = turns.command("s", "llff:3", 2, "cpu", "--steps 5", tmp_path, "0,1")
-    assert words[:3] == ["taskset", "-c", "0,1"] and words[-2:] == ["--steps", "5"]
-    env = turns.environment(tmp_path, tmp_path / "c", "0,1")
-    assert env["PYTHONPATH"] == str(tmp_path) and env["OMP_NUM_THREADS"] == "2"
-    base = {"setup": 1.0, "training": 2.0, "steps": 4, "psnr": 20.0}
-    walls = {("old", 1): 10.0, ("new", 1): 5.0, ("old", 2): 4.0, ("new", 2): 3.0}
-    rows = [{"side": s, "round": n, "wall": w} | base for (s, n), w in walls.items()]
-    assert "new over old: 0.625 of the wall time, +0.00 dB (medians of 2 rounds)" in turns.summary(rows)
-
-
-def test_memory_of_a_process_is_its_own():
-    """A peak that a process with torch in it cannot stay below."""
-    assert many_views.peak_resident() > 50 * 2**20
+        rows += results(row, "paper", [20.0, 21.0]) + results(row, "small", [19.96, 20.96], bytes=1000)
+        rows += results(row, "pruned/paper", [19.9, 20.9], ssim=None)
+    text = sizes_table(rows, "paper")
+    assert "- small: 0.50 of the bytes, -0.0400 dB [-0.0400, -0.0400], +0.0000 SSIM" in text
+    assert "- pruned/paper: 1.00 of the bytes, -0.1000 dB [-0.1000, -0.1000] over 2 scenes; beyond limits" in text

@@ -2,22 +2,17 @@
 
 import sys
 from dataclasses import replace
-from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
 import warpgs
 from bench import __main__ as bench_main
-from bench import accuracy, many, needles, ranks, result_file, splat_transform, step, training
-from bench.inputs import camera as bench_camera
-from bench.inputs import gaussians, image
-from bench.naive import rasterize
+from bench.lib import columns, needles, result_file, training
+from bench.lib.inputs import camera as bench_camera
+from bench.lib.inputs import gaussians, image
+from bench.lib.naive import rasterize
 from tests.gaussians import camera, cloud
-from tests.scenes import photos, seeds
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.train.config import FitConfig
 from warpgs.scene import Gaussians
 
 CPU = torch.device("cpu")
@@ -28,7 +23,7 @@ def test_everything_that_can_be_run_is_listed(capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["bench", "--help"])
     assert bench_main.main() == 0
     text = capsys.readouterr().out
-    for name in ("ops", "against_gsplat", "fits", "mcmc", "shape", "determinism", "experiments.tradeoff"):
+    for name in ("document", "kernels.ops", "peers.mcmc", "fits.presets", "studies.order"):
         assert f"\n  {name} " in text
     assert all(line.endswith((".", ":")) or line[:2] != "  " for line in text.splitlines()), text
     monkeypatch.setattr(sys, "argv", ["bench", "nothing"])
@@ -61,20 +56,13 @@ def test_a_result_says_what_it_was_made_by(tmp_path, monkeypatch):
 def test_statistics_of_exchanged_files():
     """Those of the same Gaussians are equal, also after another quaternion of the same rotation; a moved column is named."""
     g = cloud(30, degree=1)
-    ours, axes = splat_transform.statistics(g), splat_transform.statistics(g, axes=True)
-    assert len(ours) == 23 and len(axes) == 28 and splat_transform.difference(ours, ours)["largest_of_range"] == 0
+    ours, axes = columns.statistics(g), columns.statistics(g, axes=True)
+    assert len(ours) == 23 and len(axes) == 28 and columns.difference(ours, ours)["largest_of_range"] == 0
     other = replace(g, quats=-2 * g.quats)
-    assert splat_transform.difference(axes, splat_transform.statistics(other, axes=True))["largest_of_range"] < 1e-6
-    moved = splat_transform.difference(ours, ours | {"y": [ours["y"][0] - 1, *ours["y"][1:]]})
+    assert columns.difference(axes, columns.statistics(other, axes=True))["largest_of_range"] < 1e-6
+    moved = columns.difference(ours, ours | {"y": [ours["y"][0] - 1, *ours["y"][1:]]})
     assert moved["column"] == "y min" and moved["same_columns"]
-    assert not splat_transform.difference(ours, {"x": ours["x"]})["same_columns"]
-
-
-def test_stages_of_a_step(device):
-    """Every stage has a positive time, the whole step among them."""
-    trainer = training.make_trainer(photos(2), seeds(), FitConfig(init=InitConfig(source="points")), device)
-    rows, instances = step.stages(trainer)
-    assert instances > 0 and len(rows) == 9 and all(row["median_ms"] > 0 for row in rows)
+    assert not columns.difference(ours, {"x": ours["x"]})["same_columns"]
 
 
 def test_steps_of_given_gaussians_train(device):
@@ -88,33 +76,6 @@ def test_steps_of_given_gaussians_train(device):
         losses.append(float(steps.buffers.history[0, 0]))
     assert losses[0] < 0.95 * losses[1]
     assert all(torch.equal(t, g.tensors()[n]) for n, t in steps.table.params.items() if n == "quats")
-
-
-def points(folder: Path) -> str:
-    """A file as `bench.garden` reads it, of 400 points."""
-    generator = np.random.default_rng(0)
-    path = folder / "points.npz"
-    K = np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]], np.float32)
-    viewmat = np.eye(4, dtype=np.float32)
-    viewmat[2, 3] = 3
-    np.savez(
-        path, means3d=generator.uniform(-1, 1, (400, 3)).astype(np.float32), colors=generator.integers(0, 255, (400, 3)),
-        viewmats=viewmat[None], Ks=K[None], width=64, height=48,
-    )  # fmt: skip
-    return str(path)
-
-
-@pytest.mark.cuda
-def test_many_gaussians_train(tmp_path):
-    """The program that trains ten million trains a few hundred too: the loss falls."""
-    result = many.train(points(tmp_path), 300, 64, 48, 120)
-    assert result["loss_last"] < result["loss_first"] and result["gaussians"] == 300
-
-
-def test_the_accuracy_page_is_that_of_the_committed_results():
-    """docs/accuracy.md is what `python -m bench.accuracy` writes."""
-    page = accuracy.PAGE.read_text("utf-8")
-    assert accuracy.filled(page) == page, "docs/accuracy.md is stale: run python -m bench.accuracy"
 
 
 def test_needles_err_less_in_the_factor_form(device):
@@ -135,14 +96,3 @@ def test_naive_kernels_equal_the_real_ones(device):
     # an alpha within a rounding of the cut may be drawn by one and not by the other
     for found, wanted in [(theirs.detach(), ours.detach()), *pairs]:
         assert float((found - wanted).norm()) <= 1e-4 * float(wanted.norm())
-
-
-def test_steps_of_several_views_are_measured(tmp_path, device):
-    """A row for one process; with one for two of another model, the result says so."""
-    out, path = tmp_path / "ranks.json", points(tmp_path)
-    words = ["garden", path, "--tiles", "1", "--width", "64", "--height", "48", "--batch", "3", "--steps", "3"]
-    assert ranks.main([*words, "--device", device.type, "--out", str(out)]) == 0
-    row = result_file.read(out)["rows"][0]
-    assert row["gaussians"] == 400 and row["step_ms"] > 0 and row["same_model"] and row["efficiency"] == 1
-    rows = ranks.keep(out, device, row | {"ranks": 2, "step_ms": row["step_ms"] / 2, "sha256": "another"})
-    assert [r["efficiency"] for r in rows] == [1, 1] and not any(r["same_model"] for r in rows)

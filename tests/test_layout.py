@@ -7,6 +7,8 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PRODUCT = sorted((ROOT / "warpgs").rglob("*.py"))
+BENCH = ROOT / "bench"
+BENCHES = sorted(p for name in ("kernels", "fits", "peers", "studies") for p in (BENCH / name).glob("*.py"))
 SHARED = {
     "__init__", "functions", "native", "compiler", "falloff",
     "project_backward", "ssim_cpu", "ssim_cuda", "blend_cpu", "blend_cpu_backward",
@@ -68,3 +70,35 @@ def test_nothing_can_run_foreign_code(path):
 def test_readers_know_no_torch(path):
     """A scene is numpy; torch begins in the pipeline."""
     assert not imports(path) & {"torch", "warp"}
+
+
+def bench_imports(path: Path) -> set[str]:
+    """Modules of the benches that a file imports, as `bench.lib.timing`."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {a.name for a in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found |= {f"{node.module}.{a.name}" for a in node.names}
+    return {name for name in found if name.split(".")[0] == "bench"}
+
+
+@pytest.mark.parametrize("path", BENCHES + sorted((BENCH / "lib").glob("*.py")), ids=lambda p: p.relative_to(BENCH).as_posix())
+def test_benches_share_only_what_stands_in_lib(path):
+    """A program imports no other program; what two of them share stands in `bench/lib`. Files are short as elsewhere."""
+    assert all(name.startswith("bench.lib") for name in bench_imports(path))
+    assert len(path.read_text("utf-8").splitlines()) <= 400
+
+
+def test_tests_import_only_the_lib_of_the_benches():
+    """Programs are free to change; `bench.__main__`, the list of them, is an exception."""
+    found = {name for p in (ROOT / "tests").rglob("*.py") for name in bench_imports(p)}
+    assert {n for n in found if not n.startswith("bench.lib")} <= {"bench.__main__"}
+
+
+def test_the_readme_of_the_benches_lists_every_program():
+    """A row for each file with a `main`, with its command."""
+    text = (BENCH / "README.md").read_text("utf-8")
+    for path in BENCHES:
+        if any(isinstance(n, ast.FunctionDef) and n.name == "main" for n in ast.parse(path.read_text("utf-8")).body):
+            assert f"| `{path.parent.name}.{path.stem}` |" in text, path

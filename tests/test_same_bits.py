@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from bench import result_file, same_bits
+from bench.lib import result_file, same_bits
 from warpgs import geometry
 from warpgs.io.poses import rigid
 from warpgs.pipeline.train.loss import depth_disagreement, photometric_loss
@@ -24,7 +24,7 @@ OTHER_MAKER = {"MKL_CBWR": "COMPATIBLE", "OPENBLAS_CORETYPE": "Zen", "OPENCV_IPP
 
 def run(out: Path, *flags: str, **environment: str) -> dict:
     """Return the row of a run on a tiny scene, in a process of its own."""
-    command = [sys.executable, "-m", "bench.same_bits", "--out", str(out), "--size", "64", "48", "--steps", "12", *flags]
+    command = [sys.executable, "-m", "bench.fits.same_bits", "--out", str(out), "--size", "64", "48", "--steps", "12", *flags]
     subprocess.run(command, cwd=ROOT, env=os.environ | environment, check=True, capture_output=True)
     return result_file.read(out)["rows"][-1]
 

@@ -2,8 +2,8 @@
 
 import torch
 
-from bench import roofline
-from bench.harness import OURS, Task
+from bench.lib import roofline
+from bench.lib.timing import OURS, Task
 from warpgs.kernels.dropout import opacity_dropout
 
 AXES = ("count",)

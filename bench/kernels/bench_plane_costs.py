@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bench.harness import OURS, Task
+from bench.lib.timing import OURS, Task
 from warpgs.kernels.plane_costs import plane_costs
 
 AXES = ("image",)

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from bench.harness import OURS, Task
+from bench.lib.timing import OURS, Task
 from warpgs.kernels.plane_depths import best_inverses
 
 AXES = ("image",)

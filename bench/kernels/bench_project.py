@@ -1,7 +1,7 @@
 """Time of projecting N Gaussians into cameras."""
 
-from bench import inputs, roofline
-from bench.harness import OURS, passes
+from bench.lib import inputs, roofline
+from bench.lib.timing import OURS, passes
 from warpgs.constants import RULES
 from warpgs.kernels.project import project
 

@@ -2,9 +2,9 @@
 
 import torch
 
-from bench import inputs, peers, roofline
-from bench.harness import OURS, Task
-from bench.pairs import instances_and_pairs
+from bench.lib import inputs, peers
+from bench.lib.pairs import image_costs
+from bench.lib.timing import OURS, Task
 from warpgs import rasterize
 
 AXES = ("count", "image", "degree", "cameras", "threads")
@@ -14,24 +14,12 @@ LARGEST = {peers.DENSE: 1_000}
 """Most Gaussians that a peer is given at all."""
 
 
-def costs(point, device) -> tuple[roofline.Cost, roofline.Cost]:
-    """Forward and backward of projection, tiles and blending together."""
-    instances, pairs = instances_and_pairs(point, device)
-    tiles_in_all = point.cameras * -(-point.width // 16) * -(-point.height // 16)
-    stages = (
-        roofline.project(point.count, point.cameras, point.degree),
-        roofline.blend(point.count, point.cameras, point.pixels, instances, pairs),
-    )
-    forward = stages[0][0] + roofline.tiles(point.count, point.cameras, instances, tiles_in_all) + stages[1][0]
-    return forward, stages[0][1] + stages[1][1]
-
-
 def tasks(point, device, wanted):
     gaussians = inputs.gaussians(point.count, device, point.degree)
     camera = inputs.camera(point.width, point.height, device, point.cameras)
     upstream = torch.rand(point.cameras, point.height, point.width, 3, device=device)
     tensors = list(gaussians.tensors().values())
-    forward_cost, backward_cost = costs(point, device)
+    forward_cost, backward_cost = image_costs(point, device)
     for program, draw in {OURS: lambda g, c: rasterize(g, c).rgb, **peers.RASTERIZERS}.items():
 
         def forward(draw=draw):

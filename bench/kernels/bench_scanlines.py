@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from bench import inputs, roofline
-from bench.harness import OURS, Task
+from bench.lib import inputs, roofline
+from bench.lib.timing import OURS, Task
 from warpgs.kernels.scanlines import scanline_costs
 from warpgs.priors.sweep_planes import UNIT, step_limits
 

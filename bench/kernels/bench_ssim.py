@@ -1,7 +1,7 @@
 """Time of structural similarity, beside plain torch convolutions."""
 
-from bench import inputs, peers, roofline
-from bench.harness import OURS, passes
+from bench.lib import inputs, peers, roofline
+from bench.lib.timing import OURS, passes
 from warpgs.kernels.ssim import ssim
 
 AXES = ("image",)

@@ -6,9 +6,9 @@ gsplat's rendering, the loss in plain torch, torch's fused Adam.
 
 import torch
 
-from bench import inputs, peers, roofline, training
-from bench.harness import OURS, Task
-from bench.kernels.bench_render import costs
+from bench.lib import inputs, peers, roofline, training
+from bench.lib.pairs import image_costs
+from bench.lib.timing import OURS, Task
 
 AXES = ("count", "image", "degree", "threads")
 PROGRAMS = {OURS: ("step",), peers.GSPLAT_STEP: ("step",)}
@@ -19,7 +19,7 @@ def cost(point, device) -> roofline.Cost:
     """All stages together; the loss beside SSIM is a few bytes a pixel and left out."""
     numbers = point.count * (11 + 3 * (point.degree + 1) ** 2)
     total = roofline.adam(numbers)
-    for stage in (*costs(point, device), *roofline.ssim(point.pixels)):
+    for stage in (*image_costs(point, device), *roofline.ssim(point.pixels)):
         total += stage
     return total
 

@@ -2,8 +2,8 @@
 
 import torch
 
-from bench import inputs, roofline
-from bench.harness import OURS, Task
+from bench.lib import inputs, roofline
+from bench.lib.timing import OURS, Task
 from warpgs.kernels.step_buffers import begin_step, end_step
 
 AXES = ("image",)

@@ -2,8 +2,8 @@
 
 import torch
 
-from bench import inputs
-from bench.harness import OURS, Task
+from bench.lib import inputs
+from bench.lib.timing import OURS, Task
 from warpgs.kernels.tsdf import empty_grid, integrate
 from warpgs.scene import Camera
 

@@ -1,4 +1,4 @@
-"""Measure every line of the error budget and keep the figures; `python -m bench.accuracy` puts them into docs/accuracy.md.
+"""Measure every line of the error budget and keep the figures; `python -m bench.document` puts them into docs/accuracy.md.
 
 usage: python -m tests.numerics.report [--device cuda] [--out bench/results/budget_cpu.json]
 """
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from bench import result_file
+from bench.lib import result_file
 from tests.numerics.budget import CASES, broken, measure, tile_size_of
 from tests.numerics.scenes import SCENES
 from tests.numerics.split import split

@@ -9,7 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from bench.determinism import atomic_spread, gradients_of, scene
+from bench.lib import inputs
+from bench.lib.atomic_sums import atomic_spread, gradients_of
 from tests.gaussians import camera, cloud
 from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.ssim import differences
@@ -119,7 +120,7 @@ def test_processes_agree():
 
 def test_the_bench_of_determinism(device):
     """It measures what it says: on a CPU both modes are one, so nothing spreads; on CUDA atomics do, by rounding only."""
-    spread = atomic_spread(*scene(600, 64, 48, device), repeats=4)
+    spread = atomic_spread(inputs.gaussians(600, device), inputs.camera(64, 48, device), repeats=4)
     assert set(spread) == {"means", "quats", "log_scales", "logit_opacities", "sh"}
     for row in spread.values():
         assert row["rel_l2"] <= (0.0 if device.type == "cpu" else 1e-4)

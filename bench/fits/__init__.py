@@ -1,0 +1,1 @@
+"""Whole fits: presets, objects, poses, files, farms, scales."""

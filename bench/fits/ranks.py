@@ -1,0 +1,178 @@
+"""Steps of several views on several GPUs: their time, the time in collectives, memory, and the SHA-256 of the model.
+
+CASE is horns or garden. horns: PATH is a scene folder, split every:8, fitted from 112,000 random points; the set of Gaussians
+changes in the first half of the steps. garden: PATH is test_garden.npz; 2.8 million Gaussians on its points, 1920 x 1080 px, 8
+views, no growth. Started by `torchrun --nproc-per-node N -m bench.fits.ranks`. The time of a step is that of the last third,
+each step waited for. A row is put into --out, in place of one of the same case, batch, steps and ranks; `same_model` says
+whether all rows of a case have one SHA-256 of parameters, moments and statistics. Time in collectives is that of the first
+rank, between events around them: it has in it the wait for slower ranks.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from bench.lib import result_file
+from bench.lib.arguments import parse
+from bench.lib.inputs import garden_inputs
+from bench.lib.same_bits import digest
+from bench.lib.training import Trainer, make_trainer, one_step, set_gaussians, state_tensors
+from warpgs import load_scene
+from warpgs.io.splits import split_views
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.runs.request import choose_device
+from warpgs.pipeline.train.config import PRESETS
+from warpgs.pipeline.train.loop import train_views
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.runtime.ranks import Ranks, join
+from warpgs.scene import Camera, PointCloud, View
+
+WHAT = "steps of several views on several GPUs: time, time in collectives, memory, and the SHA-256 of the model"
+POINTS = 112_000
+"""Random points at the start of horns, as many as a fit of it has Gaussians."""
+
+
+def horns(folder: str, batch: int, steps: int, device: torch.device, ranks: Ranks) -> Trainer:
+    """Return a trainer of a scene folder, whose set of Gaussians changes three times."""
+    scene = load_scene(folder)
+    config = dataclasses.replace(
+        PRESETS["3dgs"], steps=steps, batch=batch, init=InitConfig(source="random", random_count=POINTS), sh_every=1,
+        density=DensityConfig(start=1, every=max(1, steps // 6), stop_fraction=0.5, gradient=1e-4, reset_every=10**9),
+    )  # fmt: skip
+    train = train_views(scene, split_views(scene, "every:8").train)
+    return make_trainer(train, None, config, device, scene.background, ranks)
+
+
+def garden(
+    path: str, batch: int, steps: int, device: torch.device, ranks: Ranks, *, tiles=5, width=1920, height=1080
+) -> Trainer:
+    """Return a trainer of Gaussians on photographed points, whose targets are renders of the same with other colours."""
+    gaussians, cameras = garden_inputs(path, tiles=tiles, width=width, height=height, device=device)
+    other = dataclasses.replace(gaussians, sh=gaussians.sh.detach().flip(0))
+    views = []
+    for i in range(8):
+        k = i % len(cameras.viewmat)
+        viewmat = cameras.viewmat[k].clone()
+        viewmat[0, 3] += 0.05 * (i // len(cameras.viewmat))
+        camera = Camera(viewmat, cameras.K[k], width, height)
+        with torch.no_grad():
+            image = rasterize(other, camera, RasterizeOptions()).rgb.clamp(0, 1).cpu().numpy()
+        arrays = (t.cpu().numpy().astype(np.float64) for t in (viewmat, camera.K))
+        views.append(View(f"{i}", Camera(*arrays, width, height), image))
+    config = dataclasses.replace(
+        PRESETS["3dgs"], steps=steps, batch=batch, max_gaussians=10**8, sh_every=1, density=DensityConfig(start=10**9),
+        init=InitConfig(source="points"),
+    )  # fmt: skip
+    means = gaussians.means.detach()[:1000].cpu().numpy().astype(np.float64)
+    trainer = make_trainer(views, PointCloud(means, np.full((len(means), 3), 0.5, np.float32)), config, device, ranks=ranks)
+    set_gaussians(trainer, gaussians)
+    return trainer
+
+
+class Clock:
+    """Time between points of the device's work [ms], read once it is done."""
+
+    def __init__(self, device: torch.device):
+        self.device, self.marks = device, []
+
+    def mark(self) -> None:
+        """Mark this point."""
+        if self.device.type != "cuda":
+            self.marks.append(time.perf_counter())
+            return
+        event = torch.cuda.Event(enable_timing=True)
+        event.record()
+        self.marks.append(event)
+
+    def total(self) -> float:
+        """Return the time between pairs of marks, summed [ms], and begin anew."""
+        pairs, self.marks = list(zip(self.marks[::2], self.marks[1::2])), []
+        if self.device.type == "cuda":
+            return sum(a.elapsed_time(b) for a, b in pairs)
+        return 1000 * sum(b - a for a, b in pairs)
+
+
+def clocked(ranks: Ranks, clock: Clock) -> None:
+    """Have a clock time every exchange."""
+    for name in ("to_each", "gather"):
+        honest = getattr(ranks, name)
+
+        def timed(*arguments, honest=honest):
+            clock.mark()
+            found = honest(*arguments)
+            clock.mark()
+            return found
+
+        setattr(ranks, name, timed)
+
+
+def measured(trainer: Trainer, ranks: Ranks, steps: int) -> dict:
+    """Take the steps; return the figures of a row."""
+    device, clock, times, exchanges = trainer.device, Clock(trainer.device), [], []
+    if ranks.count > 1:
+        clocked(ranks, clock)
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    for number in range(steps):
+        began = time.perf_counter()
+        one_step(trainer)
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        spent = 1000 * (time.perf_counter() - began)
+        exchanged = clock.total()
+        if number >= steps - max(1, steps // 3):
+            times.append(spent)
+            exchanges.append(exchanged)
+    row = {"gaussians": len(trainer.table), "step_ms": round(statistics.median(times), 3), "timed_steps": len(times)}
+    row |= {"least_step_ms": round(min(times), 3), "collectives_ms": round(statistics.median(exchanges), 3)}
+    if device.type == "cuda":
+        row["peak_torch_bytes"] = torch.cuda.max_memory_allocated(device)
+    return row | {"sha256": digest(*state_tensors(trainer))}
+
+
+def keep(path: Path | None, device: torch.device, row: dict) -> list[dict]:
+    """Put a row into a result, and return all rows with what follows from several."""
+    rows = result_file.read(path)["rows"] if path is not None and path.is_file() else []
+    key = ("case", "batch", "ranks", "steps")
+    rows = [r for r in rows if [r[k] for k in key] != [row[k] for k in key]] + [row]
+    rows.sort(key=lambda r: [r[k] for k in key])
+    for r in rows:
+        same = [o for o in rows if all(o[k] == r[k] for k in ("case", "batch", "steps"))]
+        one = next((o["step_ms"] for o in same if o["ranks"] == 1), None)
+        r["efficiency"] = None if one is None else round(one / r["step_ms"] / r["ranks"], 3)
+        r["same_model"] = len({o["sha256"] for o in same}) == 1
+    if path is not None:
+        result_file.keep(path, WHAT, device, rows)
+    return rows
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure one case on the ranks that there are; return 1 where rows of a case are of different models."""
+    a = parse(
+        __doc__, arguments, {"case": ("horns", "garden"), "path": str}, batch=8, steps=60, tiles=5, width=1920, height=1080,
+        device="auto", out=Path,
+    )  # fmt: skip
+    ranks = join(a.device)
+    device, size = choose_device(a.device)[0], {"tiles": a.tiles, "width": a.width, "height": a.height}
+    made = {"horns": horns, "garden": lambda *of: garden(*of, **size)}[a.case](a.path, a.batch, a.steps, device, ranks)
+    row = {"case": a.case, "batch": a.batch, "ranks": ranks.count, "backend": ranks.backend, "steps": a.steps}
+    row |= measured(made, ranks, a.steps)
+    ranks.part()
+    good = True
+    if ranks.first:
+        rows = keep(a.out, device, row)
+        good = all(r["same_model"] for r in rows)
+        print(next(r for r in rows if all(r[k] == v for k, v in row.items())), flush=True)
+    ranks.leave()
+    return int(not good)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,29 @@
+"""Time of all ops, of the whole image and of a training step over sizes, beside peers and a roofline of the machine.
+
+Points are measured from the lightest to the heaviest, all ops at each, so that what a time budget [s] cuts off is the far end
+of every series; it is skipped and listed. ``--again`` measures only what --out lacks, or what other programs disturbed.
+``--tiny``: sizes that only show that it runs. `python -m bench.document` turns the results into docs/performance.md.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from bench.lib import result_file
+from bench.lib.arguments import parse
+from bench.lib.ops import OPS, run
+
+
+def main() -> None:
+    """Parse, measure, write."""
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    a = parse(__doc__, device=device, tiny=False, out=Path, op=list(OPS), budget=float, note="", again=False)
+    earlier = result_file.read(a.out) if a.again and a.out and a.out.exists() else None
+    made = run(torch.device(a.device), tiny=a.tiny, ops=tuple(a.op), budget=a.budget, note=a.note, earlier=earlier)
+    result_file.write(a.out, made)
+
+
+if __name__ == "__main__":
+    main()

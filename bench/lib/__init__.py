@@ -1,0 +1,1 @@
+"""What several programs share: inputs, timing, fits, results, tables, pages, command lines."""

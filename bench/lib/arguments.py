@@ -1,0 +1,68 @@
+"""Command lines of the programs: places and flags from their defaults, with the same words for the same flag everywhere."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+WORDS = {
+    "device": "cpu, cuda or auto",
+    "downscale": "factor by which both sides of images shrink",
+    "first_seed": "so that several processes can share the work",
+    "jobs": "fits at a time; times mean something with 1 alone",
+    "only": "a configuration's name, or its beginning",
+    "out": "JSON file to write; finished rows are kept where the program says so",
+    "presets": "presets, also with settings: default:steps=500,optimizer.scales_lr=0.1",
+    "rows": "named rows, or FOLDER@SPLIT@DOWNSCALE",
+    "seconds": "after this long no further fit is begun",
+    "seeds": "number of seeds, or the seeds themselves where the default is a list",
+    "split": "as in `warpgs fit --split`",
+    "threads": "CPU threads; 0 for as many as there are",
+    "work": "folder that keeps scenes and fits; a temporary one where not given",
+}
+"""Help of flags that several programs have."""
+
+
+class _Help(argparse.RawDescriptionHelpFormatter, argparse.ArgumentDefaultsHelpFormatter):
+    """The docstring as it stands, and the default behind each flag."""
+
+
+def parse(
+    doc: str, given: list[str] | None = None, places: dict | None = None, need: tuple[str, ...] = (), **flags
+) -> argparse.Namespace:
+    """Return what a command line gives.
+
+    Args:
+        doc: Docstring of the program.
+        given: Words of the command line; None for those of this process.
+        places: Positional words by name, with their type; a list of one type for one or more words, a tuple for one of these
+            words. A name that ends in ``?`` may be left out.
+        need: Flags that must be given.
+        **flags: Default of each flag by name. A type takes one word and is None where not given; False makes a switch; a
+            list takes several words, a list of one type is empty where not given.
+    """
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    program = f"python -m {spec.name}" if spec else None
+    parser = argparse.ArgumentParser(program, description=doc, formatter_class=_Help)
+    for name, kind in (places or {}).items():
+        many = {"nargs": "+"} if isinstance(kind, list) else {"nargs": "?"} if name.endswith("?") else {}
+        kind = kind[0] if isinstance(kind, list) else kind
+        parser.add_argument(name.rstrip("?"), **({"choices": kind} if isinstance(kind, tuple) else {"type": kind}), **many)
+    for name, default in flags.items():
+        how: dict = {"help": WORDS.get(name, " "), "dest": name, "required": name in need}
+        if default is False:
+            how["action"] = "store_true"
+        elif isinstance(default, list):
+            several = [] if isinstance(default[0], type) else default
+            how |= {"nargs": "+", "default": several, "type": default[0] if not several else type(default[0])}
+        elif isinstance(default, type):
+            how["type"] = default
+        else:
+            how |= {"default": default, "type": type(default)}
+        parser.add_argument(f"--{name.replace('_', '-')}", **how)
+    return parser.parse_args(given)
+
+
+SCENE = {"scene": Path}
+"""The place of most programs: one scene folder."""

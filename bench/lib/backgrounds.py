@@ -1,0 +1,49 @@
+"""Images with true alpha before other backgrounds, and what Gaussians that know no background score before each."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+import warpgs
+from warpgs.pipeline.metrics.evaluate import to_8_bit
+from warpgs.pipeline.metrics.psnr import psnr
+from warpgs.scene import Gaussians, View
+
+SQUARE = 12
+"""Side of a square of the pattern [px]."""
+PATTERN = ((0.9, 0.75, 0.2), (0.15, 0.3, 0.6))
+"""Colours of the pattern's squares."""
+
+
+def backgrounds(height: int, width: int) -> dict[str, np.ndarray]:
+    """Return the images to put an object before by name, colours in [0, 1], float32, shape [H, W, 3] each."""
+    odd = (np.indices((height, width)) // SQUARE).sum(0) % 2 == 1
+    pattern = np.where(odd[..., None], *(np.array(c, np.float32) for c in PATTERN))
+    plain = {name: np.full((height, width, 3), value, np.float32) for name, value in (("black", 0), ("white", 1))}
+    return plain | {"pattern": pattern.astype(np.float32)}
+
+
+def over(view: View, behind: np.ndarray, ours: tuple[float, float, float]) -> np.ndarray:
+    """Return a view's image [H, W, 3] before another background [H, W, 3] or [3] than its own."""
+    shown: np.ndarray = view.image + (1 - view.alpha[..., None]) * (behind - np.float32(ours))
+    return np.clip(shown, 0, 1)
+
+
+@torch.no_grad()
+def ply_scores(gaussians: Gaussians, views: list[View], own: tuple[float, float, float]) -> dict[str, float]:
+    """Return the mean PSNR [dB] of Gaussians that know no background, as any viewer renders them, before each background.
+
+    Args:
+        gaussians: Those of a PLY file, in scene units [u].
+        views: Views with their true alpha.
+        own: Background that the views' images stand over.
+    """
+    found: dict[str, list[float]] = {}
+    for view in views:
+        r = warpgs.rasterize(gaussians, view.camera)  # over black
+        image, alpha = r.rgb.cpu().numpy(), r.alpha.cpu().numpy()[..., None]
+        for name, behind in backgrounds(*alpha.shape[:2]).items():
+            pair = (to_8_bit(image + (1 - alpha) * behind), to_8_bit(over(view, behind, own)))
+            found.setdefault(f"ply_{name}", []).append(psnr(*pair))
+    return {name: float(np.mean(values)) for name, values in found.items()}

@@ -1,0 +1,49 @@
+"""Statistics of the columns of Gaussians as files hold them, and how far two of them differ."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from warpgs.export.arrays import C0, arrays_of, unit_quats
+from warpgs.geometry import rotation_matrices
+from warpgs.scene import Gaussians
+
+STATISTICS = ("min", "max", "mean", "stdDev")
+
+
+def statistics(gaussians: Gaussians, axes: bool = False) -> dict[str, list[float]]:
+    """Return least, largest, mean and standard deviation of each column, as splat-transform names and states them.
+
+    It takes them of the columns of PLY, and states those of scales, opacities and colours as lengths, opacities and colours.
+
+    Args:
+        gaussians: N Gaussians.
+        axes: Whether rotations are stated as the sizes of the entries of their matrices instead of as they are: several
+            quaternions stand for the same Gaussian.
+    """
+    a = {name: array.astype(np.float64) for name, array in arrays_of(gaussians).items()}
+    quats = np.abs(rotation_matrices(unit_quats(a["quats"]))).reshape(-1, 9) if axes else a["quats"]
+    rest = a["sh"][:, 1:].transpose(0, 2, 1).reshape(len(gaussians), -1)
+    groups = (
+        ("xyz", a["means"], lambda v: v), ("rot_", quats, lambda v: v), ("scale_", a["log_scales"], np.exp),
+        ("opacity", a["logit_opacities"][:, None], lambda v: 1 / (1 + np.exp(-v))),
+        ("f_dc_", a["sh"][:, 0], lambda v: 0.5 + C0 * v), ("f_rest_", rest, lambda v: v),
+    )  # fmt: skip
+    out = {}
+    for name, table, stated in groups:
+        for i, column in enumerate(table.T):
+            key = name if name == "opacity" else "xyz"[i] if name == "xyz" else f"{name}{i}"
+            out[key] = [float(stated(f(column))) for f in (np.min, np.max, np.mean, np.std)]
+    return out
+
+
+def difference(ours: dict[str, list[float]], theirs: dict[str, list[float]]) -> dict:
+    """Return the largest difference of two statistics in parts of the range of its column, and where it is."""
+    worst = {"largest_of_range": 0.0, "column": "", "columns": len(ours), "same_columns": set(ours) <= set(theirs)}
+    for name in (n for n in ours if n in theirs):
+        low, high = ours[name][:2]
+        for which, a, b in zip(STATISTICS, ours[name], theirs[name]):
+            found = abs(a - b) / (high - low if high > low else max(abs(low), 1e-30))
+            if found > worst["largest_of_range"]:
+                worst |= {"largest_of_range": found, "column": f"{name} {which}"}
+    return worst

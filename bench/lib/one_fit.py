@@ -1,0 +1,193 @@
+"""Fits and what is kept of them: ours through the public call or bare, and gsplat's."""
+
+from __future__ import annotations
+
+import gc
+import json
+import statistics
+import tempfile
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import warpgs
+from bench.lib import gsplat_trainer
+from bench.lib.scenes import folds, scene_at
+from bench.lib.training import compile_kernels, finish, full_bytes, make_trainer, model_bytes
+from warpgs.errors import UsageError
+from warpgs.io.splits import split_views
+from warpgs.pipeline.metrics.evaluate import render_view, score
+from warpgs.pipeline.runs.prune import prune
+from warpgs.pipeline.runs.request import SceneRequest
+from warpgs.pipeline.runs.results import options_for
+from warpgs.pipeline.train.config import PRESETS, FitConfig, preset_config
+from warpgs.scene import Scene, View
+
+PEER, PEER_POINTS = "gsplat", "gsplat-points"
+PEERS = (PEER, PEER_POINTS)
+"""gsplat's default strategy from the points of our default's start, and from the points of the reconstruction."""
+PRUNED = "pruned/"
+"""Before a preset: the model is pruned after its fit by `KEEP_PSNR`."""
+KEEP_PSNR = 0.1
+"""Loss of training PSNR that pruning may cost [dB]."""
+PEER_STEPS = 7000
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One fit to run."""
+
+    row: str
+    """Name of the row."""
+    preset: str
+    """``default``, a preset, ``PRESET:GROUP.KEY=VALUE,...``, one of `PEERS`, or any of ours after ``pruned/``."""
+    seed: int
+    folder: str
+    split: str
+    left_out: str
+    """Training views that are scored instead of the held-out ones, with commas; empty for none."""
+    downscale: int
+    device: str
+    peer_steps: int = PEER_STEPS
+    """Steps of gsplat."""
+
+    @property
+    def key(self) -> dict:
+        """What tells one result from another."""
+        return {k: getattr(self, k) for k in ("row", "preset", "seed", "left_out", "downscale")}
+
+
+def config_of(preset: str, seed: int = 0) -> FitConfig:
+    """Return the settings of one of our presets with a seed; ``default`` is that of a user who names none.
+
+    ``PRESET:a.b=value,c=value`` changes what it names; values are JSON, a bare word is a word.
+
+    Raises:
+        UsageError: The preset or a setting is unknown, or a value is out of range.
+    """
+    name, _, changes = preset.removeprefix(PRUNED).partition(":")
+    name = preset_config(None).preset if name == "default" else name
+    if name not in PRESETS:
+        raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
+    values = PRESETS[name].to_json() | {"seed": seed}
+    for change in filter(None, changes.split(",")):
+        key, sep, value = change.partition("=")
+        *groups, last = key.split(".")
+        place = values
+        for group in groups:
+            place = place.get(group) if isinstance(place, dict) else None
+        if not sep or not isinstance(place, dict) or last not in place:
+            raise UsageError(f"{preset!r}: {change!r} sets nothing; write GROUP.NAME=VALUE as in optimizer.scales_lr=0.1")
+        try:
+            place[last] = json.loads(value)
+        except json.JSONDecodeError:
+            place[last] = value
+    return FitConfig.from_json(values)
+
+
+def compile_all(presets: tuple[str, ...], device: str) -> None:
+    """Compile what fits of these presets use, gsplat's own kernels too."""
+    for preset in presets:
+        if preset in PEERS:
+            gsplat_trainer.compile_kernels(torch.device(device))
+        else:
+            compile_kernels(config_of(preset), torch.device(device))
+
+
+def plan(
+    row: str, preset: str, seed: int, folder: str, place: tuple[str, int], count: int, device: str, peer_steps: int = PEER_STEPS
+) -> list[Fit]:  # fmt: skip
+    """Return the fits of a row, a preset and a seed: one, or one for each set of training views that is left out.
+
+    Args:
+        row: Name of the row.
+        preset: As in `Fit`.
+        seed: Seed of the fit.
+        folder: Folder of the scene.
+        place: Split and downscale.
+        count: Training views to leave out, 0 for none.
+        device: cpu or cuda.
+        peer_steps: Steps of gsplat.
+    """
+    split, downscale = place
+    cut = folds(scene_at(folder, downscale), split, count)
+    return [Fit(row, preset, seed, folder, part, names, downscale, device, peer_steps) for part, names in cut]
+
+
+def measure(fit: Fit) -> dict:
+    """Fit, score, and return what is kept: scores, sizes, times, steps, and why the fit ended."""
+    scene = scene_at(fit.folder, fit.downscale)
+    try:
+        if fit.preset in PEERS:
+            return peer_figures(fit, scene)
+        config = config_of(fit.preset, fit.seed)
+        if fit.preset.startswith(PRUNED):
+            return pruned_figures(fit, config)
+        fitted = warpgs.fit(scene, config, split=fit.split, device=fit.device, verbose=False)
+        return figures_of(fitted.metrics) | {"threads": torch.get_num_threads()}
+    finally:
+        gc.collect()  # a fit and its recorded steps refer to each other: without this their device memory piles up
+
+
+def figures_of(m: dict) -> dict:
+    """Return what is kept of a fit's metrics; ``ended`` and ``shape`` where they tell it."""
+    row = {"psnr": m["test"]["psnr"], "ssim": m["test"]["ssim"], "region": m["views"][0]["region"]}
+    row |= {"gaussians": m["gaussians"], "bytes": m["complexity"]["bytes"], "steps": m["steps"], "resolved": m["preset"]}
+    row |= {k: m["seconds"][k] for k in ("setup", "training")}
+    row |= {"ended": m.get("ended"), "why": m["complexity"]["why"], "config_hash": m["config_hash"]}
+    return row | {k: m[k] for k in ("shape", "peak_torch_bytes") if k in m}
+
+
+def pruned_figures(fit: Fit, config: FitConfig) -> dict:
+    """Return the figures of one of our fits after its model was pruned; SSIM is not measured."""
+    with tempfile.TemporaryDirectory() as place:
+        run, out = Path(place, "run"), Path(place, "pruned")
+        request = SceneRequest(fit.folder, fit.split, fit.downscale)
+        row = figures_of(warpgs.fit(request, config, out=run, device=fit.device, verbose=False).metrics)
+        prune(run, KEEP_PSNR, out, fit.device)
+        told = json.loads((out / "config.json").read_text("utf-8"))["pruned"]
+    return row | {"psnr": told["test_psnr"][1], "ssim": None, "bytes": told["bytes"][1], "gaussians": told["count"][1]}
+
+
+def peer_figures(fit: Fit, scene: Scene) -> dict:
+    """Train gsplat with its default strategy on the same views, in the units of its own parser, and score it as ours."""
+    split, began = split_views(scene, fit.split), time.perf_counter()
+    train, test = ([scene.view(name) for name in names] for names in (split.train, split.test))
+    first = start_of(fit, scene, train)
+    setup = time.perf_counter() - began
+    settings = gsplat_trainer.default_settings(fit.peer_steps)
+    params, row = gsplat_trainer.fit(scene, train, first, settings, seed=fit.seed)
+    row |= {"setup": setup, "training": row.pop("seconds"), "bytes": full_bytes(row["gaussians"])}
+    scored = scores((gsplat_trainer.image_of(params, view, row["unit"]) for view in test), test)
+    return {k: v for k, v in scored.items() if k != "views"} | row | {"steps": fit.peer_steps, "ended": "steps"}
+
+
+def start_of(fit: Fit, scene: Scene, train: list[View]) -> warpgs.Gaussians:
+    """Return the first Gaussians of our default with this seed, or those on the reconstruction's points."""
+    config = config_of("3dgs:init.source=points" if fit.preset == PEER_POINTS else "default", fit.seed)
+    return make_trainer(train, scene.points, config, torch.device(fit.device), scene.background).gaussians
+
+
+def scores(images: Iterable[np.ndarray], views: list[View]) -> dict:
+    """Return mean PSNR [dB] and SSIM of images against their views, and the PSNR of each."""
+    rows = [score(view, image) for view, image in zip(views, images, strict=True)]
+    by_view = {row.name: row.psnr for row in rows}
+    return {"psnr": statistics.mean(by_view.values()), "ssim": statistics.mean(r.ssim for r in rows), "views": by_view}
+
+
+def bare_fit(scene: Scene, train: list[View], test: list[View], config: FitConfig, device: torch.device) -> dict:
+    """Return wall and processor time [s] of one of our fits, without reading and reporting, its size and its scores."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    trainer = make_trainer(train, scene.points, config, device, scene.background)
+    points, setup, setup_cpu = len(trainer.gaussians), time.perf_counter() - wall, time.process_time() - cpu
+    finish(trainer)
+    row = {
+        "points": points, "seconds": time.perf_counter() - wall, "setup": setup, "cpu_seconds": time.process_time() - cpu,
+        "setup_cpu": setup_cpu, "gaussians": len(trainer.gaussians), "bytes": model_bytes(trainer), "steps": config.steps,
+    }  # fmt: skip
+    options = options_for(config.rule, scene.background, trainer.gaussians)
+    return row | scores((render_view(trainer.gaussians, v, options)[0] for v in test), test)

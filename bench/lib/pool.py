@@ -1,0 +1,92 @@
+"""Fits in worker processes: several at a time on one device, none begun after a time limit, failures as results."""
+
+from __future__ import annotations
+
+import multiprocessing
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+
+import torch
+
+from bench.lib import result_file
+from warpgs.errors import UsageError
+
+Work = Callable[[object], dict]
+Line = Callable[[dict], str]
+
+
+def finished(
+    work: Work, tasks: Sequence, jobs: int, seconds: float, first: Callable[[], object] | None = None
+) -> Iterator[tuple[object, dict]]:
+    """Yield each task with what ``work`` returned for it, as they finish; ``{"error": ...}`` where it raised or died.
+
+    Args:
+        work: Function of a module, called in a worker process.
+        tasks: Its arguments, the longest first.
+        jobs: Tasks at a time.
+        seconds: After this long no further task is begun [s].
+        first: Function of a module, called in one worker before any task begins: compiles kernels once for all.
+    """
+    began, waiting = time.monotonic(), deque(tasks)
+    while waiting and time.monotonic() - began < seconds:
+        with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+            running: dict[Future, object] = {}
+            broken = first is not None and isinstance(pool.submit(first).exception(), BrokenProcessPool)
+            first = None
+            while not broken:
+                while waiting and len(running) < jobs and time.monotonic() - began < seconds:
+                    task = waiting.popleft()
+                    running[pool.submit(work, task)] = task
+                if not running:
+                    break
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    error, task = future.exception(), running.pop(future)
+                    broken |= isinstance(error, BrokenProcessPool)  # a worker died and took all others along
+                    yield task, {"error": f"{type(error).__name__}: {error}"} if error else future.result()
+            for future, task in running.items():
+                yield task, {"error": f"{type(future.exception()).__name__}: {future.exception()}"}
+
+
+def stored_rows(path: Path | None, **facts) -> list[dict]:
+    """Return the finished rows of a file, none where there is no file; those that failed are left out.
+
+    Raises:
+        UsageError: They were measured at another commit, or with other facts than these.
+    """
+    if path is None or not path.is_file():
+        return []
+    stored = result_file.read(path)
+    for name, now in ({"commit": result_file.commit_of()} | facts).items():
+        if stored.get(name) != now:
+            raise UsageError(f"{path} was measured with {name} {stored.get(name)}, now it is {now}; choose another --out")
+    return [row for row in stored["rows"] if "error" not in row]
+
+
+def measure_all(work: Work, tasks: Sequence, first, a, what: str, device: torch.device, line: Line) -> list[dict]:
+    """Run the tasks that a file lacks, write it after each, and return all rows.
+
+    Args:
+        work: As in `finished`.
+        tasks: Tasks, each with a ``key`` that tells its row from others.
+        first: As in `finished`.
+        a: Arguments of the program: ``out``, ``jobs`` and ``seconds``.
+        what: What a row measures.
+        device: Where it is measured.
+        line: Returns a row in words.
+    """
+    rows, done = stored_rows(a.out), 0
+    todo = [t for t in tasks if not any(t.key.items() <= row.items() for row in rows)]
+    for task, figures in finished(work, todo, a.jobs, a.seconds, first):
+        rows.append(task.key | {"jobs": a.jobs} | figures)
+        done += 1
+        failed = f"failed: {figures.get('error')}"
+        print(f"{done}/{len(todo)}", *task.key.values(), line(rows[-1]) if "error" not in figures else failed, flush=True)
+        result_file.keep(a.out, what, device, rows)
+    if done < len(todo):
+        left = len(todo) - done
+        print(f"{left} fits were not begun: --seconds {a.seconds:g} had passed; give the command again for the rest")
+    return rows

@@ -1,0 +1,29 @@
+"""PSNR of Gaussians of files at the held-out views of a run, beside that of the run's own model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from warpgs.coordinates import convert_gaussians
+from warpgs.pipeline.runs.commands import scene_of
+from warpgs.pipeline.runs.folder import StoredRun, open_run
+from warpgs.pipeline.runs.results import evaluate_run
+from warpgs.scene import Gaussians
+
+
+class Scorer:
+    """The held-out views of a run, and the PSNR of its own model on them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.run: StoredRun = open_run(folder, "cpu")
+        _, train, test = scene_of(self.run)
+        self.views = (train, test)
+        self.own = self._psnr(self.run.gaussians())
+
+    def _psnr(self, gaussians: Gaussians) -> float:
+        metrics = evaluate_run(None, gaussians, *self.views, self.run.rule, self.run.background)
+        return float(metrics["test"]["psnr"])
+
+    def loss(self, gaussians: Gaussians) -> float:
+        """Return by how much the PSNR of Gaussians in file units is lower than that of the run's own model [dB]."""
+        return self.own - self._psnr(convert_gaussians(gaussians, self.run.normalization, "file", "scene"))

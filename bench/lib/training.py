@@ -1,0 +1,162 @@
+"""The trainer as benches use it: no other module of the benches knows how a fit is set up and stepped."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import torch
+
+from warpgs.pipeline.model.parameter_bounds import model_bytes as bytes_of
+from warpgs.pipeline.model.table import DensityUpdate, Table
+from warpgs.pipeline.train.complexity import complexity_figures
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loop import run
+from warpgs.pipeline.train.loss import LossConfig, built_in_terms
+from warpgs.pipeline.train.schedule import OptimizerConfig
+from warpgs.pipeline.train.step import MAX_STEPS, Learned, StepBuffers, StepGraphs, StepPlan, eager_renderer, step
+from warpgs.pipeline.train.strategies.base import Strategy
+from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.train.views import ViewStack
+from warpgs.pipeline.train.warmup import warm_up
+from warpgs.runtime.ranks import ALONE
+from warpgs.scene import Camera, Gaussians, PointCloud, View
+
+BLACK = (0.0, 0.0, 0.0)
+KIND = "image"
+"""Name of the only kind of view of `Steps`."""
+
+
+def make_trainer(
+    views: list[View], points: PointCloud | None, config: FitConfig, device: torch.device, background=BLACK, ranks=ALONE
+) -> Trainer:
+    """Return a trainer at step 0."""
+    return Trainer(views, points, config, device, background, ranks=ranks)
+
+
+def set_gaussians(trainer: Trainer, gaussians: Gaussians) -> None:
+    """Replace the Gaussians of a trainer, which then begin without moments."""
+    new = {n: t.detach().to(trainer.device) for n, t in gaussians.tensors().items()}
+    nobody = torch.empty(0, dtype=torch.int64, device=trainer.device)
+    parents = torch.full((len(gaussians),), -1, dtype=torch.int64, device=trainer.device)
+    trainer.table.apply(DensityUpdate(nobody, new, parents))
+    trainer.set_views(trainer.views)
+
+
+def state_tensors(trainer: Trainer) -> list[torch.Tensor]:
+    """Return parameters, moments and columns of the Gaussians, in an order that stays."""
+    return [t for _, t in sorted(trainer.table.state().items())]
+
+
+def compile_kernels(config: FitConfig, device: torch.device) -> None:
+    """Compile all kernels that a fit with these settings uses, by a tiny fit."""
+    warm_up(config, device)
+
+
+def finish(trainer: Trainer) -> None:
+    """Take all remaining steps, save nothing, and wait for the device."""
+    run(trainer, lambda _: None, lambda _: None, lambda: False)
+    if trainer.device.type == "cuda":
+        torch.cuda.synchronize(trainer.device)
+
+
+def take_steps(trainer: Trainer, count: int) -> int:
+    """Take at least ``count`` steps as a fit does, and return how many were taken."""
+    done = 0
+    while done < count:
+        done += len(trainer.advance(count - done))
+    return done
+
+
+def one_step(trainer: Trainer) -> None:
+    """Take one step as a fit does: on CUDA a graph, elsewhere from Python."""
+    trainer.advance()
+
+
+def sort_along_curve(trainer: Trainer) -> None:
+    """Put the Gaussians in Morton order."""
+    trainer.table.sort_along_curve()
+
+
+def model_bytes(trainer: Trainer) -> int:
+    """Return the bytes of the model, each Gaussian with the coefficients of its own degree."""
+    return complexity_figures(trainer)["complexity"]["bytes"]
+
+
+def full_bytes(count: int, degree: int = 3) -> int:
+    """Return the bytes of a model of so many Gaussians, all of one degree."""
+    return bytes_of(torch.full((count,), degree))
+
+
+def with_cap(config: FitConfig, most: int) -> FitConfig:
+    """Return the settings with at most so many Gaussians."""
+    return dataclasses.replace(config, max_gaussians=most)
+
+
+def without_density(config: FitConfig) -> FitConfig:
+    """Return the settings with the set of Gaussians left as it starts."""
+    return dataclasses.replace(config, density=dataclasses.replace(config.density, start=10**9))
+
+
+def step_parts(trainer: Trainer) -> tuple[View, dict[str, torch.Tensor], Callable[[], None]]:
+    """Return the first training view, the parameters as `project` takes them, and Adam over all with gradients of zero."""
+    table, device = trainer.table, trainer.device
+    row = table.lr_row(trainer.lrs(trainer.step + 1), trainer.step + 1, trainer.config.optimizer.head_lrs)
+    lrs, going = torch.tensor(row, device=device), torch.zeros(1, dtype=torch.int32, device=device)
+    gradients = {name: torch.zeros_like(p) for name, p in table.params.items()}
+    # leaves of their own: a live graph of the table's parameters would tie a captured step to this stream
+    parameters = {name: p.detach().requires_grad_() for name, p in table.gaussians.tensors().items()}
+    return trainer.views[0], parameters, lambda: table.adam_step(gradients, lrs, going)
+
+
+class _Settings:
+    """All that the base strategy asks of a trainer."""
+
+    config = FitConfig()
+
+
+class Steps:
+    """Training steps of given Gaussians on one image: image, L1 and SSIM, backward pass, Adam, as a fit takes them.
+
+    Args:
+        gaussians: The start; a copy of it is trained.
+        camera: A batch of one camera.
+        target: Image, shape [H, W, 3].
+        rule: Cut-offs of the rasterizer.
+        lr: Learning rate of all parameters; None for those of a fit in a scene of size 1.
+    """
+
+    def __init__(self, gaussians: Gaussians, camera: Camera, target: torch.Tensor, rule: str, lr: float | None = None):
+        device = target.device
+        self.rule, self.lr, self.background = rule, lr, torch.zeros(3, device=device)
+        self.table = Table.of_gaussians(gaussians, {})
+        self.buffers = StepBuffers(device, 3 * len(self.table.params))
+        self._settings = _Settings()  # the strategy holds it by proxy
+        strategy = Strategy(self._settings)  # of the base class: it changes nothing
+        self.learned = Learned(self.table, Table({}, {}, device, 1), strategy, None, torch.zeros(1, 3, device=device))
+        numbers = torch.zeros(1, dtype=torch.int64, device=device)
+        self.views = ViewStack(camera.viewmat, camera.K, target[None], None, {}, numbers)
+        self.plan = StepPlan(gaussians.sh_degree, False, tuple(built_in_terms(LossConfig())), None)
+        self.graphs = StepGraphs(self.learned, self.buffers, rule, self.background) if device.type == "cuda" else None
+        self._load(range(1, (MAX_STEPS if device.type == "cuda" else 1) + 1))
+
+    def _load(self, steps: range) -> None:
+        config = OptimizerConfig()
+        fixed = None if self.lr is None else dict.fromkeys(self.table.params, self.lr)
+        lrs, heads = (config.lrs(0.0, 1.0), config.head_lrs) if fixed is None else (fixed, {})
+        rows = [self.table.lr_row(lrs, k, heads) for k in steps]
+        self.buffers.load([0] * len(steps), rows, [(0.0, k, lrs["means"], 0.0, 0.0, 0.0) for k in steps])
+
+    def eager(self) -> None:
+        """Take the first step of a batch from Python, again and again: the same work each time."""
+        self.buffers.counter.zero_()
+        step(self.learned, self.views, self.buffers, self.plan, eager_renderer(self.rule, self.background, None))
+
+    def _graph(self) -> torch.cuda.CUDAGraph:
+        return self.graphs.capture_all([KIND], {KIND: self.views}, self.plan, None)[0]
+
+    def replay(self) -> None:
+        """Take the first step of a batch as a CUDA graph, again and again; captured at the first call."""
+        graph = self._graph()
+        self.buffers.counter.zero_()
+        graph.replay()

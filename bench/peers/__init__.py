@@ -1,0 +1,1 @@
+"""Ours beside other programs: gsplat, splat-transform."""

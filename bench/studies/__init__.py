@@ -1,0 +1,1 @@
+"""Studies of one question each, which a document or a decision quotes."""
