@@ -42,11 +42,11 @@ def make_orthographic(real):
         v_K: mat33
 
     @wp.func
-    def in_range(position: vec3, near: real) -> wp.bool:
+    def in_range(position: vec3, lens: wp.array(dtype=real), near: real) -> wp.bool:
         return position[2] >= near and wp.isfinite(position[2])
 
     @wp.func
-    def pixel_of(position: vec3, K: mat33) -> vec2:
+    def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
         return vec2(K[0, 0] * position[0] + K[0, 2], K[1, 1] * position[1] + K[1, 2])
 
     @wp.func
@@ -54,14 +54,16 @@ def make_orthographic(real):
         return pixel
 
     @wp.func
-    def project_axes(position: vec3, K: mat33, point: vec2, axes: mat33) -> Rows:
+    def project_axes(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, axes: mat33) -> Rows:
         rows = Rows()
         rows.first = K[0, 0] * vec3(axes[0, 0], axes[0, 1], axes[0, 2])
         rows.second = K[1, 1] * vec3(axes[1, 0], axes[1, 1], axes[1, 2])
         return rows
 
     @wp.func
-    def axes_backward(position: vec3, K: mat33, point: vec2, v_first: vec3, v_second: vec3) -> mat33:
+    def axes_backward(
+        position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, v_first: vec3, v_second: vec3
+    ) -> mat33:
         g0 = K[0, 0] * v_first
         g1 = K[1, 1] * v_second
         zero = real(0.0)
@@ -69,8 +71,8 @@ def make_orthographic(real):
 
     @wp.func
     def position_backward(
-        position: vec3, K: mat33, pixel: vec2, point: vec2, axes: mat33, v_first: vec3, v_second: vec3,
-        v_pixel: vec2, v_depth: real,
+        position: vec3, K: mat33, lens: wp.array(dtype=real), pixel: vec2, point: vec2, axes: mat33,
+        v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
     ) -> Gradients:  # fmt: skip
         g = Gradients()
         g.v_position = vec3(v_pixel[0] * K[0, 0], v_pixel[1] * K[1, 1], v_depth)
