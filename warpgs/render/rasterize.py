@@ -10,7 +10,7 @@ import torch
 
 from warpgs.constants import RULES, Rule
 from warpgs.errors import UsageError
-from warpgs.kernels.cameras.base import CAMERA_MODELS
+from warpgs.kernels.cameras.base import check_camera
 from warpgs.kernels.project import ProjectInputs, project_inputs
 from warpgs.render import graphed
 from warpgs.render.chunked import ChunkedFrame, blend_chunked, contributions_chunked, median_depth_chunked
@@ -81,7 +81,7 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
         raise UsageError(f"unknown rule {options.rule!r}: choose one of {', '.join(RULES)}, or give a Rule")
     if options.tile_size not in TILE_SIZES:
         raise UsageError(f"tile size {options.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
-    CAMERA_MODELS.find(camera.model)
+    check_camera(camera)
     if options.max_instances is not None and (options.capacity is not None or options.max_instances < 1):
         raise UsageError("max_instances must be at least 1 and does not go with a capacity")
     return rule

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+from warpgs.errors import UsageError
 from warpgs.plugins import Registry
+from warpgs.scene import Camera
 
 
 class CameraModel:
@@ -50,3 +52,19 @@ class CameraModel:
 CAMERA_MODELS = Registry("camera model", CameraModel, "warpgs.kernels.cameras")
 """Camera models by name."""
 register = CAMERA_MODELS.register
+
+
+def check_camera(camera: Camera) -> type[CameraModel]:
+    """Return the model of a camera, or of a batch.
+
+    Raises:
+        UsageError: The model is unknown, or the camera has another number of coefficients than it takes.
+    """
+    model = CAMERA_MODELS.find(camera.model)
+    found = 0 if camera.distortion is None else camera.distortion.shape[-1]
+    if found != model.coefficients:
+        raise UsageError(
+            f"the camera model {camera.model!r} takes {model.coefficients} coefficients of distortion, found {found}; give "
+            "Camera.distortion the shape [P] or [C, P]"
+        )
+    return model
