@@ -9,7 +9,7 @@ ROOT = Path(__file__).parent.parent
 PRODUCT = sorted((ROOT / "warpgs").rglob("*.py"))
 SHARED = {
     "__init__", "functions", "native", "compiler", "falloff",
-    "project_backward", "ssim_cpu", "ssim_cuda", "blend_cpu", "blend_cpu_backward",
+    "project_backward", "project_inputs", "ssim_cpu", "ssim_cuda", "blend_cpu", "blend_cpu_backward",
     "blend_cuda", "blend_settings", "scanlines_cpu", "sh",
 }  # fmt: skip
 

@@ -10,7 +10,7 @@ import torch
 
 from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
-from warpgs.kernels.project import ProjectInputs
+from warpgs.kernels.project_inputs import ProjectInputs
 from warpgs.render import graphed
 from warpgs.render.compose import inputs_of
 from warpgs.render.graphed import MIN_CALLS, Recorder, call_key

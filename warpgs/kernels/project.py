@@ -3,8 +3,6 @@
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple, Self
 
 import torch
 import warp as wp
@@ -18,6 +16,7 @@ from warpgs.kernels.functions import make_projection, make_spans, make_types
 from warpgs.kernels.native import BLOCK
 from warpgs.kernels.native import make_functions as make_native
 from warpgs.kernels.project_backward import make_backward
+from warpgs.kernels.project_inputs import ProjectInputs, ProjectSettings, checked_factors
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
 
@@ -25,24 +24,6 @@ PROJECTED_SIZE = 12
 """Numbers of a projected Gaussian, 16-byte aligned in float32:
 0:2 mean [px], 2:5 factor u11 u12 u22 [1/px], 5 opacity, 6:9 colour, 9 z-depth [u],
 10:12 half width and half height [px] of the box that holds every pixel with alpha at or above the cut."""
-
-
-@dataclass(frozen=True)
-class ProjectSettings:
-    """Everything that a projection depends on besides tensors."""
-
-    size: tuple[int, int]
-    """Width and height of the image [px]."""
-    window: tuple[int, int, int, int]
-    """Left, top, width and height [px] of the part that is rendered, from a tile's corner on."""
-    sh_count: int
-    """Spherical-harmonics coefficients a channel that are used."""
-    rule: Rule
-    """Cut-offs."""
-    tile_size: int
-    """Side of a tile [px]."""
-    camera_model: str
-    """Name of the camera model."""
 
 
 @functools.cache
@@ -180,33 +161,6 @@ def make_forward(real, native: bool, camera_model: str):
             store(projected, i, vec12())
 
     return forward
-
-
-class ProjectInputs(NamedTuple):
-    """The tensors of a projection, of one scalar type and on one device."""
-
-    means: torch.Tensor
-    """World positions [u], shape [N, 3]."""
-    quats: torch.Tensor
-    """Rotations wxyz, shape [N, 4]."""
-    log_scales: torch.Tensor
-    """Logarithm of the axis lengths [u], shape [N, 3]."""
-    logit_opacities: torch.Tensor
-    """Inverse sigmoid of the opacity, shape [N]."""
-    sh: torch.Tensor
-    """Spherical-harmonics coefficients of the colour, shape [N, K, 3]."""
-    viewmats: torch.Tensor
-    """camera_from_world, shape [C, 4, 4]."""
-    Ks: torch.Tensor
-    """Intrinsics [px] with zero skew, shape [C, 3, 3]."""
-    distortion: torch.Tensor
-    """Coefficients of the camera model, shape [C, P]. They have no gradient."""
-    opacity_factors: torch.Tensor
-    """Factors of the opacities, at least 0, shape [N]; shape [0] for none. They have no gradient."""
-
-    def detached(self) -> Self:
-        """Return the same tensors [...] without their history."""
-        return self._make(t.detach() for t in self)
 
 
 def _views(inputs: Sequence[torch.Tensor]) -> list[interop.View]:
@@ -384,25 +338,8 @@ def project(
     )
 
 
-def checked_factors(means: torch.Tensor, factors: torch.Tensor | None) -> torch.Tensor:
-    """Return opacity factors as `ProjectInputs` holds them, shape [N], or [0] for None.
-
-    Args:
-        means: Positions of the Gaussians, shape [N, 3].
-        factors: Factors, shape [N]; None for 1.
-
-    Raises:
-        TypeError: The scalar types differ.
-        ValueError: The shape or the device differs.
-    """
-    if factors is None:
-        return means.new_empty(0)
-    interop.check(means=(means, "N 3"), opacity_factors=(factors, "N"))
-    return factors.detach()
-
-
 def project_inputs(inputs: ProjectInputs, settings: ProjectSettings) -> tuple[torch.Tensor, torch.Tensor]:
-    """Project as `project` does, which says what is returned and raised.
+    """Project as `project` does.
 
     Args:
         inputs: The tensors.
@@ -410,6 +347,11 @@ def project_inputs(inputs: ProjectInputs, settings: ProjectSettings) -> tuple[to
 
     Returns:
         Projected Gaussians, shape [C, N, 12], and the number of tiles that each touches, int32, shape [C, N].
+
+    Raises:
+        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        UsageError: The camera model is unknown, or the coefficients of its distortion require gradients.
+        ValueError: A shape or device disagrees; the message names argument, wanted and found.
     """
     model = CAMERA_MODELS.find(settings.camera_model)
     sizes = interop.check(

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch.autograd.function import once_differentiable
 
-from warpgs.kernels.project import ProjectInputs, project_inputs
+from warpgs.kernels.project import project_inputs
+from warpgs.kernels.project_inputs import ProjectInputs
 from warpgs.render.compose import Images, bin_and_blend, bin_projected, median_depth_of, weights_of
 from warpgs.render.settings import RenderSettings, Window
 

@@ -15,7 +15,8 @@ import torch
 from warpgs.kernels import blend as blending
 from warpgs.kernels.blend import blend, contributions
 from warpgs.kernels.median_depth import median_depth
-from warpgs.kernels.project import ProjectInputs, checked_factors, project_inputs
+from warpgs.kernels.project import project_inputs
+from warpgs.kernels.project_inputs import ProjectInputs, checked_factors
 from warpgs.kernels.tiles import Tiles, bin_tiles
 from warpgs.render.settings import RenderSettings
 from warpgs.runtime.allocator import TORCH, Allocator
@@ -162,9 +163,17 @@ def composite_into(
     projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: RenderSettings,
     memory: InstanceMemory,
 ) -> tuple[Tiles, Sequence[torch.Tensor]]:  # fmt: skip
-    """Return instances, and what `blending.composite` returns for gradients to come; no gradient is recorded here.
+    """Return instances, and images with what their gradients take; none is recorded, and all memory is the allocator's.
 
-    Args are those of `bin_and_blend`, contiguous; all memory comes from ``memory.allocator``.
+    Args:
+        projected: Projected Gaussians, contiguous, shape [C, N, 12].
+        tile_counts: Number of tiles that each touches, int32, shape [C, N].
+        backgrounds: Colour behind everything, contiguous, shape [C, 3].
+        settings: Settings of the render.
+        memory: Memory of the instances, and of all else.
+
+    Returns:
+        The instances, and the tensors [...] that `blending.composite` returns.
     """
     tiles = bin_projected(projected, tile_counts, settings, memory)
     found = blending.composite(projected, tiles, backgrounds, settings.blending(), save=True, allocator=memory.allocator)

@@ -11,7 +11,8 @@ import torch
 from warpgs.constants import RULES, Rule
 from warpgs.errors import UsageError
 from warpgs.kernels.cameras.base import check_camera
-from warpgs.kernels.project import ProjectInputs, project_inputs
+from warpgs.kernels.project import project_inputs
+from warpgs.kernels.project_inputs import ProjectInputs
 from warpgs.render import graphed
 from warpgs.render.chunked import ChunkedFrame, blend_chunked, contributions_chunked, median_depth_chunked
 from warpgs.render.compose import InstanceMemory, bin_and_blend, inputs_of, median_depth_of, settings_of, weights_of

@@ -8,7 +8,7 @@ from typing import Any
 from warpgs.constants import Rule
 from warpgs.kernels import sh
 from warpgs.kernels.blend_settings import BlendSettings
-from warpgs.kernels.project import ProjectSettings
+from warpgs.kernels.project_inputs import ProjectSettings
 
 Window = tuple[int, int, int, int]
 """Left, top, width and height [px]."""
