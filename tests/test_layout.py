@@ -11,7 +11,7 @@ BENCH = ROOT / "bench"
 BENCHES = sorted(p for name in ("kernels", "fits", "peers", "studies") for p in (BENCH / name).glob("*.py"))
 SHARED = {
     "__init__", "functions", "native", "compiler", "falloff",
-    "project_backward", "ssim_cpu", "ssim_cuda", "blend_cpu", "blend_cpu_backward",
+    "project_backward", "project_inputs", "ssim_cpu", "ssim_cuda", "blend_cpu", "blend_cpu_backward",
     "blend_cuda", "blend_records", "blend_settings", "scanlines_cpu", "sh",
 }  # fmt: skip
 

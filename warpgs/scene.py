@@ -35,6 +35,9 @@ class Camera:
     """Image height [px]."""
     model: str = "pinhole"
     """Name of the camera model (`warpgs.kernels.cameras`)."""
+    distortion: Array | None = None
+    """Coefficients of the camera model, shape [P] or [C, P]; None for a model without, as pinhole is. No gradients flow into
+    them."""
 
     @property
     def center(self) -> np.ndarray:

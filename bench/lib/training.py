@@ -135,7 +135,9 @@ class Steps:
         strategy = Strategy(self._settings)  # of the base class: it changes nothing
         self.learned = Learned(self.table, Table({}, {}, device, 1), strategy, None, torch.zeros(1, 3, device=device))
         numbers = torch.zeros(1, dtype=torch.int64, device=device)
-        self.views = ViewStack(camera.viewmat, camera.K, target[None], None, {}, numbers)
+        self.views = ViewStack(
+            camera.viewmat, camera.K, camera.K.new_empty(1, 0), camera.model, target[None], None, {}, numbers
+        )
         self.plan = StepPlan(gaussians.sh_degree, False, tuple(built_in_terms(LossConfig())), None)
         self.graphs = StepGraphs(self.learned, self.buffers, rule, self.background) if device.type == "cuda" else None
         self._load(range(1, (MAX_STEPS if device.type == "cuda" else 1) + 1))

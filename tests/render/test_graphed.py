@@ -10,7 +10,9 @@ import torch
 
 from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
+from warpgs.kernels.project_inputs import ProjectInputs
 from warpgs.render import graphed
+from warpgs.render.compose import inputs_of
 from warpgs.render.graphed import MIN_CALLS, Recorder, call_key
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.render.settings import RenderSettings
@@ -56,22 +58,22 @@ def recorder(monkeypatch, surroundings) -> Recorder:
     """A recorder whose rasterizers render nothing; a call has `Counted.seen` instances."""
     Counted.made, Counted.seen = 0, 100
     monkeypatch.setattr(graphed, "GraphedRasterizer", Counted)
-    monkeypatch.setattr(graphed.project, "project", lambda *_, **__: (None, torch.tensor([Counted.seen])))
+    monkeypatch.setattr(graphed, "count_instances", lambda *_: Counted.seen)
     return Recorder(GraphPool(CPU))
 
 
-def sources_of(gaussians: Gaussians, cam: Camera) -> tuple[torch.Tensor, ...]:
-    return (*gaussians.tensors().values(), cam.viewmat[None], cam.K[None])
+def sources_of(gaussians: Gaussians, cam: Camera) -> ProjectInputs:
+    return inputs_of(gaussians, cam)
 
 
-def batch(**size) -> tuple[torch.Tensor, ...]:
+def batch(**size) -> ProjectInputs:
     return sources_of(leaves(cloud(20)), camera(dtype=torch.float32, **size))
 
 
 def test_the_third_of_equal_calls_is_captured(recorder):
     """Another camera is the same call; other tensors, settings or another background are not, and begin anew."""
     own, other = batch(), batch()
-    moved = (*own[:5], own[5] + 1, own[6] * 2)
+    moved = own._replace(viewmats=own.viewmats + 1, Ks=own.Ks * 2)
     background = torch.zeros(1, 3)
     assert [recorder.render(s, None, SETTINGS) for s in (own, moved, own, own)] == [None] * (MIN_CALLS - 1) + ["images"] * 2
     assert Counted.made == 1
@@ -111,9 +113,9 @@ def test_calls_that_cannot_be_captured_are_not(recorder, monkeypatch):
     assert call_key(own, None, SETTINGS) is not None
     with torch.no_grad():
         assert call_key(own, None, SETTINGS) is None
-    assert call_key(tuple(t.detach() for t in own), None, SETTINGS) is None
-    assert call_key(tuple(t.double() for t in own), None, SETTINGS) is None
-    assert call_key((own[0].T.contiguous().T, *own[1:]), None, SETTINGS) is None
+    assert call_key(own.detached(), None, SETTINGS) is None
+    assert call_key(ProjectInputs(*(t.double() for t in own)), None, SETTINGS) is None
+    assert call_key(own._replace(means=own.means.T.contiguous().T), None, SETTINGS) is None
     assert call_key(own, torch.zeros(1, 3), SETTINGS) is not None and call_key(own, torch.zeros(3), SETTINGS) is None
     monkeypatch.setattr(graphed, "available_bytes", lambda device: 0)
     assert [recorder.render(own, None, SETTINGS) for _ in range(5)] == [None] * 5 and Counted.made == 0
@@ -140,7 +142,7 @@ def results(gaussians, cam, background, recorder=None):
         rgb, alpha, depth, projected, counts = r.rgb, r.alpha, r.depth, r.projected, r.tile_counts
     else:
         settings = RenderSettings(cam.width, cam.height, (0, 0, cam.width, cam.height), gaussians.sh_degree, RULES["exact"], 16)
-        found = recorder.render((*params, cam.viewmat, cam.K), background, settings)
+        found = recorder.render(inputs_of(gaussians, cam), background, settings)
         if found is None:
             return None
         (rgb, alpha, depth), projected, counts = found
@@ -167,7 +169,7 @@ def test_a_rasterizer_that_is_too_small_says_so(surroundings):
     """The call runs without graphs, and the next rasterizer has the capacity."""
     g, own = leaves(cloud(300)), Recorder(NoGraphPool(CPU))
     cam = camera(70, 50, 1, torch.float32)
-    sources = (*g.tensors().values(), cam.viewmat, cam.K)
+    sources = inputs_of(g, cam)
     settings = RenderSettings(70, 50, (0, 0, 70, 50), g.sh_degree, RULES["exact"], 16)
     for _ in range(MIN_CALLS):
         found = own.render(sources, None, settings)
@@ -182,7 +184,7 @@ def test_a_rasterizer_that_is_too_small_says_so(surroundings):
 def first_graphed(own: Recorder, g: Gaussians, cam: Camera):
     """Return the result of the first call that a graphed rasterizer renders."""
     settings = RenderSettings(cam.width, cam.height, (0, 0, cam.width, cam.height), g.sh_degree, RULES["exact"], 16)
-    return [own.render((*g.tensors().values(), cam.viewmat, cam.K), None, settings) for _ in range(MIN_CALLS)][-1]
+    return [own.render(inputs_of(g, cam), None, settings) for _ in range(MIN_CALLS)][-1]
 
 
 def test_a_rasterizer_is_freed_when_nobody_holds_it(surroundings):

@@ -9,6 +9,7 @@ from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.render.chunked import ChunkedFrame, chunks
+from warpgs.render.compose import inputs_of
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.render.settings import RenderSettings
 
@@ -86,9 +87,10 @@ def test_chunks_hold_no_more_instances_than_asked_for():
     """Every chunk but a single tile keeps to the number; together they are the window."""
     gaussians, cam, _ = scene(torch.float32, "cpu")
     frame = ChunkedFrame(RenderSettings(*SIZE, (16, 16, 59, 37), 1, RULES["exact"], 16), 150)
-    found = list(chunks(frame, (*gaussians.tensors().values(), cam.viewmat, cam.K)))
+    found = list(chunks(frame, inputs_of(gaussians, cam)))
     covered = torch.zeros(SIZE[1], SIZE[0], dtype=torch.int32)
-    for (x, y, width, height), counts in found:
+    for settings, counts in found:
+        x, y, width, height = settings.window
         covered[y : y + height, x : x + width] += 1
         assert int(counts.sum()) <= 150 or (width <= 16 and height <= 16)
     assert len(found) > 4 and bool((covered[16:, 16:] == 1).all()) and int(covered.sum()) == 59 * 37

@@ -76,7 +76,8 @@ def fingerprint(views: list[View]) -> str:
         cameras = [np.round(m, 9) + 0.0 for m in (v.camera.viewmat, v.camera.K)]
         arrays = [*cameras, v.image] + [m for m in (v.mask, v.score_mask, v.alpha) if m is not None]
         # name and shapes are delimited, so that bytes moved from one field to the next cannot give the same hash
-        model = () if v.camera.model == "pinhole" else (v.camera.model,)
+        lens = () if v.camera.distortion is None else tuple(np.round(v.camera.distortion, 9).tolist())
+        model = () if v.camera.model == "pinhole" else (v.camera.model, *lens)
         digest.update(repr((v.name, [(a.shape, str(a.dtype)) for a in arrays], *model)).encode("utf-8", "surrogateescape"))
         for array in arrays:
             digest.update(np.ascontiguousarray(array).data)

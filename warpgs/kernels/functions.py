@@ -116,7 +116,7 @@ def make_projection(real, camera_model: str):
 
     @wp.func
     def ellipse(
-        mean: vec3, q: vec4, log_scale: vec3, view: mat44, K: mat33,
+        mean: vec3, q: vec4, log_scale: vec3, view: mat44, K: mat33, lens: wp.array(dtype=real),
         width: real, height: real, near: real, low_pass: real,
     ) -> Ellipse:  # fmt: skip
         e = Ellipse()
@@ -126,9 +126,9 @@ def make_projection(real, camera_model: str):
         )
         e.position = rotation * mean + vec3(view[0, 3], view[1, 3], view[2, 3])
         # Guards are phrased so that a NaN fails them.
-        if not camera.in_range(e.position, near):
+        if not camera.in_range(e.position, lens, near):
             return e
-        pixel = camera.pixel_of(e.position, K)
+        pixel = camera.pixel_of(e.position, K, lens)
         if not (wp.abs(pixel[0]) <= real(FARTHEST_PIXEL) and wp.abs(pixel[1]) <= real(FARTHEST_PIXEL)):
             return e
         e.quat_length = r.quat_length(q)
@@ -141,7 +141,7 @@ def make_projection(real, camera_model: str):
         e.pixel = pixel
         e.expansion_point = camera.expansion_point(pixel, width, height)
         e.axes = rotation * r.rotation(e.quat) * wp.diag(e.scales)
-        rows = camera.project_axes(e.position, K, e.expansion_point, e.axes)
+        rows = camera.project_axes(e.position, K, lens, e.expansion_point, e.axes)
         m1 = rows.first
         m2 = rows.second
         if not (finite3(m1) and finite3(m2)):

@@ -1,20 +1,22 @@
 """Projection of 3D Gaussians to ellipses in the image: activations, EWA covariance and its factor, colour, tile counts."""
 
 import functools
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
 from warpgs.constants import LARGEST_COEFFICIENT, Rule
+from warpgs.errors import UsageError
 from warpgs.kernels import sh
 from warpgs.kernels.cameras.base import CAMERA_MODELS
 from warpgs.kernels.functions import make_projection, make_spans, make_types
 from warpgs.kernels.native import BLOCK
 from warpgs.kernels.native import make_functions as make_native
 from warpgs.kernels.project_backward import make_backward
+from warpgs.kernels.project_inputs import ProjectInputs, ProjectSettings, checked_factors
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
 
@@ -22,24 +24,6 @@ PROJECTED_SIZE = 12
 """Numbers of a projected Gaussian, 16-byte aligned in float32:
 0:2 mean [px], 2:5 factor u11 u12 u22 [1/px], 5 opacity, 6:9 colour, 9 z-depth [u],
 10:12 half width and half height [px] of the box that holds every pixel with alpha at or above the cut."""
-
-
-@dataclass(frozen=True)
-class ProjectSettings:
-    """Everything that a projection depends on besides tensors."""
-
-    size: tuple[int, int]
-    """Width and height of the image [px]."""
-    window: tuple[int, int, int, int]
-    """Left, top, width and height [px] of the part that is rendered, from a tile's corner on."""
-    sh_count: int
-    """Spherical-harmonics coefficients a channel that are used."""
-    rule: Rule
-    """Cut-offs."""
-    tile_size: int
-    """Side of a tile [px]."""
-    camera_model: str
-    """Name of the camera model."""
 
 
 @functools.cache
@@ -68,7 +52,7 @@ def make_forward(real, native: bool, camera_model: str):
 
     @wp.func
     def project_one(
-        i: int, n: int, view: m.mat44, K: m.mat33,
+        i: int, n: int, view: m.mat44, K: m.mat33, lens: wp.array(dtype=real),
         means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
         logit_opacities: wp.array(dtype=real), opacity_factors: wp.array(dtype=real),
         coefficients: wp.array2d(dtype=m.vec3),
@@ -78,7 +62,7 @@ def make_forward(real, native: bool, camera_model: str):
     ):  # fmt: skip
         """Project Gaussian n; return the number of tiles it touches. Where that is 0 it is culled, and nothing is written."""
         e = m.ellipse(
-            means[n], quats[n], log_scales[n], view, K, real(width), real(height), near, low_pass
+            means[n], quats[n], log_scales[n], view, K, lens, real(width), real(height), near, low_pass
         )  # fmt: skip
         if e.valid == 0:
             return 0
@@ -154,7 +138,8 @@ def make_forward(real, native: bool, camera_model: str):
         begin: int,
         means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
         logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
-        viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33), opacity_factors: wp.array(dtype=real),
+        viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33), lenses: wp.array2d(dtype=real),
+        opacity_factors: wp.array(dtype=real),
         width: int, height: int, origin_x: int, origin_y: int, window_width: int, window_height: int,
         tile_size: int, sh_count: int,
         near: real, low_pass: real, alpha_cut: real, square_sigma: real,
@@ -166,7 +151,8 @@ def make_forward(real, native: bool, camera_model: str):
         camera = i // count
         n = i - camera * count
         tiles = project_one(
-            i, n, viewmats[camera], Ks[camera], means, quats, log_scales, logit_opacities, opacity_factors, coefficients,
+            i, n, viewmats[camera], Ks[camera], lenses[camera], means, quats, log_scales,
+            logit_opacities, opacity_factors, coefficients,
             width, height, origin_x, origin_y, window_width, window_height, tile_size, sh_count,
             near, low_pass, alpha_cut, square_sigma, projected,
         )  # fmt: skip
@@ -177,11 +163,12 @@ def make_forward(real, native: bool, camera_model: str):
     return forward
 
 
-def _inputs(means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks) -> list[interop.View]:
-    t = make_types(interop.real_of(means))
-    types = (t.vec3, t.vec4, t.vec3, interop.real_of(means), t.vec3, t.mat44, t.mat33)
-    tensors = (means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks)
-    return [interop.view(tensor, dtype) for tensor, dtype in zip(tensors, types)]
+def _views(inputs: Sequence[torch.Tensor]) -> list[interop.View]:
+    """Return the first eight inputs as the kernels take them."""
+    real = interop.real_of(inputs[0])
+    t = make_types(real)
+    types = (t.vec3, t.vec4, t.vec3, real, t.vec3, t.mat44, t.mat33, real)
+    return [interop.view(tensor, dtype) for tensor, dtype in zip(inputs, types)]
 
 
 def _native(tensor: torch.Tensor) -> bool:
@@ -190,39 +177,38 @@ def _native(tensor: torch.Tensor) -> bool:
 
 
 def project_tensors(
-    tensors: Sequence[torch.Tensor], factors: torch.Tensor, settings: ProjectSettings, allocator: Allocator = TORCH
+    inputs: ProjectInputs, settings: ProjectSettings, allocator: Allocator = TORCH
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return what `project` returns, for contiguous tensors. Nothing is checked, and no gradient is recorded.
 
     Args:
-        tensors: The seven tensors that `project` takes.
-        factors: Opacity factors, shape [N]; shape [0] for none.
+        inputs: The tensors.
         settings: Everything else.
         allocator: Provider of the results' memory.
 
     Returns:
         Projected Gaussians, shape [C, N, 12], and the number of tiles that each touches, int32, shape [C, N].
     """
-    means, real = tensors[0], interop.real_of(tensors[0])
-    cameras, count, rule = len(tensors[5]), len(means), settings.rule
+    means, real = inputs.means, interop.real_of(inputs.means)
+    cameras, count, rule = len(inputs.viewmats), len(means), settings.rule
     projected = allocator.output((cameras, count, PROJECTED_SIZE), means.dtype, means.device)
     tile_counts = allocator.output((cameras, count), torch.int32, means.device)
-    inputs = [
-        *_inputs(*tensors), interop.view(factors, real), *settings.size, *settings.window,
+    arguments = [
+        *_views(inputs), interop.view(inputs.opacity_factors, real), *settings.size, *settings.window,
         settings.tile_size, settings.sh_count, rule.near, rule.low_pass, rule.alpha_cut, rule.square_sigma,
         interop.view(projected.view(-1, PROJECTED_SIZE), real), interop.view(tile_counts.view(-1), wp.int32),
     ]  # fmt: skip
     kernel = make_forward(real, _native(means), settings.camera_model)
-    interop.launch(kernel, cameras * count, inputs, means.device, cost=5)
+    interop.launch(kernel, cameras * count, arguments, means.device, cost=5)
     return projected, tile_counts
 
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks, factors, settings):
-        tensors = [t.contiguous() for t in (means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks)]
-        projected, tile_counts = project_tensors(tensors, factors, settings)
-        ctx.save_for_backward(*tensors, projected, tile_counts)
+    def forward(ctx, settings, *tensors):
+        inputs = ProjectInputs(*(t.contiguous() for t in tensors))
+        projected, tile_counts = project_tensors(inputs, settings)
+        ctx.save_for_backward(*inputs[:-1], projected, tile_counts)
         ctx.settings = settings
         ctx.mark_non_differentiable(tile_counts)
         ctx.set_materialize_grads(False)  # else torch makes zeros for the counts
@@ -231,14 +217,14 @@ class _Project(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, v_projected, _):
-        *tensors, projected, tile_counts = ctx.saved_tensors
-        wants_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
-        found = project_gradients(tensors, ctx.settings, projected, tile_counts, v_projected, wants_camera=wants_camera)
-        return *found, None, None
+        *inputs, projected, tile_counts = ctx.saved_tensors
+        wants_camera = ctx.needs_input_grad[6] or ctx.needs_input_grad[7]  # viewmats and Ks, behind the settings
+        found = project_gradients(inputs, ctx.settings, projected, tile_counts, v_projected, wants_camera=wants_camera)
+        return None, *found, None, None
 
 
 def project_gradients(
-    tensors: Sequence[torch.Tensor],
+    inputs: Sequence[torch.Tensor],
     settings: ProjectSettings,
     projected: torch.Tensor,
     tile_counts: torch.Tensor,
@@ -247,10 +233,10 @@ def project_gradients(
     wants_camera: bool,
     allocator: Allocator = TORCH,
 ) -> list[torch.Tensor | None]:
-    """Return the gradients of the seven tensors that `project` takes. Nothing is checked.
+    """Return the gradients of the first seven inputs. Nothing is checked.
 
     Args:
-        tensors: The seven tensors, contiguous.
+        inputs: Fields of `ProjectInputs` but for the opacity factors, contiguous.
         settings: The settings of the forward pass.
         projected: First result of `project_tensors`, shape [C, N, 12].
         tile_counts: Second result of `project_tensors`, int32, shape [C, N].
@@ -259,29 +245,29 @@ def project_gradients(
         allocator: Provider of the gradients' memory.
 
     Returns:
-        One gradient of the shape of each tensor [...]; None where it is not wanted.
+        One gradient of the shape of each of the seven [...]; None where it is not wanted.
     """
     real, device = interop.real_of(projected), projected.device
     t, (width, height), rule = make_types(real), settings.size, settings.rule
     v_projected = torch.zeros_like(projected) if v_projected is None else v_projected.contiguous()
     native = _native(projected)  # writes zeros itself
-    found = [allocator.output(tensor.shape, tensor.dtype, device) for tensor in tensors[:5]]
+    found = [allocator.output(tensor.shape, tensor.dtype, device) for tensor in inputs[:5]]
     if not native:
         for gradient in found:
             gradient.zero_()
-    cameras, count = len(tensors[5]), len(tensors[0])
+    cameras, count = len(inputs[5]), len(inputs[0])
     rows = (cameras, count) if wants_camera else (0, 0)
     v_viewmats, v_Ks = (projected.new_zeros(*rows, n, n) if wants_camera else projected.new_empty(*rows, n, n) for n in (4, 3))
     outputs = [interop.view(g, dtype) for g, dtype in zip(found, (t.vec3, t.vec4, t.vec3, real, t.vec3))]
-    inputs = [
-        *_inputs(*tensors), width, height, settings.sh_count, rule.near, rule.low_pass,
+    arguments = [
+        *_views(inputs[:8]), width, height, settings.sh_count, rule.near, rule.low_pass,
         interop.view(projected.view(-1, PROJECTED_SIZE), real), interop.view(tile_counts.view(-1), wp.int32),
         interop.view(v_projected.view(-1, PROJECTED_SIZE), real),
         int(wants_camera), *outputs, interop.view(v_viewmats, t.mat44), interop.view(v_Ks, t.mat33),
     ]  # fmt: skip
     threads = -(-count // BLOCK) * BLOCK if native else count
     kernel = make_backward(real, native, settings.camera_model)
-    interop.launch(kernel, threads, inputs, device, cost=10 * cameras, block_dim=BLOCK)
+    interop.launch(kernel, threads, arguments, device, cost=10 * cameras, block_dim=BLOCK)
     if not wants_camera:
         return [*found, None, None]
     # in float64, whose rounding no number of threads shows in float32
@@ -305,10 +291,11 @@ def project(
     opacity_factors: torch.Tensor | None = None,
     window: tuple[int, int, int, int] | None = None,
     camera_model: str = "pinhole",
+    distortion: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Project N Gaussians into C cameras (EWA, first order).
 
-    Differentiable in every tensor. A Gaussian is culled, with zeros for results and gradients, where its depth is
+    Differentiable in the seven tensors. A Gaussian is culled, with zeros for results and gradients, where its depth is
     below ``rule.near``, its opacity below the cut, its box outside the image, or a parameter that is read not finite or
     outside the ranges of docs/conventions.md (depth 1e10 u, projected mean 1e9 px, axes 1e30 px, coefficients 1e6).
     Derivation of the backward pass: docs/project.md.
@@ -330,6 +317,7 @@ def project(
         window: Left, top, width and height [px] of the part of the image to render, from a tile's corner on; None for all.
             Gaussians that touch no tile in it are culled.
         camera_model: Name of the camera model (`warpgs.kernels.cameras`).
+        distortion: Coefficients of the camera model, shape [C, P]; None for a model without. Not differentiable.
 
     Returns:
         ``projected`` [C, N, 12], laid out as `PROJECTED_SIZE` says, and ``tile_counts`` [C, N] int32, the number of tiles
@@ -340,23 +328,45 @@ def project(
         UsageError: The camera model is unknown.
         ValueError: A shape or device disagrees; the message names argument, wanted and found.
     """
-    CAMERA_MODELS.find(camera_model)
-    sh_count = sh.coefficient_count(degree)
+    if distortion is None:
+        distortion = viewmats.new_empty(len(viewmats), 0)
+    factors = checked_factors(means, opacity_factors)
+    inputs = ProjectInputs(means, quats, log_scales, logit_opacities, sh_coefficients, viewmats, Ks, distortion, factors)
+    count = sh.coefficient_count(degree)
+    return project_inputs(
+        inputs, ProjectSettings((width, height), window or (0, 0, width, height), count, rule, tile_size, camera_model)
+    )
+
+
+def project_inputs(inputs: ProjectInputs, settings: ProjectSettings) -> tuple[torch.Tensor, torch.Tensor]:
+    """Project as `project` does.
+
+    Args:
+        inputs: The tensors.
+        settings: Everything else.
+
+    Returns:
+        Projected Gaussians, shape [C, N, 12], and the number of tiles that each touches, int32, shape [C, N].
+
+    Raises:
+        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        UsageError: The camera model is unknown, or the coefficients of its distortion require gradients.
+        ValueError: A shape or device disagrees; the message names argument, wanted and found.
+    """
+    model = CAMERA_MODELS.find(settings.camera_model)
     sizes = interop.check(
-        means=(means, "N 3"), quats=(quats, "N 4"), log_scales=(log_scales, "N 3"),
-        logit_opacities=(logit_opacities, "N"), sh=(sh_coefficients, "N K 3"),
-        viewmats=(viewmats, "C 4 4"), Ks=(Ks, "C 3 3"),
+        means=(inputs.means, "N 3"), quats=(inputs.quats, "N 4"), log_scales=(inputs.log_scales, "N 3"),
+        logit_opacities=(inputs.logit_opacities, "N"), sh=(inputs.sh, "N K 3"),
+        viewmats=(inputs.viewmats, "C 4 4"), Ks=(inputs.Ks, "C 3 3"),
+        distortion=(inputs.distortion, f"C {model.coefficients}"),
     )  # fmt: skip
-    if sizes["K"] < sh_count:
-        raise ValueError(f"sh holds {sizes['K']} coefficients a channel, degree {degree} needs {sh_count}")
+    if inputs.distortion.requires_grad:
+        raise UsageError("the coefficients of a camera's distortion have no gradient; detach them")
+    if sizes["K"] < settings.sh_count:
+        degree = math.isqrt(settings.sh_count) - 1
+        raise ValueError(f"sh holds {sizes['K']} coefficients a channel, degree {degree} needs {settings.sh_count}")
+    width, height = settings.size
     if width < 1 or height < 1:
         raise ValueError(f"the image must be at least 1 x 1 px, not {width} x {height}")
-    if opacity_factors is None:
-        opacity_factors = means.new_empty(0)
-    else:
-        interop.check(means=(means, "N 3"), opacity_factors=(opacity_factors, "N"))
-    factors = opacity_factors.detach().contiguous()
-    settings = ProjectSettings((width, height), window or (0, 0, width, height), sh_count, rule, tile_size, camera_model)
-    return _Project.apply(
-        means, quats, log_scales, logit_opacities, sh_coefficients, viewmats, Ks, factors, settings,
-    )  # fmt: skip
+    projected, tile_counts = _Project.apply(settings, *inputs)
+    return projected, tile_counts

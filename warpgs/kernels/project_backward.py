@@ -35,11 +35,11 @@ def make_functions(real, camera_model: str):
 
     @wp.func
     def shape(
-        mean: vec3, quat: vec4, log_scale: vec3, view: m.mat44, K: mat33,
+        mean: vec3, quat: vec4, log_scale: vec3, view: m.mat44, K: mat33, lens: wp.array(dtype=real),
         width: real, height: real, near: real, low_pass: real, v_projected: wp.array2d(dtype=real), i: int,
     ) -> ShapeGradient:  # fmt: skip
         g = ShapeGradient()
-        e = m.ellipse(mean, quat, log_scale, view, K, width, height, near, low_pass)
+        e = m.ellipse(mean, quat, log_scale, view, K, lens, width, height, near, low_pass)
         rotation = mat33(
             view[0, 0], view[0, 1], view[0, 2],
             view[1, 0], view[1, 1], view[1, 2],
@@ -64,7 +64,7 @@ def make_functions(real, camera_model: str):
         v_m2 = s_det * (per_det * (wp.cross(normal, e.m1) + blur * e.m2)) + v_b * e.m1 + s_c * (per_c * e.m2)
 
         # projected axes -> camera axes (section 3)
-        v_axes = m.axes_backward(e.position, K, e.expansion_point, v_m1, v_m2)
+        v_axes = m.axes_backward(e.position, K, lens, e.expansion_point, v_m1, v_m2)
         axes0 = vec3(e.axes[0, 0], e.axes[0, 1], e.axes[0, 2])
         axes1 = vec3(e.axes[1, 0], e.axes[1, 1], e.axes[1, 2])
         axes2 = vec3(e.axes[2, 0], e.axes[2, 1], e.axes[2, 2])
@@ -79,7 +79,7 @@ def make_functions(real, camera_model: str):
         # mean in the image, Jacobian and depth -> position in the camera (section 3)
         v_pixel = vec2(v_projected[i, 0], v_projected[i, 1])
         c = m.position_backward(
-            e.position, K, e.pixel, e.expansion_point, e.axes, v_m1, v_m2, v_pixel, v_projected[i, 9]
+            e.position, K, lens, e.pixel, e.expansion_point, e.axes, v_m1, v_m2, v_pixel, v_projected[i, 9]
         )  # fmt: skip
         g.position = c.v_position
         g.mean = wp.transpose(rotation) * g.position
@@ -145,7 +145,7 @@ def make_backward(real, native: bool, camera_model: str):
         begin: int,
         means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
         logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
-        viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33),
+        viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33), lenses: wp.array2d(dtype=real),
         width: int, height: int, sh_count: int, near: real, low_pass: real,
         projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), v_projected: wp.array2d(dtype=real),
         camera_gradients: int,
@@ -185,6 +185,7 @@ def make_backward(real, native: bool, camera_model: str):
                     log_scales[n],
                     view,
                     Ks[camera],
+                    lenses[camera],
                     real(width),
                     real(height),
                     near,

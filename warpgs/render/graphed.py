@@ -17,8 +17,11 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from warpgs.kernels import blend, project, sh
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, Tiles, bin_tiles
+from warpgs.kernels import blend, project
+from warpgs.kernels.cameras.base import CAMERA_MODELS
+from warpgs.kernels.project_inputs import ProjectInputs
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, Tiles
+from warpgs.render.compose import InstanceMemory, composite_into, count_instances
 from warpgs.render.settings import RenderSettings
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import Allocator, fetch
@@ -47,13 +50,9 @@ class GraphedRasterizer:
             capacity: Number of instances to allocate memory for.
             graphs: Pool to capture graphs in.
         """
-        x, y, width, height = settings.window
         self.settings, self.cameras, self.capacity, self.device = settings, cameras, capacity, graphs.device
-        size, sh_count = (settings.width, settings.height), sh.coefficient_count(settings.degree)
-        self._project_settings = project.ProjectSettings(
-            size, settings.window, sh_count, settings.rule, settings.tile_size, settings.camera_model
-        )
-        self._blend_settings = blend.BlendSettings((x, y), width, height, settings.rule)
+        self._project_settings = settings.projection()
+        self._coefficients = CAMERA_MODELS.find(settings.camera_model).coefficients
         self.rendered = 0
         """Number of renders that fitted."""
         self.instances = 0
@@ -62,7 +61,7 @@ class GraphedRasterizer:
         self._host_total = wp.zeros(1, dtype=wp.int64, device="cpu", pinned=on_gpu)
         self._total, self._stream = self._host_total.numpy(), graphs.stream
         self._total_ready = torch.cuda.Event() if on_gpu else None
-        self._table = wp.zeros(2, dtype=wp.uint64, device="cpu", pinned=on_gpu)
+        self._table = wp.zeros(3, dtype=wp.uint64, device="cpu", pinned=on_gpu)
         self._addresses = self._table.numpy()
         # by proxy, so that this object is freed, and its graphs with it, as soon as nobody holds it
         functions = [
@@ -80,25 +79,25 @@ class GraphedRasterizer:
         self._no_factors = torch.empty(0, dtype=torch.float32, device=self.device)
         self._black: torch.Tensor | None = None
 
-    def render(self, sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor | None):
+    def render(self, inputs: ProjectInputs, backgrounds: torch.Tensor | None):
         """Return images, projected Gaussians and tile counts; None where the instances exceed the capacity.
 
         Args:
-            sources: The seven tensors that `project` takes, with their shapes [...].
+            inputs: The tensors, without opacity factors.
             backgrounds: Colour behind everything, shape [C, 3]; None for black.
         """
-        viewmats, Ks = sources[5].contiguous(), sources[6].contiguous()
-        self._addresses[:] = viewmats.data_ptr(), Ks.data_ptr()  # nobody reads them any more: the last call was waited for
-        (cameras, *projection), _ = self._forward_project(*sources[:5])
+        of_cameras = [t.contiguous() for t in inputs[5:8]]
+        self._addresses[:] = [t.data_ptr() for t in of_cameras]  # nobody reads them any more: the last call was waited for
+        (cameras, *projection), _ = self._forward_project(*inputs[:5])
         if self._total_ready is not None:
             self._total_ready.record(self._stream)
         if backgrounds is None:
             if self._black is None:
-                self._black = torch.zeros(len(sources[5]), 3, dtype=torch.float32, device=self.device)
+                self._black = torch.zeros(self.cameras, 3, dtype=torch.float32, device=self.device)
             backgrounds = self._black
         backgrounds = backgrounds.contiguous()
         images, block = self._forward_blend(*projection, backgrounds.detach())
-        projected = _projected(*sources, self, cameras, projection)
+        projected = _projected(*inputs[:7], self, cameras, projection)
         images = _blended(projected, backgrounds, self, projection[1], images, block)
         if self._total_ready is not None:
             self._total_ready.synchronize()  # not before: the device goes on meanwhile
@@ -108,16 +107,18 @@ class GraphedRasterizer:
         self.rendered += 1
         return images, projected, projection[1]
 
-    def _seven(self, sources, cameras: torch.Tensor) -> list[torch.Tensor]:
-        """Return the seven tensors that `project` takes, from five and one that holds viewmats and Ks one after the other."""
-        first = 16 * self.cameras
-        return [*sources, cameras[:first].view(-1, 4, 4), cameras[first:].view(-1, 3, 3)]
+    def _inputs(self, gaussians, cameras: torch.Tensor) -> ProjectInputs:
+        """Return all inputs from the tensors of the Gaussians [...] and one that holds those of the cameras, [F]."""
+        first, second = 16 * self.cameras, 25 * self.cameras
+        viewmats, Ks = cameras[:first].view(-1, 4, 4), cameras[first:second].view(-1, 3, 3)
+        distortion = cameras[second:].view(self.cameras, self._coefficients)
+        return ProjectInputs(*gaussians, viewmats, Ks, distortion, self._no_factors)
 
-    def _project_and_count(self, allocator: Allocator, *sources: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def _project_and_count(self, allocator: Allocator, *gaussians: torch.Tensor) -> tuple[torch.Tensor, ...]:
         # a copy, since gradients are still to come when the next call's cameras are at the same addresses
-        cameras = allocator.output((25 * self.cameras,), torch.float32, self.device)
-        fetch(self._table.ptr, 16 * self.cameras, cameras)
-        _, counts = project.project_tensors(self._seven(sources, cameras), self._no_factors, self._project_settings, allocator)
+        cameras = allocator.output(((25 + self._coefficients) * self.cameras,), torch.float32, self.device)
+        fetch(self._table.ptr, 16 * self.cameras, 25 * self.cameras, cameras)
+        _, counts = project.project_tensors(self._inputs(gaussians, cameras), self._project_settings, allocator)
         total = allocator.workspace((1,), torch.int64, self.device)
         torch.sum(counts.view(-1), 0, keepdim=True, dtype=torch.int64, out=total)
         with interop.stream_of(self.device):
@@ -125,28 +126,24 @@ class GraphedRasterizer:
         return ()
 
     def _bin_and_blend(self, allocator: Allocator, projected, counts, backgrounds) -> tuple[torch.Tensor, ...]:
-        s = self._blend_settings
         overflow = allocator.workspace((1,), torch.int32, self.device).zero_()  # not read: the count tells before
-        tiles = bin_tiles(
-            projected, counts, width=s.width, height=s.height, tile_size=self.settings.tile_size, rule=s.rule, origin=s.origin,
-            capacity=self.capacity, overflow=overflow, allocator=allocator,
-        )  # fmt: skip
-        _, _, _, *saved = blend.composite(projected, tiles, backgrounds, s, save=True, allocator=allocator)
+        memory = InstanceMemory(None, self.capacity, overflow, allocator)
+        tiles, (_, _, _, *saved) = composite_into(projected, counts, backgrounds, self.settings, memory)
         return *(t for t in tiles.tensors() if t is not tiles.counts), *saved
 
     def _blend_gradients(self, allocator: Allocator, projected, counts, backgrounds, rgb, depth, block, *v_images) -> tuple[()]:
         ranges, ids, slots, starts, tile_ids, total, *saved = self._forward_blend.saved(block)
         tiles = Tiles(self.settings.tile_size, ranges, ids, slots, starts, counts.view(-1), tile_ids, total)
         saved = (rgb, depth, *saved)
-        blend.composite_gradients(projected, tiles, backgrounds, self._blend_settings, saved, v_images, allocator)
+        blend.composite_gradients(projected, tiles, backgrounds, self.settings.blending(), saved, v_images, allocator)
         return ()
 
     def _project_gradients(self, allocator: Allocator, *inputs: torch.Tensor) -> tuple[()]:
-        *sources, cameras, projected, counts, v_projected = inputs
-        seven = self._seven(sources, cameras)
+        *gaussians, cameras, projected, counts, v_projected = inputs
         project.project_gradients(
-            seven, self._project_settings, projected, counts, v_projected, wants_camera=False, allocator=allocator
-        )
+            self._inputs(gaussians, cameras)[:8], self._project_settings, projected, counts, v_projected,
+            wants_camera=False, allocator=allocator,
+        )  # fmt: skip
         return ()
 
     def blend_gradients(self, saved: tuple[torch.Tensor, ...], v_images, wants_backgrounds: bool):
@@ -164,15 +161,19 @@ class GraphedRasterizer:
         Raises:
             RuntimeError: The number of Gaussians has changed since they were rendered.
         """
-        *sources, cameras, projected, counts = saved
-        if len(sources[0]) != projected.shape[1]:  # by way of `.data`, which autograd does not see
+        *gaussians, cameras, projected, counts = saved
+        if len(gaussians[0]) != projected.shape[1]:  # by way of `.data`, which autograd does not see
             raise RuntimeError(
-                f"{projected.shape[1]:,} Gaussians were rendered, and now there are {len(sources[0]):,}: render again first"
+                f"{projected.shape[1]:,} Gaussians were rendered, and now there are {len(gaussians[0]):,}: render again first"
             )
         if v_projected is None or wants_camera:
-            seven = self._seven(sources, cameras)
             return project.project_gradients(
-                seven, self._project_settings, projected, counts, v_projected, wants_camera=wants_camera
+                self._inputs(gaussians, cameras)[:8],
+                self._project_settings,
+                projected,
+                counts,
+                v_projected,
+                wants_camera=wants_camera,
             )
         found, _ = self._backward_project(*saved, v_projected.contiguous())
         return *found, None, None
@@ -240,12 +241,12 @@ class Recorder:
         self._exceeded: tuple[tuple | None, int] = (None, 0)
         """Key of the last call that exceeded its capacity, and its number of instances."""
 
-    def render(self, sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor | None, settings: RenderSettings):
+    def render(self, inputs: ProjectInputs, backgrounds: torch.Tensor | None, settings: RenderSettings):
         """Return what `GraphedRasterizer.render` returns; None where the call must run without graphs.
 
-        ``sources`` are the seven tensors that `project` takes, with their shapes [...]; ``backgrounds`` [C, 3] may be None.
+        ``inputs`` are without opacity factors; ``backgrounds`` [C, 3] may be None.
         """
-        key = None if self.graphs.failed else call_key(sources, backgrounds, settings)
+        key = None if self.graphs.failed else call_key(inputs, backgrounds, settings)
         if key is None or not self.graphs.lock.acquire(blocking=False):
             return None
         try:
@@ -256,11 +257,11 @@ class Recorder:
             if self._calls < self.min_calls or self._too_large:
                 return None
             if self.rasterizer is None:
-                self._make(sources, settings)
+                self._make(inputs, settings)
             if self.rasterizer is None:
                 return None
             try:
-                found = self.rasterizer.render(sources, backgrounds)
+                found = self.rasterizer.render(inputs, backgrounds)
             except BaseException:
                 if self.graphs.stream is not None:
                     with contextlib.suppress(RuntimeError):  # what went wrong is raised below
@@ -274,17 +275,16 @@ class Recorder:
         finally:
             self.graphs.lock.release()
 
-    def _make(self, sources: tuple[torch.Tensor, ...], settings: RenderSettings) -> None:
+    def _make(self, inputs: ProjectInputs, settings: RenderSettings) -> None:
         """Make the rasterizer, unless its lists would take too much memory."""
-        with torch.no_grad():
-            instances = int(project.project(*sources, **settings.project_options())[1].sum())
+        instances = int(count_instances(inputs, settings))
         if self._exceeded[0] == self._key:
             instances = max(instances, self._exceeded[1])
         budget = MAX_MEMORY_FRACTION * available_bytes(self.graphs.device)
         self._too_large = CAPACITY_FACTOR * instances * BYTES_PER_INSTANCE > budget
         if not self._too_large:
             capacity = int(CAPACITY_FACTOR * instances) + 1024
-            self.rasterizer = GraphedRasterizer(settings, len(sources[5]), capacity, self.graphs)
+            self.rasterizer = GraphedRasterizer(settings, len(inputs.viewmats), capacity, self.graphs)
 
     def _drop(self) -> None:
         if self.rasterizer is not None:
@@ -299,25 +299,25 @@ class Recorder:
             self.min_calls, self._exceeded = MIN_CALLS, (None, 0)
 
 
-def call_key(sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor | None, settings: RenderSettings) -> tuple | None:
+def call_key(inputs: ProjectInputs, backgrounds: torch.Tensor | None, settings: RenderSettings) -> tuple | None:
     """Return the values that calls must have in common to use one rasterizer.
 
-    None for calls that cannot be captured, and for those that need not be: large ones, and those without gradients. ``sources``
-    are the seven tensors that `project` takes, with their shapes [...]; ``backgrounds`` [C, 3] may be None.
+    None for calls that cannot be captured, and for those that need not be: large ones, and those without gradients.
+    ``backgrounds`` [C, 3] may be None.
     """
-    means, viewmats = sources[0], sources[5]
+    means, viewmats = inputs.means, inputs.viewmats
     small = 0 < len(means) * len(viewmats) <= MAX_PROJECTED
-    fit = means.dtype == torch.float32 and torch.is_grad_enabled() and any(t.requires_grad for t in sources)
+    fit = means.dtype == torch.float32 and torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
     if not (small and fit) or torch.is_inference_mode_enabled() or not _can_capture(means.device):
         return None
     if backgrounds is not None and tuple(backgrounds.shape) != (len(viewmats), 3):
         return None
     places = []
-    for t in sources[:5]:
+    for t in inputs[:5]:
         if not (t.is_contiguous() and t.dtype == torch.float32 and t.device == means.device):
             return None
         places.append((t.data_ptr(), t.shape))
-    return *places, viewmats.shape, sources[6].shape, backgrounds is None, settings
+    return *places, viewmats.shape, inputs.Ks.shape, inputs.distortion.shape, backgrounds is None, settings
 
 
 def _can_capture(device: torch.device) -> bool:

@@ -10,13 +10,12 @@ import torch
 
 from warpgs.constants import RULES, Rule
 from warpgs.errors import UsageError
-from warpgs.kernels.blend import blend, contributions
-from warpgs.kernels.cameras.base import CAMERA_MODELS
-from warpgs.kernels.median_depth import median_depth
-from warpgs.kernels.project import project
-from warpgs.kernels.tiles import bin_tiles
+from warpgs.kernels.cameras.base import check_camera
+from warpgs.kernels.project import project_inputs
+from warpgs.kernels.project_inputs import ProjectInputs
 from warpgs.render import graphed
 from warpgs.render.chunked import ChunkedFrame, blend_chunked, contributions_chunked, median_depth_chunked
+from warpgs.render.compose import InstanceMemory, bin_and_blend, inputs_of, median_depth_of, settings_of, weights_of
 from warpgs.render.settings import RenderSettings, Window
 from warpgs.scene import Camera, Gaussians, Render
 
@@ -83,7 +82,7 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
         raise UsageError(f"unknown rule {options.rule!r}: choose one of {', '.join(RULES)}, or give a Rule")
     if options.tile_size not in TILE_SIZES:
         raise UsageError(f"tile size {options.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
-    CAMERA_MODELS.find(camera.model)
+    check_camera(camera)
     if options.max_instances is not None and (options.capacity is not None or options.max_instances < 1):
         raise UsageError("max_instances must be at least 1 and does not go with a capacity")
     return rule
@@ -136,14 +135,6 @@ def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
     return x, y, w, h
 
 
-def _as_batch(array: Any, like: torch.Tensor, rows: int) -> torch.Tensor:
-    """Return one matrix or a batch of them as a tensor [C, rows, rows] of the type and on the device of ``like``."""
-    if isinstance(array, torch.Tensor) and array.ndim == 3 and array.dtype == like.dtype and array.device == like.device:
-        return array
-    tensor = torch.as_tensor(array, dtype=like.dtype, device=like.device)
-    return tensor.reshape(-1, rows, rows) if tensor.ndim < 3 else tensor
-
-
 def _backgrounds(background: Any, viewmats: torch.Tensor) -> torch.Tensor:
     """Return one colour or a batch of them as a tensor [C, 3]."""
     colors: torch.Tensor = torch.as_tensor(background, dtype=viewmats.dtype, device=viewmats.device)
@@ -176,48 +167,38 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
     """
     _check_arguments(gaussians, camera, options)
     rule = _checked_rule(camera, options)
-    means = gaussians.means
-    viewmats, Ks = _as_batch(camera.viewmat, means, 4), _as_batch(camera.K, means, 3)
+    inputs = inputs_of(gaussians, camera, options.opacity_factors)
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
-    window = _checked_window(camera, options)
-    settings = RenderSettings(camera.width, camera.height, window, degree, rule, options.tile_size, camera.model)
-    backgrounds = None if options.background is None else _backgrounds(options.background, viewmats)
-    sources = (*gaussians.tensors().values(), viewmats, Ks)
-    if means.is_cuda and options.repeatable():
-        found = graphed.recorder(means.device).render(sources, backgrounds, settings)
+    settings = settings_of(camera, degree, rule, window=_checked_window(camera, options), tile_size=options.tile_size)
+    backgrounds = None if options.background is None else _backgrounds(options.background, inputs.viewmats)
+    if inputs.means.is_cuda and options.repeatable():
+        found = graphed.recorder(inputs.means.device).render(inputs, backgrounds, settings)
         if found is not None:
             return _as_render(camera, *found)
-    backgrounds = _backgrounds(means.new_zeros(3), viewmats) if backgrounds is None else backgrounds
-    *found, median = _rasterize(sources, backgrounds, settings, options)
+    backgrounds = _backgrounds(inputs.means.new_zeros(3), inputs.viewmats) if backgrounds is None else backgrounds
+    *found, median = _rasterize(inputs, backgrounds, settings, options)
     return _as_render(camera, *found, median=median)
 
 
 def _rasterize(
-    sources: tuple[torch.Tensor, ...], backgrounds: torch.Tensor, settings: RenderSettings, options: RasterizeOptions
+    inputs: ProjectInputs, backgrounds: torch.Tensor, settings: RenderSettings, options: RasterizeOptions
 ) -> tuple[Any, ...]:
     """Return the images as one tuple, and the further fields of `Render`, by kernels that are launched one by one.
 
     The last is the median depth, shape [C, H, W], or None.
     """
-    projected, tile_counts = project(*sources, opacity_factors=options.opacity_factors, **settings.project_options())
+    projected, tile_counts = project_inputs(inputs, settings.projection())
     if options.max_instances is not None and int(tile_counts.sum()) > options.max_instances:
         frame = ChunkedFrame(settings, options.max_instances, options.deterministic)
-        factors = () if options.opacity_factors is None else (options.opacity_factors,)
-        sources = (*sources, *factors)
-        images = blend_chunked(projected, backgrounds, frame, sources)
-        weights = contributions_chunked(projected, frame, sources) if options.contributions else (None, None)
-        median = median_depth_chunked(projected, frame, sources) if options.median_depth else None
+        images = blend_chunked(projected, backgrounds, frame, inputs)
+        weights = contributions_chunked(projected, frame, inputs) if options.contributions else (None, None)
+        median = median_depth_chunked(projected, frame, inputs) if options.median_depth else None
         return images, projected, tile_counts, *weights, None, median
     overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=projected.device)
-    x, y, width, height = settings.window
-    shared: dict[str, Any] = {"width": width, "height": height, "rule": settings.rule, "origin": (x, y)}
-    tiles = bin_tiles(
-        projected, tile_counts, tile_size=options.tile_size,
-        budget_bytes=options.memory_budget, capacity=options.capacity, overflow=overflow, **shared,
-    )  # fmt: skip
-    images = blend(projected, tiles, backgrounds, deterministic=options.deterministic, **shared)
-    weights = contributions(projected, tiles, **shared) if options.contributions else (None, None)
-    median = median_depth(projected, tiles, **shared) if options.median_depth else None
+    memory = InstanceMemory(options.memory_budget, options.capacity, overflow)
+    tiles, images = bin_and_blend(projected, tile_counts, backgrounds, settings, memory, options.deterministic)
+    weights = weights_of(projected, tiles, settings) if options.contributions else (None, None)
+    median = median_depth_of(projected, tiles, settings) if options.median_depth else None
     return images, projected, tile_counts, *weights, overflow, median
 
 

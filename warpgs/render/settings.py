@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from warpgs.constants import Rule
+from warpgs.kernels import sh
+from warpgs.kernels.blend_settings import BlendSettings
+from warpgs.kernels.project_inputs import ProjectSettings
 
 Window = tuple[int, int, int, int]
 """Left, top, width and height [px]."""
@@ -12,7 +16,7 @@ Window = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """Image, window and cut-offs of a render."""
+    """Image, window, cut-offs and camera model of a render."""
 
     width: int
     """Width of the whole image [px]."""
@@ -24,14 +28,22 @@ class RenderSettings:
     """Spherical-harmonics degree used."""
     rule: Rule
     """Cut-offs."""
-    tile_size: int
+    tile_size: int = 16
     """Side of a tile [px]."""
     camera_model: str = "pinhole"
     """Name of the camera model."""
 
-    def project_options(self) -> dict:
-        """Return the keyword arguments of `project` but for the opacity factors."""
-        return {
-            "width": self.width, "height": self.height, "window": self.window, "degree": self.degree, "rule": self.rule,
-            "tile_size": self.tile_size, "camera_model": self.camera_model,
-        }  # fmt: skip
+    def projection(self) -> ProjectSettings:
+        """Return what the projection takes."""
+        size, count = (self.width, self.height), sh.coefficient_count(self.degree)
+        return ProjectSettings(size, self.window, count, self.rule, self.tile_size, self.camera_model)
+
+    def of_window(self) -> dict[str, Any]:
+        """Return size, place and cut-offs of the window, as binning and blending take them by name."""
+        x, y, width, height = self.window
+        return {"width": width, "height": height, "rule": self.rule, "origin": (x, y)}
+
+    def blending(self, deterministic: bool = True) -> BlendSettings:
+        """Return what blending takes; ``deterministic`` sums gradients in a fixed order."""
+        x, y, width, height = self.window
+        return BlendSettings((x, y), width, height, self.rule, deterministic)

@@ -126,21 +126,22 @@ def part(block: torch.Tensor, begin: int, shape: tuple[int, ...], dtype: torch.d
 @functools.cache
 def _make_fetch():
     @wp.func_native(source("allocator_fetch.cu"))
-    def body(item: int, table: wp.uint64, first: int, out: wp.array(dtype=float)): ...
+    def body(item: int, table: wp.uint64, first: int, second: int, out: wp.array(dtype=float)): ...
 
     @wp.kernel(enable_backward=False, module="warpgs.runtime.allocator.fetch")
-    def fetch(begin: int, table: wp.uint64, first: int, out: wp.array(dtype=float)):
-        body(begin + wp.tid(), table, first, out)
+    def fetch(begin: int, table: wp.uint64, first: int, second: int, out: wp.array(dtype=float)):
+        body(begin + wp.tid(), table, first, second, out)
 
     return fetch
 
 
-def fetch(table: int, first: int, out: torch.Tensor) -> None:
-    """Copy two tensors into one, from the addresses that a table holds when the kernel runs.
+def fetch(table: int, first: int, second: int, out: torch.Tensor) -> None:
+    """Copy three tensors into one, from the addresses that a table holds when the kernel runs.
 
     Args:
-        table: Address of a table of two addresses of float32 numbers, in memory that the device of ``out`` can read.
-        first: Count of numbers at the first address; the rest is at the second.
+        table: Address of a table of three addresses of float32 numbers, in memory that the device of ``out`` can read.
+        first: Count of numbers at the first address.
+        second: Count of numbers at the first two; the rest is at the third.
         out: Result, float32, contiguous, any shape.
     """
-    interop.launch(_make_fetch(), out.numel(), [table, first, interop.view(out.view(-1), wp.float32)], out.device)
+    interop.launch(_make_fetch(), out.numel(), [table, first, second, interop.view(out.view(-1), wp.float32)], out.device)

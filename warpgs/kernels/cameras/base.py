@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+from warpgs.errors import UsageError
 from warpgs.plugins import Registry
+from warpgs.scene import Camera
 
 
 class CameraModel:
@@ -12,31 +14,34 @@ class CameraModel:
 
     name: str
     """Name that `Camera.model` selects the model by."""
+    coefficients: int = 0
+    """Number P of the coefficients that `Camera.distortion` holds for this model."""
 
     @staticmethod
     def make_functions(real: type) -> SimpleNamespace:
         """Make the functions for one scalar type, wp.float32 or wp.float64.
 
         Below, ``position`` is a mean in camera coordinates [u] (+x right, +y down, +z forward), ``K`` the intrinsics [3, 3],
-        ``pixel`` the result of ``pixel_of`` and J the Jacobian of ``pixel_of`` by the position, 2 x 3. The namespace has:
+        ``lens`` the coefficients of distortion, a Warp array [P], ``pixel`` the result of ``pixel_of`` and J the Jacobian of
+        ``pixel_of`` by the position, 2 x 3. The namespace has:
 
-        ``in_range(position, near) -> bool``: True where the model can project this position. A NaN must give False.
+        ``in_range(position, lens, near) -> bool``: True where the model can project this position. A NaN must give False.
 
-        ``pixel_of(position, K) -> vec2``: The projected position [px].
+        ``pixel_of(position, K, lens) -> vec2``: The projected position [px].
 
         ``expansion_point(pixel, width, height) -> vec2``: The pixel at which J is taken [px]: ``pixel`` itself, clamped
         to somewhat more than the image, since far outside of it a first-order expansion errs too much.
 
-        ``project_axes(position, K, point, axes) -> Rows``: J times ``axes`` [3, 3], with J at the expansion point
+        ``project_axes(position, K, lens, point, axes) -> Rows``: J times ``axes`` [3, 3], with J at the expansion point
         ``point``. ``Rows`` is a struct with two vec3, ``first`` and ``second``.
 
-        ``axes_backward(position, K, point, v_first, v_second) -> mat33``: The gradient of ``axes`` from that of the two
+        ``axes_backward(position, K, lens, point, v_first, v_second) -> mat33``: The gradient of ``axes`` from that of the two
         rows.
 
-        ``position_backward(position, K, pixel, point, axes, v_first, v_second, v_pixel, v_depth) -> Gradients``: The
+        ``position_backward(position, K, lens, pixel, point, axes, v_first, v_second, v_pixel, v_depth) -> Gradients``: The
         gradients of position and intrinsics from those of the two rows, of the pixel and of ``position[2]``.
         ``Gradients`` is a struct with ``v_position`` (vec3) and ``v_K`` (mat33). Where ``point`` equals ``pixel``, J
-        moves with the position; else it does not.
+        moves with the position; else it does not. The coefficients have no gradient.
 
         Raises:
             TypeError: The class does not define it.
@@ -47,3 +52,19 @@ class CameraModel:
 CAMERA_MODELS = Registry("camera model", CameraModel, "warpgs.kernels.cameras")
 """Camera models by name."""
 register = CAMERA_MODELS.register
+
+
+def check_camera(camera: Camera) -> type[CameraModel]:
+    """Return the model of a camera, or of a batch.
+
+    Raises:
+        UsageError: The model is unknown, or the camera has another number of coefficients than it takes.
+    """
+    model = CAMERA_MODELS.find(camera.model)
+    found = 0 if camera.distortion is None else camera.distortion.shape[-1]
+    if found != model.coefficients:
+        raise UsageError(
+            f"the camera model {camera.model!r} takes {model.coefficients} coefficients of distortion, found {found}; give "
+            "Camera.distortion the shape [P] or [C, P]"
+        )
+    return model

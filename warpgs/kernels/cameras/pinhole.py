@@ -40,12 +40,12 @@ def _make_functions(real: type) -> SimpleNamespace:
         v_K: mat33
 
     @wp.func
-    def in_range(position: vec3, near: real) -> wp.bool:
+    def in_range(position: vec3, lens: wp.array(dtype=real), near: real) -> wp.bool:
         # phrased so that a NaN gives False
         return position[2] >= near and position[2] <= real(FAR)
 
     @wp.func
-    def pixel_of(position: vec3, K: mat33) -> vec2:
+    def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
         return vec2(K[0, 0] * position[0] / position[2] + K[0, 2], K[1, 1] * position[1] / position[2] + K[1, 2])
 
     @wp.func
@@ -57,7 +57,7 @@ def _make_functions(real: type) -> SimpleNamespace:
         )
 
     @wp.func
-    def project_axes(position: vec3, K: mat33, point: vec2, axes: mat33) -> Rows:
+    def project_axes(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, axes: mat33) -> Rows:
         z = position[2]
         jx = K[0, 0] / z
         jy = K[1, 1] / z
@@ -77,7 +77,9 @@ def _make_functions(real: type) -> SimpleNamespace:
         return rows
 
     @wp.func
-    def axes_backward(position: vec3, K: mat33, point: vec2, v_first: vec3, v_second: vec3) -> mat33:
+    def axes_backward(
+        position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, v_first: vec3, v_second: vec3
+    ) -> mat33:
         inv_z = real(1.0) / position[2]
         jx = K[0, 0] * inv_z
         jy = K[1, 1] * inv_z
@@ -90,8 +92,8 @@ def _make_functions(real: type) -> SimpleNamespace:
 
     @wp.func
     def position_backward(
-        position: vec3, K: mat33, pixel: vec2, point: vec2, axes: mat33, v_first: vec3, v_second: vec3,
-        v_pixel: vec2, v_depth: real,
+        position: vec3, K: mat33, lens: wp.array(dtype=real), pixel: vec2, point: vec2, axes: mat33,
+        v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
     ) -> Gradients:  # fmt: skip
         x = position[0]
         y = position[1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -81,7 +82,7 @@ def _reduced(view: View, render: Rendered) -> _Small:
     if view.mask is not None:
         counts &= cv2.resize(view.mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
     K = np.diag([width / c.width, height / c.height, 1]) @ c.K
-    return _Small(Camera(c.viewmat, K, width, height, c.model), cv2.blur(beyond, (side, side)), depth, counts)
+    return _Small(replace(c, K=K, width=width, height=height), cv2.blur(beyond, (side, side)), depth, counts)
 
 
 def _residuals_elsewhere(small: Sequence[_Small], index: int, others: Sequence[int]) -> np.ndarray:

@@ -51,6 +51,8 @@ def failed_step(trainer: Trainer, view: int, name: str, slot: int = 0) -> Bundle
         shift = torch.tensor(settings[SHIFT], dtype=torch.float32, device=image.device)
         image, background = over(image, shown.alpha, shift), background + shift
     tensors = {"image": image, "viewmat": camera.viewmat, "K": camera.K, "background": background}
+    if camera.distortion is not None:
+        tensors["distortion"] = camera.distortion
     tensors |= {f"params.{n}": t for n, t in trainer.gaussians.tensors().items()}
     tensors |= {f"maps.{n}": t for n, t in shown.maps.items()}
     tensors |= {f"own.{n}": t.detach()[view] for n, t in trainer.view_table.params.items()}
@@ -62,7 +64,7 @@ def failed_step(trainer: Trainer, view: int, name: str, slot: int = 0) -> Bundle
         tensors["alpha"] = shown.alpha
     plain = {
         "config": trainer.config.to_json(), "step": number, "view": name, "width": camera.width, "height": camera.height,
-        "degree": plan.degree, "settings": settings, "dropout_seed": trainer.learned.dropout_seed,
+        "camera_model": camera.model, "degree": plan.degree, "settings": settings, "dropout_seed": trainer.learned.dropout_seed,
     }  # fmt: skip
     return tensors, plain
 
@@ -138,7 +140,9 @@ def _rendered(gaussians: Gaussians, bundle: Bundle, config: FitConfig) -> Render
     options = RasterizeOptions(
         rule=config.rule, sh_degree=plain["degree"], background=tensors["background"], opacity_factors=factors
     )
-    return rasterize(gaussians, Camera(tensors["viewmat"], tensors["K"], plain["width"], plain["height"]), options)
+    size, model = (plain["width"], plain["height"]), plain.get("camera_model", "pinhole")
+    camera = Camera(tensors["viewmat"], tensors["K"], *size, model, tensors.get("distortion"))
+    return rasterize(gaussians, camera, options)
 
 
 def _state(values: torch.Tensor) -> str:

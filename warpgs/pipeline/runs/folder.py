@@ -18,6 +18,7 @@ from warpgs import __version__, schema
 from warpgs.errors import DataError, UsageError
 from warpgs.files import is_empty, plain
 from warpgs.io.splits import Split
+from warpgs.kernels.cameras.base import check_camera
 from warpgs.pipeline.model.model_file import FittedModel, checked_gaussians
 from warpgs.pipeline.model.parameter_bounds import unpack
 from warpgs.pipeline.runs.checkpoint import FORMAT, TENSORS, load_checkpoint
@@ -79,8 +80,17 @@ def _check_folder(out: Path, resume: bool) -> None:
 
 
 def camera_values(camera: Camera) -> dict[str, Any]:
-    """Return the values of a camera as config.json holds them."""
-    return {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in vars(camera).items()}
+    """Return the values of a camera as config.json holds them; coefficients only where the model has some."""
+    values = {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in vars(camera).items()}
+    return values if camera.distortion is not None else {n: v for n, v in values.items() if n != "distortion"}
+
+
+def _camera(values: dict[str, Any]) -> Camera:
+    """Return the camera of values that `camera_values` made; UsageError where its model is not there."""
+    arrays = {k: np.array(values[k], np.float64) for k in ("viewmat", "K", "distortion") if values.get(k) is not None}
+    camera = Camera(**(values | arrays))
+    check_camera(camera)
+    return camera
 
 
 def record_of(
@@ -263,8 +273,10 @@ def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredR
     folder = Path(folder)
     where, _ = choose_device(device)
     record = read_record(folder)
-    matrices = ("viewmat", "K")
-    cameras = {n: Camera(**(c | {k: np.array(c[k], np.float64) for k in matrices})) for n, c in record["cameras"].items()}
+    try:
+        cameras = {n: _camera(c) for n, c in record["cameras"].items()}
+    except UsageError as e:
+        raise DataError(f"{folder / CONFIG}: {e}") from e
     offset, scale = record["normalization"]["offset"], record["normalization"]["scale"]
     red, green, blue = map(float, record["background"])
     tensors, state = load_checkpoint(folder)

@@ -39,7 +39,7 @@ def _matrix(rows: int) -> Schema:
 
 _CAMERA = fields(
     {"viewmat": _matrix(4), "K": _matrix(3), "width": whole(1, MAX_SIDE), "height": whole(1, MAX_SIDE)},
-    {"model": text},
+    {"model": text, "distortion": items(number())},
     others=False,
 )
 _SCENE = fields(

@@ -15,10 +15,11 @@ import torch
 from warpgs.constants import RULES, TILE_SIZE
 from warpgs.errors import UsageError
 from warpgs.kernels import blend, blend_cuda
-from warpgs.kernels.project import PROJECTED_SIZE, project
+from warpgs.kernels.project import PROJECTED_SIZE
 from warpgs.kernels.tiles import LIST_BYTES, MAX_INSTANCES, grid
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.views import TrainingView
+from warpgs.render.compose import count_instances, inputs_of, settings_of
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.terminal import Detail
 from warpgs.scene import Camera, Gaussians
@@ -287,11 +288,7 @@ def view_bytes(views: Iterable[TrainingView]) -> int:
 @torch.no_grad()
 def most_instances(gaussians: Gaussians, cameras: list[Camera], rule: str) -> int:
     """Return the (Gaussian, tile) instances of the camera that has most; cameras hold tensors."""
-    counts = []
-    for c in cameras:
-        how = {"width": c.width, "height": c.height, "degree": 0, "rule": RULES[rule]}
-        counts.append(int(project(*gaussians.tensors().values(), c.viewmat[None], c.K[None], **how)[1].sum()))
-    return max(counts)
+    return max(int(count_instances(inputs_of(gaussians, c), settings_of(c, 0, RULES[rule]))) for c in cameras)
 
 
 def plan(

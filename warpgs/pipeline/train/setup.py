@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from warpgs.errors import UsageError
+from warpgs.kernels.cameras.base import check_camera
 from warpgs.pipeline.metrics.region import fitted_region
 from warpgs.pipeline.model.init import Start, check_points, initial_points, subsample
 from warpgs.pipeline.train.config import FitConfig
@@ -56,7 +57,10 @@ def prepare(
 
     Raises:
         DataError: There is nothing to start from.
+        UsageError: A view's camera cannot be rendered: its model is not there, or it has other coefficients.
     """
+    for view in train:
+        check_camera(view.camera)
     check_points(train, points, config.init)  # before anything takes time
     where = device if config.memory_limit is None else torch.device("cpu")
 

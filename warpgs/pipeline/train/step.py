@@ -15,11 +15,9 @@ import torch
 
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
-from warpgs.kernels.blend import blend
 from warpgs.kernels.dropout import opacity_dropout
-from warpgs.kernels.project import project
 from warpgs.kernels.step_buffers import NOT_FINITE, SHIFT, Setting, begin_step, end_step
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, bin_tiles
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES
 from warpgs.pipeline.metrics.psnr import masked_mse
 from warpgs.pipeline.model.scale_limits import NO_LIMITS, Limits
 from warpgs.pipeline.model.table import Table
@@ -28,6 +26,7 @@ from warpgs.pipeline.train.loss import LossTerm, Target, over
 from warpgs.pipeline.train.refine_poses import ROTATION, TRANSLATION, moved
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.views import Kind, Rows, ViewStack
+from warpgs.render.compose import InstanceMemory, compose, count_instances, inputs_of, settings_of
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.runtime.cuda_graph import CapturedGraph, GraphMemory
 from warpgs.runtime.device_memory import available_bytes
@@ -94,7 +93,10 @@ class StepBuffers:
         return done, stop, self.history[: done + 1].tolist()
 
     def begin(self, views: ViewStack) -> tuple[torch.Tensor, ...]:
-        """Return learning rates, settings [6], viewmat [1, 4, 4], K [1, 3, 3] and image [H, W, 3] of the current step."""
+        """Return learning rates, settings [6], viewmat [1, 4, 4], K [1, 3, 3] and image [H, W, 3] of the current step.
+
+        The coefficients of its camera are `of_view` of the stack's.
+        """
         if self.device.type == "cpu":  # no copies
             step, row = int(self.counter), int(self.view_rows[int(self.counter)])
             view = views.viewmats[row : row + 1], views.Ks[row : row + 1], views.images[row]
@@ -111,8 +113,8 @@ class StepBuffers:
 
 
 Renderer = Callable[[Gaussians, Camera, int, "torch.Tensor | None", "torch.Tensor | None"], Render]
-"""Function that renders Gaussians for a camera with tensors of one view, a degree, factors of the opacities, and a colour [3]
-that is added to the background."""
+"""Function that renders Gaussians for a batch of one camera, a degree, factors of the opacities, and a colour [3] that is added
+to the background."""
 
 
 def eager_renderer(rule: str, background: torch.Tensor, max_instances: int | None) -> Renderer:
@@ -126,29 +128,29 @@ def eager_renderer(rule: str, background: torch.Tensor, max_instances: int | Non
             rule=rule, sh_degree=degree, background=behind, opacity_factors=factors, max_instances=max_instances,
             record=False,  # it would allocate more than was planned
         )  # fmt: skip
-        camera = replace(camera, viewmat=camera.viewmat[0], K=camera.K[0])
-        return rasterize(gaussians, camera, options)
+        return _single(rasterize(gaussians, camera, options))
 
     return render
 
 
 def captured_renderer(rule: str, background: torch.Tensor, capacity: int, overflow: torch.Tensor) -> Renderer:
     """Return a renderer with a fixed capacity of instances, which sets ``overflow`` [1] if they do not fit; background [3]."""
-    cut, backgrounds = RULES[rule], background[None]
+    cut, backgrounds, memory = RULES[rule], background[None], InstanceMemory(capacity=capacity, overflow=overflow)
 
     def render(
         gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None, shift: torch.Tensor | None
     ) -> Render:
         behind = backgrounds if shift is None else backgrounds + shift
-        size = {"width": camera.width, "height": camera.height}
-        of = (*gaussians.tensors().values(), camera.viewmat, camera.K)
-        projected, counts = project(*of, **size, degree=degree, rule=cut, opacity_factors=factors)
-        tiles = bin_tiles(projected, counts, **size, rule=cut, capacity=capacity, overflow=overflow)
-        # not p[0], whose gradient would be a copy among zeros
-        images = (p.squeeze(0) for p in blend(projected, tiles, behind, **size, rule=cut))
-        return Render(*images, projected, counts)
+        found = compose(inputs_of(gaussians, camera, factors), behind, settings_of(camera, degree, cut), memory)
+        return _single(Render(*found.images, found.projected, found.tile_counts))
 
     return render
+
+
+def _single(batch: Render) -> Render:
+    """Return a render of one camera without the leading axis of its images."""
+    # not p[0], whose gradient would be a copy among zeros
+    return replace(batch, **{n: getattr(batch, n).squeeze(0) for n in ("rgb", "alpha", "depth")})
 
 
 @dataclass(frozen=True)
@@ -227,7 +229,8 @@ def view_gradients(learned: Learned, views: ViewStack, buffers: StepBuffers, pla
     factors = None
     if learned.dropout_seed is not None:
         factors = opacity_dropout(len(table), settings, learned.dropout_seed)
-    rendered = render(table.gaussians, Camera(viewmat, K, **views.size), plan.degree, factors, shift)
+    camera = views.camera(viewmat, K, buffers.of_view(views.distortions)[None] if views.distortions.numel() else None)
+    rendered = render(table.gaussians, camera, plan.degree, factors, shift)
     if EXPOSURE in own:
         rendered = replace(rendered, rgb=exposed(rendered.rgb, own[EXPOSURE]))
     loss = total_loss(plan, rendered, target, table.gaussians, strategy)
@@ -237,8 +240,7 @@ def view_gradients(learned: Learned, views: ViewStack, buffers: StepBuffers, pla
     *gradients, v_projected = torch.autograd.grad(loss, [*params, projected], buffers.one, materialize_grads=True)
     with torch.no_grad():
         going = end_step(loss, masked_mse(rendered.rgb, image, mask), buffers.counter, buffers.stop, buffers.history)
-        size = (views.size["width"], views.size["height"])
-        statistics = strategy.statistics(plan.phase, v_projected, rendered.visible & going, size)
+        statistics = strategy.statistics(plan.phase, v_projected, rendered.visible & going, views.size)
     return ViewGradients(gradients, statistics, lrs, settings, going)
 
 
@@ -355,9 +357,7 @@ def instance_capacity(gaussians: Gaussians, views: ViewStack, degree: int, rule:
     Raises:
         ResourceError: They would not fit into memory.
     """
-    how = {**views.size, "degree": degree, "rule": RULES[rule]}
-    of = gaussians.tensors().values()
-    counts = [project(*of, m[None], K[None], **how)[1].sum() for m, K in zip(views.viewmats, views.Ks)]
+    counts = [count_instances(inputs_of(gaussians, c), settings_of(c, degree, RULES[rule])) for c in views.cameras()]
     wanted = int(CAPACITY_FACTOR * int(torch.stack(counts).max())) + 1024
     budget = available_bytes(gaussians.means.device) * 4 // 5
     if wanted > MAX_INSTANCES or wanted * BYTES_PER_INSTANCE > budget:

@@ -76,8 +76,8 @@ class Trainer:
 
         Raises:
             DataError: There is nothing to start from.
-            UsageError: The memory limit is below what the smallest step needs, a plug-in is not there, two loss terms use one
-                name for a map or a parameter, or views that know their opacity were to have exposures.
+            UsageError: A camera cannot be rendered, the memory limit is below what the smallest step needs, a plug-in is not
+                there, two loss terms share the name of a map or a parameter, or views with an opacity were to have exposures.
         """
         if not train:
             raise DataError("there is no training view; name at least one in --split")

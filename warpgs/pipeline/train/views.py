@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,8 +13,8 @@ from torch.nn.functional import interpolate
 from warpgs.pipeline.metrics.region import OPAQUE
 from warpgs.scene import Camera, View
 
-Kind = tuple[int, int, bool]
-"""Width and height [px] of a view, and whether it has a mask."""
+Kind = tuple[int, int, bool, str]
+"""Width and height [px] of a view, whether it has a mask, and its camera model."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,15 @@ class TrainingView:
             return torch.as_tensor(array, dtype=torch.float32, device=device)
 
         c = view.camera
-        camera = replace(c, viewmat=there(c.viewmat), K=there(c.K))
+        distortion = None if c.distortion is None else there(c.distortion)
+        camera = replace(c, viewmat=there(c.viewmat), K=there(c.K), distortion=distortion)
         mask, alpha = (None if a is None else there(a) for a in (view.mask, view.alpha))
         return TrainingView(camera, there(view.image), mask, alpha=alpha)
 
     @property
     def kind(self) -> Kind:
-        """Width, height and presence of a mask, which the views of one stack share."""
-        return self.camera.width, self.camera.height, self.mask is not None
+        """Width, height, presence of a mask and camera model, which the views of one stack share."""
+        return self.camera.width, self.camera.height, self.mask is not None, self.camera.model
 
     @property
     def countable(self) -> torch.Tensor | None:
@@ -111,6 +112,10 @@ class ViewStack:
     """camera_from_world, shape [V, 4, 4]."""
     Ks: torch.Tensor
     """Intrinsics [px], shape [V, 3, 3]."""
+    distortions: torch.Tensor
+    """Coefficients of the camera model, shape [V, P]."""
+    model: str
+    """Camera model of all views."""
     images: Rows
     """Colours in [0, 1], shape [V, H, W, 3]."""
     masks: Rows | None
@@ -123,10 +128,24 @@ class ViewStack:
     """Opacity of what was photographed, shape [V, H, W]; None where no training view has one."""
 
     @property
-    def size(self) -> dict[str, int]:
-        """Width and height [px] by name."""
+    def size(self) -> tuple[int, int]:
+        """Width and height [px]."""
         height, width = self.images[0].shape[:2]
-        return {"width": width, "height": height}
+        return width, height
+
+    def camera(self, viewmat: torch.Tensor, K: torch.Tensor, distortion: torch.Tensor | None) -> Camera:
+        """Return the camera of views of this stack; all that renders them takes their camera model from here.
+
+        Args:
+            viewmat: camera_from_world, shape [..., 4, 4].
+            K: Intrinsics [px], shape [..., 3, 3].
+            distortion: Coefficients of the camera model, shape [..., P]; None for a model without.
+        """
+        return Camera(viewmat, K, *self.size, self.model, distortion)
+
+    def cameras(self) -> Iterator[Camera]:
+        """Yield the camera of each view."""
+        yield from map(self.camera, self.viewmats, self.Ks, self.distortions)
 
 
 def stacked(tensors: Sequence[torch.Tensor]) -> Rows:
@@ -147,10 +166,15 @@ def stacked(tensors: Sequence[torch.Tensor]) -> Rows:
     return first.as_strided((len(tensors), *first.shape), (first.numel(), *first.stride()))
 
 
+def _coefficients(camera: Camera) -> torch.Tensor:
+    """Return the coefficients of a camera with tensors, shape [P]; [0] for a model without."""
+    return camera.K.new_empty(0) if camera.distortion is None else camera.distortion
+
+
 def stack_views(
     views: list[TrainingView], count: int
 ) -> tuple[list[TrainingView], dict[Kind, ViewStack], list[tuple[Kind, int]]]:
-    """Stack views by size and by whether they have a mask.
+    """Stack views by size, by whether they have a mask, and by camera model.
 
     Args:
         views: Views in the order of their numbers; those beyond ``count`` are the same views again at another size.
@@ -168,6 +192,7 @@ def stack_views(
         device = same[0].image.device
         stack = ViewStack(
             torch.stack([v.camera.viewmat for v in same]), torch.stack([v.camera.K for v in same]),
+            torch.stack([_coefficients(v.camera) for v in same]), kind[3],
             stacked([v.image for v in same]), stacked([v.mask for v in same]) if kind[2] else None,
             {n: stacked([v.maps[n] for v in same]) for n in same[0].maps},
             torch.tensor([i % count for i in numbers], device=device),

@@ -1,0 +1,146 @@
+"""A fit of views whose camera model is not a pinhole: model and coefficients reach every place that renders."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from tests.parallel_camera import NAME
+from tests.scenes import photos, ring, seeds, three_gaussians
+from warpgs.errors import UsageError
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.runs.failed_step import _rendered, failed_step
+from warpgs.pipeline.runs.folder import _camera, camera_values
+from warpgs.pipeline.train import step
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.memory_plan import most_instances
+from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.train.views import half_size
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.scene import Camera, View
+
+CPU = torch.device("cpu")
+CONFIG = FitConfig(
+    steps=40, strategy="clone_split", init=InitConfig(source="points"), max_gaussians=60, half_resolution=0.0, dropout=0.0,
+    batch=1,
+)  # fmt: skip
+BEND = (0.15, -0.05, -0.1, 0.08)
+
+
+def bent(camera: Camera, bend: tuple[float, ...] = BEND) -> Camera:
+    """Return a parallel camera that shows about what a pinhole shows at the distance of the scene's middle."""
+    distance = np.linalg.norm(camera.center)
+    K = np.diag([1 / distance, 1 / distance, 1]) @ camera.K
+    K[:2, 2] = camera.K[:2, 2]
+    return dataclasses.replace(camera, K=K, model=NAME, distortion=np.array(bend))
+
+
+def views(count: int = 4) -> list[View]:
+    """Views of three Gaussians; of every two cameras the second bends the other way."""
+    found = []
+    for i, camera in enumerate(ring(count, 40, 32)):
+        c = bent(camera, tuple((-1) ** i * b for b in BEND))
+        found.append(View(f"{i:02d}.png", c, rasterize(three_gaussians(), c).rgb.clamp(0, 1).numpy()))
+    return found
+
+
+@pytest.fixture(scope="module")
+def fit() -> Trainer:
+    """A fit before its first step."""
+    return Trainer(views(), seeds(), CONFIG, CPU)
+
+
+def rendered_alone(fit: Trainer, number: int, **options) -> torch.Tensor:
+    """Return a view's image from the fit's Gaussians, by its own camera."""
+    camera = views()[number].camera
+    return rasterize(fit.gaussians, camera, RasterizeOptions(rule=fit.config.rule, sh_degree=0, **options)).rgb
+
+
+@pytest.mark.slow
+def test_the_fit_explains_what_the_model_shows():
+    """As pinholes, the same cameras leave nearly twice the error."""
+    lost = [dataclasses.replace(v, camera=dataclasses.replace(v.camera, model="pinhole", distortion=None)) for v in views()]
+    errors = []
+    for train in (views(), lost):
+        trainer, mse = Trainer(train, seeds(), dataclasses.replace(CONFIG, steps=200), CPU), []
+        while trainer.step < trainer.steps:
+            mse += [10 ** (-report.psnr / 10) for report in trainer.advance()]
+        errors.append(np.mean(mse[-4:]))
+    assert errors[0] < 0.7 * errors[1]
+
+
+@pytest.mark.parametrize("captured", [False, True], ids=["eager", "fixed capacity"])
+def test_a_step_renders_by_the_views_own_camera(fit, captured):
+    """The loss of the first step is that of an image which `rasterize` renders alone, to the bit."""
+    plan = fit.plan_of(1)
+    (stack,) = fit.stacks.values()
+    for number in range(4):
+        fit.buffers.load([number], [[0.0] * fit.buffers.lr_rows.shape[1]], [fit.settings(1)])
+        if captured:
+            capacity = step.instance_capacity(fit.gaussians, stack, plan.degree, fit.config.rule)
+            render = step.captured_renderer(fit.config.rule, fit.background, capacity, fit.buffers.stop)
+        else:
+            render = step.eager_renderer(fit.config.rule, fit.background, None)
+        step.view_gradients(fit.learned, stack, fit.buffers, plan, render)
+        image = torch.as_tensor(views()[number].image)
+        wanted = ((rendered_alone(fit, number) - image) ** 2).mean()
+        _, _, history = fit.buffers.result()
+        assert history[0][1] == pytest.approx(float(wanted), rel=1e-6) and float(wanted) > 1e-3
+
+
+def test_a_step_in_chunks_renders_the_same(fit):
+    """Chunks count the tiles of each window by the same camera."""
+    whole, chunks = rendered_alone(fit, 1), rendered_alone(fit, 1, max_instances=20)
+    assert torch.equal(whole, chunks)
+
+
+def test_memory_is_planned_for_the_instances_of_the_model(fit):
+    """Capacity of captured steps and the memory plan count what the model projects."""
+    cameras = [v.camera for v in views()]
+    options = RasterizeOptions(rule=fit.config.rule, sh_degree=0)
+    most = max(int(rasterize(fit.gaussians, c, options).tile_counts.sum()) for c in cameras)
+    pinholes = [dataclasses.replace(c, model="pinhole", distortion=None) for c in cameras]
+    assert most != max(int(rasterize(fit.gaussians, c, options).tile_counts.sum()) for c in pinholes)
+    assert most_instances(fit.gaussians, [v.camera for v in fit.views], fit.config.rule) == most
+    (stack,) = fit.stacks.values()
+    capacity = step.instance_capacity(fit.gaussians, stack, 0, fit.config.rule)
+    assert capacity == int(step.CAPACITY_FACTOR * most) + 1024
+
+
+def test_half_size_views_and_stacks_keep_the_model(fit):
+    """Coefficients do not depend on the size; stacks hold views of one model."""
+    for shown, view in zip(fit.views, views()):
+        for camera in (shown.camera, half_size(shown).camera):
+            assert camera.model == NAME and np.allclose(camera.distortion, view.camera.distortion)
+    mixed = Trainer([*views(2), *photos(2, 40, 32)], seeds(), CONFIG, CPU)
+    assert sorted(s.model for s in mixed.stacks.values()) == ["pinhole", NAME]
+    for stack in mixed.stacks.values():
+        for camera, number in zip(stack.cameras(), stack.numbers):
+            assert camera.model == mixed.views[number].camera.model
+
+
+def test_a_failed_step_is_rendered_again_by_the_model(fit):
+    """The file of a step whose loss was not finite holds model and coefficients."""
+    tensors, plain = failed_step(fit, 1, "01.png")
+    plain = json.loads(json.dumps(plain))
+    found = _rendered(fit.gaussians, (tensors, plain), fit.config).rgb
+    assert torch.equal(found, rendered_alone(fit, 1))
+
+
+def test_run_folders_keep_the_model():
+    """config.json holds model and coefficients, and a pinhole's record has none."""
+    camera = views()[1].camera
+    back = _camera(json.loads(json.dumps(camera_values(camera))))
+    assert back.model == NAME and np.array_equal(back.distortion, camera.distortion) and np.array_equal(back.K, camera.K)
+    assert "distortion" not in camera_values(photos(1)[0].camera)
+
+
+def test_what_cannot_be_rendered_is_refused_before_the_first_step():
+    """An unknown model, or one with other coefficients; the error says which."""
+    first, *rest = views(2)
+    for change, words in (({"model": "fisheye"}, "no camera model 'fisheye'"), ({"distortion": np.zeros(2)}, "takes 4")):
+        wrong = dataclasses.replace(first, camera=dataclasses.replace(first.camera, **change))
+        with pytest.raises(UsageError, match=words):
+            Trainer([*rest, wrong], seeds(), CONFIG, CPU)

@@ -1,0 +1,73 @@
+"""Inputs of a projection: its tensors and its settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import torch
+
+from warpgs.constants import Rule
+from warpgs.runtime import interop
+
+
+@dataclass(frozen=True)
+class ProjectSettings:
+    """Everything that a projection depends on besides tensors."""
+
+    size: tuple[int, int]
+    """Width and height of the image [px]."""
+    window: tuple[int, int, int, int]
+    """Left, top, width and height [px] of the part that is rendered, from a tile's corner on."""
+    sh_count: int
+    """Spherical-harmonics coefficients a channel that are used."""
+    rule: Rule
+    """Cut-offs."""
+    tile_size: int
+    """Side of a tile [px]."""
+    camera_model: str
+    """Name of the camera model."""
+
+
+class ProjectInputs(NamedTuple):
+    """The tensors of a projection, of one scalar type and on one device."""
+
+    means: torch.Tensor
+    """World positions [u], shape [N, 3]."""
+    quats: torch.Tensor
+    """Rotations wxyz, shape [N, 4]."""
+    log_scales: torch.Tensor
+    """Logarithm of the axis lengths [u], shape [N, 3]."""
+    logit_opacities: torch.Tensor
+    """Inverse sigmoid of the opacity, shape [N]."""
+    sh: torch.Tensor
+    """Spherical-harmonics coefficients of the colour, shape [N, K, 3]."""
+    viewmats: torch.Tensor
+    """camera_from_world, shape [C, 4, 4]."""
+    Ks: torch.Tensor
+    """Intrinsics [px] with zero skew, shape [C, 3, 3]."""
+    distortion: torch.Tensor
+    """Coefficients of the camera model, shape [C, P]. They have no gradient."""
+    opacity_factors: torch.Tensor
+    """Factors of the opacities, at least 0, shape [N]; shape [0] for none. They have no gradient."""
+
+    def detached(self) -> Self:
+        """Return the same tensors [...] without their history."""
+        return self._make(t.detach() for t in self)
+
+
+def checked_factors(means: torch.Tensor, factors: torch.Tensor | None) -> torch.Tensor:
+    """Return opacity factors as `ProjectInputs` holds them, shape [N], or [0] for None.
+
+    Args:
+        means: Positions of the Gaussians, shape [N, 3].
+        factors: Factors, shape [N]; None for 1.
+
+    Raises:
+        TypeError: The scalar types differ.
+        ValueError: The shape or the device differs.
+    """
+    if factors is None:
+        return means.new_empty(0)
+    interop.check(means=(means, "N 3"), opacity_factors=(factors, "N"))
+    return factors.detach()

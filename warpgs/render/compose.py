@@ -1,0 +1,180 @@
+"""Project, bin, blend: the one way from Gaussians to images.
+
+`rasterize`, chunked and graphed rendering and the training step all come here, each with its own memory: what a render
+depends on (camera model, channels, cut-offs, window) stands in `RenderSettings` and `ProjectInputs`, and nowhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from warpgs.kernels import blend as blending
+from warpgs.kernels.blend import blend, contributions
+from warpgs.kernels.median_depth import median_depth
+from warpgs.kernels.project import project_inputs
+from warpgs.kernels.project_inputs import ProjectInputs, checked_factors
+from warpgs.kernels.tiles import Tiles, bin_tiles
+from warpgs.render.settings import RenderSettings
+from warpgs.runtime.allocator import TORCH, Allocator
+from warpgs.scene import Camera, Gaussians
+
+Images = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+"""Colour [C, H, W, 3], alpha [C, H, W] and expected z-depth [C, H, W]."""
+
+
+@dataclass(frozen=True)
+class InstanceMemory:
+    """Memory that the (Gaussian, tile) instances of a render may take."""
+
+    budget: int | None = None
+    """Bytes; None for four fifths of what is free."""
+    capacity: int | None = None
+    """Number of instances to allocate for, without asking the device how many there are; None for as many as there are."""
+    overflow: torch.Tensor | None = None
+    """Set to 1 where there are more instances than the capacity; int32, shape [1]."""
+    allocator: Allocator = TORCH
+    """Provider of the lists' memory."""
+
+
+@dataclass(frozen=True)
+class Composed:
+    """A render with what it was made of."""
+
+    images: Images
+    """Colour, alpha and depth."""
+    projected: torch.Tensor
+    """Projected Gaussians, shape [C, N, 12]."""
+    tile_counts: torch.Tensor
+    """Number of tiles that each touches, int32, shape [C, N]."""
+    tiles: Tiles
+    """Instances of each tile."""
+
+
+def as_batch(array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
+    """Return an array of one camera or of a batch, of ``axes`` axes each, as a tensor [C, ...] of the type of ``like``."""
+    tensor: torch.Tensor = array
+    if not (isinstance(array, torch.Tensor) and array.dtype == like.dtype and array.device == like.device):
+        tensor = torch.as_tensor(array, dtype=like.dtype, device=like.device)
+    return tensor[None] if tensor.ndim == axes else tensor
+
+
+def inputs_of(gaussians: Gaussians, camera: Camera, opacity_factors: torch.Tensor | None = None) -> ProjectInputs:
+    """Return the tensors of a render; the camera's are brought to the type and device of ``gaussians.means``.
+
+    Args:
+        gaussians: The scene, N Gaussians.
+        camera: One camera, or C of them.
+        opacity_factors: Factors of the opacities, shape [N]; None for 1.
+
+    Raises:
+        ValueError: The factors have another shape.
+    """
+    means = gaussians.means
+    viewmats, Ks = as_batch(camera.viewmat, means), as_batch(camera.K, means)
+    if camera.distortion is None:
+        distortion = means.new_empty(len(viewmats), 0)
+    else:
+        distortion = as_batch(camera.distortion, means, 1)
+    factors = checked_factors(means, opacity_factors)
+    return ProjectInputs(*gaussians.tensors().values(), viewmats, Ks, distortion, factors)
+
+
+def settings_of(camera: Camera, degree: int, rule: Any, **others: Any) -> RenderSettings:
+    """Return the settings of a render of a whole image; ``others`` are further fields of `RenderSettings`."""
+    window = (0, 0, camera.width, camera.height)
+    named = {"window": window, "camera_model": camera.model, **others}
+    return RenderSettings(camera.width, camera.height, degree=degree, rule=rule, **named)
+
+
+def bin_projected(
+    projected: torch.Tensor, tile_counts: torch.Tensor, settings: RenderSettings, memory: InstanceMemory = InstanceMemory()
+) -> Tiles:
+    """Return the instances of each tile of the window.
+
+    Args:
+        projected: Projected Gaussians, shape [C, N, 12].
+        tile_counts: Number of tiles of the window that each touches, int32, shape [C, N].
+        settings: Settings of the render.
+        memory: Memory of the instances.
+
+    Raises:
+        ResourceError: There are more than memory allows.
+    """
+    return bin_tiles(
+        projected, tile_counts, tile_size=settings.tile_size, budget_bytes=memory.budget, capacity=memory.capacity,
+        overflow=memory.overflow, allocator=memory.allocator, **settings.of_window(),
+    )  # fmt: skip
+
+
+def compose(
+    inputs: ProjectInputs, backgrounds: torch.Tensor, settings: RenderSettings, memory: InstanceMemory = InstanceMemory(),
+    deterministic: bool = True,
+) -> Composed:  # fmt: skip
+    """Render the window of a batch of cameras. Differentiable as `project` and `blend` are.
+
+    Args:
+        inputs: The tensors.
+        backgrounds: Colour behind everything, shape [C, 3].
+        settings: Settings of the render.
+        memory: Memory of the instances.
+        deterministic: True to sum gradients in a fixed order.
+
+    Raises:
+        ResourceError: There are more instances than memory allows.
+        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        UsageError: The camera model is unknown.
+        ValueError: A shape or a device disagrees.
+    """
+    projected, tile_counts = project_inputs(inputs, settings.projection())
+    tiles, images = bin_and_blend(projected, tile_counts, backgrounds, settings, memory, deterministic)
+    return Composed(images, projected, tile_counts, tiles)
+
+
+def bin_and_blend(
+    projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: RenderSettings,
+    memory: InstanceMemory = InstanceMemory(), deterministic: bool = True,
+) -> tuple[Tiles, Images]:  # fmt: skip
+    """Return the instances and the images of projected Gaussians [C, N, 12]; arguments are those of `compose`."""
+    tiles = bin_projected(projected, tile_counts, settings, memory)
+    return tiles, blend(projected, tiles, backgrounds, deterministic=deterministic, **settings.of_window())
+
+
+def weights_of(projected: torch.Tensor, tiles: Tiles, settings: RenderSettings) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return sum and maximum of each Gaussian's blending weights, shape [C, N] each (`contributions`)."""
+    return contributions(projected, tiles, **settings.of_window())
+
+
+def median_depth_of(projected: torch.Tensor, tiles: Tiles, settings: RenderSettings) -> torch.Tensor:
+    """Return the z-depth [u] at which transmittance falls to one half, shape [C, H, W] (`median_depth`)."""
+    return median_depth(projected, tiles, **settings.of_window())
+
+
+@torch.no_grad()
+def count_instances(inputs: ProjectInputs, settings: RenderSettings) -> torch.Tensor:
+    """Return the number of (Gaussian, tile) instances of a render, int64, shape []."""
+    return project_inputs(inputs, settings.projection())[1].sum()
+
+
+def composite_into(
+    projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: RenderSettings,
+    memory: InstanceMemory,
+) -> tuple[Tiles, Sequence[torch.Tensor]]:  # fmt: skip
+    """Return instances, and images with what their gradients take; none is recorded, and all memory is the allocator's.
+
+    Args:
+        projected: Projected Gaussians, contiguous, shape [C, N, 12].
+        tile_counts: Number of tiles that each touches, int32, shape [C, N].
+        backgrounds: Colour behind everything, contiguous, shape [C, 3].
+        settings: Settings of the render.
+        memory: Memory of the instances, and of all else.
+
+    Returns:
+        The instances, and the tensors [...] that `blending.composite` returns.
+    """
+    tiles = bin_projected(projected, tile_counts, settings, memory)
+    found = blending.composite(projected, tiles, backgrounds, settings.blending(), save=True, allocator=memory.allocator)
+    return tiles, found
