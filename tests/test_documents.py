@@ -61,3 +61,15 @@ def test_the_page_on_presets_says_what_the_rule_chooses():
             config.half_resolution,
         )  # fmt: skip
         assert tuple(float(row[column].replace(",", "")) for row in rows[2:]) == chosen, views
+
+
+def test_every_line_of_the_security_page_names_a_test_that_is_there():
+    """Each row of its tables names at least one test."""
+    text = (ROOT / "SECURITY.md").read_text("utf-8")
+    rows = [line for line in text.splitlines() if line.startswith("|") and not re.match(r"\|(---|.* \| test \|$)", line)]
+    assert len(rows) > 20
+    for row in rows:
+        named = re.findall(r"`([\w/]+\.py)::(\w+)`", row)
+        assert named, row
+        for path, name in named:
+            assert re.search(rf"^def {name}\(", (ROOT / "tests" / path).read_text("utf-8"), re.M), f"{path}::{name}"
