@@ -6,10 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent.parent
-TESTED = {
-    f"warpgs/runtime/{name}.py"
-    for name in ("device_memory", "file_names", "permissions", "load_module", "processor", "rank_watch")
-}
+TESTED = {f"warpgs/runtime/{name}.py" for name in ("device_memory", "permissions", "load_module", "processor", "rank_watch")}
 FILES = [p for p in sorted((ROOT / "warpgs").rglob("*.py")) if p.relative_to(ROOT).as_posix() not in TESTED]
 MODULES = {"fcntl", "grp", "pty", "pwd", "resource", "syslog", "termios", "msvcrt", "winreg"}
 NAMES = {

@@ -249,3 +249,28 @@ def test_a_page_names_nobody(folder, tmp_path, capsys):
     assert b"/gaussians" in scene and not [w for w in (b".png", b"run", str(folder).encode()) if w in scene]
     said = capsys.readouterr().out
     assert "without a network" in said and "removed: " in said and "turned by" in said
+
+
+def test_names_that_are_not_utf8(window, monkeypatch):
+    """Text for the page is UTF-8, and a view is chosen by what is shown of its name."""
+    chosen, texts = [], []
+    (camera, *_) = window.content.model.scene_cameras.values()
+    content = dataclasses.replace(
+        window.content,
+        title="b\udce4r",
+        model=dataclasses.replace(window.content.model, scene_cameras={"b\udce4r.png": camera}),
+    )
+    monkeypatch.setattr(window.panel, "content", content)
+    monkeypatch.setattr(window, "step_into", lambda name, client: chosen.append(name))
+
+    def dropdown(label, options, initial_value):
+        texts.extend(options)
+        chooser = SimpleNamespace(value=options[-1], on_update=lambda step: step(SimpleNamespace(client=None)))
+        return chooser
+
+    monkeypatch.setattr(window.panel.server.gui, "add_dropdown", dropdown)
+    window.panel._add_stepping()
+    window.panel.explain("of b\udce4r")
+    assert chosen == ["b\udce4r.png"] and texts[-1] == "b\\xe4r.png"
+    window.panel._note.content.encode("utf-8")
+    window.panel.explain("")

@@ -12,11 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from warpgs.errors import UsageError
-from warpgs.files import readable
+from warpgs.files import DESCRIPTORS, readable
 from warpgs.runtime.terminal import say
-
-DESCRIPTORS = Path("/proc/self/fd")
-"""Folder in which Linux has the open files of a process by their numbers."""
 
 
 def is_utf8(text: str) -> bool:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from warpgs.errors import WarpgsError
-from warpgs.files import remove_leftovers, write_json
+from warpgs.files import readable, remove_leftovers, write_json
 from warpgs.geometry import rotation_matrices
 from warpgs.io.decoding import decode
 from warpgs.runtime.terminal import say
@@ -104,13 +104,13 @@ class Panel:
         self._note.content, self._note.visible = _plain(note), bool(note)
 
     def _add_stepping(self) -> None:
-        names = list(self.content.model.scene_cameras)
+        names = {readable(name): name for name in self.content.model.scene_cameras}  # viser takes UTF-8 alone
         if names:
             chooser = self.server.gui.add_dropdown("step into", (NOWHERE, *names), initial_value=NOWHERE)
 
             def step(event: Any) -> None:
                 if chooser.value != NOWHERE:
-                    self.window.step_into(chooser.value, event.client)
+                    self.window.step_into(names[chooser.value], event.client)
 
             chooser.on_update(guarded(step))
 
@@ -205,5 +205,5 @@ class Panel:
 
 
 def _plain(text: str) -> str:
-    """Return text without what Markdown would make of it."""
-    return "".join(f"\\{c}" if c in "\\`*_{}[]()<>#|!" else c for c in text)
+    """Return text in UTF-8 without what Markdown would make of it."""
+    return "".join(f"\\{c}" if c in "\\`*_{}[]()<>#|!" else c for c in readable(text))
