@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from warpgs.errors import ResourceError, UsageError
-from warpgs.files import writing_into
+from warpgs.files import remove_leftovers, writing_into
 from warpgs.pipeline.farm.engine import Engine
 from warpgs.pipeline.farm.farm import JobStatus, run_farm, seconds_left
 from warpgs.pipeline.farm.index import INDEX, TABLE, row_of, write_index
@@ -90,6 +90,7 @@ def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bo
     say(f"{count}, engine {engine.name}, {engine.slots} at a time; results: {results / INDEX}, {TABLE}")
     try:
         with writing_into(results), FarmTable(live=live) as table:
+            remove_leftovers(results)  # of a farm that was killed while it wrote its index
 
             def show(statuses: list[JobStatus]) -> None:
                 nonlocal shown, written
