@@ -265,7 +265,7 @@ def camera_nonsense(found: dict) -> str:
 
 CAMERAS = (camera_files, read_cameras, read_poses)
 CAMERA_CHANGES = (rarely(many_rows, json_value), json_value, text_number, text_line)
-register(Target("cameras", camera_paths, read_any, CAMERAS, CAMERA_CHANGES, nonsense=camera_nonsense))
+register(Target("cameras", camera_paths, read_any, CAMERAS, CAMERA_CHANGES, nonsense=camera_nonsense, lines=0.75))
 
 
 def box_files(root: Path) -> list[Path]:

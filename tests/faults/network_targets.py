@@ -33,7 +33,7 @@ def converted(root: Path, path: Path) -> object:
 
 
 STATES = (lpips_weights._read_state, lpips_weights._net_of, lpips_weights.convert_lpips)
-register(Target("LPIPS state dict", state_files, converted, STATES, (zip_member, rarely(zip_bomb, zip_member))))
+register(Target("LPIPS state dict", state_files, converted, STATES, (zip_member, rarely(zip_bomb, zip_member)), lines=0.8))
 
 # ---- maps on disk ------------------------------------------------------------------------------------------------------
 
@@ -77,7 +77,7 @@ NETWORK = (session.open_network, session._start, session._input_axes)
 register(
     Target(
         "network", network_files, lambda root, path: session.open_network(path, threads=1), NETWORK,
-        (onnx_field, onnx_field, onnx_field), share=0.3,
+        (onnx_field, onnx_field, onnx_field), lines=0.7, share=0.3,
     )
 )  # fmt: skip
 
@@ -93,6 +93,6 @@ def flow_networks(root: Path) -> list[Path]:
 register(
     Target(
         "flow network", flow_networks, lambda root, path: flow._network(path, "255"), (flow._network,),
-        (onnx_field, onnx_field, onnx_field), share=0.3,
+        (onnx_field, onnx_field, onnx_field), lines=0.45, share=0.3,
     )
 )  # fmt: skip

@@ -152,7 +152,9 @@ def heic_in_process(root: Path, path: Path) -> np.ndarray:
 
 if importlib.util.find_spec("pi_heif"):
     register(Target("heic", heic_files, heic_copy, (heic._coded_again,), (box, box, box), own_process=True))
-    register(Target("heic by its process", heic_files, heic_in_process, (heic.to_jpeg,), (box, box, box), share=0.01))
+    register(
+        Target("heic by its process", heic_files, heic_in_process, (heic.to_jpeg,), (box, box, box), lines=0.7, share=0.01)
+    )
 
 # ---- videos ------------------------------------------------------------------------------------------------------------
 

@@ -64,7 +64,7 @@ def path_nonsense(cameras: list[Camera]) -> str:
 
 PATH = [{"c2w": turned(0.3 * i), "fov_y": 0.8 + 0.1 * i, "seconds": 2.0 * i} for i in range(4)]
 KEYFRAMES = (keyframes.read_keyframes, keyframes.through)
-add("keyframes", "path.json", PATH, cameras_of_path, KEYFRAMES, nonsense=path_nonsense)
+add("keyframes", "path.json", PATH, cameras_of_path, KEYFRAMES, nonsense=path_nonsense, lines=0.85)
 
 # ---- scores of a run ---------------------------------------------------------------------------------------------------
 
@@ -84,14 +84,21 @@ SCORES = {
     "coverage": {"classes": CLASSES, "views": [{"name": "a.png", "classes": CLASSES}], "tolerance": 0.01,
         "depth_differences": [0.5], "photo_psnr": [None, 20.5], "summary": "all seen"},
 }  # fmt: skip
-add("scores", "metrics.json", SCORES, lambda root, path: ensure_run._scores(path), (ensure_run._scores, schema, schemas))
+add(
+    "scores",
+    "metrics.json",
+    SCORES,
+    lambda root, path: ensure_run._scores(path),
+    (ensure_run._scores, schema, schemas),
+    lines=0.6,
+)
 
 # ---- farms -------------------------------------------------------------------------------------------------------------
 
 JOB = record.JobRecord("a", "ab12", "done", "fitted", seconds=1.5, psnr=24.5, files=dict.fromkeys(record.CHECKED, "ab12"))
 add(
     "record of a job", record.RECORD, dataclasses.asdict(JOB), lambda root, path: record.read_record(root),
-    (record.read_record, schema.fields, schema.mapping, schema.one_of),
+    (record.read_record, schema.fields, schema.mapping, schema.one_of), lines=0.6,
 )  # fmt: skip
 
 LINES = (
@@ -131,7 +138,7 @@ def jobs_with_flags(root: Path, path: Path) -> list:
         raise UsageError(f"{path}: {e}") from e
 
 
-register(Target("flags of jobs", job_files, jobs_with_flags, (farm_command._jobs,), LINE_CHANGES, share=0.01))
+register(Target("flags of jobs", job_files, jobs_with_flags, (farm_command._jobs,), LINE_CHANGES, lines=0.7, share=0.01))
 
 # ---- found poses, events, locks ----------------------------------------------------------------------------------------
 
@@ -182,9 +189,10 @@ def events_nonsense(found: list[dict]) -> str:
     return "" if sound else "an event holds something else than numbers"
 
 
+EVENTS = (events.read_events, events.EventLog.rewind)
 register(
     Target(
-        "events", event_files, events_of, (events.read_events, events.EventLog.rewind), LINE_CHANGES, nonsense=events_nonsense
+        "events", event_files, events_of, EVENTS, LINE_CHANGES, nonsense=events_nonsense, lines=0.75
     )
 )  # fmt: skip
 
@@ -213,7 +221,7 @@ def resumed(root: Path, path: Path) -> object:
     return request
 
 
-register(Target("continued run", run_files, resumed, RESUMED, JSON_CHANGES))
+register(Target("continued run", run_files, resumed, RESUMED, JSON_CHANGES, lines=0.65))
 
 
 def failed_steps(root: Path) -> list[Path]:

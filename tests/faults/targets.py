@@ -33,6 +33,8 @@ class Target:
     """Says what of a result is nonsense; empty where nothing is."""
     unexplained: Callable[[bytes, bytes, object, object], str] = lambda before, after, good, found: ""
     """Says what of a result plain damage does not explain: bytes before and after, results of both; empty where nothing."""
+    lines: float = 0.9
+    """Share of the parser's lines that many inputs must reach: less where lines wait for what no file can bring about."""
     own_process: bool = False
     """Whether a process of its own does the reading in warpgs: then an input that ends the process is refused, not a defect."""
     share: float = 1.0

@@ -11,7 +11,7 @@ from warpgs.pipeline.metrics import lpips_weights
 INPUTS = int(os.environ.get("FUZZ", "2000"))
 FEW, ENOUGH = 10_000, 50_000
 """Numbers of inputs from which on the share past the first check is judged, and the lines reached."""
-SEED = int(os.environ.get("FUZZ_SEED", "29001"))
+SEED = int(os.environ.get("FUZZ_SEED", "29100"))
 NAMES = sorted(all_targets())
 
 
@@ -35,7 +35,9 @@ def test_many_damaged_files(name, capfd):
     assert not tally.failures
     assert INPUTS < FEW or not shallow(tally)
     if INPUTS >= ENOUGH:
-        assert len(tally.lines) >= 0.9 * sum(map(len, parser_lines(all_targets()[name]).values())), missed(tally)
+        assert len(tally.lines) >= all_targets()[name].lines * sum(map(len, parser_lines(all_targets()[name]).values())), (
+            missed(tally)
+        )
 
 
 @pytest.mark.parametrize("name", ["png", "model file", "run record"])
