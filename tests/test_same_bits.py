@@ -12,7 +12,7 @@ import torch
 
 from bench.lib import result_file, same_bits
 from warpgs import geometry
-from warpgs.io.poses import rigid
+from warpgs.io.pose_matrices import rigid
 from warpgs.pipeline.train.loss import depth_disagreement, photometric_loss
 from warpgs.runtime.interop import set_threads
 

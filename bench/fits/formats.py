@@ -18,8 +18,8 @@ from bench.lib.scorer import Scorer
 from warpgs.export import spz
 from warpgs.export.arrays import arrays_of
 from warpgs.export.formats import FORMATS, read_gaussians
-from warpgs.pipeline.runs.share import export
-from warpgs.pipeline.runs.share_filters import Filters
+from warpgs.pipeline.runs.export_filters import Filters
+from warpgs.pipeline.runs.export_model import export
 
 WHAT = "file size, and loss of PSNR on held-out views, of each file format"
 

@@ -22,7 +22,7 @@ from bench.lib.arguments import SCENE, parse
 from bench.lib.refined_views import refined
 from warpgs.geometry import camera_extent, matmul
 from warpgs.io.splits import split_views
-from warpgs.pipeline.runs.refined_poses import similar_cameras
+from warpgs.pipeline.runs.cameras_after_fit import similar_cameras
 from warpgs.pipeline.runs.request import choose_device
 from warpgs.pipeline.train.config import PRESETS
 from warpgs.pipeline.train.refine_poses import increments

@@ -27,8 +27,8 @@ from bench.lib.scorer import Scorer
 from warpgs.export import spz
 from warpgs.export.arrays import arrays_of, gaussians_of, half_turn
 from warpgs.export.formats import FORMATS, read_gaussians
-from warpgs.pipeline.runs.share import export
-from warpgs.pipeline.runs.share_filters import Filters
+from warpgs.pipeline.runs.export_filters import Filters
+from warpgs.pipeline.runs.export_model import export
 from warpgs.scene import Gaussians
 
 WHAT = "differences between what splat-transform and this program read of the same files, and loss of PSNR of its own files"

@@ -131,7 +131,7 @@ def serve() -> None:
     """Fork for each line of stdin, and answer with exit codes."""
     import warpgs.viewer.watch  # noqa: F401  (and all that commands import late)
     from warpgs.app.commands import compare, convert, eval, export, farm, fit, mesh, poses, prune, render, view  # noqa: F401
-    from warpgs.pipeline.runs import commands, share  # noqa: F401
+    from warpgs.pipeline.runs import commands, export_model  # noqa: F401
     from warpgs.pipeline.study import compare as study  # noqa: F401
 
     if sys.platform.startswith("linux"):

@@ -12,7 +12,7 @@ import sys
 import pytest
 
 from tests.faults.tiny_runs import Reference, check_whole, digests, environment, leftovers, words_of
-from warpgs.pipeline.runs.share import export
+from warpgs.pipeline.runs.export_model import export
 
 pytestmark = pytest.mark.fault
 RACES = max(1, int(os.environ.get("WARPGS_KILLS", "0")) // 10)

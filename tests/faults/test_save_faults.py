@@ -25,10 +25,10 @@ from warpgs.pipeline.model import model_file
 from warpgs.pipeline.model.compress import Pruned
 from warpgs.pipeline.runs.checkpoint import save_checkpoint
 from warpgs.pipeline.runs.commands import evaluate
+from warpgs.pipeline.runs.export_model import export
 from warpgs.pipeline.runs.failed_step import save_failed_step
 from warpgs.pipeline.runs.folder import StoredRun, open_run
 from warpgs.pipeline.runs.prune import _write
-from warpgs.pipeline.runs.share import export
 from warpgs.report.events import EventLog
 from warpgs.report.film import write_film
 from warpgs.runtime.folder_lock import hold_folder

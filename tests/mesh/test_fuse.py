@@ -14,7 +14,7 @@ from warpgs.mesh.fuse import MeshOptions, fuse, vertex_colors
 from warpgs.mesh.surface_views import sample_surface, surface_view
 from warpgs.pipeline.films.rig import common_up
 from warpgs.pipeline.model.model_file import FittedModel
-from warpgs.pipeline.runs import mesh as run_mesh
+from warpgs.pipeline.runs import mesh_of_run as run_mesh
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.scene import Normalization
 

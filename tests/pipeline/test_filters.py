@@ -23,8 +23,8 @@ from warpgs.pipeline.model.filters import (
     rotate,
     rotation_about,
 )
-from warpgs.pipeline.runs.share import convert
-from warpgs.pipeline.runs.share_filters import Filters
+from warpgs.pipeline.runs.export_filters import Filters
+from warpgs.pipeline.runs.export_model import convert
 
 TURN = rotation_about(np.array([1.0, -2.0, 0.5]), 1.1)
 

@@ -18,9 +18,9 @@ from warpgs.geometry import look_at
 from warpgs.io.camera_files import read_cameras
 from warpgs.pipeline.films.plan import FilmSettings
 from warpgs.pipeline.runs.commands import render
+from warpgs.pipeline.runs.export_filters import Filters
+from warpgs.pipeline.runs.export_model import convert
 from warpgs.pipeline.runs.model_and_cameras import open_file
-from warpgs.pipeline.runs.share import convert
-from warpgs.pipeline.runs.share_filters import Filters
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera
 

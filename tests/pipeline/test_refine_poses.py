@@ -12,7 +12,7 @@ from tests import scenes
 from warpgs.app.cli import main
 from warpgs.errors import DataError
 from warpgs.geometry import matmul
-from warpgs.pipeline.runs.refined_poses import _similarity, pose_figures, refined_cameras
+from warpgs.pipeline.runs.cameras_after_fit import _similarity, pose_figures, refined_cameras
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.refine_poses import ROTATION, TRANSLATION, increments, moved
 from warpgs.pipeline.train.schedule import OptimizerConfig

@@ -146,7 +146,7 @@ def test_more_signals_while_the_program_ends(monkeypatch, capsys):
 
     from warpgs.app import cli
 
-    monkeypatch.setattr("warpgs.pipeline.runs.share.export", tidy)
+    monkeypatch.setattr("warpgs.pipeline.runs.export_model.export", tidy)
     say = cli.say
     monkeypatch.setattr(cli, "say", lambda *a, **k: (signal.raise_signal(signal.SIGINT), say(*a, **k)))
     try:

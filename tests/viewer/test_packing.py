@@ -12,8 +12,8 @@ from warpgs.coordinates import convert_camera, convert_gaussians
 from warpgs.geometry import rotation_matrices
 from warpgs.pipeline.films.rig import up_of
 from warpgs.scene import Normalization
+from warpgs.viewer.camera_conventions import camera_at, camera_before, distance_ahead, fov_y, stands_at, wxyz_of
 from warpgs.viewer.packing import LARGEST_HALF, packed
-from warpgs.viewer.poses import camera_at, camera_before, distance_ahead, fov_y, stands_at, wxyz_of
 from warpgs.viewer.saved import CropBox, keyframe
 
 

@@ -41,7 +41,7 @@ def encode(arrays: Arrays) -> list[bytes]:
     """Return the bytes of a file; harmonics beyond 4 are clamped."""
     n, k = arrays["sh"].shape[:2]
     chunks = np.arange(n) // CHUNK
-    colors = base_colors(arrays["sh"].astype(np.float64))
+    colors = base_colors(arrays["sh"][:, :1].astype(np.float64))
     bounds, fractions = [], []
     for values in (arrays["means"], arrays["log_scales"], colors):
         starts = np.arange(0, n, CHUNK)

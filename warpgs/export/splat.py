@@ -22,7 +22,7 @@ def encode(arrays: Arrays) -> list[bytes]:
     rows = np.empty(len(arrays["means"]), _ROW)
     rows["mean"] = arrays["means"]
     rows["scale"] = np.clip(np.exp(arrays["log_scales"].astype(np.float64)), _TINY, 3e38)
-    rows["rgba"][:, :3] = rounded(255 * base_colors(arrays["sh"].astype(np.float64)), 255)
+    rows["rgba"][:, :3] = rounded(255 * base_colors(arrays["sh"][:, :1].astype(np.float64)), 255)
     rows["rgba"][:, 3] = rounded(255 * sigmoid(arrays["logit_opacities"]), 255)
     rows["quat"] = rounded(128 * unit_quats(arrays["quats"]) + 128, 255)
     return [rows.tobytes()]

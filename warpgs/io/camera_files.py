@@ -12,7 +12,7 @@ from warpgs.errors import DataError
 from warpgs.input_files import read_input, unread_reason
 from warpgs.io import colmap, transforms
 from warpgs.io.images import Lens
-from warpgs.io.poses import from_camera_to_world, quat_rotation, rigid
+from warpgs.io.pose_matrices import from_camera_to_world, quat_rotation, rigid
 from warpgs.scene import Camera
 from warpgs.schema import check_parts
 

@@ -17,7 +17,7 @@ from warpgs.errors import DataError
 from warpgs.input_files import read_input, unread_reason
 from warpgs.io.folders import SceneFolder, ViewList, has_folder, view_name
 from warpgs.io.images import Lens, list_images
-from warpgs.io.poses import quat_rotation, rigid
+from warpgs.io.pose_matrices import quat_rotation, rigid
 from warpgs.io.readers import Probe, Reader, ReadOptions, register
 from warpgs.scene import PointCloud, Scene, View
 

@@ -12,7 +12,7 @@ from warpgs.geometry import matmul
 from warpgs.input_files import open_input
 from warpgs.io.folders import SceneFolder, ViewList, has_folder, resampling_note
 from warpgs.io.images import Lens, list_images
-from warpgs.io.poses import rigid
+from warpgs.io.pose_matrices import rigid
 from warpgs.io.readers import Probe, Reader, ReadOptions, register
 from warpgs.scene import Scene
 

@@ -10,7 +10,7 @@ from warpgs.errors import DataError
 from warpgs.input_files import open_input
 from warpgs.io.folders import SceneFolder, ViewList, has_folder
 from warpgs.io.images import Lens, list_images
-from warpgs.io.poses import from_camera_to_world
+from warpgs.io.pose_matrices import from_camera_to_world
 from warpgs.io.readers import Probe, Reader, ReadOptions, register
 from warpgs.scene import Scene
 

@@ -16,7 +16,7 @@ from warpgs.io.folders import SceneFolder
 from warpgs.io.image_formats.kinds import READ
 from warpgs.io.images import list_images
 from warpgs.io.normalize import fingerprint, normalization_of, normalize_points, normalize_view
-from warpgs.io.poses import rigid
+from warpgs.io.pose_matrices import rigid
 from warpgs.io.readers import Reader, ReadOptions, all_readers, find_reader, image_scale
 from warpgs.io.score_masks import FOLDER, add_score_masks
 from warpgs.io.unread_formats import unread_note

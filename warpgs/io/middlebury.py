@@ -11,7 +11,7 @@ from warpgs.errors import DataError
 from warpgs.input_files import read_input, unread_reason
 from warpgs.io.folders import SceneFolder, ViewList, resampling_note, view_name
 from warpgs.io.images import Lens
-from warpgs.io.poses import rigid
+from warpgs.io.pose_matrices import rigid
 from warpgs.io.readers import Probe, Reader, ReadOptions, register
 from warpgs.scene import Scene
 

@@ -13,7 +13,7 @@ from warpgs.errors import DataError
 from warpgs.input_files import read_input, unread_reason
 from warpgs.io.folders import SceneFolder, ViewList, resampling_note, view_name_of
 from warpgs.io.images import BLACK, SUFFIXES, Lens
-from warpgs.io.poses import from_camera_to_world
+from warpgs.io.pose_matrices import from_camera_to_world
 from warpgs.io.readers import Probe, Reader, ReadOptions, register
 from warpgs.scene import Scene
 from warpgs.schema import SchemaError, check_depth, check_parts

@@ -15,14 +15,14 @@ from warpgs.coordinates import convert_camera, convert_gaussians
 from warpgs.errors import DataError
 from warpgs.files import write_text
 from warpgs.pipeline.films.rig import up_of
+from warpgs.pipeline.runs.export_filters import NO_FILTERS, Filters, file_gaussians, filtered, rotate_camera
 from warpgs.pipeline.runs.folder import open_run
-from warpgs.pipeline.runs.share_filters import NO_FILTERS, Filters, file_gaussians, filtered, rotate_camera
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Camera, Gaussians
+from warpgs.viewer.camera_conventions import camera_before, distance_ahead, fov_y
 from warpgs.viewer.packing import packed
 from warpgs.viewer.page import NO_PARAMETERS, NO_TEXT_AS_CODE
-from warpgs.viewer.poses import camera_before, distance_ahead, fov_y
 from warpgs.viewer.server import open_server, require_viser, stop_server
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.report.coverage_image import coverage_image
 from warpgs.report.images import depth_map, error_map
 from warpgs.scene import Camera, Gaussians
+from warpgs.viewer.camera_conventions import stands_at
 from warpgs.viewer.content import Content
-from warpgs.viewer.poses import stands_at
 
 GAUSSIANS, RENDER, DEPTH, COVERAGE, ERROR = "Gaussians (browser)", "render", "depth", "coverage", "error"
 MAPS = {

@@ -10,7 +10,7 @@ import torch
 
 from warpgs.coordinates import convert_camera
 from warpgs.scene import Camera, Normalization
-from warpgs.viewer.poses import fov_y
+from warpgs.viewer.camera_conventions import fov_y
 
 CROP, PATH = "crop.json", "path.json"
 """Names of the files in a run folder."""

@@ -13,12 +13,12 @@ from warpgs.geometry import camera_extent
 from warpgs.report.images import resized
 from warpgs.scene import Camera, Gaussians
 from warpgs.viewer.callbacks import guarded, said
+from warpgs.viewer.camera_conventions import camera_at, camera_before, distance_ahead, fov_y, wxyz_of
 from warpgs.viewer.content import Content
 from warpgs.viewer.html import place_first_camera, plain_background
 from warpgs.viewer.maps import GAUSSIANS, Maps
 from warpgs.viewer.packing import packed
 from warpgs.viewer.panel import ALL, FINE, Panel
-from warpgs.viewer.poses import camera_at, camera_before, distance_ahead, fov_y, wxyz_of
 
 if TYPE_CHECKING:
     import viser

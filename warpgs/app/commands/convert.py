@@ -30,8 +30,8 @@ def run(arguments: list[str], about: str) -> int:
         """Turn the model about the origin: x,y,z,degrees."""
 
     a = parse_flags(Convert, arguments, "warpgs convert", about)
-    from warpgs.pipeline.runs.share import convert
-    from warpgs.pipeline.runs.share_filters import Filters
+    from warpgs.pipeline.runs.export_filters import Filters
+    from warpgs.pipeline.runs.export_model import convert
 
     for line in convert(a.source, a.target, Filters(a.crop, either(a, "clean"), a.sh_degree, a.rotate)):
         say(line)

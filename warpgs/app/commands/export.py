@@ -31,7 +31,7 @@ def run(arguments: list[str], about: str) -> int:
         """Turn the model about the origin: x,y,z,degrees, or level (up as the cameras say)."""
 
     a = parse_flags(Export, arguments, "warpgs export", about)
-    from warpgs.pipeline.runs.share_filters import Filters
+    from warpgs.pipeline.runs.export_filters import Filters
 
     filters = Filters(a.crop, either(a, "clean"), a.sh_degree, a.rotate)
     if a.to.suffix.lower() == ".html":
@@ -39,7 +39,7 @@ def run(arguments: list[str], about: str) -> int:
 
         lines = export_html(a.run, a.to, filters)
     else:
-        from warpgs.pipeline.runs.share import export
+        from warpgs.pipeline.runs.export_model import export
 
         lines = export(a.run, a.to, filters)
     for line in lines:

@@ -30,7 +30,7 @@ def run(arguments: list[str], about: str) -> int:
 
     a = parse_flags(Mesh, arguments, "warpgs mesh", about)
     from warpgs.mesh.fuse import MeshOptions
-    from warpgs.pipeline.runs.mesh import mesh
+    from warpgs.pipeline.runs.mesh_of_run import mesh
     from warpgs.report.progress import Stages
 
     options = MeshOptions(a.voxel, a.resolution, a.max_faces, a.depth)

@@ -16,11 +16,11 @@ from warpgs.pipeline.films.film import COVERAGE, FILM, render_film, sheet_path
 from warpgs.pipeline.films.plan import FilmSettings, plan_film
 from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.model.model_file import FittedModel
+from warpgs.pipeline.runs.cameras_after_fit import with_cameras
 from warpgs.pipeline.runs.coverage_report import coverage_lines, coverage_of_run
 from warpgs.pipeline.runs.failed_step import findings, read_failed_step
 from warpgs.pipeline.runs.folder import IMAGE_FOLDERS, StoredRun, open_run
 from warpgs.pipeline.runs.model_and_cameras import open_file
-from warpgs.pipeline.runs.refined_poses import with_cameras
 from warpgs.pipeline.runs.request import choose_device, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line
 from warpgs.pipeline.train.background import color_of, over_background

@@ -22,19 +22,19 @@ from warpgs.pipeline.metrics.moved import Rendered, moved_fractions, moved_notes
 from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.model.scale_limits import shape_figures, shape_summary
+from warpgs.pipeline.runs.batched import batched_notes, check_batched
+from warpgs.pipeline.runs.cameras_after_fit import refined_scene
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.runs.coverage_report import coverage_of_run
-from warpgs.pipeline.runs.exposures import exposure_figures
+from warpgs.pipeline.runs.exposure_report import exposure_figures
 from warpgs.pipeline.runs.failed_step import FILE as FAILED
 from warpgs.pipeline.runs.failed_step import failed_step, save_failed_step
 from warpgs.pipeline.runs.folder import CONFIG, check_checkpoint, check_same, read_record, record_of, run_folder
 from warpgs.pipeline.runs.job import FitJob
-from warpgs.pipeline.runs.refined_poses import refined_scene
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device, choose_split, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, overview_of, protocol_of, result_lines, write_report
 from warpgs.pipeline.runs.rule_report import rule_report_of
 from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, sampling_report_of
-from warpgs.pipeline.runs.shared import check_shared, shared_notes
 from warpgs.pipeline.runs.with_poses import lost_lines, with_poses
 from warpgs.pipeline.train.background import choose_background, over_background
 from warpgs.pipeline.train.by_views import settings_by_views
@@ -124,7 +124,7 @@ def fit(
     spec = scene.split if split is None and isinstance(scene, SceneRequest) else split
     if spec is not None:
         check_spec(spec)
-    check_shared(scene, config, ranks, time_budget, resume)
+    check_batched(scene, config, ranks, time_budget, resume)
     verbose, own = ranks.first and verbose, out if ranks.first else None
     stages = Stages() if verbose else Stages(lambda line: None)
     nothing: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
@@ -228,7 +228,7 @@ def _finish(job: FitJob, trainer: Trainer, state: State | None, record: dict[str
         except DataError as e:
             raise DataError(f"{job.out}/{TENSORS}: {e}") from e
         job.notes.append(f"continued from step {trainer.step}")
-    shared = shared_notes(job.config, job.ranks)
+    shared = batched_notes(job.config, job.ranks)
     job.announce([*photo_notes(job.photographs), *trainer.notes, *shared, trainer.memory.summary()])
     setup = time.perf_counter() - job.began
     nothing = contextlib.nullcontext(lambda: None)

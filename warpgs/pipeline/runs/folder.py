@@ -21,8 +21,8 @@ from warpgs.io.splits import Split
 from warpgs.kernels.cameras.base import check_camera
 from warpgs.pipeline.model.model_file import FittedModel, checked_gaussians
 from warpgs.pipeline.model.parameter_bounds import unpack
+from warpgs.pipeline.runs.cameras_after_fit import refined_cameras
 from warpgs.pipeline.runs.checkpoint import FORMAT, TENSORS, load_checkpoint
-from warpgs.pipeline.runs.refined_poses import refined_cameras
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device
 from warpgs.pipeline.runs.schemas import MODEL_STATE, check_record
 from warpgs.pipeline.train.config import FitConfig

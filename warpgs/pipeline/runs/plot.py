@@ -73,7 +73,7 @@ def _gaussians(stored: StoredRun, train: list[Camera], by_coverage: bool) -> tup
     gaussians = stored.gaussians()
     shown = (torch.sigmoid(gaussians.logit_opacities) >= MIN_OPACITY).cpu()
     if not by_coverage:
-        colors = np.clip(base_colors(gaussians.sh.cpu().numpy()), 0, 1)
+        colors = np.clip(base_colors(gaussians.sh[:, :1].cpu().numpy()), 0, 1)
     else:
         tensors = [replace(c, viewmat=gaussians.means.new_tensor(c.viewmat), K=gaussians.means.new_tensor(c.K)) for c in train]
         views = coverage(gaussians, tensors, stored.options()).views.cpu().numpy()

@@ -208,7 +208,7 @@ def _images(
 def overview_of(gaussians: Gaussians, train: list[View], test: list[View]) -> Callable[[], Overview]:
     """Return a function that draws the 3D overview, in a process of its own: it may be called from another thread."""
     means = gaussians.means.detach().cpu().numpy()
-    colors = np.clip(base_colors(gaussians.sh.detach().cpu().numpy()), 0, 1)
+    colors = np.clip(base_colors(gaussians.sh[:, :1].detach().cpu().numpy()), 0, 1)
     sample = np.random.default_rng(0).permutation(len(means))[:OVERVIEW_POINTS]
     points, cameras = means[sample].astype(np.float64), ([v.camera for v in train], [v.camera for v in test])
     up = up_of(cameras[0], points)

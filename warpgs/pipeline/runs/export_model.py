@@ -12,8 +12,7 @@ from warpgs.export.formats import Format, format_of, read_gaussians, write_gauss
 from warpgs.io.camera_files import read_cameras
 from warpgs.kernels.knn import morton_codes
 from warpgs.pipeline.model.filters import limit_degree, select
-from warpgs.pipeline.runs.folder import StoredRun, open_run
-from warpgs.pipeline.runs.share_filters import (
+from warpgs.pipeline.runs.export_filters import (
     NO_FILTERS,
     Filters,
     file_gaussians,
@@ -23,6 +22,7 @@ from warpgs.pipeline.runs.share_filters import (
     training_cameras,
     turned_line,
 )
+from warpgs.pipeline.runs.folder import StoredRun, open_run
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Camera, Gaussians
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from warpgs.coordinates import convert_mesh
 from warpgs.errors import DataError
-from warpgs.export.mesh import check_suffix, write_mesh
+from warpgs.export.mesh_files import check_suffix, write_mesh
 from warpgs.mesh.fuse import FusedMesh, MeshOptions, fuse
 from warpgs.mesh.grid import GridPlan
 from warpgs.pipeline.films.rig import common_up

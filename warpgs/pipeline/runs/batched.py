@@ -13,7 +13,7 @@ from warpgs.runtime.ranks import Ranks
 from warpgs.scene import Scene
 
 
-def check_shared(
+def check_batched(
     scene: Scene | SceneRequest | str | Path, config: FitConfig, ranks: Ranks, time_budget: float | None, resume: bool
 ) -> None:
     """Check that the processes can share a fit.
@@ -44,7 +44,7 @@ def check_shared(
         )
 
 
-def shared_notes(config: FitConfig, ranks: Ranks) -> list[str]:
+def batched_notes(config: FitConfig, ranks: Ranks) -> list[str]:
     """Return sentences on views and processes of a step, none for one view."""
     if config.batch == 1:
         return []
