@@ -33,6 +33,8 @@ from tests.faults.targets import MODULES, Target, all_targets, parser_lines
 FAILURES_KEPT = 20
 PAST = 0.1
 """Smallest share of inputs that must get past the first check of a reader."""
+JUDGED = 30
+"""Number of inputs from which on that share is judged; slow readers get fewer in a short run."""
 ATTEMPTS = 8
 """Number of changes that are tried until one changes the file."""
 
@@ -297,12 +299,10 @@ def table(tallies: list[Tally]) -> str:
 
 
 def shallow(tally: Tally) -> str:
-    """Say where too few inputs get past the first check of a reader; empty where enough do."""
-    return (
-        ""
-        if tally.past >= PAST * tally.inputs
-        else f"{tally.name}: {tally.past} of {tally.inputs} inputs get past the first check"
-    )
+    """Say where too few inputs get past the first check of a reader; empty where enough do, or where few inputs say little."""
+    if tally.inputs < JUDGED or tally.past >= PAST * tally.inputs:
+        return ""
+    return f"{tally.name}: {tally.past} of {tally.inputs} inputs get past the first check"
 
 
 def missed(tally: Tally) -> dict[str, list[int]]:
