@@ -93,7 +93,7 @@ REASONS = {
     "poses/mapping.py": {"_lines": PIPE},
     "poses/worker.py": {"main": PIPE, "extract": OWN, "match": OWN},
     "priors/export.py": {
-        "_onnx_bytes": OWN, "_fcn_resnet18": "reads weights of 45 MB with safetensors, as the readers named here do",
+        "_onnx_bytes": OWN, "_own_weights": "reads weights of 45 MB with safetensors, as the readers named here do",
     },
     "report/film.py": {"_decoded_sizes": OWN},
     "report/images.py": {"webp": OWN},

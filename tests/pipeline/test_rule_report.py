@@ -9,10 +9,10 @@ import torch
 
 from tests.gaussians import cloud
 from tests.scenes import photos, seeds, three_gaussians
-from warpgs.constants import RULES
+from warpgs.constants import RULES, TILE_SIZE
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.rule_report import TILE, rule_report_of
+from warpgs.pipeline.runs.rule_report import rule_report_of
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView, half_size
@@ -67,8 +67,8 @@ def test_the_seed_draws_views_and_parts():
     assert first["views"] == again["views"] and first["mean"] == again["mean"] and first["views"] != other["views"]
     assert len(first["views"]) == 3
     for x, y, w, h in first["views"].values():
-        assert x % TILE == y % TILE == 0 and x + w <= 150 and y + h <= 100 and 0 < w <= 64 and 0 < h <= 64
-        assert all(side % TILE == 0 or end == whole for side, end, whole in ((w, x + w, 150), (h, y + h, 100)))
+        assert x % TILE_SIZE == y % TILE_SIZE == 0 and x + w <= 150 and y + h <= 100 and 0 < w <= 64 and 0 < h <= 64
+        assert all(side % TILE_SIZE == 0 or end == whole for side, end, whole in ((w, x + w, 150), (h, y + h, 100)))
 
 
 def test_a_gaussian_that_is_no_number_changes_nothing():
@@ -112,7 +112,7 @@ def test_a_fit_starts_at_half_size_and_ends_whole(device):
         number = fit.next_view()
         fit.order.append(number)
         kind, _ = fit.places[number + fit.plan_of(fit.step + 1).half_size * len(fit.views)]
-        sizes.append(fit.stacks[kind].size["width"])
+        sizes.append(fit.stacks[kind].size[0])
         (report,) = fit.advance()
         assert math.isfinite(report.loss)
     assert sizes == [20] * 4 + [40] * 4

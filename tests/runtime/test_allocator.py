@@ -58,18 +58,19 @@ def test_addresses_name_all_memory():
 def test_addresses_are_looked_up_when_the_kernel_runs(device):
     """Two tensors of any lengths are joined; another time they are others, also where a graph is replayed."""
     on_gpu = device.type == "cuda"
-    table = wp.zeros(2, dtype=wp.uint64, device="cpu", pinned=on_gpu)
-    out = torch.zeros(7, device=device)
+    table = wp.zeros(3, dtype=wp.uint64, device="cpu", pinned=on_gpu)
+    out = torch.zeros(9, device=device)
 
     def work():
-        fetch(table.ptr, 4, out)
+        fetch(table.ptr, 4, 7, out)
 
     graph = None
     for base in (0, 100, 200):
         first, second = base + torch.arange(4.0, device=device), base + 50 + torch.arange(3.0, device=device)
-        table.numpy()[:] = first.data_ptr(), second.data_ptr()
+        third = base + 80 + torch.arange(2.0, device=device)
+        table.numpy()[:] = first.data_ptr(), second.data_ptr(), third.data_ptr()
         if on_gpu and graph is None and base > 0:
             graph = CapturedGraph(work, torch.cuda.Stream())
             torch.cuda.synchronize()
         work() if graph is None else graph.replay()
-        assert out.tolist() == [*first.tolist(), *second.tolist()]
+        assert out.tolist() == [*first.tolist(), *second.tolist(), *third.tolist()]

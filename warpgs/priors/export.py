@@ -80,6 +80,7 @@ def _dpt(request: ExportRequest) -> torch.nn.Module:
 
 def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
     """Return FCN-8s (Long et al. 2015) on ResNet-18 (He et al. 2016): class scores at strides 8, 16, 32, summed at stride 8."""
+    given = None if request.random_weights else _own_weights(request)
     import torch
     from transformers import ResNetBackbone, ResNetConfig
 
@@ -105,8 +106,17 @@ def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
             return grow(total, pixel_values.shape[-2:])
 
     network = FCN()
-    if request.random_weights:
+    if given is None:
         return network
+    try:
+        network.load_state_dict(given)
+    except RuntimeError as e:
+        raise _no_weights(request, e) from e
+    return network
+
+
+def _own_weights(request: ExportRequest) -> dict[str, torch.Tensor]:
+    """Return the tensors [...] of the user's weights by name, before any library of networks is loaded."""
     if request.weights is None:
         raise UsageError(
             "fcn-resnet18: no weights of it for the 21 VOC classes are known to be public; give your own by "
@@ -116,10 +126,13 @@ def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
     from safetensors.torch import load
 
     try:
-        network.load_state_dict(load(read_input(request.weights)))
-    except (OSError, SafetensorError, RuntimeError) as e:
-        raise DataError(f"{request.weights}: no weights of fcn-resnet18 ({str(e).splitlines()[0][:200]})") from e
-    return network
+        return load(read_input(request.weights))
+    except (OSError, SafetensorError) as e:
+        raise _no_weights(request, e) from e
+
+
+def _no_weights(request: ExportRequest, error: Exception) -> DataError:
+    return DataError(f"{request.weights}: no weights of fcn-resnet18 ({str(error).splitlines()[0][:200]})")
 
 
 def _fcn_resnet50(request: ExportRequest) -> torch.nn.Module:
