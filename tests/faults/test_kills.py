@@ -33,8 +33,8 @@ from warpgs.files import LOCK, OWN_NAMES
 pytestmark = pytest.mark.fault
 KILLS = int(os.environ.get("WARPGS_KILLS", "0"))
 SHARES = {
-    "fit": 0.22, "resume": 0.14, "eval": 0.1, "render": 0.08, "prune": 0.06, "export": 0.04, "convert": 0.04, "mesh": 0.04,
-    "view": 0.04, "compare": 0.08, "worker": 0.08, "farm": 0.02, "poses": 0.06,
+    "fit": 0.22, "resume": 0.15, "eval": 0.08, "render": 0.076, "prune": 0.06, "export": 0.026, "convert": 0.024, "mesh": 0.026,
+    "view": 0.026, "compare": 0.1, "worker": 0.1, "farm": 0.02, "poses": 0.092,
 }  # fmt: skip
 """Parts of all kills by command: more for those with many calls, fewer for those that take long."""
 CASES = [(c, i) for c in COMMANDS for i in range(round(SHARES[c] * KILLS))] or [("fit", 0)]
