@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from warpgs.export.arrays import C0, arrays_of, unit_quats
+from warpgs.colors import C0
+from warpgs.export.arrays import arrays_of, unit_quats
 from warpgs.geometry import rotation_matrices
 from warpgs.scene import Gaussians
 

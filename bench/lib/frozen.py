@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from bench.lib import inputs
-from warpgs.export.arrays import C0
+from warpgs.colors import C0
 from warpgs.pipeline.runs.folder import open_run
 from warpgs.scene import Camera, Gaussians
 

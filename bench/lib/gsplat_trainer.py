@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 from bench.lib.peers import torch_ssim
+from warpgs.colors import C0
 from warpgs.errors import UsageError
-from warpgs.export.arrays import C0
 from warpgs.kernels.knn import mean_square_distances
 from warpgs.scene import Camera, Gaussians, Normalization, Scene, View
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from warpgs.export.arrays import C0
+from warpgs.colors import C0
 from warpgs.scene import Camera, Gaussians
 
 

@@ -125,7 +125,7 @@ class ProgramResult(NamedTuple):
     """Exit code; 1 if the program could not be run or took too long."""
     output: str
     errors: str
-    """Its stderr, or the reason why it could not be run."""
+    """Text of stderr, or the reason why it could not be run."""
 
 
 def run_program(program: str, *options: str, stdin: str, timeout: float, hidden: str) -> ProgramResult:
