@@ -91,7 +91,7 @@ def test_what_only_cuda_runs():
 
 
 def test_every_kernel_file_has_mutants_and_tests(candidates):
-    """All files but packages, an interface, a call and names; mutants have numbers of their own; samples nest."""
+    """All files but packages, a call and names; mutants have numbers of their own; samples nest."""
     assert len(candidates) > 4000 and len({c.key for c in candidates}) == len({c.id for c in candidates}) == len(candidates)
     found = {pattern: [p.relative_to(ROOT).as_posix() for p in ROOT.glob(pattern)] for pattern in rules.MUTATED}
     assert all(found.values())
