@@ -1,6 +1,5 @@
 """Fixtures that every op's tests share: the devices there are, and both scalar types."""
 
-import gc
 import os
 import re
 
@@ -70,15 +69,6 @@ def no_overview_in_reports():
     patch.setattr("warpgs.pipeline.runs.results.render_overview", lambda *_: (None, "no overview image: this is a test"))
     yield
     patch.undo()
-
-
-@pytest.fixture(autouse=True)
-def give_back_device_memory():
-    """Give unused memory of a GPU back after a test: workers share it, and torch would keep what the largest test took."""
-    yield
-    if torch.cuda.is_initialized() and torch.cuda.memory_reserved() > 2**30:
-        gc.collect()
-        torch.cuda.empty_cache()
 
 
 @pytest.fixture(autouse=True)
