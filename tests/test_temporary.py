@@ -11,7 +11,7 @@ from warpgs import temporary
 from warpgs.files import filling, remove_leftovers, replacing
 from warpgs.output_folders import open_folder
 from warpgs.runtime.folder_lock import hold_folder
-from warpgs.temporary import NAMES, TemporaryFile, TemporaryFolder, shared_locks, sweep, temporary_folder
+from warpgs.temporary import NAMES, TemporaryFile, TemporaryFolder, shared_locks, sweep, system_folder, temporary_folder
 
 HOLDS = """
 import sys
@@ -176,3 +176,15 @@ def test_leftovers_in_a_folder_that_is_made_anew_go(tmp_path):
             file.touch()
             remove_leftovers(tmp_path / "a")
         assert (tmp_path / "a" / "b").exists() and left.path.is_dir()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows keeps Python's own choice")
+def test_the_system_s_folder_is_found_without_writing(tmp_path, monkeypatch):
+    """Python's own search writes a file, which a command that is killed at that moment leaves behind."""
+    named = tmp_path / "named"
+    named.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(tempfile, "_get_default_tempdir", lambda *_: pytest.fail("it searched"))
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "missing"))
+    monkeypatch.setenv("TEMP", str(named))
+    assert system_folder() == named.resolve() and tempfile.gettempdir() == str(named)

@@ -79,7 +79,8 @@ def matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def cofactors(m: np.ndarray) -> np.ndarray:
     """Return the cofactor matrix of m [3, 3]: that of a rotation is the rotation itself."""
-    return np.stack([np.cross(m[1], m[2]), np.cross(m[2], m[0]), np.cross(m[0], m[1])])
+    a, b = m[[1, 2, 0]], m[[2, 0, 1]]  # row i is the cross product of the two others
+    return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
 
 
 def inverse(m: np.ndarray) -> np.ndarray:
@@ -92,7 +93,10 @@ def nearest_rotation(m: np.ndarray) -> np.ndarray:
     """Return the rotation nearest to m [3, 3], whose determinant is positive: its polar factor, by Newton (Higham 1986)."""
     for _ in range(10):  # from a matrix that is orthogonal to 0.1 it takes five; more change nothing
         c = cofactors(m)
-        m = 0.5 * (m + c / (m[0] * c[0]).sum())
+        nearer = 0.5 * (m + c / (m[0] * c[0]).sum())
+        if (nearer == m).all():
+            break
+        m = nearer
     return m
 
 

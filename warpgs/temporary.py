@@ -142,17 +142,23 @@ def temporary_folder() -> TemporaryFolder:
         OSError: There is no place for it.
     """
     sweep_temporary_files()
-    return TemporaryFolder(open_folder(_system_folder()), "warpgs-", 0o700)
+    return TemporaryFolder(open_folder(system_folder()), "warpgs-", 0o700)
 
 
 @functools.cache
 def sweep_temporary_files() -> None:
     """Remove what killed commands of this user left where the system has temporary files; looks once in each process."""
-    with contextlib.suppress(OSError), open_folder(_system_folder()) as folder:
+    with contextlib.suppress(OSError), open_folder(system_folder()) as folder:
         sweep(folder, own=True)
 
 
-def _system_folder() -> Path:
+def system_folder() -> Path:
+    """Return the folder of temporary files by TMPDIR, TEMP or TMP, else the system's; Python's tempfile takes it, too."""
+    if tempfile.tempdir is None and sys.platform != "win32":
+        # Python would write a file to try each of these, which a command that is killed then leaves behind
+        named = [os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP")]
+        usable = (f for f in (*named, "/tmp") if f and os.path.isdir(f) and os.access(f, os.W_OK | os.X_OK))
+        tempfile.tempdir = next(map(os.path.abspath, usable), None)
     return Path(tempfile.gettempdir()).resolve()
 
 

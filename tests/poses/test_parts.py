@@ -148,3 +148,9 @@ def test_reasons_and_advice():
     well = mapping(keypoints=(900, 800), matches={(0, 1): 200}, views=dict(list(mapping().views.items())[:2]))
     assert advice(well, ["a", "b"]) == []
     assert "matches no other" in reason(mapping(matches={}), 3, names)
+
+
+def test_a_record_without_photographs_has_lines():
+    """Records are files that anybody may have changed."""
+    record = {"notes": ["a note"], "photographs": [], "advice": []}
+    assert report_lines(record)[0] == "a note"

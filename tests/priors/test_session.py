@@ -223,3 +223,13 @@ def test_a_size_that_the_graph_cannot_take_is_said(tmp_path):
     network = open_network(nw.write(tmp_path / "m.onnx", nw.model(graph)))
     with pytest.raises(DataError, match="cannot run it on an input of 1 x 3 x 5 x 5"):
         network.run(np.random.default_rng(0).random((5, 5, 3), np.float32))
+
+
+def test_names_that_are_not_utf8_are_refused(tmp_path):
+    """onnxruntime loads such a network, and fails only where the name is read."""
+    path = nw.depth_network(tmp_path / "a.onnx", size=(8, 12))
+    name = open_network(path).session.get_inputs()[0].name.encode()
+    file = tmp_path / "a.onnx"
+    file.write_bytes(file.read_bytes().replace(name, b"\xff" * len(name)))
+    with pytest.raises(DataError, match=r"a\.onnx"):
+        open_network(path)

@@ -15,6 +15,7 @@ from warpgs.runtime.output_streams import careful_output
 from warpgs.runtime.ranks import last_words
 from warpgs.runtime.stop_signals import ignored_signals, interrupting_signals
 from warpgs.runtime.terminal import accept_all_letters, say
+from warpgs.temporary import system_folder
 
 COMMANDS = {
     "demo": "write a synthetic scene to try things with",
@@ -76,6 +77,7 @@ def main(arguments: list[str] | None = None) -> int:
     """
     if arguments is None:
         use_utf8_names()
+    system_folder()
     words = sys.argv[1:] if arguments is None else arguments
     prints = words[:1] in ([], *([name] for name in PRINTING)) and "--warm" not in words
     with careful_output(prints or bool(ASKING & {*words})) as output:

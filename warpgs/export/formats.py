@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import struct
 import zipfile
@@ -9,6 +10,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +20,7 @@ from warpgs.export import compressed_ply, gltf, sog, splat, spz
 from warpgs.export.arrays import Arrays, arrays_of, check_finite, gaussians_of, malformed
 from warpgs.export.ply import read_ply, write_ply
 from warpgs.files import write_bytes
-from warpgs.input_files import read_input, read_start, unread_reason
+from warpgs.input_files import open_input, read_input, read_start, unread_reason
 from warpgs.scene import Gaussians, Normalization
 
 
@@ -30,12 +32,14 @@ class Format:
     """Name for messages."""
     encode: Callable[[Arrays], list[bytes]] | None
     """Function from arrays in file units to the bytes of a file; None for plain PLY, which is written in pieces."""
-    decode: Callable[[Path, bytes], Arrays] | None
-    """Function from the bytes of a file to arrays in file units."""
+    decode: Callable[[Path, Any], Arrays] | None
+    """Function from the bytes of a file, or from the open file of an archive, to arrays in file units."""
     cleaned: bool = True
     """True where exports are cleaned unless asked otherwise: the formats that strangers open."""
     sorted: bool = False
     """True where Gaussians that are near each other in space should be so in the file."""
+    archive: bool = False
+    """True where the file holds others, which are read one by one."""
     max_degree: int = 3
     """Highest degree of harmonics that it holds."""
     note: str = ""
@@ -51,7 +55,7 @@ FORMATS = {
     ".ply": Format("PLY", None, None, cleaned=False),
     ".splat": Format("splat", splat.encode, splat.decode, max_degree=0),
     ".spz": Format("SPZ", spz.encode, spz.decode, sorted=True, note=_SPZ_NOTE),
-    ".sog": Format("SOG", sog.encode, sog.decode, sorted=True),
+    ".sog": Format("SOG", sog.encode, sog.decode, sorted=True, archive=True),
     ".glb": Format("glTF (binary)", gltf.encode_glb, gltf.decode),
     ".gltf": Format("glTF (text)", gltf.encode_gltf, gltf.decode),
 }
@@ -141,12 +145,12 @@ def read_gaussians(
             if not compressed_ply.is_compressed(path, read_start(path, compressed_ply.MAX_HEADER_BYTES)):
                 return read_ply(path, normalization, units=units)
             decode = compressed_ply.decode
-        data = read_input(path)
+        data = open_input(path) if kind.archive else io.BytesIO(read_input(path))
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
     try:
-        with np.errstate(all="ignore"):  # infinities and NaN of a broken file are named below, with their Gaussian
-            arrays = decode(path, data)
+        with data, np.errstate(all="ignore"):  # infinities and NaN of a broken file are named below, with their Gaussian
+            arrays = decode(path, data if kind.archive else data.getvalue())
     except _BROKEN as e:
         raise malformed(path, f"its content makes no sense ({type(e).__name__}: {str(e)[:80]})") from e
     return convert_gaussians(gaussians_of(path, arrays), normalization, "file", units)

@@ -10,11 +10,12 @@ from __future__ import annotations
 import io
 import json
 import math
+import os
 import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -42,6 +43,10 @@ ROUNDS = 12
 """Rounds of Lloyd's algorithm for a codebook."""
 MAX_META_BYTES = 2**20
 MAX_PER_BYTE, MAX_PIXELS, SMALL = 1, 4, 4096
+MAX_PIXEL_BYTES = 8
+"""Most bytes of a pixel in a lossless WebP image; one that cannot be compressed takes little more than 4."""
+MAX_PALETTE_PIXELS = 2**20
+"""Most pixels of the palette's image: 65,536 rows of 15 coefficients."""
 """Most Gaussians per byte of a file, most pixels per Gaussian, and what any file may have of both: real ones have one in ten
 bytes, and one pixel each. Beyond, images are bombs."""
 _DATE = (1980, 1, 1, 0, 0, 0)
@@ -145,28 +150,30 @@ def _webp(pixels: np.ndarray) -> bytes:
     return out.getvalue()
 
 
-def decode(path: Path, data: bytes) -> Arrays:
-    """Return the Gaussians of a file's bytes.
+def decode(path: Path, file: BinaryIO) -> Arrays:
+    """Return the Gaussians of an open file, of which no more is read than its Gaussians can take.
 
     Raises:
         DataError: The file is malformed, cut short, or announces more than its size can hold.
     """
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+    size = file.seek(0, os.SEEK_END)
+    with zipfile.ZipFile(file) as archive:
         meta = json.loads(_member(path, archive, "meta.json", MAX_META_BYTES))
         n = meta.get("count") if isinstance(meta, dict) else None
         if not isinstance(meta, dict) or meta.get("version") != 2:
             raise malformed(path, "its meta.json is not of version 2")
         if meta.get("model", "default") != "default":
             raise malformed(path, f"it is for the model {str(meta['model'])[:40]!r}, which this program does not render")
-        if type(n) is not int or not 0 < n <= MAX_PER_BYTE * len(data) + SMALL:
-            raise malformed(path, f"{str(n)[:20]} Gaussians in {len(data)} bytes")
+        if type(n) is not int or not 0 < n <= MAX_PER_BYTE * size + SMALL:
+            raise malformed(path, f"{str(n)[:20]} Gaussians in {size} bytes")
+        most = MAX_PIXEL_BYTES * (MAX_PIXELS * n + SMALL)
 
         def pixels(part: str, i: int) -> np.ndarray:
             name = meta[part]["files"][i]
-            return _pixels(path, str(name), _member(path, archive, name, len(data)), n)
+            return _pixels(path, str(name), _member(path, archive, name, most), n)
 
         # one attribute after another, the largest first, so that little lies in memory beside the result
-        sh = _harmonics(path, meta, n, pixels, lambda name: _member(path, archive, name, len(data)))
+        sh = _harmonics(path, meta, n, pixels, lambda name: _member(path, archive, name, MAX_PIXEL_BYTES * MAX_PALETTE_PIXELS))
         opacities = _colors(_book(path, meta["sh0"]), pixels("sh0", 0), sh)
         quats = _quats(path, pixels("quats", 0), n)
         means = _means(meta["means"], pixels("means", 0), pixels("means", 1), n)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -155,10 +155,18 @@ def open_network(path: str | Path, *, provider: str = "cpu", threads: int = 0) -
     path = Path(path)
     data = read_model(path)
     session = _start(data, path, provider, threads)
+    try:
+        return _checked(path, data, session)
+    except UnicodeDecodeError as e:
+        raise DataError(f"{path}: the name of an input or an output is not UTF-8; export the network again") from e
+
+
+def _checked(path: Path, data: bytes, session: Any) -> Network:
+    """Return the network of a session that has one input and one output; DataError for others."""
     inputs, outputs = session.get_inputs(), session.get_outputs()
     for what, found in (("input", inputs), ("output", outputs)):
+        names = ", ".join(f.name for f in found)  # read in any case: one that is not UTF-8 fails here
         if len(found) != 1:
-            names = ", ".join(f.name for f in found)
             raise DataError(f"{path}: it has {len(found)} {what}s ({names}); one is needed. Export it with that one alone")
     if inputs[0].type not in TYPES:
         raise DataError(f"{path}: its input is a {inputs[0].type}; float or float16 is needed")

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import subprocess
-import tempfile
-from pathlib import Path
 
 import numpy as np
 
 from warpgs.runtime.disk_space import disk_is_full
 from warpgs.runtime.subprocesses import run_python
 from warpgs.scene import Camera
-from warpgs.temporary import temporary_folder
+from warpgs.temporary import system_folder, temporary_folder
 
 REMEDY = "install a software renderer: on Debian or Ubuntu `apt-get install libegl1 libgl1 libgl1-mesa-dri libxrender1`"
 TIMEOUT = 90
@@ -39,7 +37,7 @@ def run_pyvista(code: str, *arguments: str) -> tuple[bool, str]:
 
 def remedy_for(why: str) -> str:
     """Return how to help against the reason that `run_pyvista` gave."""
-    if disk_is_full(folder := Path(tempfile.gettempdir()), why):
+    if disk_is_full(folder := system_folder(), why):
         return f"free some disk space for temporary files in {folder}, or name another folder by the variable TMPDIR"
     return "`pip install pyvista`" if "No module named" in why else REMEDY
 
