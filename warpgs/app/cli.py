@@ -1,5 +1,6 @@
 """The command line: finds the command, runs it, and turns errors into sentences and exit codes."""
 
+import contextlib
 import importlib
 import sys
 
@@ -77,7 +78,8 @@ def main(arguments: list[str] | None = None) -> int:
     """
     if arguments is None:
         use_utf8_names()
-    system_folder()
+    with contextlib.suppress(OSError):  # without a place for temporary files: what needs one says so
+        system_folder()
     words = sys.argv[1:] if arguments is None else arguments
     prints = words[:1] in ([], *([name] for name in PRINTING)) and "--warm" not in words
     with careful_output(prints or bool(ASKING & {*words})) as output:

@@ -63,10 +63,10 @@ FORMATS = {
 
 _BROKEN = (
     struct.error, zlib.error, zipfile.BadZipFile, EOFError, ValueError, KeyError, TypeError, IndexError, OverflowError,
-    NotImplementedError, RecursionError, RuntimeError,
+    NotImplementedError, RecursionError, RuntimeError, OSError,
 )  # fmt: skip
 """What the decoders of the standard library, zstandard and our own raise about content that makes no sense: zipfile reports
-encryption as RuntimeError and methods it does not know as NotImplementedError."""
+encryption as RuntimeError, methods it does not know as NotImplementedError, and seeks before the start as OSError."""
 
 
 def format_of(path: str | os.PathLike[str]) -> Format:
