@@ -16,6 +16,7 @@ from tests.pipeline.farms import HereEngine
 from tests.pipeline.test_table_files import cells
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
+from warpgs.files import LOCK
 from warpgs.pipeline.farm.engine import Event
 from warpgs.pipeline.farm.ensure_run import ensure_run
 from warpgs.pipeline.farm.job import job_of
@@ -124,8 +125,9 @@ def test_finished_runs_are_kept_and_half_finished_ones_continued(finished, tmp_p
     before = metrics_of(request, "a", 1)["test"]
     half = run_folder(request, "still", "a", 1)
     (half / "metrics.json").unlink()
+    (run_folder(request, "still", "a", 0) / LOCK).touch()  # of a fit that was killed after its last file
     run_study(request)
-    assert states(request) == ["kept", "kept", "continued", "kept"]
+    assert states(request) == ["kept", "kept", "continued", "kept"] and not list(request.out.rglob(LOCK))
     assert metrics_of(request, "a", 1)["test"] == before
     assert [p.parent for p, t in times.items() if p.stat().st_mtime_ns != t] == [half]
     assert "continued from its last checkpoint" in capsys.readouterr().out

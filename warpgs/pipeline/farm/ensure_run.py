@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from warpgs import __version__, schema
-from warpgs.errors import DataError, ResourceError, UsageError, WarpgsError
-from warpgs.files import is_empty, move_folder
+from warpgs.errors import DataError, FolderHeldError, ResourceError, UsageError, WarpgsError
+from warpgs.files import LOCK, is_empty, move_folder
 from warpgs.io.splits import Split
 from warpgs.pipeline.runs.commands import evaluate
 from warpgs.pipeline.runs.fit import fit_request
@@ -137,6 +138,9 @@ def _outcome(
             note = f"the run that was there had another {gap}; moved to {_set_aside(folder).name} and done anew"
             state = "redone"
         elif metrics is not None:
+            if (folder / LOCK).exists():  # of a fit that was killed after its last file, with what else it left
+                with contextlib.suppress(FolderHeldError), hold_folder(folder):
+                    pass
             try:
                 scores = _with_lpips(metrics, folder, request, variants) if variants else metrics
             except WarpgsError as e:
