@@ -166,6 +166,7 @@ def test_settings_of_plug_ins_reach_the_run(plugged, capsys):
     assert "slow-growth options" in text and "Rate of nothing, on two lines." in text and "--opaque.weight" in text
 
 
+@pytest.mark.slow
 def test_a_run_folder_never_decides_what_code_is_loaded(plugged):
     """In a new process: eval asks for the reader by name, --resume for strategy and term, and go on once they are named."""
     folder, command, named = plugged

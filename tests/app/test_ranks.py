@@ -46,7 +46,9 @@ def ended(processes: list[subprocess.Popen]) -> list[tuple[int, str, str]]:
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no such signal")
-@pytest.mark.parametrize(("first", "then"), [(2, 1), pytest.param(3, 2, marks=pytest.mark.fault)])
+@pytest.mark.parametrize(
+    ("first", "then"), [pytest.param(2, 1, marks=pytest.mark.slow), pytest.param(3, 2, marks=pytest.mark.fault)]
+)
 def test_any_number_of_processes_fits_the_same_model(tmp_path, capsys, first, then):
     """Some, of which one is killed; fewer that go on; and one alone, uninterrupted: the same PLY and the same state."""
     write_demo(tmp_path / "scene", views=8, width=48, height=36)
@@ -167,6 +169,7 @@ print(json.dumps(found))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="torch takes no socket of ours there")
 def test_ranks_of_one_machine_listen_there_alone():
     """The store and gloo, on both ranks; and nothing is said about it."""

@@ -70,6 +70,7 @@ def fitted(views, steps, config):
     return trainer
 
 
+@pytest.mark.slow
 def test_steps_on_any_number_of_threads_and_continued_ones_have_the_same_bits():
     views, whole = dimmed(scenes.photos(4), [0.6, 1, 0.8, 0.9]), None
     config = FitConfig(steps=40, half_resolution=0.25, exposure=True, refine_poses=True)

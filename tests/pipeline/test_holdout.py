@@ -107,6 +107,7 @@ def test_trimmed_within_the_loss_and_everything_by_row_stays_aligned():
     assert all(bool(t.isfinite().all()) for n, t in tensors.items() if n.startswith(("params", "exp_avg")))
 
 
+@pytest.mark.slow
 def test_what_a_fit_is_better_than_enough_goes_for_size():
     """Far below enough there is one trim, within its loss; above it the loss counts from enough, and there are more."""
     (own,) = advanced(with_trims(), 60).strategy.trims
@@ -211,7 +212,8 @@ def _turned():
     return turn
 
 
-@pytest.mark.parametrize(("width", "steps", "psnr"), [(32, 200, 30), pytest.param(64, 600, 39, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("width", "steps", "psnr"), [(32, 200, 30), (64, 600, 39)])
+@pytest.mark.slow
 def test_a_wall_of_one_colour_needs_next_to_nothing(width, steps, psnr):
     """With default flags a handful of Gaussians of degree 0 for a card of one colour that fills the views, seen as it is."""
     fit = finished(textured_planes.photos(textured_planes.plain, half=(9, 9), width=width, height=3 * width // 4), steps=steps)

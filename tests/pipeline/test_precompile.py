@@ -59,6 +59,7 @@ def test_a_fit_launches_nothing_else(device, strategy, recorded, monkeypatch):
     assert len(launched) > 8 and launched <= warmed
 
 
+@pytest.mark.slow
 def test_the_second_call_finds_all_in_the_cache(tmp_path, monkeypatch, capsys):
     """One small module in an empty cache: compiled by the first call, found by the second, which knows nothing of the first."""
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))

@@ -102,6 +102,7 @@ def test_prune_keeps_its_promise(run, tmp_path, capsys):
     assert scores["test"]["psnr"] == pytest.approx(record["test_psnr"][1], abs=1e-9)
 
 
+@pytest.mark.slow
 def test_more_loss_allowed_more_goes(run, tmp_path):
     """A hundredth of a decibel keeps more than two."""
     counts = []

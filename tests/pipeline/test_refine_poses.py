@@ -99,6 +99,7 @@ def fitted(views, steps=240):
     return trainer
 
 
+@pytest.mark.slow
 def test_a_fit_finds_poses_back(tmp_path):
     """Of a ray-cast scene with poses that are off, a good part of the error goes, at the rates of the default."""
     write_demo(tmp_path, views=8, width=64, height=48)
