@@ -128,6 +128,9 @@ def test_finished_runs_are_kept_and_half_finished_ones_continued(finished, tmp_p
     (run_folder(request, "still", "a", 0) / LOCK).touch()  # of a fit that was killed after its last file
     run_study(request)
     assert states(request) == ["kept", "kept", "continued", "kept"] and not list(request.out.rglob(LOCK))
+    (half / "report.html").unlink()  # a fit was killed between its scores and its report
+    run_study(request)
+    assert states(request) == ["kept", "kept", "continued", "kept"] and (half / "report.html").is_file()
     assert metrics_of(request, "a", 1)["test"] == before
     assert [p.parent for p, t in times.items() if p.stat().st_mtime_ns != t] == [half]
     assert "continued from its last checkpoint" in capsys.readouterr().out

@@ -133,7 +133,8 @@ def _outcome(
     """Return the outcome of `ensure_run`, or raise what keeps it from beginning."""
     folder, note, state, resume = request.out, "", "fitted", False
     if record is not None:
-        metrics = _scores(folder / "metrics.json")
+        # the report is what a fit writes last
+        metrics = _scores(folder / "metrics.json") if (folder / "report.html").is_file() else None
         if gap:
             note = f"the run that was there had another {gap}; moved to {_set_aside(folder).name} and done anew"
             state = "redone"
