@@ -27,7 +27,7 @@ def make_records(real, tile_size: int):
 
     @wp.struct
     class Pixels:
-        """What is known of each pixel of a tile."""
+        """Values of each pixel of a tile."""
 
         t: tile_reals  # transmittance behind the current instance, then before it
         behind: tile_reals  # sum of w d over what lies behind, background included
@@ -41,7 +41,7 @@ def make_records(real, tile_size: int):
 
     @wp.struct
     class Reach:
-        """What a Gaussian has at each strip, and the strips that it reaches."""
+        """Values of a Gaussian at each strip, and the strips that it reaches."""
 
         dx: list_reals  # from the mean to the first pixel [px]
         dy: list_reals
@@ -53,7 +53,7 @@ def make_records(real, tile_size: int):
 
     @wp.struct
     class Shades:
-        """What a Gaussian has at each pixel of the strips that it reaches, in their order."""
+        """Values of a Gaussian at each pixel of the strips that it reaches, in their order."""
 
         alpha: tile_reals
         inverse: tile_reals  # of 1 - alpha

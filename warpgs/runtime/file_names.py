@@ -37,6 +37,7 @@ def use_utf8_names() -> None:
     os.environ["PYTHONUTF8"] = "1"  # for processes that this one starts
     if sys.stdout is not None:  # letters that the terminal lacks are still printed as codes
         os.environ.setdefault("PYTHONIOENCODING", f"{sys.stdout.encoding}:backslashreplace")
+    # the options of the interpreter, -P and -I among them, are part of orig_argv
     os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])
 
 
