@@ -11,9 +11,12 @@ import pytest
 import torch
 
 from bench.lib import result_file, same_bits
+from tests.example_terms import DepthCorrelation, NormalSmoothness
+from tests.gaussians import camera
 from warpgs import geometry
 from warpgs.io.pose_matrices import rigid
-from warpgs.pipeline.train.loss import depth_disagreement, photometric_loss
+from warpgs.pipeline.train.loss import LossInputs, Target
+from warpgs.pipeline.train.loss_terms.photometric import photometric_loss
 from warpgs.runtime.interop import set_threads
 
 ROOT = Path(__file__).parent.parent
@@ -58,18 +61,22 @@ def test_libraries_for_other_processors_and_other_thread_counts_give_the_same_fi
 
 
 def test_losses_do_not_depend_on_the_number_of_threads():
-    """Values and gradients over more pixels than torch sums on one thread, with a mask and with a depth term."""
+    """Values and gradients over more pixels than torch sums on one thread, with a mask and of the terms of `examples/`."""
     random = torch.Generator().manual_seed(0)
     rgb, target = (torch.rand(230, 240, 3, generator=random) for _ in range(2))
     depth, disparity, mask = (torch.rand(230, 240, generator=random) + 0.5 for _ in range(3))
     mask, alpha = (mask > 0.6).float(), torch.ones(230, 240)
+    cam, one = camera(240, 230, dtype=torch.float32), torch.ones(())
     found, before = [], torch.get_num_threads()
     try:
         for threads in (1, 2, 5):
             set_threads(threads)
             image, z = rgb.clone().requires_grad_(), depth.clone().requires_grad_()
             losses = [photometric_loss(image, target, m, w) for m, w in ((mask, 0.2), (mask, 0.0), (None, 0.2), (None, 0.0))]
-            losses.append(depth_disagreement(z, alpha, disparity, mask))
+            inputs = LossInputs(
+                {"alpha": alpha, "depth": z}, Target(target, mask, {"disparity": disparity}, {}), None, cam, one
+            )
+            losses += [DepthCorrelation()(inputs), NormalSmoothness()(inputs)]
             found.append(same_bits.digest(*losses, *torch.autograd.grad(sum(losses), [image, z])))
     finally:
         set_threads(before)

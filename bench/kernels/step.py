@@ -23,7 +23,7 @@ from warpgs.kernels.tiles import bin_tiles
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.request import choose_device
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import photometric_loss
+from warpgs.pipeline.train.loss_terms.photometric import photometric_loss
 
 
 def stages(trainer: Trainer) -> tuple[list[dict], int]:

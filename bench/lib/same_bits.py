@@ -21,11 +21,13 @@ from bench.lib.tables import markdown
 from warpgs.export.ply import write_ply
 from warpgs.io.load import load_scene
 from warpgs.io.splits import split_views
-from warpgs.pipeline.train.config import PRESETS, FitConfig
+from warpgs.pipeline.train.by_views import settings_by_views
+from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loop import train_views
-from warpgs.pipeline.train.loss import Target
+from warpgs.pipeline.train.loss import LossInputs, Target, outputs_of
+from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.setup import samples
 from warpgs.pipeline.train.step import total_loss
-from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.priors.matches import triangulate_matches
 from warpgs.priors.semantics import classical_maps
@@ -133,7 +135,10 @@ def _first_step(trainer: Trainer) -> Iterator[Stage]:
     render = rasterize(leaves, view.camera, options)
     for name, image in (("colour", render.rgb), ("alpha", render.alpha), ("depth", render.depth)):
         yield f"first render: {name}", digest(image)
-    loss = total_loss(plan, render, Target(view.image, view.mask, view.maps, {}, view.alpha), leaves, trainer.strategy)
+    outputs = {n: getattr(render, n) for n in outputs_of(plan.terms)}
+    target = Target(view.image, view.mask, view.maps, view.alpha)
+    inputs = LossInputs(outputs, target, leaves, view.camera, torch.ones((), device=trainer.device))
+    loss = total_loss(plan, inputs, trainer.strategy)
     yield "first loss", digest(loss)
     loss.backward()
     for name, leaf in leaves.tensors().items():
@@ -144,8 +149,9 @@ def fit_stages(
     scene: Scene, train: list[View], config: FitConfig, device: torch.device, folder: Path, *, only_start: bool
 ) -> Iterator[Stage]:
     """Yield the stages of one fit: its start, the first step, parameters after 1, 10 and all steps, and both PLY files."""
+    config, _ = settings_by_views(config, train, device.type)
     trainer = Trainer(train, scene.points, config, device, scene.background)
-    if find_strategy(config.strategy).samples(config):
+    if samples(config):
         yield "consistent depths", digest(*(v.consistent for v in trainer.views))
         yield "disparities", digest(*trainer.disparities)
         yield "semantic score", digest(*(v.semantic for v in trainer.views))

@@ -12,7 +12,7 @@ from tests.reference.project import project_reference
 from tests.tolerances import close
 from warpgs.colors import C0
 from warpgs.constants import ALPHA_CUT, ALPHA_MAX, RULES, TRANSMITTANCE_STOP
-from warpgs.kernels.blend import blend, contributions
+from warpgs.kernels.blend import blend, composite, contributions
 from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import Tiles, bin_tiles
@@ -246,6 +246,24 @@ def test_cpu_equals_cuda():
         found[device] = everything(gaussians, cam)
     for a, b in zip(found["cuda:0"], found["cpu"]):
         close("gradient", a, b)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("tile_size", [8, 16])
+def test_blocks_per_warp_change_no_bit(tile_size):
+    """One or two blocks of pixels to a warp: images, and what is saved for the gradients, are the same bits."""
+    gaussians, cam = cloud(400, torch.float32, "cuda:0"), camera(77, 45, cameras=2, dtype=torch.float32, device="cuda:0")
+    size, rule = {"width": cam.width, "height": cam.height}, RULES["exact"]
+    tensors = gaussians.tensors().values()
+    projected, counts = project(*tensors, cam.viewmat, cam.K, **size, degree=1, rule=rule, tile_size=tile_size)
+    tiles = bin_tiles(projected, counts, **size, rule=rule, tile_size=tile_size)
+    found = []
+    for visible in (1, len(tiles.gaussian_ids)):  # many tiles to a Gaussian, and one
+        some = dataclasses.replace(tiles, visible=visible)
+        settings = BlendSettings((0, 0), cam.width, cam.height, rule)
+        found.append(composite(projected, some, torch.full((2, 3), 0.3, device="cuda:0"), settings, save=True))
+    for one, other in zip(*(f[:6] for f in found)):
+        assert torch.equal(one, other)
 
 
 def test_both_passes_see_the_same_alpha(device):

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from scipy.stats import chisquare
 
 from tests.reference.dropout import expected_factors
 from warpgs.kernels.dropout import opacity_dropout
@@ -12,18 +11,18 @@ COUNT = 20_000
 
 
 def factors(device, p: float, step: int = 1, seed: int = 0) -> torch.Tensor:
-    settings = Setting.row(dropout=p, number=step, means_lr=0.1, shift=(0.2, 0.3, 0.4))
+    settings = Setting.row(dropout=p, number=step, step=step, means_lr=0.1, shift=(0.2, 0.3, 0.4))
     return opacity_dropout(COUNT, torch.tensor(settings, dtype=torch.float32, device=device), seed)
 
 
 def test_frequencies(device):
-    """Both values occur as often as the probability says (chi-square), for several steps and seeds."""
+    """Both values occur as often as the probability says (within 3.9 standard deviations), for several steps and seeds."""
     for p, step, seed in ((0.2, 1, 0), (0.05, 9_999, 0), (0.5, 3, 7)):
         values, chances = expected_factors(p)
         drawn = factors(device, p, step, seed).double().cpu()
         dropped = int((drawn == 0).sum())
         assert torch.allclose(drawn[drawn > 0], torch.tensor(values[1]), rtol=1e-6)
-        assert chisquare([dropped, COUNT - dropped], COUNT * chances).pvalue > 1e-4
+        assert abs(dropped - COUNT * chances[0]) < 3.9 * (COUNT * chances.prod()) ** 0.5
 
 
 def test_nothing_is_dropped_at_zero(device):

@@ -55,6 +55,7 @@ def test_a_step_is_written_down_and_counted_if_it_counts(device, value, stopped)
 
 def test_settings_stand_in_their_columns():
     """A row holds each setting where its column says."""
-    row = Setting.row(dropout=0.2, number=7, means_lr=1e-4, shift=(0.1, 0.5, 0.9))
+    row = Setting.row(dropout=0.2, number=7, step=4, means_lr=1e-4, shift=(0.1, 0.5, 0.9))
     assert (row[Setting.DROPOUT], row[Setting.NUMBER], row[Setting.MEANS_LR], row[SHIFT]) == (0.2, 7, 1e-4, (0.1, 0.5, 0.9))
+    assert row[Setting.STEP] == 4
     assert (row[Setting.RED], row[Setting.GREEN], row[Setting.BLUE]) == row[SHIFT] and len(row) == len(Setting)

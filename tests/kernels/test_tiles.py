@@ -8,6 +8,7 @@ from tests.reference.project import project_reference
 from tests.reference.tiles import touched_reference
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
+from warpgs.kernels.blend import blend, contributions
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
 
@@ -131,3 +132,38 @@ def test_bad_input_names_the_argument():
         bin_tiles(projected, counts.long(), width=40, height=30, rule=EXACT)
     with pytest.raises(ValueError, match="projected"):
         bin_tiles(projected[..., :9], counts, width=40, height=30, rule=EXACT)
+
+
+def test_lists_without_slots_are_the_same(device):
+    """Without slots ranges, Gaussian numbers and images are the same bits; gradients and contributions are refused."""
+    gaussians, cam = cloud(300, torch.float32, device), camera(64, 48, cameras=2, dtype=torch.float32, device=device)
+    projected, _, tiles = binned(gaussians, cam)
+    bare = binned(gaussians, cam, slotted=False)[2]
+    assert len(bare.slots) == 0
+    assert torch.equal(bare.ranges, tiles.ranges)
+    assert torch.equal(bare.gaussian_ids, tiles.gaussian_ids)
+    size = {"width": cam.width, "height": cam.height, "rule": EXACT}
+    backgrounds = torch.rand(2, 3, device=device)
+    for one, other in zip(blend(projected, bare, backgrounds, **size), blend(projected, tiles, backgrounds, **size)):
+        assert torch.equal(one, other)
+    with pytest.raises(ValueError, match="no slots"):
+        blend(projected.requires_grad_(), bare, backgrounds, **size)
+    with pytest.raises(ValueError, match="no slots"):
+        contributions(projected, bare, **size)
+
+
+@pytest.mark.cuda
+def test_cuda_lists_are_those_of_the_cpu():
+    """Gaussians of one tile beside some of a thousand, also over several batches of rows: slot for slot the CPU's lists."""
+    gaussians, cam = cloud(500, torch.float32), camera(640, 720, cameras=2, dtype=torch.float32)
+    gaussians.log_scales[::7] += 3.0
+    projected, counts, _ = binned(gaussians, cam)
+    assert int(counts.max()) > 1000
+    size = {"width": cam.width, "height": cam.height, "rule": EXACT}
+    for slotted in (True, False):
+        found = bin_tiles(projected.cuda(), counts.cuda(), slotted=slotted, **size)
+        wanted = bin_tiles(projected, counts, slotted=slotted, **size)
+        listed_ones = counts.view(-1) > 0  # the others have no start
+        assert torch.equal(found.starts.cpu()[listed_ones], wanted.starts[listed_ones])
+        for name in ("ranges", "gaussian_ids", "slots", "counts", "tile_ids", "total"):
+            assert torch.equal(getattr(found, name).cpu(), getattr(wanted, name))

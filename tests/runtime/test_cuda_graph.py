@@ -124,7 +124,7 @@ def test_a_failed_capture_warns_once_and_the_function_still_runs():
 def test_a_captured_graph_replays_torch_and_warp():
     """Kernels of both read new inputs at each replay, the result stays alive, and a second graph shares the memory."""
     cuda = torch.device("cuda", 0)
-    settings, stream = torch.tensor([0.5, 1.0, 0.0, 0.0, 0.0, 0.0], device=cuda), torch.cuda.Stream()
+    settings, stream = torch.tensor([0.5, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0], device=cuda), torch.cuda.Stream()
 
     def work():
         return 2 * opacity_dropout(1000, settings, 7)

@@ -16,6 +16,7 @@ from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.median_depth import median_depth
 from warpgs.kernels.project import project
 from warpgs.kernels.ssim import differences, ssim
+from warpgs.kernels.step_buffers import Setting
 from warpgs.kernels.tiles import bin_tiles
 from warpgs.runtime import interop
 
@@ -83,7 +84,8 @@ def everything():
     moved = torch.rand(3 * 4096, 3, generator=torch.Generator().manual_seed(1))
     state = [moved, moved.flip(0).contiguous(), moved * 0, moved * 0]
     adam_step(*state, lr=0.1, step=1)
-    factors = opacity_dropout(53, torch.tensor([0.3, 1.0, 0.0, 0.0, 0.0, 0.0]), 5)
+    settings = Setting.row(dropout=0.3, number=1, step=1, means_lr=0.1, shift=(0.0, 0.0, 0.0))
+    factors = opacity_dropout(53, torch.tensor(settings, dtype=torch.float32), 5)
     lists = [t for tiled in (tiles, capped) for t in (tiled.ranges, tiled.counts, tiled.gaussian_ids[: len(tiles.slots)])]
     weights = (*contributions(projected, tiles, **size, rule=rule), median_depth(projected, tiles, **size, rule=rule))
     near = mean_square_distances(moved[:91])

@@ -20,7 +20,7 @@ import warp as wp
 from warpgs.kernels import tiles
 from warpgs.runtime import interop
 
-module = tiles.make_kernels(wp.float32, False).find_ranges.module
+module = tiles.make_kernels(wp.float32, False).pack_counts.module
 made = module.load(interop.warp_device(torch.device("cpu")), block_dim=1).binary_path
 folder = wp.config.kernel_cache_dir
 assert str(made).startswith(folder) and os.path.isfile(made)

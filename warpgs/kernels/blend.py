@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from warpgs.constants import Rule
 from warpgs.kernels import blend_cpu, blend_cuda
-from warpgs.kernels.blend_records import VALUES
+from warpgs.kernels.blend_records import COLORS, VALUES
 from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.tiles import Tiles, grid
 from warpgs.runtime import interop
@@ -18,25 +18,26 @@ from warpgs.runtime.allocator import TORCH, Allocator
 
 
 @functools.cache
-def make_segments(real):
-    """Make the kernels that sum over the slots of each Gaussian, in slot order and so repeatably."""
-    vec10 = wp.types.vector(VALUES, real)
+def make_segments(real, values: int = VALUES):
+    """Make the kernels that sum over the slots of each Gaussian, in slot order and so repeatably; ``values`` of a gradient."""
+    reals = wp.types.vector(values, real)
+    count = wp.constant(values)
 
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.blend.{real.__name__}")
+    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.blend.{real.__name__}.{values}")
     def sum_gradients(
         begin: int, v_slots: wp.array2d(dtype=real), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
         # outputs, zero on entry
         v_projected: wp.array2d(dtype=real),
     ):  # fmt: skip
         i = begin + wp.tid()
-        total = vec10()
+        total = reals()
         for slot in range(starts[i], starts[i] + counts[i]):
-            for k in range(VALUES):
+            for k in range(count):
                 total[k] += v_slots[slot, k]
-        for k in range(VALUES):
+        for k in range(count):
             v_projected[i, k] = total[k]
 
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.blend.{real.__name__}")
+    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.blend.{real.__name__}.{values}")
     def gather_weights(
         begin: int, weights: wp.array2d(dtype=real), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
         # outputs
@@ -54,8 +55,8 @@ def make_segments(real):
     return SimpleNamespace(sum_gradients=sum_gradients, gather_weights=gather_weights)
 
 
-def _native(projected: torch.Tensor) -> bool:
-    """Return whether the CUDA kernels apply; else the generic ones do."""
+def is_native(projected: torch.Tensor) -> bool:
+    """Return whether the CUDA kernels apply to projected Gaussians [C, N, 9 + D]; else the generic ones do."""
     return projected.is_cuda and projected.dtype == torch.float32
 
 
@@ -65,7 +66,7 @@ def _launch(kernel, tiles: int, inputs: list, device: torch.device) -> None:
 
 
 def tile_inputs(projected: torch.Tensor, tiles: Tiles, real) -> list[interop.View]:
-    """Return what the generic kernels take: projected Gaussians [C, N, 12], and the instances of each tile."""
+    """Return what the generic kernels take: projected Gaussians [C, N, 9 + D], and the instances of each tile."""
     return [
         interop.view(projected.view(-1, projected.shape[-1]), real),
         interop.view(tiles.ranges, wp.int32),
@@ -85,31 +86,33 @@ def composite(
     """Return the images, and what the backward pass needs. Nothing is checked, and no gradient is recorded.
 
     Args:
-        projected: Projected Gaussians, contiguous, shape [C, N, 12].
+        projected: Projected Gaussians, contiguous, shape [C, N, 9 + D] with D channels in place of the colour, D out of
+            `WIDTHS`; [C, N, 12] with a colour.
         tiles: Their instances.
-        backgrounds: Colour behind everything, contiguous, shape [C, 3].
+        backgrounds: Channels behind everything, contiguous, shape [C, D].
         settings: Settings.
         save: True where gradients will be taken.
         allocator: Provider of the results' memory.
 
     Returns:
-        ``rgb`` [C, H, W, 3]; ``alpha``, ``depth``, transmittances and weight sums [C, H, W]; one past the last instance that
+        ``rgb`` [C, H, W, D]; ``alpha``, ``depth``, transmittances and weight sums [C, H, W]; one past the last instance that
         was blended [C, H, W]; states of the chunks (CUDA only, else empty).
     """
-    if _native(projected):
+    if is_native(projected):
         return blend_cuda.forward(projected, tiles, backgrounds, settings, save=save, allocator=allocator)
     real, device = interop.real_of(projected), projected.device
-    shape = (len(backgrounds), settings.height, settings.width)
-    rgb, alpha, depth = (allocator.output(s, projected.dtype, device) for s in ((*shape, 3), shape, shape))
+    cameras, channels = backgrounds.shape
+    shape = (cameras, settings.height, settings.width)
+    rgb, alpha, depth = (allocator.output(s, projected.dtype, device) for s in ((*shape, channels), shape, shape))
     transmittances, weights = (allocator.saved(shape, projected.dtype, device) for _ in range(2))
     ends = allocator.saved(shape, torch.int32, device)
     inputs = [
         settings.struct(tiles.size, real), *tile_inputs(projected, tiles, real), interop.view(backgrounds, real),
-        interop.view(rgb.view(-1, 3), real),
+        interop.view(rgb.view(-1, channels), real),
         *(interop.view(t.view(-1), real) for t in (alpha, depth, transmittances, weights)),
         interop.view(ends.view(-1), wp.int32),
     ]  # fmt: skip
-    _launch(blend_cpu.make_kernels(real, tiles.size).forward, len(tiles.ranges), inputs, device)
+    _launch(blend_cpu.make_kernels(real, tiles.size, channels).forward, len(tiles.ranges), inputs, device)
     return rgb, alpha, depth, transmittances, weights, ends, allocator.saved((0,), projected.dtype, device)
 
 
@@ -117,10 +120,11 @@ def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_i
     """Return what `blend_cuda.backward` returns, by the generic kernels."""
     _, depth, transmittances, weights, ends, _ = saved
     v_rgb, v_alpha, v_depth = v_images
-    real, device = interop.real_of(projected), projected.device
+    real, device, channels = interop.real_of(projected), projected.device, backgrounds.shape[1]
+    values = VALUES + channels - COLORS
     v_projected = allocator.output(projected.shape, projected.dtype, device).zero_()
-    v_slots = allocator.workspace((len(tiles.slots), VALUES), projected.dtype, device).zero_()
-    upstream = [interop.view(v_rgb.contiguous().view(-1, 3), real)]
+    v_slots = allocator.workspace((len(tiles.slots), values), projected.dtype, device).zero_()
+    upstream = [interop.view(v_rgb.contiguous().view(-1, channels), real)]
     for v in (v_alpha, v_depth):
         upstream.append(interop.view((torch.zeros_like(depth) if v is None else v.contiguous()).view(-1), real))
     inputs = [
@@ -129,12 +133,12 @@ def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_i
         *(interop.view(t.view(-1), real) for t in (transmittances, weights, depth)), interop.view(ends.view(-1), wp.int32),
         *upstream, interop.view(v_slots, real),
     ]  # fmt: skip
-    _launch(blend_cpu.make_kernels(real, tiles.size).backward, len(tiles.ranges), inputs, device)
+    _launch(blend_cpu.make_kernels(real, tiles.size, channels).backward, len(tiles.ranges), inputs, device)
     inputs = [
         interop.view(v_slots, real), interop.view(tiles.starts, wp.int32), interop.view(tiles.counts, wp.int32),
         interop.view(v_projected.view(-1, v_projected.shape[-1]), real),
     ]  # fmt: skip
-    interop.launch(make_segments(real).sum_gradients, len(tiles.counts), inputs, device, cost=5)
+    interop.launch(make_segments(real, values).sum_gradients, len(tiles.counts), inputs, device, cost=5)
     return v_projected
 
 
@@ -147,29 +151,29 @@ def composite_gradients(
     v_images: Sequence[torch.Tensor | None],
     allocator: Allocator = TORCH,
 ) -> torch.Tensor:
-    """Return the gradient of ``projected``, shape [C, N, 12]. Nothing is checked.
+    """Return the gradient of ``projected``, shape [C, N, 9 + D]. Nothing is checked.
 
     Args:
-        projected: Projected Gaussians as given to `composite`, shape [C, N, 12].
+        projected: Projected Gaussians as given to `composite`, shape [C, N, 9 + D].
         tiles: Their tiles.
-        backgrounds: Colour behind everything, shape [C, 3].
+        backgrounds: Channels behind everything, shape [C, D].
         settings: Settings as given to `composite`.
         saved: Results of `composite` but for ``alpha``.
-        v_images: Gradients of ``rgb`` [C, H, W, 3], ``alpha`` and ``depth`` [C, H, W], each of which may be None.
+        v_images: Gradients of ``rgb`` [C, H, W, D], ``alpha`` and ``depth`` [C, H, W], each of which may be None.
         allocator: Provider of the gradient's memory.
     """
     v_rgb, v_alpha, v_depth = v_images
     v_rgb = torch.zeros_like(saved[0]) if v_rgb is None else v_rgb
-    backward = blend_cuda.backward if _native(projected) else _backward
+    backward = blend_cuda.backward if is_native(projected) else _backward
     return backward(projected, tiles, backgrounds, settings, saved, (v_rgb, v_alpha, v_depth), allocator)
 
 
-def background_gradient(transmittances: torch.Tensor, v_rgb: torch.Tensor | None) -> torch.Tensor:
-    """Return the gradient of the backgrounds, shape [C, 3]; ``v_rgb`` None is zero."""
+def background_gradient(transmittances: torch.Tensor, v_rgb: torch.Tensor | None, channels: int = 3) -> torch.Tensor:
+    """Return the gradient of the backgrounds, shape [C, D] with D ``channels``; ``v_rgb`` None is zero."""
     # a product of matrices would sum the pixels one by one, and err several times as much
     if v_rgb is None:
-        return transmittances.new_zeros(len(transmittances), 3)
-    return torch.stack([(transmittances * v_rgb[..., k]).sum((1, 2)) for k in range(3)], 1)
+        return transmittances.new_zeros(len(transmittances), channels)
+    return torch.stack([(transmittances * v_rgb[..., k]).sum((1, 2)) for k in range(channels)], 1)
 
 
 class _Blend(torch.autograd.Function):
@@ -177,6 +181,8 @@ class _Blend(torch.autograd.Function):
     def forward(ctx, projected, backgrounds, tiles, settings):
         projected, backgrounds = projected.contiguous(), backgrounds.contiguous()
         save = any(ctx.needs_input_grad)
+        if save:
+            check_slots(tiles)
         rgb, alpha, depth, *rest = composite(projected, tiles, backgrounds, settings, save=save)
         if save:
             # all of it as saved tensors: those are freed once the gradient is taken
@@ -193,6 +199,12 @@ class _Blend(torch.autograd.Function):
         v_projected = composite_gradients(projected, tiles, backgrounds, ctx.settings, saved, v_images)
         v_backgrounds = background_gradient(saved[2], v_images[0]) if ctx.needs_input_grad[1] else None
         return v_projected, v_backgrounds, None, None
+
+
+def check_slots(tiles: Tiles) -> None:
+    """Raise ValueError where the instances have no slots."""
+    if len(tiles.slots) != len(tiles.gaussian_ids):
+        raise ValueError("tiles have no slots, which gradients and contributions need: make them by bin_tiles(slotted=True)")
 
 
 def check_tiles(projected: torch.Tensor, tiles: Tiles, width: int, height: int, **backgrounds) -> None:
@@ -274,8 +286,9 @@ def contributions(
     projected = projected.detach().contiguous()
     real, device = interop.real_of(projected), projected.device
     settings = BlendSettings(origin, width, height, rule)
+    check_slots(tiles)
     ends = composite(projected, tiles, projected.new_zeros(len(projected), 3), settings, save=False)[5]
-    if _native(projected):
+    if is_native(projected):
         weights = blend_cuda.instance_weights(projected, tiles, settings, ends)
     else:
         weights = projected.new_zeros(len(tiles.slots), 2)

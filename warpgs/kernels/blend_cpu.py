@@ -11,6 +11,7 @@ import warp as wp
 
 from warpgs.constants import SMALLEST_WEIGHT
 from warpgs.kernels.blend_cpu_backward import make_backward
+from warpgs.kernels.blend_records import COLORS
 from warpgs.kernels.compiler import ROLLED
 from warpgs.kernels.falloff import ABREAST, STRIP, make_functions
 
@@ -19,8 +20,8 @@ BATCH = 64
 
 
 @functools.cache
-def make_kernels(real, tile_size: int):
-    """Make the forward, backward and contribution kernels for one scalar type and tile size."""
+def make_forward(real, tile_size: int, channels: int):
+    """Make the forward kernel for one scalar type, tile size and number of channels."""
     f = make_functions(real)
     # Vectors rather than local arrays: the compiler must see that they do not overlap. One row longer than the tile, so that
     # they do not lie 4096 bytes apart, where a load is taken to wait for a store to the other.
@@ -31,6 +32,13 @@ def make_kernels(real, tile_size: int):
     batch_reals = wp.types.vector(BATCH, real)
     batch_ints = wp.types.vector(BATCH, wp.int32)
     batch_strips = wp.types.vector(BATCH * STRIP, real)
+    # of several channels, one after the other
+    tile_channels = wp.types.vector(channels * tile_size * (tile_size + 1), real)
+    strip_channels = wp.types.vector(channels * STRIP, real)
+    batch_channels = wp.types.vector(channels * BATCH, real)
+    count_of_channels = wp.constant(channels)
+    place_z = wp.constant(6 + channels)
+    tile_stride = wp.constant(tile_size * (tile_size + 1))
     side = wp.constant(tile_size)
     pixels = wp.constant(tile_size * tile_size)
     strip = wp.constant(STRIP)
@@ -40,6 +48,36 @@ def make_kernels(real, tile_size: int):
     bits = wp.constant(BATCH - 1)
     finished = wp.constant(real(2.0))
     smallest = wp.constant(real(SMALLEST_WEIGHT))
+
+    # Loops over channels are unrolled, because of the static number, and so stand apart from the loops that must not be.
+    @wp.func(inline=True)
+    def at(entry: wp.ref[real]) -> real:
+        """Return an entry of a vector that is taken by reference; Warp would copy the vector otherwise."""
+        return entry
+
+    @wp.func(inline=True)
+    def load_channels(projected: wp.array2d(dtype=real), i: wp.int32, j: wp.int32, color: wp.ref[batch_channels]):
+        """Load the channels of a Gaussian of the batch."""
+        for c in range(wp.static(channels)):
+            color[c * batch + j] = projected[i, 6 + c]
+
+    @wp.func(inline=True)
+    def load_strip(base: wp.int32, lane: wp.int32, sums: wp.ref[tile_channels], strip_sums: wp.ref[strip_channels]):
+        """Load the sums of a pixel of a strip."""
+        for c in range(wp.static(channels)):
+            strip_sums[c * strip + lane] = at(sums[c * tile_stride + base + lane])
+
+    @wp.func(inline=True)
+    def store_strip(base: wp.int32, lane: wp.int32, strip_sums: wp.ref[strip_channels], sums: wp.ref[tile_channels]):
+        """Store the sums of a pixel of a strip."""
+        for c in range(wp.static(channels)):
+            sums[c * tile_stride + base + lane] = at(strip_sums[c * strip + lane])
+
+    @wp.func(inline=True)
+    def add_channels(w: real, lane: wp.int32, j: wp.int32, color: wp.ref[batch_channels], strip_sums: wp.ref[strip_channels]):
+        """Add the channels of a Gaussian to the sums of a pixel of a strip."""
+        for c in range(wp.static(channels)):
+            strip_sums[c * strip + lane] = at(strip_sums[c * strip + lane]) + w * at(color[c * batch + j])
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def forward(
@@ -59,9 +97,7 @@ def make_kernels(real, tile_size: int):
         # pixel is finished; sums; one past the last instance blended.
         t = tile_reals()
         floor = tile_reals()
-        red = tile_reals()
-        green = tile_reals()
-        blue = tile_reals()
+        sums = tile_channels()
         z = tile_reals()
         total = tile_reals()
         end = tile_ints()
@@ -74,9 +110,7 @@ def make_kernels(real, tile_size: int):
         # The same for one strip, in registers.
         strip_t = strip_reals()
         strip_floor = strip_reals()
-        strip_red = strip_reals()
-        strip_green = strip_reals()
-        strip_blue = strip_reals()
+        strip_sums = strip_channels()
         strip_z = strip_reals()
         strip_total = strip_reals()
         strip_end = strip_ints()
@@ -87,9 +121,7 @@ def make_kernels(real, tile_size: int):
         u12 = batch_reals()
         u22 = batch_reals()
         opacity = batch_reals()
-        c0 = batch_reals()
-        c1 = batch_reals()
-        c2 = batch_reals()
+        color = batch_channels()
         distance = batch_reals()
         aside = batch_reals()
         limit = batch_reals()
@@ -121,11 +153,11 @@ def make_kernels(real, tile_size: int):
                 u12[j] = projected[i, 3]
                 u22[j] = projected[i, 4]
                 opacity[j] = projected[i, 5]
-                c0[j] = projected[i, 6]
-                c1[j] = projected[i, 7]
-                c2[j] = projected[i, 8]
-                distance[j] = projected[i, 9]
-                bounds = f.bounds_of(mx[j], my[j], u11[j], u22[j], projected[i, 10], projected[i, 11], settings.whole_tiles)
+                load_channels(projected, i, j, color)
+                distance[j] = projected[i, place_z]
+                bounds = f.bounds_of(
+                    mx[j], my[j], u11[j], u22[j], projected[i, place_z + 1], projected[i, place_z + 2], settings.whole_tiles
+                )
                 aside[j] = bounds[0]
                 limit[j] = bounds[1]
                 j += 1
@@ -171,9 +203,7 @@ def make_kernels(real, tile_size: int):
                                     alphas[(o + n) * strip + lane] = wp.where(alpha >= settings.alpha_cut, alpha, real(0.0))
                         for lane in range(strip):
                             strip_t[lane] = t[base + lane]
-                            strip_red[lane] = red[base + lane]
-                            strip_green[lane] = green[base + lane]
-                            strip_blue[lane] = blue[base + lane]
+                            load_strip(base, lane, sums, strip_sums)
                             strip_z[lane] = z[base + lane]
                             strip_total[lane] = total[base + lane]
                             strip_end[lane] = end[base + lane]
@@ -192,17 +222,13 @@ def make_kernels(real, tile_size: int):
                                 strip_t[lane] = wp.where(blended, after, before)
                                 strip_floor[lane] = wp.where(after < settings.stop, finished, strip_floor[lane])
                                 strip_end[lane] = wp.where(w > real(0.0), number, strip_end[lane])
-                                strip_red[lane] = strip_red[lane] + w * c0[j]
-                                strip_green[lane] = strip_green[lane] + w * c1[j]
-                                strip_blue[lane] = strip_blue[lane] + w * c2[j]
+                                add_channels(w, lane, j, color, strip_sums)
                                 strip_z[lane] = strip_z[lane] + w * distance[j]
                                 strip_total[lane] = strip_total[lane] + w
                         for lane in range(strip):
                             t[base + lane] = strip_t[lane]
                             floor[base + lane] = strip_floor[lane]
-                            red[base + lane] = strip_red[lane]
-                            green[base + lane] = strip_green[lane]
-                            blue[base + lane] = strip_blue[lane]
+                            store_strip(base, lane, strip_sums, sums)
                             z[base + lane] = strip_z[lane]
                             total[base + lane] = strip_total[lane]
                             end[base + lane] = strip_end[lane]
@@ -215,14 +241,27 @@ def make_kernels(real, tile_size: int):
             for lane in range(wp.min(side, settings.width - left)):
                 p = row * side + lane
                 o = (camera * settings.height + top + row) * settings.width + left + lane
-                rgb[o, 0] = red[p] + t[p] * backgrounds[camera, 0]
-                rgb[o, 1] = green[p] + t[p] * backgrounds[camera, 1]
-                rgb[o, 2] = blue[p] + t[p] * backgrounds[camera, 2]
+                for c in range(count_of_channels):
+                    rgb[o, c] = sums[c * tile_stride + p] + t[p] * backgrounds[camera, c]
                 alpha_out[o] = real(1.0) - t[p]
                 depth[o] = wp.where(total[p] >= smallest, z[p] / total[p], real(0.0))
                 transmittances[o] = t[p]
                 weights[o] = total[p]
                 ends[o] = end[p]
+
+    return forward
+
+
+@functools.cache
+def make_contributions(real, tile_size: int):
+    """Make the contribution kernel for one scalar type and tile size."""
+    f = make_functions(real)
+    tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
+    tile_ints = wp.types.vector(tile_size * (tile_size + 1), wp.int32)
+    strip_reals = wp.types.vector(STRIP, real)
+    side = wp.constant(tile_size)
+    strip = wp.constant(STRIP)
+    parts = wp.constant(tile_size // STRIP)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def contributions(
@@ -277,4 +316,14 @@ def make_kernels(real, tile_size: int):
             weights[slots[instance], 0] = weight_sum
             weights[slots[instance], 1] = weight_max
 
-    return SimpleNamespace(forward=forward, backward=make_backward(real, tile_size), contributions=contributions)
+    return contributions
+
+
+@functools.cache
+def make_kernels(real, tile_size: int, channels: int = COLORS):
+    """Make the forward, backward and contribution kernels for one scalar type, tile size and number of channels."""
+    return SimpleNamespace(
+        forward=make_forward(real, tile_size, channels),
+        backward=make_backward(real, tile_size, channels),
+        contributions=make_contributions(real, tile_size),
+    )

@@ -2,6 +2,7 @@
 
 The kernel walks the Gaussians of its tile back to front. A Gaussian's whole effect on a pixel is one number
 d = c . v_rgb + z v_z + v_w (docs/blend.md, section 3). Each step of the walk is a function over the records of `blend_records`.
+Loops over channels are unrolled, because of their static number, and so stand apart from the loops that must not be.
 """
 
 import functools
@@ -10,16 +11,17 @@ from types import SimpleNamespace
 import warp as wp
 
 from warpgs.constants import SMALLEST_WEIGHT
-from warpgs.kernels.blend_records import VALUES, make_records
+from warpgs.kernels.blend_records import COLORS, VALUES, make_records
 from warpgs.kernels.compiler import ROLLED
 from warpgs.kernels.falloff import ABREAST, STRIP, make_functions
 
 
 @functools.cache
-def make_walk(real, tile_size: int):
+def make_walk(real, tile_size: int, channels: int):
     """Make the functions that load the pixels of a tile and walk past a Gaussian."""
     f = make_functions(real)
-    r = make_records(real, tile_size)
+    r = make_records(real, tile_size, channels)
+    stride = wp.constant(tile_size * (tile_size + 1))
     side = wp.constant(tile_size)
     strip = wp.constant(STRIP)
     parts = wp.constant(tile_size // STRIP)
@@ -30,6 +32,27 @@ def make_walk(real, tile_size: int):
     row_reals = wp.types.vector(tile_size, real)
     at = r.at
     at_int = r.at_int
+
+    @wp.func(inline=True)
+    def load_channels(
+        o: wp.int32, p: wp.int32, camera: wp.int32, backgrounds: wp.array2d(dtype=real), v_rgb: wp.array2d(dtype=real),
+        pixels: wp.ref[r.Pixels],
+    ) -> real:  # fmt: skip
+        """Load the upstream gradient of a pixel's channels; return its product with the background."""
+        pixels.g[p] = v_rgb[o, 0]
+        product = backgrounds[camera, 0] * v_rgb[o, 0]
+        for c in range(1, wp.static(channels)):
+            pixels.g[c * stride + p] = v_rgb[o, c]
+            product = product + backgrounds[camera, c] * v_rgb[o, c]
+        return product
+
+    @wp.func(inline=True)
+    def effect(g: r.Projected, p: wp.int32, pixels: wp.ref[r.Pixels]) -> real:
+        """Return the product of a Gaussian's channels with the upstream gradient of a pixel."""
+        product = at(g.color[0]) * at(pixels.g[p])
+        for c in range(1, wp.static(channels)):
+            product = product + at(g.color[c]) * at(pixels.g[c * stride + p])
+        return product
 
     @wp.func(inline=True)
     def load_pixels(
@@ -50,19 +73,13 @@ def make_walk(real, tile_size: int):
                 o = (camera * settings.height + top + row) * settings.width + left + column
                 t = transmittances[o]
                 pixels.t[p] = t
-                pixels.g0[p] = v_rgb[o, 0]
-                pixels.g1[p] = v_rgb[o, 1]
-                pixels.g2[p] = v_rgb[o, 2]
                 v_w = real(0.0)
                 if weights[o] >= smallest:
                     v_z = v_depth[o] / weights[o]
                     pixels.v_z[p] = v_z
                     v_w = -v_z * depth[o]
                 pixels.v_w[p] = v_w + v_alpha[o]
-                pixels.behind[p] = t * (
-                    backgrounds[camera, 0] * v_rgb[o, 0] + backgrounds[camera, 1] * v_rgb[o, 1]
-                    + backgrounds[camera, 2] * v_rgb[o, 2]
-                )  # fmt: skip
+                pixels.behind[p] = t * load_channels(o, p, camera, backgrounds, v_rgb, pixels)
                 pixels.end[p] = ends[o]
                 pixels.strip_end[part * side + row] = wp.max(at_int(pixels.strip_end[part * side + row]), ends[o])
                 last = wp.max(last, ends[o])
@@ -146,10 +163,7 @@ def make_walk(real, tile_size: int):
             for lane in range(strip):
                 p = o * strip + lane
                 q = base + lane
-                d = (
-                    g.c0 * at(pixels.g0[p]) + g.c1 * at(pixels.g1[p]) + g.c2 * at(pixels.g2[p]) + g.z * at(pixels.v_z[p])
-                    + at(pixels.v_w[p])
-                )  # fmt: skip
+                d = effect(g, p, pixels) + g.z * at(pixels.v_z[p]) + at(pixels.v_w[p])
                 before = at(pixels.t[p]) * at(shades.inverse[q])
                 w = at(shades.alpha[q]) * before
                 shades.v[q] = (at(pixels.t[p]) * d - at(pixels.behind[p])) * at(shades.inverse[q]) * at(shades.slope[q])
@@ -161,17 +175,27 @@ def make_walk(real, tile_size: int):
 
 
 @functools.cache
-def make_gradient(real, tile_size: int):
+def make_gradient(real, tile_size: int, channels: int):
     """Make the functions that sum the gradient of one instance."""
-    r = make_records(real, tile_size)
+    r = make_records(real, tile_size, channels)
+    count = VALUES + channels - COLORS
+    values = wp.constant(count)
+    channels_of_strip = wp.constant(channels * STRIP)
+    stride = wp.constant(tile_size * (tile_size + 1))
     at = r.at
     at_int = r.at_int
-    half_sums = wp.types.vector(VALUES * (STRIP // 2), real)
-    strip_sums = wp.types.vector(VALUES * STRIP, real)
-    value_reals = wp.types.vector(VALUES, real)
+    half_sums = wp.types.vector(count * (STRIP // 2), real)
+    strip_sums = wp.types.vector(count * STRIP, real)
+    value_reals = wp.types.vector(count, real)
     bits = wp.constant(tile_size * (tile_size // STRIP) - 1)
     strip = wp.constant(STRIP)
     half = wp.constant(STRIP // 2)
+
+    @wp.func(inline=True)
+    def add_channels(w: real, p: wp.int32, lane: wp.int32, pixels: wp.ref[r.Pixels], s: wp.ref[r.Gradient]):
+        """Add what a pixel gives to the gradient of the channels."""
+        for c in range(wp.static(channels)):
+            s.color[c * strip + lane] = at(s.color[c * strip + lane]) + w * at(pixels.g[c * stride + p])
 
     @wp.func(inline=True)
     def sum_up(
@@ -199,9 +223,7 @@ def make_gradient(real, tile_size: int):
                 s.xy[lane] = at(s.xy[lane]) + v_e1 * dy
                 s.yy[lane] = at(s.yy[lane]) + v_y * dy
                 s.opacity[lane] = at(s.opacity[lane]) + v
-                s.c0[lane] = at(s.c0[lane]) + w * at(pixels.g0[p])
-                s.c1[lane] = at(s.c1[lane]) + w * at(pixels.g1[p])
-                s.c2[lane] = at(s.c2[lane]) + w * at(pixels.g2[p])
+                add_channels(w, p, lane, pixels, s)
                 s.z[lane] = at(s.z[lane]) + w * at(pixels.v_z[p])
         return s
 
@@ -217,16 +239,15 @@ def make_gradient(real, tile_size: int):
             sums[3 * strip + lane] = at(s.xy[lane])
             sums[4 * strip + lane] = at(s.yy[lane])
             sums[5 * strip + lane] = at(s.opacity[lane])
-            sums[6 * strip + lane] = at(s.c0[lane])
-            sums[7 * strip + lane] = at(s.c1[lane])
-            sums[8 * strip + lane] = at(s.c2[lane])
-            sums[9 * strip + lane] = at(s.z[lane])
+            sums[(values - 1) * strip + lane] = at(s.z[lane])
+        for k in range(channels_of_strip):
+            sums[6 * strip + k] = at(s.color[k])
         halves = half_sums()
-        for k in range(VALUES):
+        for k in range(values):
             for lane in range(half):
                 halves[k * half + lane] = sums[k * strip + lane] + sums[k * strip + half + lane]
         totals = value_reals()
-        for k in range(VALUES):
+        for k in range(values):
             o = k * half
             totals[k] = (halves[o] + halves[o + 2]) + (halves[o + 1] + halves[o + 3])
         return totals
@@ -241,20 +262,27 @@ def make_gradient(real, tile_size: int):
         v_slots[slot, 2] = -g.opacity * totals[2]
         v_slots[slot, 3] = -g.opacity * totals[3]
         v_slots[slot, 4] = -g.opacity * g.u22 * totals[4]
-        for k in range(5, VALUES):
+        for k in range(5, values):
             v_slots[slot, k] = totals[k]
 
     return SimpleNamespace(sum_up=sum_up, totals_of=totals_of, store=store)
 
 
 @functools.cache
-def make_backward(real, tile_size: int):
-    """Make the kernel for one scalar type and tile size."""
+def make_backward(real, tile_size: int, channels: int):
+    """Make the kernel for one scalar type, tile size and number of channels."""
     f = make_functions(real)
-    r = make_records(real, tile_size)
-    m = make_walk(real, tile_size)
-    n = make_gradient(real, tile_size)
+    r = make_records(real, tile_size, channels)
+    m = make_walk(real, tile_size, channels)
+    n = make_gradient(real, tile_size, channels)
     side = wp.constant(tile_size)
+    place_z = wp.constant(6 + channels)
+
+    @wp.func(inline=True)
+    def load_color(projected: wp.array2d(dtype=real), i: int, g: wp.ref[r.Projected]):
+        """Load the channels of a projected Gaussian."""
+        for c in range(wp.static(channels)):
+            g.color[c] = projected[i, 6 + c]
 
     @wp.func(inline=True)
     def projected_at(projected: wp.array2d(dtype=real), i: int, x: real, whole_tiles: int) -> r.Projected:
@@ -266,11 +294,9 @@ def make_backward(real, tile_size: int):
         g.u12 = projected[i, 3]
         g.u22 = projected[i, 4]
         g.opacity = projected[i, 5]
-        g.c0 = projected[i, 6]
-        g.c1 = projected[i, 7]
-        g.c2 = projected[i, 8]
-        g.z = projected[i, 9]
-        bounds = f.bounds_of(g.x, g.y, g.u11, g.u22, projected[i, 10], projected[i, 11], whole_tiles)
+        load_color(projected, i, g)
+        g.z = projected[i, place_z]
+        bounds = f.bounds_of(g.x, g.y, g.u11, g.u22, projected[i, place_z + 1], projected[i, place_z + 2], whole_tiles)
         g.aside = bounds[0]
         g.limit = bounds[1]
         return g

@@ -12,6 +12,7 @@ import torch
 import warp as wp
 
 from warpgs.constants import SMALLEST_WEIGHT
+from warpgs.kernels.blend_records import COLORS
 from warpgs.kernels.blend_settings import BlendSettings, make_struct
 from warpgs.kernels.tiles import Tiles
 from warpgs.runtime import interop
@@ -25,36 +26,48 @@ multiple of this, so that several warps can share a long list. Multiples of 32."
 MAX_SMALL_TILES = 4096
 """Tiles beyond which the larger chunk is the faster one (docs/decisions/005-cuda-blending.md)."""
 STATE = 5
-"""Floats of that state: transmittance, colour and depth sum so far."""
+"""Floats of that state with three channels: transmittance, colour and depth sum so far. One more for each further channel."""
 WARPS = 2
 """Warps in a block; each works alone."""
+LARGE_GAUSSIAN = 8
+"""Tiles per visible Gaussian from which on a warp of the forward pass takes two blocks of pixels instead of one: it loads and
+tests half as many instances, while few of them touch one block alone (docs/decisions/005-cuda-blending.md)."""
 THREADS = 1024
 """Threads of the one block that puts tiles in order."""
 STRIDE = 12
-"""Floats from one instance's sums to the next, so that rows are 16-byte aligned. There are at most ten sums: two along the rows
-of the factor, three for the factor, opacity, colour, depth."""
+"""Floats from one instance's sums to the next with three channels: as many as a projected Gaussian has, so that rows are
+16-byte aligned. There are at most ten sums: two along the rows of the factor, three for the factor, opacity, colour, depth.
+Each further channel has one more."""
 
 # 2^-(e1^2 + e2^2) = exp(-|U d|^2 / 2) where e = SCALE U d
 SCALE = "0.84932180028801904272f"  # sqrt(log2(e) / 2)
 
 
-def _source(name: str, tile_size: int, **numbers) -> str:
+def _source(name: str, tile_size: int, channels: int, **numbers) -> str:
     """Return the CUDA text of one body."""
-    numbers |= {"SIDE": tile_size, "STATE": STATE, "SCALE": SCALE, "WARPS": WARPS, "STRIDE": STRIDE}
+    more = channels - COLORS
+    numbers |= {"SIDE": tile_size, "SCALE": SCALE, "WARPS": WARPS}
+    numbers |= {"CHANNELS": channels, "STATE": STATE + more, "STRIDE": STRIDE + more}
     numbers["SMALLEST_WEIGHT"] = f"{SMALLEST_WEIGHT}f"
     return source(f"blend_{name}.cu", **numbers)
 
 
 @functools.cache
-def make_kernels(tile_size: int):
-    """Make the forward and contribution kernels for one tile size.
+def make_forward(tile_size: int, save: bool, per: int, channels: int = COLORS):
+    """Make the kernel that composites, for one tile size and number of channels, out of `WIDTHS`.
 
     Images and projected Gaussians are flat arrays. Arrays with a row per instance have two axes, since a flat one could be too
     long for 32-bit sizes.
+
+    Args:
+        tile_size: Side of a tile [px].
+        save: True to write what the backward pass needs: transmittances, weights and the states of the chunks.
+        per: Blocks of 8 x 4 px that a warp composites: 1, or 2 one below the other. The image does not depend on it.
+        channels: Number of channels.
     """
     Blending = make_struct(wp.float32)
 
-    @wp.func_native(_source("forward", tile_size))
+    @wp.func_native(_source("forward", tile_size, channels, SAVE=str(save).lower(), PER=per))
     def forward_body(
         item: int, settings: Blending, chunk: int, projected: wp.array(dtype=float), order: wp.array(dtype=int),
         ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
@@ -63,20 +76,9 @@ def make_kernels(tile_size: int):
         states: wp.array2d(dtype=float),
     ): ...  # fmt: skip
 
-    @wp.func_native(source("blend_order.cu", THREADS=THREADS))
-    def order_body(ranges: wp.array(dtype=int), count: int, order: wp.array(dtype=int)): ...
+    module = f"warpgs.kernels.blend_cuda.forward.{tile_size}.{int(save)}.{per}.{channels}"
 
-    @wp.func_native(_source("contributions", tile_size))
-    def contributions_body(
-        tile: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
-        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), ends: wp.array(dtype=int),
-        instance_weights: wp.array(dtype=float),
-    ): ...  # fmt: skip
-
-    threads = wp.constant(tile_size * tile_size)
-    options = {"enable_backward": False, "grid_stride": False, "module": f"warpgs.kernels.blend_cuda.{tile_size}"}
-
-    @wp.kernel(**options)
+    @wp.kernel(enable_backward=False, grid_stride=False, module=module)
     def forward(
         begin: int, settings: Blending, chunk: int, projected: wp.array(dtype=float), order: wp.array(dtype=int),
         ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
@@ -89,6 +91,31 @@ def make_kernels(tile_size: int):
             wp.tid() // 32, settings, chunk, projected, order, ranges, gaussian_ids, backgrounds,
             rgb, alpha_out, depth, transmittances, weights, ends, states,
         )  # fmt: skip
+
+    return forward
+
+
+@functools.cache
+def make_kernels(tile_size: int):
+    """Make the forward and contribution kernels for one tile size.
+
+    Images and projected Gaussians are flat arrays. Arrays with a row per instance have two axes, since a flat one could be too
+    long for 32-bit sizes.
+    """
+    Blending = make_struct(wp.float32)
+
+    @wp.func_native(source("blend_order.cu", THREADS=THREADS))
+    def order_body(ranges: wp.array(dtype=int), count: int, order: wp.array(dtype=int)): ...
+
+    @wp.func_native(_source("contributions", tile_size, COLORS))
+    def contributions_body(
+        tile: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
+        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), ends: wp.array(dtype=int),
+        instance_weights: wp.array(dtype=float),
+    ): ...  # fmt: skip
+
+    threads = wp.constant(tile_size * tile_size)
+    options = {"enable_backward": False, "grid_stride": False, "module": f"warpgs.kernels.blend_cuda.{tile_size}"}
 
     @wp.kernel(**options)
     def order_tiles(
@@ -109,11 +136,11 @@ def make_kernels(tile_size: int):
             wp.tid() // threads, settings, projected, ranges, gaussian_ids, slots, ends, weights
         )  # fmt: skip
 
-    return SimpleNamespace(forward=forward, order_tiles=order_tiles, contributions=contributions)
+    return SimpleNamespace(order_tiles=order_tiles, contributions=contributions)
 
 
 @functools.cache
-def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
+def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool, channels: int = COLORS):
     """Make the backward kernels: sums per instance, then per Gaussian.
 
     Args:
@@ -121,11 +148,12 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
         with_depth: True for gradients of depth and alpha, too.
         chunk: Instances per warp.
         atomic: True to add each sum to its Gaussian's at once, in no fixed order, instead of by slots.
+        channels: Number of channels, out of `WIDTHS`.
     """
     Blending = make_struct(wp.float32)
     numbers = {"CHUNK": chunk, "WITH_DEPTH": str(with_depth).lower(), "ATOMIC": str(atomic).lower()}
 
-    @wp.func_native(_source("backward", tile_size, **numbers))
+    @wp.func_native(_source("backward", tile_size, channels, **numbers))
     def backward_body(
         item: int, settings: Blending, capacity: int, no_tile: int, projected: wp.array(dtype=float),
         keys: wp.array(dtype=int), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int),
@@ -136,16 +164,17 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool):
         v_slots: wp.array2d(dtype=float),
     ): ...  # fmt: skip
 
-    @wp.func_native(_source("gather", tile_size, **numbers))
+    @wp.func_native(_source("gather", tile_size, channels, **numbers))
     def gather_body(
         i: int, projected: wp.array(dtype=float), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
         v_slots: wp.array2d(dtype=float), v_projected: wp.array(dtype=float),
     ): ...  # fmt: skip
 
-    name = f"warpgs.kernels.blend_cuda.backward.{tile_size}.{int(with_depth)}.{chunk}.{int(atomic)}"
+    name = f"warpgs.kernels.blend_cuda.backward.{tile_size}.{int(with_depth)}.{chunk}.{int(atomic)}.{channels}"
     options = {"enable_backward": False, "grid_stride": False, "module": name}
-    # many chunks want many warps at a time more than they want registers
-    registers = {"cuda_max_registers": 80} if chunk == CHUNKS[1] and not with_depth else {"launch_bounds": 32 * WARPS}
+    # many chunks want many warps at a time more than they want registers, unless channels fill these
+    small = chunk == CHUNKS[1] and not with_depth and channels == COLORS
+    registers = {"cuda_max_registers": 80} if small else {"launch_bounds": 32 * WARPS}
 
     @wp.kernel(**registers, **options)
     def backward(
@@ -197,21 +226,21 @@ def forward(
     save: bool,
     allocator: Allocator = TORCH,
 ) -> tuple[torch.Tensor, ...]:
-    """Return what `blend.composite` returns for projected Gaussians [C, N, 12] and backgrounds [C, 3], on CUDA.
+    """Return what `blend.composite` returns for projected Gaussians [C, N, 9 + D] and backgrounds [C, D], on CUDA.
 
     Returns:
-        rgb [C, H, W, 3]; alpha, depth, transmittances, weights and ends [C, H, W]; and states [S, P], with a row for each chunk
-        of instances and `STATE` numbers for each pixel of a tile.
+        rgb [C, H, W, D]; alpha, depth, transmittances, weights and ends [C, H, W]; and states [S, P], with a row for each chunk
+        of instances and `STATE` numbers for each pixel of a tile, of three channels.
     """
-    device = projected.device
+    device, channels = projected.device, backgrounds.shape[1]
     shape = (backgrounds.shape[0], settings.height, settings.width)
-    rgb, alpha, depth = (allocator.output(s, torch.float32, device) for s in ((*shape, 3), shape, shape))
-    transmittances, weights = allocator.saved((2, *shape), torch.float32, device).unbind()
+    rgb, alpha, depth = (allocator.output(s, torch.float32, device) for s in ((*shape, channels), shape, shape))
+    transmittances, weights = allocator.saved((2, *(shape if save else (0,))), torch.float32, device).unbind()
     ends = allocator.saved(shape, torch.int32, device)
     pixels = tiles.size * tiles.size
-    # without gradients no state is saved: no instance but the first is a multiple of this
-    chunk = chunk_of(tiles, settings.deterministic) if save else interop.MAX_SIZE
-    states = allocator.saved((tiles.slots.shape[0] // chunk + 1, STATE * pixels), torch.float32, device)
+    chunk = chunk_of(tiles, settings.deterministic)
+    rows, state = tiles.slots.shape[0] // chunk + 1 if save else 0, STATE + channels - COLORS
+    states = allocator.saved((rows, state * pixels), torch.float32, device)
     k, count = make_kernels(tiles.size), tiles.ranges.shape[0]
     order = allocator.workspace((count,), torch.int32, device)
     interop.launch(k.order_tiles, THREADS, [*_ints(tiles.ranges), count, *_ints(order)], device, block_dim=THREADS)
@@ -220,7 +249,8 @@ def forward(
         *_ints(order, tiles.ranges, tiles.gaussian_ids), *_floats(backgrounds),
         *_floats(rgb, alpha, depth, transmittances, weights), *_ints(ends), interop.view(states, wp.float32),
     ]  # fmt: skip
-    interop.launch(k.forward, count * pixels, inputs, device, block_dim=32 * WARPS)
+    per = 2 if tiles.gaussian_ids.shape[0] >= LARGE_GAUSSIAN * tiles.visible else 1
+    interop.launch(make_forward(tiles.size, save, per, channels), count * pixels // per, inputs, device, block_dim=32 * WARPS)
     return rgb, alpha, depth, transmittances, weights, ends, states
 
 
@@ -233,15 +263,15 @@ def backward(
     v_images: Sequence[torch.Tensor | None],
     allocator: Allocator = TORCH,
 ) -> torch.Tensor:
-    """Return the gradient of ``projected``, shape [C, N, 12].
+    """Return the gradient of ``projected``, shape [C, N, 9 + D].
 
     Args:
-        projected: Projected Gaussians as given to `forward`, shape [C, N, 12].
+        projected: Projected Gaussians as given to `forward`, shape [C, N, 9 + D].
         tiles: Their tiles.
-        backgrounds: Colour behind everything, shape [C, 3].
+        backgrounds: Colour behind everything, shape [C, D].
         settings: Settings as given to `forward`.
         saved: Results of `forward` but for ``alpha``.
-        v_images: Gradients of ``rgb`` [C, H, W, 3], ``alpha`` and ``depth`` [C, H, W]; the last two may be None.
+        v_images: Gradients of ``rgb`` [C, H, W, D], ``alpha`` and ``depth`` [C, H, W]; the last two may be None.
         allocator: Provider of the gradient's memory.
     """
     rgb, depth, transmittances, weights, ends, states = saved
@@ -249,16 +279,16 @@ def backward(
     device, count, deterministic = projected.device, tiles.slots.shape[0], settings.deterministic
     with_depth = v_alpha is not None or v_depth is not None
     chunk = chunk_of(tiles, deterministic)
-    k = make_backward(tiles.size, with_depth, chunk, not deterministic)
+    k = make_backward(tiles.size, with_depth, chunk, not deterministic, backgrounds.shape[1])
     if with_depth:
         v_alpha, v_depth = (torch.zeros_like(depth) if v is None else v.contiguous() for v in (v_alpha, v_depth))
     else:
         v_alpha = v_depth = depth  # never read
     v_projected = allocator.output(projected.shape, torch.float32, device)
     if deterministic:
-        v_slots = allocator.workspace((count, STRIDE), torch.float32, device)
+        v_slots = allocator.workspace((count, projected.shape[2]), torch.float32, device)
     else:
-        v_slots = v_projected.zero_().view(-1, STRIDE)
+        v_slots = v_projected.zero_().view(-1, projected.shape[2])
     inputs = [
         settings.struct(tiles.size, wp.float32), count, tiles.ranges.shape[0], *_floats(projected),
         *_ints(tiles.tile_ids, tiles.ranges, tiles.gaussian_ids, tiles.slots), interop.view(tiles.total, wp.int64),

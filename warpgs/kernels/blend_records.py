@@ -7,16 +7,20 @@ import warp as wp
 
 from warpgs.kernels.falloff import STRIP
 
+COLORS = 3
+"""Channels of a projected Gaussian as `project` makes it: a colour."""
 VALUES = 10
-"""Gradient values of an instance: those of a projected Gaussian but for its last two, which are the box."""
+"""Gradient values of an instance with a colour: those of a projected Gaussian but for its last two, which are the box."""
+WIDTHS = (COLORS, 7, 11)
+"""Numbers of channels that kernels are compiled for: with nine other values a projected Gaussian fills whole 16-byte loads."""
 
 
 @functools.cache
-def make_records(real, tile_size: int):
-    """Make the records, and the functions that read an entry of their vectors, for one scalar type and tile size.
+def make_records(real, tile_size: int, channels: int):
+    """Make the records, and the functions that read an entry of their vectors, for one scalar type, tile size and channels.
 
     A tile lies in columns as wide as a strip, one beside the other; entries of its pixels follow in that order. Vectors are
-    one row longer than the tile: see `blend_cpu.make_kernels`.
+    one row longer than the tile: see `blend_cpu.make_forward`. Channels stand one after the other.
     """
     count = tile_size * (tile_size // STRIP)
     tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
@@ -24,6 +28,9 @@ def make_records(real, tile_size: int):
     list_reals = wp.types.vector(count, real)
     list_ints = wp.types.vector(count, wp.int32)
     strip_reals = wp.types.vector(STRIP, real)
+    tile_channels = wp.types.vector(channels * tile_size * (tile_size + 1), real)
+    strip_channels = wp.types.vector(channels * STRIP, real)
+    channel_reals = wp.types.vector(channels, real)
 
     @wp.struct
     class Pixels:
@@ -31,9 +38,7 @@ def make_records(real, tile_size: int):
 
         t: tile_reals  # transmittance behind the current instance, then before it
         behind: tile_reals  # sum of w d over what lies behind, background included
-        g0: tile_reals  # upstream gradient of the colour
-        g1: tile_reals
-        g2: tile_reals
+        g: tile_channels  # upstream gradient of the channels
         v_z: tile_reals
         v_w: tile_reals
         end: tile_ints  # one past the last instance that was blended
@@ -71,9 +76,7 @@ def make_records(real, tile_size: int):
         xy: strip_reals
         yy: strip_reals
         opacity: strip_reals
-        c0: strip_reals
-        c1: strip_reals
-        c2: strip_reals
+        color: strip_channels
         z: strip_reals
 
     @wp.struct
@@ -86,9 +89,7 @@ def make_records(real, tile_size: int):
         u12: real
         u22: real
         opacity: real
-        c0: real
-        c1: real
-        c2: real
+        color: channel_reals
         z: real
         aside: real  # see `falloff.make_functions`
         limit: real

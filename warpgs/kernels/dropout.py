@@ -36,14 +36,14 @@ def opacity_dropout(count: int, settings: torch.Tensor, seed: int) -> torch.Tens
 
     Args:
         count: Number of Gaussians N.
-        settings: Settings of the step (`Setting`), of which p and the number are read, float32, shape [6].
+        settings: Settings of the step (`Setting`), of which p and the number are read, float32, shape [7].
         seed: Any 32-bit integer.
 
     Returns:
         Factors, float32, shape [N], on the device of ``settings``.
 
     Raises:
-        ValueError: ``settings`` is not of shape [6].
+        ValueError: ``settings`` is not of shape [7].
     """
     interop.check(settings=(settings, str(len(Setting))))
     factors = torch.empty(count, dtype=torch.float32, device=settings.device)

@@ -15,6 +15,7 @@ from warpgs.kernels.blend_cuda import SCALE
 from warpgs.kernels.blend_settings import BlendSettings, make_struct
 from warpgs.kernels.compiler import ROLLED
 from warpgs.kernels.falloff import STRIP, make_functions
+from warpgs.kernels.project import PROJECTED_SIZE
 from warpgs.kernels.tiles import Tiles
 from warpgs.runtime import interop
 from warpgs.runtime.cuda_source import source
@@ -95,7 +96,7 @@ def make_native(tile_size: int):
     """Make the CUDA kernel in float32 for one tile size, a thread block per tile."""
     Blending = make_struct(wp.float32)
 
-    @wp.func_native(source("median_depth.cu", SIDE=tile_size, SCALE=SCALE))
+    @wp.func_native(source("median_depth.cu", SIDE=tile_size, SCALE=SCALE, STRIDE=PROJECTED_SIZE))
     def body(
         tile: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
         gaussian_ids: wp.array(dtype=int), depths: wp.array(dtype=float),

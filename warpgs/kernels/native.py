@@ -34,14 +34,9 @@ def make_functions():
         """Set the rows of the block's items to zero, except those that are kept. All BLOCK threads must call it."""
         ...
 
-    @wp.func_native(source("native_ballot.cu"))
-    def ballot(wanted: int) -> int:
-        """Return a mask with bit l set where lane l wants. All 32 lanes of the warp must call this and the next three."""
-        ...
-
     @wp.func_native(source("native_broadcast.cu"))
     def broadcast(value: int, lane: int) -> int:
-        """Return the value that a lane of the warp holds."""
+        """Return the value that a lane of the warp holds. All 32 lanes of the warp must call this and the next three."""
         ...
 
     @wp.func_native(source("native_running_sum.cu"))
@@ -54,9 +49,9 @@ def make_functions():
         """Return the sum over all lanes of the warp."""
         ...
 
-    @wp.func_native(source("native_lowest.cu"))
-    def lowest(mask: int) -> int:
-        """Return the position of the lowest bit set, -1 for none."""
+    @wp.func_native(source("native_holder.cu"))
+    def holder(running_sum: int, item: int) -> int:
+        """Return the first lane of the warp whose running sum exceeds ``item``; the last lane where none does."""
         ...
 
     @wp.func_native(source("native_color.cu"))
@@ -78,7 +73,7 @@ def make_functions():
         ...
 
     return SimpleNamespace(
-        compact=compact, store_row=store_row, clear_rows=clear_rows, ballot=ballot, broadcast=broadcast,
-        running_sum=running_sum, whole_sum=whole_sum, lowest=lowest, color=color, color_backward=color_backward,
+        compact=compact, store_row=store_row, clear_rows=clear_rows, broadcast=broadcast,
+        running_sum=running_sum, whole_sum=whole_sum, holder=holder, color=color, color_backward=color_backward,
         color_weights=color_weights,
     )  # fmt: skip

@@ -17,7 +17,7 @@ NOT_FINITE = 2
 
 
 class Setting(IntEnum):
-    """Columns of the settings of a step, float32 of shape [6]: host and kernels read a setting by its column."""
+    """Columns of the settings of a step, float32 of shape [7]: host and kernels read a setting by its column."""
 
     DROPOUT = 0
     """Probability that opacity dropout hides a Gaussian, in [0, 1)."""
@@ -29,11 +29,15 @@ class Setting(IntEnum):
     """Red of the colour behind the view, less that behind the scene; green and blue follow (`SHIFT`)."""
     GREEN = 4
     BLUE = 5
+    STEP = 6
+    """Number of the step, for all its views; a whole number from 1, below 2^24."""
 
     @classmethod
-    def row(cls, *, dropout: float, number: int, means_lr: float, shift: tuple[float, float, float]) -> tuple[float, ...]:
-        """Return the settings of one step in the order of the columns, 6 numbers."""
-        return dropout, number, means_lr, *shift
+    def row(
+        cls, *, dropout: float, number: int, step: int, means_lr: float, shift: tuple[float, float, float]
+    ) -> tuple[float, ...]:
+        """Return the settings of one step in the order of the columns, 7 numbers."""
+        return dropout, number, means_lr, *shift, step
 
 
 SHIFT = slice(Setting.RED, Setting.BLUE + 1)

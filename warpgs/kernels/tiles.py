@@ -9,8 +9,8 @@ import warp as wp
 
 from warpgs.constants import TILE_SIZE, Rule
 from warpgs.errors import ResourceError
-from warpgs.kernels.functions import make_spans
 from warpgs.kernels.native import make_functions as make_native
+from warpgs.kernels.tiles_emit import make_emit, make_find_ranges
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
 from warpgs.runtime.device_memory import available_bytes, installed_bytes
@@ -24,8 +24,6 @@ VISIBLE = 2**36
 """Number that a visible Gaussian adds to a running sum of tile counts, so that one sum counts both."""
 MAX_VISIBLE = 2**63 // VISIBLE - 1
 """Most visible Gaussians that such a sum can count."""
-SMALL = 32
-"""Most tiles of a Gaussian that one CUDA thread lists alone."""
 MAX_INSTANCES = interop.MAX_SIZE // 2
 """Most instances: a radix sort needs one array of twice that size."""
 
@@ -54,9 +52,11 @@ class Tiles:
     """Tile of each instance, int32, shape [M]; the number of tiles where none was found after all."""
     total: torch.Tensor
     """M, int64, shape [1], where kernels can read it."""
+    visible: int = 0
+    """Number of Gaussians that have instances; with a capacity, of all."""
 
     def tensors(self) -> tuple[torch.Tensor, ...]:
-        """Return all fields but the size, with the shapes [...] named there, in the order of the constructor."""
+        """Return all tensors, with the shapes [...] named there, in the order of the constructor."""
         return self.ranges, self.gaussian_ids, self.slots, self.starts, self.counts, self.tile_ids, self.total
 
 
@@ -125,136 +125,9 @@ def make_kernels(real, native: bool):
         j = begin + wp.tid()
         counts[j] = wp.int64(tile_counts[order[j]])
 
-    @wp.kernel(enable_backward=False, module="warpgs.kernels.tiles.ranges")
-    def find_ranges(
-        begin: int, keys: wp.array(dtype=int), slots: wp.array(dtype=int), owners: wp.array(dtype=int), count: int,
-        no_tile: int,
-        # outputs; ranges zero on entry
-        ids: wp.array(dtype=int), ranges: wp.array2d(dtype=int),
-    ):  # fmt: skip
-        i = begin + wp.tid()
-        tile = keys[i]
-        slot = slots[i]  # loaded before its tile is known, like the neighbours: the waits overlap
-        before = keys[wp.max(i - 1, 0)]
-        after = keys[wp.min(i + 1, count - 1)]
-        if tile == no_tile:
-            ids[i] = 0
-            return
-        ids[i] = owners[slot]
-        if i == 0 or before != tile:
-            ranges[tile, 0] = i
-        if i == count - 1 or after != tile:
-            ranges[tile, 1] = i + 1
-
     return SimpleNamespace(
-        depth_keys=depth_keys, pack_counts=pack_counts, visible_keys=visible_keys, ordered_counts=ordered_counts,
-        find_ranges=find_ranges,
+        depth_keys=depth_keys, pack_counts=pack_counts, visible_keys=visible_keys, ordered_counts=ordered_counts
     )  # fmt: skip
-
-
-@functools.cache
-def make_emit(real, native: bool):
-    """Make the kernel that writes the instances of each Gaussian, row by row of tiles.
-
-    ``native`` is for CUDA: a Gaussian of more than SMALL tiles is written by its whole warp, a lane a row.
-    """
-    s = make_spans(real)
-    vec3 = wp.types.vector(3, real)
-    vec2i = s.vec2i
-    lanes = make_native() if native else None
-
-    @wp.func
-    def span_of(
-        projected: wp.array2d(dtype=real), i: int, row: int, alpha_cut: real, square_sigma: real,
-        origin_x: int, width: int, tile_size: int,
-    ) -> vec2i:  # fmt: skip
-        factor = vec3(projected[i, 2], projected[i, 3], projected[i, 4])
-        reach = s.reach_of(projected[i, 5], alpha_cut, square_sigma)
-        return s.tile_columns(
-            projected[i, 0], projected[i, 1], factor, reach, projected[i, 10], projected[i, 11], row, origin_x, width, tile_size
-        )
-
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.tiles.emit.{real.__name__}.{int(native)}")
-    def emit(
-        begin: int, projected: wp.array2d(dtype=real), order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
-        ends: wp.array(dtype=wp.int64), count: int, per_camera: int,
-        origin_x: int, origin_y: int, width: int, height: int, tile_size: int,
-        alpha_cut: real, square_sigma: real, columns: int, tiles: int, no_tile: int, capacity: int,
-        # outputs
-        starts: wp.array(dtype=int), keys: wp.array(dtype=int), slots: wp.array(dtype=int), owners: wp.array(dtype=int),
-        overflow: wp.array(dtype=int),
-    ):  # fmt: skip
-        j = begin + wp.tid()
-        corner = (origin_y // tile_size) * columns + origin_x // tile_size  # rows and columns count from the image's corner
-        i = int(0)
-        touched = int(0)
-        slot = int(0)
-        end = int(0)
-        if j < count:
-            i = order[j]
-            touched = tile_counts[i]
-            last_slot = ends[j]
-            if last_slot > wp.int64(capacity):  # the lists are cut, and must not be used; see `bin_tiles`
-                overflow[0] = 1
-                touched = int(wp.max(wp.int64(touched) - (last_slot - wp.int64(capacity)), wp.int64(0)))
-                last_slot = wp.int64(capacity)
-                tile_counts[i] = touched
-            end = int(last_slot)
-            slot = end - touched
-            starts[i] = slot
-        if touched > 0 and wp.static(SMALL if native else 2**31 - 1) >= touched:
-            rows = s.tile_rows(projected[i, 1], projected[i, 11], origin_y, height, tile_size)
-            base = (i // per_camera) * tiles - corner
-            for row in range(rows[0], rows[1]):
-                span = span_of(projected, i, row, alpha_cut, square_sigma, origin_x, width, tile_size)
-                for column in range(span[0], span[1]):
-                    if slot < end:
-                        keys[slot] = base + row * columns + column
-                        slots[slot] = slot
-                        owners[slot] = i
-                        slot += 1
-            # Two compilations of one formula may round apart, and then a margin tile is counted but not found again.
-            while slot < end:
-                keys[slot] = no_tile
-                slots[slot] = slot
-                owners[slot] = i
-                slot += 1
-        if wp.static(native):
-            heavy = lanes.ballot(wp.where(touched > SMALL, 1, 0))
-            lane = wp.tid() % 32
-            while heavy != 0:
-                owner = lanes.lowest(heavy)
-                heavy = heavy & (heavy - 1)
-                g = lanes.broadcast(i, owner)
-                at = lanes.broadcast(slot, owner)
-                last = lanes.broadcast(end, owner)
-                base = (g // per_camera) * tiles - corner
-                rows = s.tile_rows(projected[g, 1], projected[g, 11], origin_y, height, tile_size)
-                first = rows[0]
-                while first < rows[1]:
-                    row = first + lane
-                    span = vec2i(0, 0)
-                    if row < rows[1]:
-                        span = span_of(projected, g, row, alpha_cut, square_sigma, origin_x, width, tile_size)
-                    wide = span[1] - span[0]
-                    sum = lanes.running_sum(wide)
-                    to = at + sum - wide
-                    for column in range(span[0], span[1]):
-                        if to < last:
-                            keys[to] = base + row * columns + column
-                            slots[to] = to
-                            owners[to] = g
-                            to += 1
-                    at += lanes.broadcast(sum, 31)
-                    first += 32
-                at += lane
-                while at < last:
-                    keys[at] = no_tile
-                    slots[at] = at
-                    owners[at] = g
-                    at += 32
-
-    return emit
 
 
 def _check_total(total: int, visible: int, device: torch.device, tiles: int, budget_bytes: int | None) -> None:
@@ -325,6 +198,7 @@ def bin_tiles(
     overflow: torch.Tensor | None = None,
     origin: tuple[int, int] = (0, 0),
     allocator: Allocator = TORCH,
+    slotted: bool = True,
 ) -> Tiles:
     """Return for every tile the Gaussians that touch it, front to back. Not differentiable.
 
@@ -342,6 +216,7 @@ def bin_tiles(
             used. Int32, shape [1]; needed with ``capacity``.
         origin: Left and top [px] of the window of that width and height which `project` was given; a tile's corner.
         allocator: Provider of the lists' memory.
+        slotted: True to return ``slots``, which gradients and `contributions` need; False leaves them empty and is faster.
 
     Returns:
         Sorted instances; M is ``capacity`` where one is given.
@@ -380,7 +255,7 @@ def bin_tiles(
         interop.launch(k.ordered_counts, visible, [order_view, counts_view, ends_view], device)
         ends = torch.cumsum(ends, 0, out=ends) if visible > 0 else ends.zero_()
         starts, keys, slots = (allocator.saved((n,), torch.int32, device) for n in (count, 2 * total, 2 * total))
-        owners = allocator.workspace((total,), torch.int32, device)
+        owners = allocator.workspace((total if slotted else 0,), torch.int32, device)
         if fixed:
             keys[:total].fill_(no_tile)
         keys_view, slots_view, owners_view = (interop.view(t, wp.int32) for t in (keys, slots, owners))
@@ -391,10 +266,11 @@ def bin_tiles(
             interop.view(overflow if fixed else starts, wp.int32),
         ]  # fmt: skip
         threads = -(-visible // 256) * 256 if native else visible
-        interop.launch(make_emit(real, native), threads, inputs, device, cost=10)
+        interop.launch(make_emit(real, native, slotted), threads, inputs, device, cost=10)
         wp.utils.radix_sort_pairs(keys_view.array(), slots_view.array(), total, end_bit=no_tile.bit_length())
-        ids = slots[total:]  # the second half of the sorted buffers is free again
+        ids = slots[total:] if slotted else slots[:total]  # the second half of the sorted buffers is free again
         outputs = [interop.view(ids, wp.int32), interop.view(ranges, wp.int32)]
         inputs = [keys_view, slots_view, owners_view, total, no_tile, *outputs]
-        interop.launch(k.find_ranges, total, inputs, device)
-    return Tiles(tile_size, ranges, ids, slots[:total], starts, counts, keys[:total], ends[-1:])
+        interop.launch(make_find_ranges(slotted), total, inputs, device)
+    own_slots = slots[: total if slotted else 0]
+    return Tiles(tile_size, ranges, ids, own_slots, starts, counts, keys[:total], ends[-1:], visible)

@@ -72,20 +72,21 @@ def _place(frame: ChunkedFrame, window: Window) -> tuple[slice, slice]:
 
 class _BlendChunked(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, projected, backgrounds, frame, *inputs):
+    def forward(ctx, projected, backgrounds, colors, frame, *inputs):
         _, _, width, height = frame.settings.window
-        images = [projected.new_empty(len(projected), height, width, *rest) for rest in ((3,), (), ())]
+        images = [projected.new_empty(len(projected), height, width, *rest) for rest in (backgrounds.shape[1:], (), ())]
+        values = None if colors is None else colors.detach()
         ctx.windows = []
         for settings, counts in chunks(frame, ProjectInputs(*inputs)):
             rows, columns = _place(frame, settings.window)
             _, parts = bin_and_blend(
-                projected.detach(), counts, backgrounds.detach(), settings, deterministic=frame.deterministic
+                projected.detach(), counts, backgrounds.detach(), settings, deterministic=frame.deterministic, colors=values
             )
             for image, part in zip(images, parts):
                 image[:, rows, columns] = part
             ctx.windows.append(settings.window)
         # the inputs too, so that torch notices where they are changed before the gradient is taken
-        ctx.save_for_backward(projected, backgrounds, *inputs)
+        ctx.save_for_backward(projected, backgrounds, colors, *inputs)
         ctx.frame = frame
         ctx.set_materialize_grads(False)
         return tuple(images)
@@ -93,21 +94,23 @@ class _BlendChunked(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, *upstream):
-        projected, backgrounds, *rest = ctx.saved_tensors
-        inputs, frame = ProjectInputs(*rest).detached(), ctx.frame
-        v_projected, v_backgrounds = torch.zeros_like(projected), torch.zeros_like(backgrounds)
+        *blended, colors = ctx.saved_tensors[:3]
+        inputs, frame = ProjectInputs(*ctx.saved_tensors[3:]).detached(), ctx.frame
+        blended = blended if colors is None else [*blended, colors]
+        gradients = [torch.zeros_like(t) for t in blended]
         for window in ctx.windows:
             settings, counts = _part(frame, window, inputs)
             rows, columns = _place(frame, window)
             with torch.enable_grad():
-                own = [projected.detach().requires_grad_(), backgrounds.detach().requires_grad_()]
-                _, parts = bin_and_blend(own[0], counts, own[1], settings, deterministic=frame.deterministic)
-            wanted = [(p, v[:, rows, columns]) for p, v in zip(parts, upstream) if v is not None]
-            images, gradients = zip(*wanted)
-            part, part_background = torch.autograd.grad(images, own, gradients)
-            v_projected += part
-            v_backgrounds += part_background
-        return v_projected, v_backgrounds, *(None for _ in range(1 + len(rest)))
+                own = [t.detach().requires_grad_() for t in blended]
+                values = None if colors is None else own[2]
+                _, parts = bin_and_blend(
+                    own[0], counts, own[1], settings, deterministic=frame.deterministic, colors=values
+                )  # fmt: skip
+            images, v_images = zip(*[(p, v[:, rows, columns]) for p, v in zip(parts, upstream) if v is not None])
+            for total, part in zip(gradients, torch.autograd.grad(images, own, v_images)):
+                total += part
+        return *gradients, *(None for _ in range(3 + 1 + len(inputs) - len(gradients)))
 
 
 def contributions_chunked(
@@ -146,24 +149,30 @@ def median_depth_chunked(projected: torch.Tensor, frame: ChunkedFrame, inputs: P
     depths = projected.new_empty(len(projected), height, width)
     for settings, counts in chunks(frame, inputs.detached()):
         rows, columns = _place(frame, settings.window)
-        depths[:, rows, columns] = median_depth_of(projected, bin_projected(projected, counts, settings), settings)
+        depths[:, rows, columns] = median_depth_of(
+            projected, bin_projected(projected, counts, settings, slotted=False), settings
+        )
     return depths
 
 
-def blend_chunked(projected: torch.Tensor, backgrounds: torch.Tensor, frame: ChunkedFrame, inputs: ProjectInputs) -> Images:
-    """Composite projected Gaussians chunk by chunk: the same images as `blend` gives, to the bit.
+def blend_chunked(
+    projected: torch.Tensor, backgrounds: torch.Tensor, frame: ChunkedFrame, inputs: ProjectInputs,
+    colors: torch.Tensor | None = None,
+) -> Images:  # fmt: skip
+    """Composite projected Gaussians chunk by chunk: the same images as `images_of` gives, to the bit.
 
     The backward pass renders each chunk again and adds up the gradients, so nothing but the inputs is saved for it. That
     takes about half as long again as `blend`, and memory for the instances of one chunk only.
 
     Args:
         projected: Result of `project` for the frame's window, shape [C, N, 12]; differentiable.
-        backgrounds: Colour behind everything, shape [C, 3]; differentiable.
+        backgrounds: Colour behind everything, shape [C, 3], or [C, D] with ``colors``; differentiable.
         frame: Settings.
         inputs: The tensors that ``projected`` was projected from.
+        colors: Channels of each Gaussian, shape [1, N, D] or [C, N, D]; differentiable. None for their own colours.
 
     Returns:
-        ``rgb`` [C, H, W, 3], ``alpha`` and ``depth`` [C, H, W], as `blend` returns them.
+        ``rgb`` [C, H, W, 3] or [C, H, W, D], ``alpha`` and ``depth`` [C, H, W].
     """
-    images: Images = _BlendChunked.apply(projected, backgrounds, frame, *inputs.detached())
+    images: Images = _BlendChunked.apply(projected, backgrounds, colors, frame, *inputs.detached())
     return images

@@ -6,7 +6,7 @@ depends on (camera model, channels, cut-offs, window) stands in `RenderSettings`
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ import torch
 
 from warpgs.kernels import blend as blending
 from warpgs.kernels.blend import blend, contributions
+from warpgs.kernels.blend_channels import blend_channels
 from warpgs.kernels.median_depth import median_depth
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs, checked_factors
@@ -23,7 +24,7 @@ from warpgs.runtime.allocator import TORCH, Allocator
 from warpgs.scene import Camera, Gaussians
 
 Images = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
-"""Colour [C, H, W, 3], alpha [C, H, W] and expected z-depth [C, H, W]."""
+"""Colour [C, H, W, 3], or [C, H, W, D] of Gaussians with D channels; alpha and expected z-depth [C, H, W]."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +92,9 @@ def settings_of(camera: Camera, degree: int, rule: Any, **others: Any) -> Render
 
 
 def bin_projected(
-    projected: torch.Tensor, tile_counts: torch.Tensor, settings: RenderSettings, memory: InstanceMemory = InstanceMemory()
-) -> Tiles:
+    projected: torch.Tensor, tile_counts: torch.Tensor, settings: RenderSettings, memory: InstanceMemory = InstanceMemory(),
+    slotted: bool = True,
+) -> Tiles:  # fmt: skip
     """Return the instances of each tile of the window.
 
     Args:
@@ -100,13 +102,14 @@ def bin_projected(
         tile_counts: Number of tiles of the window that each touches, int32, shape [C, N].
         settings: Settings of the render.
         memory: Memory of the instances.
+        slotted: True for gradients and `weights_of`; False is faster (`bin_tiles`).
 
     Raises:
         ResourceError: There are more than memory allows.
     """
     return bin_tiles(
         projected, tile_counts, tile_size=settings.tile_size, budget_bytes=memory.budget, capacity=memory.capacity,
-        overflow=memory.overflow, allocator=memory.allocator, **settings.of_window(),
+        overflow=memory.overflow, allocator=memory.allocator, slotted=slotted, **settings.of_window(),
     )  # fmt: skip
 
 
@@ -136,11 +139,36 @@ def compose(
 
 def bin_and_blend(
     projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: RenderSettings,
-    memory: InstanceMemory = InstanceMemory(), deterministic: bool = True,
+    memory: InstanceMemory = InstanceMemory(), deterministic: bool = True, colors: torch.Tensor | None = None,
 ) -> tuple[Tiles, Images]:  # fmt: skip
-    """Return the instances and the images of projected Gaussians [C, N, 12]; arguments are those of `compose`."""
-    tiles = bin_projected(projected, tile_counts, settings, memory)
-    return tiles, blend(projected, tiles, backgrounds, deterministic=deterministic, **settings.of_window())
+    """Return the instances and the images of projected Gaussians [C, N, 12], see `compose` and `images_of`."""
+    tiles = bin_projected(projected, tile_counts, settings, memory, needs_slots((projected, backgrounds, colors)))
+    return tiles, images_of(projected, tiles, backgrounds, settings, deterministic, colors)
+
+
+def needs_slots(tensors: Iterable[torch.Tensor | None]) -> bool:
+    """Return whether gradients of a render may be asked for: those of tensors of any shape [...]."""
+    return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
+
+
+def images_of(
+    projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, settings: RenderSettings, deterministic: bool = True,
+    colors: torch.Tensor | None = None,
+) -> Images:  # fmt: skip
+    """Return the images of binned Gaussians: in their own colours (`blend`), or in D channels (`blend_channels`).
+
+    Args:
+        projected: Projected Gaussians, shape [C, N, 12].
+        tiles: Their instances.
+        backgrounds: Colour behind everything, shape [C, 3], or [C, D] with ``colors``.
+        settings: Settings of the render.
+        deterministic: True to sum gradients in a fixed order.
+        colors: Channels of each Gaussian, shape [1, N, D] or [C, N, D]; None for their own colours.
+    """
+    named = {"deterministic": deterministic, **settings.of_window()}
+    if colors is None:
+        return blend(projected, tiles, backgrounds, **named)
+    return blend_channels(projected, tiles, colors, backgrounds, **named)
 
 
 def weights_of(projected: torch.Tensor, tiles: Tiles, settings: RenderSettings) -> tuple[torch.Tensor, torch.Tensor]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,8 +15,18 @@ from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs
 from warpgs.render import graphed
 from warpgs.render.chunked import ChunkedFrame, blend_chunked, contributions_chunked, median_depth_chunked
-from warpgs.render.compose import InstanceMemory, bin_and_blend, inputs_of, median_depth_of, settings_of, weights_of
+from warpgs.render.compose import (
+    InstanceMemory,
+    bin_projected,
+    images_of,
+    inputs_of,
+    median_depth_of,
+    needs_slots,
+    settings_of,
+    weights_of,
+)  # fmt: skip
 from warpgs.render.settings import RenderSettings, Window
+from warpgs.runtime import interop
 from warpgs.scene import Camera, Gaussians, Render
 
 TILE_SIZES = (8, 16)
@@ -32,7 +42,16 @@ class RasterizeOptions:
     sh_degree: int | None = None
     """Spherical-harmonics degree used; None for all that is stored."""
     background: torch.Tensor | None = None
-    """Colour behind the scene, shape [3] or [C, 3]; None for black. Gradients flow into it."""
+    """Colour behind the scene, shape [3] or [C, 3], with ``colors`` [D] or [C, D]; None for black. Gradients flow into it."""
+    colors: torch.Tensor | None = None
+    """Colours instead of those of the spherical harmonics, shape [N, D], or [C, N, D] for each camera its own: any number of
+    channels D, finite values of any sign and size, never clamped. `Render.rgb` then has D channels. Gradients flow into it,
+    and none into ``sh``. None for the spherical harmonics."""
+    features: torch.Tensor | None = None
+    """Channels to render beside the colours, shape [N, D] or [C, N, D], as free as ``colors``: `Render.features` holds them,
+    blended with the same weights. Gradients flow into it."""
+    feature_background: torch.Tensor | None = None
+    """Features behind the scene, shape [D] or [C, D]; None for zeros. Gradients flow into it."""
     tile_size: int = 16
     """Side of a tile [px]: 8 or 16. The image does not depend on it."""
     contributions: bool = False
@@ -56,13 +75,13 @@ class RasterizeOptions:
     gradients. That is the same image in less memory and more time. None for all at once. Not with ``capacity``."""
     record: bool = True
     """True to let CUDA graphs replay the calls that a loop repeats: the same bits in half the time. It applies to small calls
-    with gradients in a fixed order, without opacity factors, contributions, median depth and limits
+    with gradients in a fixed order, without colors, features, opacity factors, contributions, median depth and limits
     (docs/decisions/010-recorded-calls.md). Choose False where other threads wait for the whole device, as
     torch.cuda.synchronize does."""
 
     def repeatable(self) -> bool:
         """Return whether calls with these options may be captured as CUDA graphs."""
-        others = (self.opacity_factors, self.memory_budget, self.capacity, self.max_instances)
+        others = (self.colors, self.features, self.opacity_factors, self.memory_budget, self.capacity, self.max_instances)
         plain = self.record and self.deterministic and not self.contributions and not self.median_depth
         return plain and all(o is None for o in others)
 
@@ -89,12 +108,13 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
 
 
 def _check_arguments(gaussians: Gaussians, camera: Camera, options: RasterizeOptions) -> None:
-    """Check types, and the shapes of the camera and the background; those of the Gaussians are checked where they are used.
+    """Check types, and the shapes of the camera; those of other tensors are checked where they are used.
 
     Nothing is read from the device: values are not checked, and a Gaussian that is not finite is culled.
 
     Raises:
         TypeError: An argument, or the size of the image, is of another type.
+        UsageError: A background has nothing before it.
         ValueError: A shape is another.
     """
     for name, given, kind in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
@@ -112,9 +132,8 @@ def _check_arguments(gaussians: Gaussians, camera: Camera, options: RasterizeOpt
         size = getattr(camera, name)
         if not isinstance(size, (int, np.integer)):
             raise TypeError(f"camera.{name} must be a whole number of pixels, not {size!r}")
-    shape = (3,) if options.background is None else tuple(np.shape(options.background))
-    if len(shape) not in (1, 2) or shape[-1] != 3:
-        raise ValueError(f"background must have shape [3] or [C, 3], not {list(shape)}")
+    if options.feature_background is not None and options.features is None:
+        raise UsageError("feature_background is behind features: give features=..., too, or leave it out")
     sh = gaussians.sh
     if sh.ndim != 3 or sh.shape[1] != (gaussians.sh_degree + 1) ** 2:
         raise ValueError(f"sh must have shape [N, K, 3], where K is 1, 4, 9 or 16, not {list(sh.shape)}")
@@ -135,19 +154,51 @@ def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
     return x, y, w, h
 
 
-def _backgrounds(background: Any, viewmats: torch.Tensor) -> torch.Tensor:
-    """Return one colour or a batch of them as a tensor [C, 3]."""
-    colors: torch.Tensor = torch.as_tensor(background, dtype=viewmats.dtype, device=viewmats.device)
-    return colors.expand(len(viewmats), 3) if colors.ndim == 1 else colors
+def _checked_channels(name: str, values: torch.Tensor | None, inputs: ProjectInputs) -> torch.Tensor | None:
+    """Return channels [N, D] or [C, N, D] with an axis of cameras, [1, N, D] or [C, N, D].
+
+    Raises:
+        TypeError: They are no tensor, or of another scalar type than the Gaussians.
+        ValueError: The shape or the device is another.
+    """
+    if values is None:
+        return None
+    pattern = "C N D" if isinstance(values, torch.Tensor) and values.ndim == 3 else "N D"
+    interop.check(means=(inputs.means, "N 3"), viewmats=(inputs.viewmats, "C 4 4"), **{name: (values, pattern)})
+    if values.shape[-1] == 0:
+        raise ValueError(f"{name} must have at least one channel, not shape {list(values.shape)}")
+    return values if values.ndim == 3 else values[None]
+
+
+class _Layer(NamedTuple):
+    """Values that are blended into one image."""
+
+    colors: torch.Tensor | None
+    """Channels of each Gaussian, shape [1, N, D] or [C, N, D]; None for the spherical harmonics."""
+    backgrounds: torch.Tensor
+    """Values behind the scene, shape [C, D]."""
+
+
+def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: ProjectInputs) -> _Layer:
+    """Return channels [..., D] with their background: one, a batch of them, or None for zeros; ``name`` is its option's.
+
+    Raises:
+        ValueError: The shape of the background is another.
+    """
+    channels, like = 3 if colors is None else colors.shape[-1], inputs.viewmats
+    values: torch.Tensor = like.new_zeros(channels) if background is None else torch.as_tensor(background).to(like)
+    if values.ndim not in (1, 2) or values.shape[-1] != channels:
+        raise ValueError(f"{name} must have shape [{channels}] or [C, {channels}], not {list(values.shape)}")
+    return _Layer(colors, values.expand(len(like), channels) if values.ndim == 1 else values)
 
 
 def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = RasterizeOptions()) -> Render:
     """Render Gaussians as one camera, or each camera of a batch, sees them.
 
     Differentiable in the five tensors of ``gaussians``, in ``camera.viewmat`` and ``camera.K`` where those are tensors that
-    require gradients, and in ``options.background``. Float32 or float64, CPU or CUDA, as the tensors are; the same inputs
-    give the same bits every time, unless ``options.deterministic`` is False. Cameras are moved to the type and device of
-    ``gaussians.means``.
+    require gradients, and in the colours, features and backgrounds of ``options``. Float32 or float64, CPU or CUDA, as the
+    tensors are; the same inputs give the same bits every time, unless ``options.deterministic`` is False. Cameras and
+    backgrounds are moved to the type and device of ``gaussians.means``.
 
     Args:
         gaussians: The scene, N Gaussians.
@@ -169,42 +220,54 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
     rule = _checked_rule(camera, options)
     inputs = inputs_of(gaussians, camera, options.opacity_factors)
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
+    degree = degree if options.colors is None else 0  # as little as can be of what is not shown
     settings = settings_of(camera, degree, rule, window=_checked_window(camera, options), tile_size=options.tile_size)
-    backgrounds = None if options.background is None else _backgrounds(options.background, inputs.viewmats)
+    colors = _checked_channels("colors", options.colors, inputs)
+    features = _checked_channels("features", options.features, inputs)
     if inputs.means.is_cuda and options.repeatable():
+        backgrounds = None if options.background is None else _layer("background", options.background, None, inputs).backgrounds
         found = graphed.recorder(inputs.means.device).render(inputs, backgrounds, settings)
         if found is not None:
             return _as_render(camera, *found)
-    backgrounds = _backgrounds(inputs.means.new_zeros(3), inputs.viewmats) if backgrounds is None else backgrounds
-    *found, median = _rasterize(inputs, backgrounds, settings, options)
-    return _as_render(camera, *found, median=median)
+    layers = [_layer("background", options.background, colors, inputs)]
+    if features is not None:
+        layers.append(_layer("feature_background", options.feature_background, features, inputs))
+    *found, features_found, median = _rasterize(inputs, layers, settings, options)
+    return _as_render(camera, *found, features=features_found, median_depth=median)
 
 
 def _rasterize(
-    inputs: ProjectInputs, backgrounds: torch.Tensor, settings: RenderSettings, options: RasterizeOptions
+    inputs: ProjectInputs, layers: list[_Layer], settings: RenderSettings, options: RasterizeOptions
 ) -> tuple[Any, ...]:
-    """Return the images as one tuple, and the further fields of `Render`, by kernels that are launched one by one.
+    """Return the images of the first layer as one tuple, and the further fields of `Render`, by kernels launched one by one.
 
-    The last is the median depth, shape [C, H, W], or None.
+    The last two are the features, shape [C, H, W, D], and the median depth, shape [C, H, W]; or None.
     """
     projected, tile_counts = project_inputs(inputs, settings.projection())
+    overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=projected.device)
     if options.max_instances is not None and int(tile_counts.sum()) > options.max_instances:
         frame = ChunkedFrame(settings, options.max_instances, options.deterministic)
-        images = blend_chunked(projected, backgrounds, frame, inputs)
+        images = [blend_chunked(projected, layer.backgrounds, frame, inputs, layer.colors) for layer in layers]
         weights = contributions_chunked(projected, frame, inputs) if options.contributions else (None, None)
         median = median_depth_chunked(projected, frame, inputs) if options.median_depth else None
-        return images, projected, tile_counts, *weights, None, median
-    overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=projected.device)
-    memory = InstanceMemory(options.memory_budget, options.capacity, overflow)
-    tiles, images = bin_and_blend(projected, tile_counts, backgrounds, settings, memory, options.deterministic)
-    weights = weights_of(projected, tiles, settings) if options.contributions else (None, None)
-    median = median_depth_of(projected, tiles, settings) if options.median_depth else None
-    return images, projected, tile_counts, *weights, overflow, median
+    else:
+        memory = InstanceMemory(options.memory_budget, options.capacity, overflow)
+        leaves = [projected, *(t for layer in layers for t in (layer.backgrounds, layer.colors) if t is not None)]
+        slotted = options.contributions or needs_slots(leaves)
+        tiles = bin_projected(projected, tile_counts, settings, memory, slotted)
+        order = options.deterministic
+        images = [images_of(projected, tiles, layer.backgrounds, settings, order, layer.colors) for layer in layers]
+        weights = weights_of(projected, tiles, settings) if options.contributions else (None, None)
+        median = median_depth_of(projected, tiles, settings) if options.median_depth else None
+    features = images[1][0] if len(images) > 1 else None
+    return images[0], projected, tile_counts, *weights, overflow, features, median
 
 
-def _as_render(camera: Camera, images: tuple[torch.Tensor, ...], *rest: Any, median: torch.Tensor | None = None) -> Render:
+def _as_render(camera: Camera, images: tuple[torch.Tensor, ...], *rest: Any, **maps: torch.Tensor | None) -> Render:
     """Return the result; without a leading axis for a single camera."""
     single = len(camera.viewmat.shape) == 2
-    # not p[0], whose gradient would be a copy among zeros
-    render = Render(*(p.squeeze(0) if single else p for p in images), *rest)
-    return render if median is None else replace(render, median_depth=median.squeeze(0) if single else median)
+
+    def own(image: torch.Tensor) -> torch.Tensor:
+        return image.squeeze(0) if single else image  # not image[0], whose gradient would be a copy among zeros
+
+    return Render(*map(own, images), *rest, **{name: own(image) for name, image in maps.items() if image is not None})

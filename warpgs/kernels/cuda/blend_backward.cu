@@ -2,12 +2,12 @@
 #include "blend_settings.cu"
 // One warp takes CHUNK instances back to front, for all pixels of their tiles: item = number of the chunk. The sums of an
 // instance go to its slot; if ATOMIC, they are added to its Gaussian's at once, in whatever order warps get there.
-__shared__ float4 s_a[WARPS][32], s_b[WARPS][32], s_c[WARPS][32];
+__shared__ float4 s_a[WARPS][32], s_b[WARPS][32], s_rest[WARPS][REST][32];
 const int warp = threadIdx.x / 32;
 constexpr bool with_depth = WITH_DEPTH, atomic = ATOMIC;
 const int total = (int)min(totals.data[0], (long long)capacity);  // of a cut list, what there is
 const int floor = item * CHUNK;
-constexpr int values = with_depth ? 10 : 9;
+constexpr int values = 6 + CHANNELS + with_depth;
 // number of the sum that this lane holds after the reduction below
 int held = 0;
 {
@@ -22,7 +22,8 @@ int held = 0;
             size = min(size, half);
         n = half;
     }
-    held = size > 0 && !(lane & 1) ? held : -1;
+    // up to 16 sums end in pairs of lanes that hold the same one
+    held = size > 0 && (values > 16 || !(lane & 1)) ? held : -1;
 }
 int top_instance = min(floor + CHUNK, total);
 while (top_instance > floor) {
@@ -41,15 +42,18 @@ while (top_instance > floor) {
     const int camera = tile / tiles, in_camera = tile - camera * tiles;
     const int left = (in_camera % columns) * SIDE, top = (in_camera / columns) * SIDE;
     const float px = origin_x + left + lane % 8 + 0.5f, py = origin_y + top + lane / 8 + 0.5f;  // of the pixel in the first block
-    const float* background = backgrounds.data + 3 * camera;
-    float T[BLOCKS], behind[BLOCKS], g0[BLOCKS], g1[BLOCKS], g2[BLOCKS], vz[BLOCKS], vw[BLOCKS];
+    const float* background = backgrounds.data + CHANNELS * camera;
+    float T[BLOCKS], behind[BLOCKS], G[BLOCKS][CHANNELS], vz[BLOCKS], vw[BLOCKS];
     int last[BLOCKS];
     int part_last = 0;
     #pragma unroll
     for (int k = 0; k < BLOCKS; ++k) {
         const int x = left + (k % WIDE) * 8 + lane % 8, y = top + (k / WIDE) * 4 + lane / 8;
         T[k] = 1.0f;
-        behind[k] = g0[k] = g1[k] = g2[k] = vz[k] = vw[k] = 0.0f;
+        behind[k] = vz[k] = vw[k] = 0.0f;
+        #pragma unroll
+        for (int c = 0; c < CHANNELS; ++c)
+            G[k][c] = 0.0f;
         last[k] = 0;
         if (tile != no_tile && x < width && y < height) {
             const long long o = ((long long)camera * height + y) * width + x;
@@ -57,7 +61,9 @@ while (top_instance > floor) {
         }
         part_last = max(part_last, last[k]);
     }
-    part_last = __reduce_max_sync(ALL, part_last);
+    #pragma unroll
+    for (int distance = 16; distance > 0; distance /= 2)  // __reduce_max_sync is not there before sm_80
+        part_last = max(part_last, __shfl_xor_sync(ALL, part_last, distance));
     if (part_last > first) {
         #pragma unroll
         for (int k = 0; k < BLOCKS; ++k) {
@@ -66,9 +72,9 @@ while (top_instance > floor) {
                 const long long o = ((long long)camera * height + y) * width + x;
                 const float T_end = transmittances.data[o];
                 T[k] = T_end;
-                g0[k] = v_rgb.data[3 * o];
-                g1[k] = v_rgb.data[3 * o + 1];
-                g2[k] = v_rgb.data[3 * o + 2];
+                #pragma unroll
+                for (int c = 0; c < CHANNELS; ++c)
+                    G[k][c] = v_rgb.data[CHANNELS * o + c];
                 float z_end = 0.0f;
                 if (with_depth) {
                     const float W = weights.data[o];
@@ -79,16 +85,21 @@ while (top_instance > floor) {
                     }
                     vw[k] += v_alpha.data[o];
                 }
-                behind[k] = T_end * (background[0] * g0[k] + background[1] * g1[k] + background[2] * g2[k]);
+                float empty = background[0] * G[k][0];
+                #pragma unroll
+                for (int c = 1; c < CHANNELS; ++c)
+                    empty += background[c] * G[k][c];
+                behind[k] = T_end * empty;
                 if (last[k] > stop_at) {
                     // something was blended behind this chunk: the whole image less what lies up to here
                     const float* state = states.data + (long long)(stop_at / CHUNK) * (STATE * PIXELS) + k * 32 + lane;
                     T[k] = state[0];
-                    behind[k] = (rgb.data[3 * o] - state[PIXELS]) * g0[k]
-                        + (rgb.data[3 * o + 1] - state[2 * PIXELS]) * g1[k]
-                        + (rgb.data[3 * o + 2] - state[3 * PIXELS]) * g2[k];
+                    behind[k] = (rgb.data[CHANNELS * o] - state[PIXELS]) * G[k][0];
+                    #pragma unroll
+                    for (int c = 1; c < CHANNELS; ++c)
+                        behind[k] += (rgb.data[CHANNELS * o + c] - state[(1 + c) * PIXELS]) * G[k][c];
                     if (with_depth)
-                        behind[k] += (z_end - state[4 * PIXELS]) * vz[k] + (state[0] - T_end) * vw[k];
+                        behind[k] += (z_end - state[(1 + CHANNELS) * PIXELS]) * vz[k] + (state[0] - T_end) * vw[k];
                 }
             }
         }
@@ -114,7 +125,9 @@ while (top_instance > floor) {
                         mask |= 1u << k;
                 s_a[warp][lane] = s.a;
                 s_b[warp][lane] = s.b;
-                s_c[warp][lane] = s.c;
+                #pragma unroll
+                for (int q = 0; q < REST; ++q)
+                    s_rest[warp][q][lane] = s.rest[q];
             }
         }
         __syncwarp();
@@ -124,7 +137,13 @@ while (top_instance > floor) {
             const int j = 31 - __clz(todo);
             todo &= ~(1u << j);
             const unsigned blocks = __shfl_sync(ALL, mask, j);
-            const float4 a = s_a[warp][j], b = s_b[warp][j], c = s_c[warp][j];
+            Splat s;
+            s.a = s_a[warp][j];
+            s.b = s_b[warp][j];
+            #pragma unroll
+            for (int q = 0; q < REST; ++q)
+                s.rest[q] = s_rest[warp][q][j];
+            const float4 a = s.a, b = s.b;
             float v[STRIDE] = {};
             bool any = false;
             float dx[WIDE], p[WIDE];
@@ -155,9 +174,12 @@ while (top_instance > floor) {
                         const float inverse = __fdividef(1.0f, 1.0f - alpha);
                         T[k] *= inverse;
                         const float w = alpha * T[k];
-                        float d = b.z * g0[k] + b.w * g1[k] + c.x * g2[k];
+                        float d = s.channel(0) * G[k][0];
+                        #pragma unroll
+                        for (int c = 1; c < CHANNELS; ++c)
+                            d += s.channel(c) * G[k][c];
                         if (with_depth)
-                            d += c.y * vz[k] + vw[k];
+                            d += s.depth() * vz[k] + vw[k];
                         const float v_a = raw <= alpha_max ? T[k] * d - behind[k] * inverse : 0.0f;
                         behind[k] += w * d;
                         const float v_q = -raw * v_a;
@@ -168,11 +190,11 @@ while (top_instance > floor) {
                         v[3] += v_e1 * dy;
                         v[4] += v_e2 * dy;
                         v[5] += v_a * g;
-                        v[6] += w * g0[k];
-                        v[7] += w * g1[k];
-                        v[8] += w * g2[k];
+                        #pragma unroll
+                        for (int c = 0; c < CHANNELS; ++c)
+                            v[6 + c] += w * G[k][c];
                         if (with_depth)
-                            v[9] += w * vz[k];
+                            v[6 + CHANNELS] += w * vz[k];
                     }
                 }
             }
@@ -189,7 +211,9 @@ while (top_instance > floor) {
                     v[0] += __shfl_xor_sync(ALL, v[0], distance);
                 else {
                     #pragma unroll
-                    for (int h = 0; h < half; ++h) {
+                    for (int h = 0; h < STRIDE / 2; ++h) {  // a number, or v would not stay in registers
+                        if (h >= half)
+                            break;
                         const float low = v[h], high = h + half < n ? v[h + half] : 0.0f;
                         v[h] = (upper ? high : low) + __shfl_xor_sync(ALL, upper ? low : high, distance);
                     }
@@ -206,7 +230,9 @@ while (top_instance > floor) {
         }
         if (!atomic && mine && !(written >> lane & 1u)) {
             float4* row = reinterpret_cast<float4*>(v_slots.data + (long long)STRIDE * target);
-            row[0] = row[1] = row[2] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+            #pragma unroll
+            for (int q = 0; q < QUADS; ++q)
+                row[q] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
         }
     }
 }

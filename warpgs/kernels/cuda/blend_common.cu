@@ -3,27 +3,41 @@
 // rounding: the compiler's choice of fused operations may differ between kernels, and both passes must see one alpha.
 constexpr unsigned ALL = 0xffffffffu;
 constexpr int WIDE = SIDE / 8, BLOCKS = WIDE * (SIDE / 4), PIXELS = SIDE * SIDE;
+constexpr int QUADS = STRIDE / 4, REST = QUADS - 2;  // of a projected Gaussian; of its quads after the first two
 const int lane = threadIdx.x % 32;
 struct Splat {
-    float4 a, b, c;  // a projected Gaussian; u11 = a.z, u12 = a.w, u22 = b.x in units where the falloff is 2^-|U d|^2
+    // A projected Gaussian; u11 = a.z, u12 = a.w, u22 = b.x in units where the falloff is 2^-|U d|^2. Channels are b.z, b.w and
+    // the rest but for the last three, which are depth and half sides.
+    float4 a, b, rest[REST];
     __device__ void load(const float* projected, int i) {
-        const float4* record = reinterpret_cast<const float4*>(projected) + 3ll * i;
+        const float4* record = reinterpret_cast<const float4*>(projected) + (long long)QUADS * i;
         a = record[0];
         b = record[1];
-        c = record[2];
+        #pragma unroll
+        for (int q = 0; q < REST; ++q)
+            rest[q] = record[2 + q];
+    }
+    __device__ float channel(int k) const {
+        const float4 v = k < 2 ? b : rest[(k - 2) / 4];
+        const int part = (k + 2) % 4;
+        return part == 0 ? v.x : part == 1 ? v.y : part == 2 ? v.z : v.w;
+    }
+    __device__ float depth() const {
+        return rest[REST - 1].y;
     }
     __device__ void rescale() {
         a.z *= SCALE;
         a.w *= SCALE;
         b.x *= SCALE;
     }
-    // Whether some pixel centre of the 8 x 4 block at (left, top) may have alpha at or above the cut, where 2^-limit
-    // does: the least |U d|^2 over the block lies on one of the two edges that face the mean. Distances are
+    // Whether some pixel centre of the block at (left, top), 8 px wide and bottom + 0.5 px high, may have alpha at or above the
+    // cut, where 2^-limit does: the least |U d|^2 over the block lies on one of the two edges that face the mean. Distances are
     // widened by what rounding can take from them. A NaN is kept; it changes nothing.
-    __device__ bool touches(float left, float top, float limit) const {
+    __device__ bool touches(float left, float top, float limit, float bottom = 3.5f) const {
+        const float4 c = rest[REST - 1];
         const float slack_x = 0.01f + 2e-6f * (fabsf(a.x) + c.z), slack_y = 0.01f + 2e-6f * (fabsf(a.y) + c.w);
         const float x0 = left + 0.5f - a.x - slack_x, x1 = left + 7.5f - a.x + slack_x;
-        const float y0 = top + 0.5f - a.y - slack_y, y1 = top + 3.5f - a.y + slack_y;
+        const float y0 = top + 0.5f - a.y - slack_y, y1 = top + bottom - a.y + slack_y;
         const float near_x = fminf(fmaxf(0.0f, x0), x1), near_y = fminf(fmaxf(0.0f, y0), y1);
         const float y = fminf(fmaxf(-__fdividef(a.w * a.z * near_x, a.w * a.w + b.x * b.x), y0), y1);
         const float x = fminf(fmaxf(-__fdividef(a.w * near_y, a.z), x0), x1);

@@ -1,20 +1,28 @@
 #include "blend_common.cu"
 #include "blend_settings.cu"
-// One warp composites one block of 8 x 4 pixels: item = place of the tile in the order * BLOCKS + block.
+// One warp composites PER blocks of 8 x 4 pixels, one below the other, a pixel of each in a lane:
+// item = place of the tile in the order * (BLOCKS / PER) + part.
 constexpr int AHEAD = 4;  // alphas computed before they are blended: they do not wait for each other
-__shared__ float4 s_a[WARPS][32 + AHEAD], s_b[WARPS][32 + AHEAD], s_c[WARPS][32 + AHEAD];
+__shared__ float4 s_a[WARPS][32 + AHEAD], s_b[WARPS][32 + AHEAD], s_rest[WARPS][REST][32 + AHEAD];
 __shared__ int s_i[WARPS][32 + AHEAD];
 const int warp = threadIdx.x / 32;
-const int tile = order.data[item / BLOCKS], block = item % BLOCKS;
+const int tile = order.data[item / (BLOCKS / PER)], part = item % (BLOCKS / PER);
 const int camera = tile / tiles, in_camera = tile - camera * tiles;
+const int block = part / WIDE * PER * WIDE + part % WIDE;  // the first one; the next lies WIDE further
 const int left = (in_camera % columns) * SIDE + (block % WIDE) * 8, top = (in_camera / columns) * SIDE + (block / WIDE) * 4;
 const int x = left + lane % 8, y = top + lane / 8;
-const bool inside = x < width && y < height;
-const long long o = ((long long)camera * height + y) * width + x;
 const float px = origin_x + x + 0.5f, py = origin_y + y + 0.5f;
-float T = 1.0f, red = 0.0f, green = 0.0f, blue = 0.0f, z = 0.0f, total = 0.0f;
-int last = 0;
-bool done = !inside;
+float T[PER], color[PER][CHANNELS] = {}, z[PER], total[PER];
+int last[PER];
+bool done[PER], finished = true;
+#pragma unroll
+for (int k = 0; k < PER; ++k) {
+    T[k] = 1.0f;
+    z[k] = total[k] = 0.0f;
+    last[k] = 0;
+    done[k] = !(x < width && y + 4 * k < height);
+    finished = finished && done[k];
+}
 const int begin = ranges.data[2 * tile], end = ranges.data[2 * tile + 1];
 // batches start at multiples of 32, so that one starts at every multiple of CHUNK
 int i = (begin & ~31) + lane;
@@ -23,20 +31,24 @@ if (i >= begin && i < end)
     s.load(projected.data, gaussian_ids.data[i]);
 int next_id = i + 32 < end ? gaussian_ids.data[i + 32] : 0;  // known a batch before it is loaded
 for (int batch = begin & ~31; batch < end; batch += 32) {
-    if (__all_sync(ALL, done))
+    if (__all_sync(ALL, finished))
         break;
-    if (batch % chunk == 0 && batch > begin) {
-        float* state = states.data + (long long)(batch / chunk) * (STATE * PIXELS) + block * 32 + lane;
-        state[0] = T;
-        state[PIXELS] = red;
-        state[2 * PIXELS] = green;
-        state[3 * PIXELS] = blue;
-        state[4 * PIXELS] = z;
+    if (SAVE && batch % chunk == 0 && batch > begin) {
+        #pragma unroll
+        for (int k = 0; k < PER; ++k) {
+            float* state = states.data + (long long)(batch / chunk) * (STATE * PIXELS) + (block + k * WIDE) * 32 + lane;
+            state[0] = T[k];
+            #pragma unroll
+            for (int c = 0; c < CHANNELS; ++c)
+                state[(1 + c) * PIXELS] = color[k][c];
+            state[(1 + CHANNELS) * PIXELS] = z[k];
+        }
     }
     bool touched = false;
     if (i >= begin && i < end) {
         s.rescale();
-        touched = whole_tiles || s.touches((float)(origin_x + left), (float)(origin_y + top), limit_of(s.b.y, alpha_cut));
+        touched = whole_tiles
+            || s.touches((float)(origin_x + left), (float)(origin_y + top), limit_of(s.b.y, alpha_cut), 4 * PER - 0.5f);
     }
     const unsigned mask = __ballot_sync(ALL, touched);
     const int slot = __popc(mask & ((1u << lane) - 1u));
@@ -45,7 +57,9 @@ for (int batch = begin & ~31; batch < end; batch += 32) {
     if (touched) {
         s_a[warp][slot] = s.a;
         s_b[warp][slot] = s.b;
-        s_c[warp][slot] = s.c;
+        #pragma unroll
+        for (int q = 0; q < REST; ++q)
+            s_rest[warp][q][slot] = s.rest[q];
         s_i[warp][slot] = i + 1;
     }
     if (lane < AHEAD)
@@ -57,44 +71,65 @@ for (int batch = begin & ~31; batch < end; batch += 32) {
     if (i + 32 < end)
         next_id = gaussian_ids.data[i + 32];
     for (int j = 0; j < count; j += AHEAD) {
-        float alpha[AHEAD];
+        float alpha[AHEAD][PER];
         #pragma unroll
-        for (int k = 0; k < AHEAD; ++k) {
-            const float4 a = s_a[warp][j + k];
-            const float2 b = *reinterpret_cast<const float2*>(&s_b[warp][j + k]);
-            const float dx = __fsub_rn(px, a.x), dy = __fsub_rn(py, a.y);
-            const float e1 = __fmaf_rn(a.w, dy, __fmul_rn(a.z, dx)), e2 = __fmul_rn(b.x, dy);
-            alpha[k] = fminf(alpha_max, __fmul_rn(b.y, falloff(e1, e2)));
+        for (int ahead = 0; ahead < AHEAD; ++ahead) {
+            const float4 a = s_a[warp][j + ahead];
+            const float2 b = *reinterpret_cast<const float2*>(&s_b[warp][j + ahead]);
+            const float dx = __fsub_rn(px, a.x), p = __fmul_rn(a.z, dx);
+            #pragma unroll
+            for (int k = 0; k < PER; ++k) {
+                const float dy = __fsub_rn(py + 4 * k, a.y);
+                const float e1 = __fmaf_rn(a.w, dy, p), e2 = __fmul_rn(b.x, dy);
+                alpha[ahead][k] = fminf(alpha_max, __fmul_rn(b.y, falloff(e1, e2)));
+            }
         }
         #pragma unroll
-        for (int k = 0; k < AHEAD; ++k) {
-            const int next = s_i[warp][j + k];
-            if (!done && alpha[k] >= alpha_cut && next > 0) {
-                const float after = __fmul_rn(T, __fsub_rn(1.0f, alpha[k]));
-                done = !(after >= stop);
-                if (inclusive || !done) {
-                    const float4 b = s_b[warp][j + k], c = s_c[warp][j + k];
-                    const float w = alpha[k] * T;
-                    T = after;
-                    red += w * b.z;
-                    green += w * b.w;
-                    blue += w * c.x;
-                    z += w * c.y;
-                    total += w;
-                    last = next;
+        for (int ahead = 0; ahead < AHEAD; ++ahead) {
+            const int next = s_i[warp][j + ahead];
+            #pragma unroll
+            for (int k = 0; k < PER; ++k) {
+                if (!done[k] && alpha[ahead][k] >= alpha_cut && next > 0) {
+                    const float after = __fmul_rn(T[k], __fsub_rn(1.0f, alpha[ahead][k]));
+                    done[k] = !(after >= stop);
+                    if (inclusive || !done[k]) {
+                        Splat g;
+                        g.b = s_b[warp][j + ahead];
+                        #pragma unroll
+                        for (int q = 0; q < REST; ++q)
+                            g.rest[q] = s_rest[warp][q][j + ahead];
+                        const float w = alpha[ahead][k] * T[k];
+                        T[k] = after;
+                        #pragma unroll
+                        for (int c = 0; c < CHANNELS; ++c)
+                            color[k][c] += w * g.channel(c);
+                        z[k] += w * g.depth();
+                        total[k] += w;
+                        last[k] = next;
+                    }
                 }
             }
         }
     }
+    finished = true;
+    #pragma unroll
+    for (int k = 0; k < PER; ++k)
+        finished = finished && done[k];
 }
-if (inside) {
-    const float* background = backgrounds.data + 3 * camera;
-    rgb.data[3 * o] = red + T * background[0];
-    rgb.data[3 * o + 1] = green + T * background[1];
-    rgb.data[3 * o + 2] = blue + T * background[2];
-    alpha_out.data[o] = 1.0f - T;
-    depth.data[o] = total >= SMALLEST_WEIGHT ? z / total : 0.0f;
-    transmittances.data[o] = T;
-    weights.data[o] = total;
-    ends.data[o] = last;
+const float* background = backgrounds.data + CHANNELS * camera;
+#pragma unroll
+for (int k = 0; k < PER; ++k) {
+    if (x < width && y + 4 * k < height) {
+        const long long o = ((long long)camera * height + y + 4 * k) * width + x;
+        #pragma unroll
+        for (int c = 0; c < CHANNELS; ++c)
+            rgb.data[CHANNELS * o + c] = color[k][c] + T[k] * background[c];
+        alpha_out.data[o] = 1.0f - T[k];
+        depth.data[o] = total[k] >= SMALLEST_WEIGHT ? z[k] / total[k] : 0.0f;
+        if (SAVE) {
+            transmittances.data[o] = T[k];
+            weights.data[o] = total[k];
+        }
+        ends.data[o] = last[k];
+    }
 }

@@ -3,7 +3,7 @@
 // shares a long one. The factors common to all pixels are applied here, once.
 constexpr int SHORT = 32;
 constexpr bool with_depth = WITH_DEPTH, atomic = ATOMIC;
-constexpr int values = with_depth ? 10 : 9;
+constexpr int values = 6 + CHANNELS + with_depth;
 const bool valid = i < counts.shape[0];
 const bool seen = valid && counts.data[i] > 0;
 const int count = atomic ? (int)seen : seen ? counts.data[i] : 0;
@@ -12,13 +12,15 @@ float v[STRIDE] = {};
 if (count <= SHORT)
     for (int s = 0; s < count; ++s) {
         const float4* row = reinterpret_cast<const float4*>(v_slots.data + STRIDE * (start + s));
-        const float4 p = row[0], q = row[1];
-        v[0] += p.x; v[1] += p.y; v[2] += p.z; v[3] += p.w;
-        v[4] += q.x; v[5] += q.y; v[6] += q.z; v[7] += q.w;
-        const float* rest = reinterpret_cast<const float*>(row + 2);
-        v[8] += rest[0];
+        #pragma unroll
+        for (int q = 0; q < QUADS - 1; ++q) {
+            const float4 p = row[q];
+            v[4 * q] += p.x; v[4 * q + 1] += p.y; v[4 * q + 2] += p.z; v[4 * q + 3] += p.w;
+        }
+        const float* last = reinterpret_cast<const float*>(row + QUADS - 1);
+        v[5 + CHANNELS] += last[0];
         if (with_depth)
-            v[9] += rest[1];
+            v[6 + CHANNELS] += last[1];
     }
 unsigned heavy = __ballot_sync(ALL, count > SHORT);
 while (heavy) {
@@ -28,6 +30,7 @@ while (heavy) {
     const long long from = __shfl_sync(ALL, start, owner);
     float u[STRIDE] = {};
     for (int s = lane; s < many; s += 32)
+        #pragma unroll
         for (int k = 0; k < values; ++k)
             u[k] += v_slots.data[STRIDE * (from + s) + k];
     #pragma unroll
@@ -39,15 +42,19 @@ while (heavy) {
     }
 }
 if (valid) {
-    float4* row = reinterpret_cast<float4*>(v_projected.data) + 3ll * i;
+    float4* row = reinterpret_cast<float4*>(v_projected.data) + (long long)QUADS * i;
     if (count > 0) {
-        const float4* values_of = reinterpret_cast<const float4*>(projected.data) + 3ll * i;
+        const float4* values_of = reinterpret_cast<const float4*>(projected.data) + (long long)QUADS * i;
         const float4 a = values_of[0], b = values_of[1];
         constexpr float back = 1.0f / SCALE;
         const float s1 = back * v[0], s2 = back * v[1];
         row[0] = make_float4(-a.z * s1, -(a.w * s1 + b.x * s2), back * v[2], back * v[3]);
         row[1] = make_float4(back * v[4], v[5], v[6], v[7]);
-        row[2] = make_float4(v[8], v[9], 0.0f, 0.0f);
+        #pragma unroll
+        for (int q = 2; q < QUADS; ++q)
+            row[q] = make_float4(v[4 * q], v[4 * q + 1], v[4 * q + 2], v[4 * q + 3]);
     } else
-        row[0] = row[1] = row[2] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+        #pragma unroll
+        for (int q = 0; q < QUADS; ++q)
+            row[q] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
 }

@@ -23,7 +23,7 @@ for (int first = begin; first < end; first += BATCH) {
         s.rescale();
         s_a[t] = s.a;
         s_b[t] = s.b;
-        s_z[t] = s.c.y;
+        s_z[t] = s.depth();
     }
     __syncthreads();
     for (int j = 0; j < count && !done; ++j) {

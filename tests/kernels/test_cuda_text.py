@@ -1,0 +1,32 @@
+"""CUDA text compiles, also on a machine without a GPU: NVRTC comes with Warp."""
+
+import pytest
+import warp as wp
+
+from warpgs.kernels import blend_channels, blend_cuda, median_depth
+from warpgs.pipeline.runs.precompile import fit_kernels
+
+ARCHITECTURE = 75
+"""Oldest architecture that is compiled for (Turing)."""
+
+
+def modules() -> dict[str, wp.Module]:
+    """Modules of all kernels that a fit launches on CUDA, and of those that only the public op launches."""
+    kernels = [k for k, _ in fit_kernels(True)]
+    kernels += [median_depth.make_native(size) for size in (8, 16)]
+    for channels in blend_channels.WIDTHS:
+        kernels += [blend_cuda.make_forward(8, save, per, channels) for save in (True, False) for per in (1, 2)]
+        kernels += [blend_cuda.make_backward(8, depth, 64, True, channels).backward for depth in (True, False)]
+    return {k.module.name: k.module for k in kernels}
+
+
+@pytest.mark.slow
+def test_cuda_text_compiles(tmp_path):
+    """Each module, to PTX."""
+    wp.init()
+    if wp.get_cuda_supported_archs() == []:
+        pytest.skip("this build of Warp has no NVRTC")
+    found = modules()
+    assert len(found) > 20
+    for module in found.values():
+        wp.compile_aot_module(module, arch=ARCHITECTURE, use_ptx=True, module_dir=str(tmp_path))

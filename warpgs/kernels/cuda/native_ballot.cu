@@ -1,1 +1,0 @@
-return (int)__ballot_sync(0xffffffffu, wanted != 0);

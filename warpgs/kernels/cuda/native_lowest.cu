@@ -1,1 +1,0 @@
-return __ffs(mask) - 1;
