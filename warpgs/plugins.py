@@ -7,6 +7,7 @@ import importlib
 import importlib.util
 import os
 import pkgutil
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -37,7 +38,7 @@ class Registry(Generic[T]):
         """Begin with nothing.
 
         Args:
-            kind: What the classes are, for messages: strategy, loss term, reader.
+            kind: What the classes are, for messages: strategy, loss term, view module, reader.
             base: What each class derives from.
             package: Dotted name of the package, or module, that ours live in.
         """
@@ -82,6 +83,10 @@ class Registry(Generic[T]):
         self._checked(cls, cls.__name__)
         return cls.name if self.has(cls) else self.register(f"{cls.__module__}:{cls.__qualname__}")(cls).name
 
+    def described(self) -> dict[str, str]:
+        """Return a line about each of ours by name: its ``description``, or the first sentence of its docstring."""
+        return {name: _line_about(self._classes[name]) for name in self.names()}
+
     def knows(self, name: str) -> bool:
         """Return whether `find` needs no class that was not loaded: True for all names without a colon."""
         return ":" not in name or name in self._classes
@@ -113,17 +118,9 @@ class Registry(Generic[T]):
         Raises:
             UsageError: The module, file or class is not there, or the class is of another kind.
         """
-        where, colon, name = spec.rpartition(":")
-        if not colon or spec in self._classes:
+        if ":" not in spec or spec in self._classes:
             return self.find(spec)
-        try:
-            module = _load_file(Path(where)) if where.endswith(".py") else _import_module(where)
-        except (ImportError, OSError) as e:
-            raise UsageError(f"the {self.kind} {spec!r} cannot be imported ({e}); give path/to/file.py:Class") from e
-        if not hasattr(module, name):
-            raise UsageError(f"the {self.kind} {spec!r} is not there: {where} has no class {name}")
-        cls = self._checked(getattr(module, name), spec)
-        LOADED.add(module.__name__)
+        cls = self._checked(load_object(self.kind, spec), spec)
         self._classes[spec] = cls
         cls.name = spec
         return cls
@@ -136,6 +133,42 @@ class Registry(Generic[T]):
 
 LOADED: set[str] = set()
 """Names of the modules that users' own classes were loaded from."""
+
+
+def load_object(kind: str, spec: str) -> object:
+    """Return the object of ``module:NAME`` or ``path/to/file.py:NAME``, importing it: runs that code.
+
+    Args:
+        kind: What it is, for messages.
+        spec: Place and name.
+
+    Raises:
+        UsageError: The module, file or object is not there.
+    """
+    where, _, name = spec.rpartition(":")
+    try:
+        module = _load_file(Path(where)) if where.endswith(".py") else _import_module(where)
+    except (ImportError, OSError) as e:
+        raise UsageError(f"the {kind} {spec!r} cannot be imported ({e}); give path/to/file.py:{name or 'NAME'}") from e
+    if not hasattr(module, name):
+        raise UsageError(f"the {kind} {spec!r} is not there: {where} has no {name}; give a name that it defines")
+    LOADED.add(module.__name__)
+    return getattr(module, name)
+
+
+def _line_about(cls: type) -> str:
+    if text := getattr(cls, "description", ""):
+        return str(text)
+    text = cls.__dict__.get("__doc__") or ""
+    if text.startswith(f"{cls.__name__}("):  # what dataclasses write where there is no docstring
+        return ""
+    return re.split(r"(?<!\bal)\.(?: |$)", " ".join(text.split("\n\n")[0].split()))[0]
+
+
+def flag_group(name: str) -> str:
+    """Return the name of the flags of a plug-in's own settings: ``my.module:MyStrategy`` has the group ``my_strategy``."""
+    word = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name.rpartition(":")[2])
+    return re.sub(r"\W", "_", word).lower()
 
 
 def own_frame(error: BaseException) -> str:

@@ -131,10 +131,11 @@ def one_of(*values: Any) -> Schema:
 
 def whole(low: int = -MAX_WHOLE, high: int = MAX_WHOLE) -> Schema:
     """Return the schema of whole numbers from ``low`` to ``high``."""
+    wanted = "a whole number of 64 bits" if (low, high) == (-MAX_WHOLE, MAX_WHOLE) else f"a whole number from {low} to {high}"
 
     def check(value: Any, place: str) -> None:
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            _refuse(value, place, f"a whole number from {low} to {high}")
+            _refuse(value, place, wanted)
 
     return check
 

@@ -11,8 +11,9 @@ import pytest
 from warpgs.app.cli import main
 from warpgs.app.commands.fit import request_of
 from warpgs.app.flags import field_docs, flags_of, settings_of
-from warpgs.pipeline.train.config import PRESETS, FitConfig
-from warpgs.pipeline.train.loss import DepthCorrelation
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loss_terms.opacity import AlphaDifference
+from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.strategies.mcmc import MCMCConfig
 from warpgs.synthetic.demo import split_spec, write_demo
 
@@ -49,8 +50,10 @@ class Opaque(loss.LossTerm):
     weight: float = 0.25
     """Weight of the mean alpha."""
 
-    def __call__(self, render, target, gaussians):
-        return self.weight * render.alpha.mean()
+    needs_outputs = ("alpha",)
+
+    def __call__(self, inputs):
+        return self.weight * inputs.outputs["alpha"].mean()
 '''
 
 
@@ -79,9 +82,9 @@ def test_every_setting_is_a_flag_with_its_own_help(capsys, monkeypatch):
     """Whatever FitConfig and its parts hold is in the help, word for word, without a second text."""
     monkeypatch.setenv("COLUMNS", "110")
     with pytest.raises(SystemExit) as end:
-        request_of(["--help", "--strategy", "mcmc", "--loss-terms", "depth_correlation"], "")
+        request_of(["--help", "--strategy", "mcmc", "--loss-terms", "alpha"], "")
     text = squeezed(capsys.readouterr().out)
-    flags = [*leaves(FitConfig), *leaves(MCMCConfig, "mcmc."), *leaves(DepthCorrelation, "depth-correlation.")]
+    flags = [*leaves(FitConfig), *leaves(MCMCConfig, "mcmc."), *leaves(AlphaDifference, "alpha.")]
     assert end.value.code == 0 and len(flags) > 80
     for flag, doc in flags:
         assert flag in text and squeezed(doc) in text, flag
@@ -102,10 +105,8 @@ def test_flags_change_what_they_name(capsys):
     found = parsed("--memory-limit", "2GiB", "--init.source=random", "--no-cuda-graph", "--max-gaussians", "900")
     assert (found.memory_limit, found.init.source, found.cuda_graph, found.max_gaussians) == (2 * 2**30, "random", False, 900)
     assert found.preset == "default" and "preset default: any capture" in capsys.readouterr().out
-    found = parsed(
-        "--strategy=mcmc", "--mcmc.noise-lr", "1e4", "--loss-terms", "depth_correlation", "--depth-correlation.until", "0.5"
-    )
-    assert found.strategy_config == MCMCConfig(noise_lr=1e4) and found.loss_terms == (DepthCorrelation(until=0.5),)
+    found = parsed("--strategy=mcmc", "--mcmc.noise-lr", "1e4", "--loss-terms", "alpha", "--alpha.weight", "0.5")
+    assert found.strategy_config == MCMCConfig(noise_lr=1e4) and found.loss_terms == (AlphaDifference(0.5),)
     assert parsed("--preset", "mcmc", "--mcmc.every", "7").strategy_config.every == 7
     assert parsed("--preset", "mcmc", "--strategy", "clone_split").strategy_config is None
 
@@ -119,7 +120,7 @@ def test_mistakes_are_named_before_anything_starts(tmp_path, capsys):
     for flags, message in [
         (["--memory-limit", "2 cows"], "2 cows"),
         (["--strategy", "best"], "there is no strategy 'best'; choose one of"),
-        (["--loss-terms", "depth_correlation,depth_correlation"], "two terms have the flags --depth_correlation"),
+        (["--loss-terms", "alpha,alpha"], "two of them have the flags --alpha"),
         (["--strategy", f"{tmp_path}/none.py:A"], "there is no file"),
         (["--strategy", "json:JSONDecoder"], "must be a class that derives from"),
         (["--strategy", f"{tmp_path}/broken.py:A"], "ZeroDivisionError: division by zero"),

@@ -10,9 +10,13 @@ import pytest
 from warpgs.app import fit_help
 from warpgs.app.cli import COMMANDS, GROUPS, main
 from warpgs.app.commands.fit import request_of
+from warpgs.io.readers import READERS, Reader
 from warpgs.io.splits import SPECS
-from warpgs.pipeline.train.by_views import QUICK_STEPS
-from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESET_NOTES, PRESETS
+from warpgs.kernels.cameras.base import CAMERA_MODELS, CameraModel
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
+from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.strategies.base import STRATEGIES, Strategy
 
 BASE = ["SCENE", "--out", "RUN"]
 SCENE_FIELDS = {"split", "downscale", "max_side", "masks"}
@@ -43,7 +47,7 @@ def test_all_flags_are_one_word_further(capsys):
         main(["fit", help_all])
     text = capsys.readouterr().out
     assert end.value.code == 0 and all(name in text for name, *_ in fit_help.FLAGS)
-    assert "--holdout.levels" in text and len(text.splitlines()) > 200
+    assert "--stopping.measurements" in text and len(text.splitlines()) > 200
 
 
 def test_every_command_has_one_purpose(capsys):
@@ -64,12 +68,31 @@ def test_flags_and_their_defaults_are_those_of_the_parser(flag, word, default):
         assert request_of([*BASE, flag], "") != request
 
 
-def test_presets_are_those_of_the_code():
-    assert list(fit_help.PRESETS) == list(PRESETS) == list(PRESET_NOTES)
-    assert {f[0]: f[2] for f in fit_help.FLAGS}["--preset"] == DEFAULT_PRESET
-    for name, line in fit_help.PRESETS.items():
-        stated = re.search(r"([0-9]+) steps", line)
-        assert (stated and int(stated[1])) == (QUICK_STEPS if name == "quick" else PRESETS[name].steps)
+def test_steps_that_a_preset_s_line_names_are_its_own():
+    for name, line in PRESETS.described().items():
+        stated, config = re.search(r"([0-9]+) steps", line), PRESETS[name]
+        assert (int(stated[1]) if stated else FitConfig().max_steps) == (config.steps or config.max_steps)
+
+
+def test_what_is_registered_is_in_the_help(capsys, monkeypatch):
+    """Presets on one screen; these, strategies, loss terms, readers and camera models where every flag is."""
+    monkeypatch.setattr(PRESETS, "_made", dict(PRESETS._made))
+    monkeypatch.setattr(PRESETS, "_about", dict(PRESETS._about))
+    PRESETS.register("mine", PRESETS["quick"], "one of my own")
+    assert "  mine           one of my own" in printed(capsys, "fit", "--help")
+    kinds = {STRATEGIES: Strategy, LOSS_TERMS: LossTerm, READERS: Reader, CAMERA_MODELS: CameraModel}
+    for registry, base in kinds.items():
+        registry.names()
+        monkeypatch.setattr(registry, "_classes", dict(registry._classes))
+        registry.register("my_" + registry.kind.replace(" ", "_"))(type("Mine", (base,), {"__doc__": "A part of mine. More."}))
+    with pytest.raises(SystemExit):
+        main(["fit", "--help-all"])
+    text = capsys.readouterr().out
+    for registry in kinds:
+        lines = registry.described()
+        assert lines["my_" + registry.kind.replace(" ", "_")] == "A part of mine" and all(lines.values())
+        assert all(" ".join(f"{name}: {about}".split()) in " ".join(text.split()) for name, about in lines.items())
+    assert all(f"{name}: {about}" in " ".join(text.split()) for name, about in PRESETS.described().items())
 
 
 def test_splits_are_those_of_the_code():

@@ -15,7 +15,7 @@ from tests.export import memory_of_readers
 from tests.gaussians import cloud
 from warpgs.export import sog, spz
 from warpgs.export.arrays import SH_SIZES, arrays_of
-from warpgs.export.formats import FORMATS, write_gaussians
+from warpgs.export.formats import suffixes, write_gaussians
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux bounds and tells the memory of a process")
 
@@ -108,7 +108,7 @@ def test_memory_beyond_the_result(tmp_path):
 def test_memory_beyond_the_result_of_every_format(tmp_path):
     """And of larger files: what is held beside the result does not grow with it."""
     check(tmp_path, MORE)
-    assert {suffix for name in (QUICK | MORE) for suffix in FORMATS if name[1:] == suffix} == FORMATS.keys() - {".gltf"}
+    assert {suffix for name in (QUICK | MORE) for suffix in suffixes() if name[1:] == suffix} == {*suffixes()} - {".gltf"}
 
 
 def test_cases_hold_what_they_claim():

@@ -4,7 +4,6 @@ import contextlib
 import importlib
 import sys
 
-from warpgs import __version__
 from warpgs.app.failures import report_defect, report_no_memory
 from warpgs.app.fit_help import help_lines, wants_help
 from warpgs.errors import UsageError, WarpgsError
@@ -17,6 +16,7 @@ from warpgs.runtime.ranks import last_words
 from warpgs.runtime.stop_signals import ignored_signals, interrupting_signals
 from warpgs.runtime.terminal import accept_all_letters, say
 from warpgs.temporary import system_folder
+from warpgs.version import __version__
 
 COMMANDS = {
     "demo": "write a synthetic scene to try things with",
@@ -26,7 +26,7 @@ COMMANDS = {
     "render": "render a run as a film: along a path, its views, or keyframes",
     "plot": "show a run's cameras and Gaussians in one image",
     "priors": "look at what is known before a fit, or write networks as ONNX",
-    "export": "write a run's Gaussians to a file: .ply, .spz, .glb, .html",
+    "export": "write a run's Gaussians to a file, or to a page",
     "convert": "write a file of Gaussians or cameras in another format",
     "mesh": "make a mesh of the surfaces that a run's views see: .ply, .glb",
     "prune": "shrink a finished model as far as its training views allow",

@@ -1,11 +1,11 @@
 """The last words of a command that failed, and its exit code."""
 
-from warpgs import __version__
 from warpgs.errors import ResourceError, UsageError, WarpgsError
 from warpgs.plugins import own_frame
 from warpgs.runtime.device_memory import no_memory_message
 from warpgs.runtime.ranks import last_words
 from warpgs.runtime.terminal import say
+from warpgs.version import __version__
 
 
 def report_no_memory(error: Exception) -> int:

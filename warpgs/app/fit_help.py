@@ -1,9 +1,11 @@
 """`warpgs fit --help` on one screen. Importing it costs nothing: no settings, no torch; tests hold it against the code."""
 
+from warpgs.pipeline.train.presets import DEFAULT_PRESET, PRESETS
+
 FLAGS = (
     ("--out", "RUN", "", "run folder to fill; must not exist yet"),
     ("--split", "SPEC", "", "views to hold out for scores; without it all train"),
-    ("--preset", "NAME", "default", "settings to start from: presets, below"),
+    ("--preset", "NAME", DEFAULT_PRESET, "settings to start from: below, or a .toml file"),
     ("--steps", "N", "", "steps, one view each; without it the preset decides"),
     ("--device", "NAME", "auto", "auto, cpu or cuda"),
     ("--downscale", "F", "", "divide both sides of the images by F"),
@@ -15,15 +17,6 @@ FLAGS = (
     ("--view", "", "False", "watch in a browser while it trains"),
 )
 """Flags that most fits need: name, word for the value, default (empty for none; False for a switch), and words about it."""
-
-PRESETS = {
-    "default": "any capture; steps follow from the number of views",
-    "quick": "a first look: the same in at most 600 steps",
-    "3dgs": "a baseline: Kerbl et al. 2023, 7000 steps",
-    "mcmc": "a baseline: Kheradmand et al. 2024, 7000 steps",
-    "paper-literal": "the paper to the letter, 30000 steps; slow",
-}
-"""Presets, each in a line."""
 
 SPLITS = {
     "every:N": "hold out every Nth view",
@@ -42,7 +35,7 @@ EXAMPLES = (
 """Commands to begin with."""
 
 SCENE = (
-    "folder: COLMAP, transforms.json, LLFF, DTU, Middlebury;",
+    "folder with cameras, in a format that --help-all lists;",
     "or photographs or a video, whose poses are then found",
 )
 """Words about the positional argument."""
@@ -71,6 +64,6 @@ def help_lines(about: str) -> list[str]:
     return [
         f"warpgs fit: {about}", "", "usage: warpgs fit SCENE --out RUN [flags]", "",
         "flags most fits need, and their [defaults]:", *rows(flags), "",
-        "presets (--preset):", *rows(list(PRESETS.items())), "", "splits (--split):", *rows(list(SPLITS.items())), "",
+        "presets (--preset):", *rows([*PRESETS.described().items()]), "", "splits (--split):", *rows([*SPLITS.items()]), "",
         "examples:", *(f"  {line}" for line in EXAMPLES), "", "`warpgs fit --help-all` lists every flag by topic.",
     ]  # fmt: skip

@@ -165,6 +165,11 @@ def check_range(flag: str, value: float, low: float, high: float) -> None:
         raise UsageError(f"{flag} must be a number from {low:,} to {high:,}, not {value}")
 
 
+def listed(title: str, lines: Mapping[str, str]) -> str:
+    """Return names and a line about each under a title, for the head of a help."""
+    return "\n".join([f"{title}:", *(f"  {name}: {about}" if about else f"  {name}" for name, about in lines.items())])
+
+
 def word_after(arguments: list[str], flag: str) -> str | None:
     """Return the word after a flag that must be known before the others can be described; None where it is not given."""
     found = None

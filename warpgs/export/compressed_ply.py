@@ -25,6 +25,7 @@ from warpgs.export.arrays import (
     sigmoid,
     smallest_three,
 )
+from warpgs.export.base import Format, register
 from warpgs.export.ply_header import COMMENTS, MAX_HEADER_BYTES, Element, parse_header
 
 CHUNK = 256
@@ -182,3 +183,14 @@ def _unpack(packed: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
         columns.append((packed & most) / most)
         packed = packed >> width
     return np.stack(columns[::-1], 1)
+
+
+@register("compressed_ply")
+class CompressedPLY(Format):
+    """The compressed PLY format."""
+
+    suffix = ".compressed.ply"
+    description = "PlayCanvas: PLY of 8 to 11 bits within chunks of 256; SuperSplat"
+    sorted = True
+    encode = staticmethod(encode)
+    decode = staticmethod(decode)

@@ -28,6 +28,7 @@ from warpgs.export.arrays import (
     sigmoid,
     unit_quats,
 )
+from warpgs.export.base import Format, register
 
 EXTENSION = "KHR_gaussian_splatting"
 COLOR_SPACE = "srgb_rec709_display"
@@ -278,3 +279,23 @@ def _accessor(path: Path, document: dict[str, Any], body: bytes | memoryview, in
     if not rows:
         return _Table(np.empty((0, width), np.float32))
     return _Table(np.ndarray((rows, width), dtype, body, start + offset, (stride, dtype.itemsize)))
+
+
+@register("glb")
+class BinaryGltf(Format):
+    """Binary glTF."""
+
+    suffix = ".glb"
+    description = "glTF 2.0 with KHR_gaussian_splatting, binary, float32; Cesium, engines"
+    encode = staticmethod(encode_glb)
+    decode = staticmethod(decode)
+
+
+@register("gltf")
+class TextGltf(Format):
+    """Text glTF."""
+
+    suffix = ".gltf"
+    description = "glTF 2.0 with KHR_gaussian_splatting, text with its numbers inside"
+    encode = staticmethod(encode_gltf)
+    decode = staticmethod(decode)

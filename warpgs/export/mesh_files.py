@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgs import __version__
 from warpgs.errors import DataError, UsageError
 from warpgs.files import write_bytes
 from warpgs.scene import Mesh
+from warpgs.version import __version__
 
 SUFFIXES = (".ply", ".glb")
 """Suffixes of the files that can be written."""

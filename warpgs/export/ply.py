@@ -19,9 +19,11 @@ import numpy as np
 from warpgs.coordinates import checked_normalization, convert_gaussians
 from warpgs.errors import DataError
 from warpgs.export.arrays import arrays_of, check_finite, parts
+from warpgs.export.base import Format, register
+from warpgs.export.compressed_ply import CompressedPLY, is_compressed
 from warpgs.export.ply_header import COMMENTS, MAX_HEADER_BYTES, Element, parse_header, ply_error
 from warpgs.files import writing
-from warpgs.input_files import open_input, unread_reason
+from warpgs.input_files import open_input, read_start, unread_reason
 from warpgs.scene import Gaussians, Normalization
 
 CHUNK_ROWS = 65536
@@ -220,3 +222,30 @@ def _columns(
         row, column = np.argwhere(bad)[0]
         raise ply_error(path, f"{names[column]} of Gaussian {first + row} is not finite in float32")
     return out
+
+
+@register("ply")
+class PLY(Format):
+    """The PLY format; a file of it may be compressed."""
+
+    suffix = ".ply"
+    description = "layout of Kerbl et al. 2023, float32; every tool"
+    cleaned = False
+
+    def write(self, path: Path, gaussians: Gaussians, normalization: Normalization | None, units: str) -> None:
+        """Write Gaussians with `write_ply`."""
+        write_ply(path, gaussians, normalization, units=units)
+
+    def read(self, path: Path, normalization: Normalization | None, units: str) -> Gaussians:
+        """Read Gaussians with `read_ply`, or as `CompressedPLY` where the header is of that.
+
+        Raises:
+            DataError: The file is missing or malformed.
+        """
+        try:
+            compressed = is_compressed(path, read_start(path, MAX_HEADER_BYTES))
+        except OSError as e:
+            raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
+        if compressed:
+            return CompressedPLY().read(path, normalization, units)
+        return read_ply(path, normalization, units=units)

@@ -32,6 +32,7 @@ from warpgs.export.arrays import (
     sigmoid,
     smallest_three,
 )
+from warpgs.export.base import Format, register
 
 LEVELS = 256
 """Entries of a codebook."""
@@ -300,3 +301,15 @@ def _within(path: Path, labels: np.ndarray, count: int, first: int) -> np.ndarra
         row = first + int(np.argmax(labels >= count))
         raise malformed(path, f"Gaussian {row} points beyond its {count} rows of harmonics")
     return labels
+
+
+@register("sog")
+class SOG(Format):
+    """The SOG format."""
+
+    suffix = ".sog"
+    description = "PlayCanvas: images of 8-bit indices in a zip archive; SuperSplat"
+    sorted = True
+    archive = True
+    encode = staticmethod(encode)
+    decode = staticmethod(decode)

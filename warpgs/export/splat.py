@@ -11,6 +11,7 @@ import numpy as np
 
 from warpgs.colors import base_coefficients, base_colors
 from warpgs.export.arrays import Arrays, by_rows, logits, malformed, parts, rounded, sigmoid, unit_quats
+from warpgs.export.base import Format, register
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 _TINY = 1e-37
@@ -51,3 +52,14 @@ def decode(path: Path, data: bytes) -> Arrays:
         "logit_opacities": by_rows(n, (), lambda p: logits(rows["rgba"][p, 3] / 255, 1 / 255)),
         "sh": by_rows(n, (1, 3), lambda p: base_coefficients(rows["rgba"][p, None, :3].astype(np.float64) / 255)),
     }
+
+
+@register("splat")
+class Splat(Format):
+    """The .splat format."""
+
+    suffix = ".splat"
+    description = "antimatter15: 8 bits, colours without a direction; small viewers"
+    max_degree = 0
+    encode = staticmethod(encode)
+    decode = staticmethod(decode)

@@ -13,6 +13,7 @@ import math
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -35,6 +36,7 @@ from warpgs.export.arrays import (
     smallest_three,
     unit_quats,
 )
+from warpgs.export.base import Format, register
 
 Section = Callable[[int], bytes]
 """Function that returns the next bytes of a section, exactly as many as are asked for."""
@@ -278,3 +280,30 @@ def _zstandard():
     except ImportError as e:
         raise UsageError("SPZ version 4 needs zstandard: pip install 'warpgs[formats]', or use version 3") from e
     return zstandard
+
+
+@dataclass(frozen=True)
+class SPZConfig:
+    """Options of the SPZ format."""
+
+    version: int = VERSION
+    """Version of the format to write: 2, 3, or 4, which needs zstandard (the extra ``formats``)."""
+
+
+@register("spz")
+class SPZ(Format):
+    """The SPZ format."""
+
+    suffix = ".spz"
+    description = "Niantic: fixed point and 8 bits, gzip; Scaniverse, Babylon.js, SuperSplat"
+    Config = SPZConfig
+    sorted = True
+    note = (
+        "SPZ has y up, as Niantic defines it; SuperSplat, splat-transform 3, gsply and gaussforge take its axes for those of "
+        "PLY: --rotate 1,0,0,180 turns a file from them or for them"
+    )
+    decode = staticmethod(decode)
+
+    def encode(self, arrays: Arrays) -> list[bytes]:
+        """Return the bytes of a file of the version that the options name."""
+        return encode(arrays, self.config.version)

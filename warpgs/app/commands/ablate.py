@@ -3,22 +3,23 @@
 from dataclasses import dataclass
 
 from warpgs.app.commands.study import run_study_of, study_flags
-from warpgs.app.flags import parse_flags
+from warpgs.app.flags import listed, parse_flags
+from warpgs.app.own_code import load_own
 
 
 def run(arguments: list[str], about: str) -> int:
     """Run the command; ``about`` heads its help."""
-    from warpgs.pipeline.train.config import DEFAULT_PRESET
+    from warpgs.pipeline.train.presets import DEFAULT_PRESET, PRESETS
 
     base = study_flags()
 
     @dataclass(frozen=True, kw_only=True)
     class Ablate(base):
         preset: str = DEFAULT_PRESET
-        """Preset whose parts are switched off one at a time."""
+        """Preset, as `warpgs fit --preset` takes it, whose parts are switched off one at a time."""
 
-    a = parse_flags(Ablate, arguments, "warpgs ablate", about)
+    a = parse_flags(Ablate, arguments, "warpgs ablate", f"{about}\n\n{listed('presets', PRESETS.described())}")
     from warpgs.pipeline.study.compare import ablation_variants, preset_variants
 
-    (config,) = preset_variants([a.preset], a.steps).values()
+    (config,) = load_own("preset", a.preset, lambda: preset_variants([a.preset], a.steps)).values()
     return run_study_of(a, *ablation_variants(config))

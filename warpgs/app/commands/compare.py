@@ -3,22 +3,23 @@
 from dataclasses import dataclass
 
 from warpgs.app.commands.study import run_study_of, study_flags
-from warpgs.app.flags import parse_flags
+from warpgs.app.flags import listed, parse_flags
+from warpgs.app.own_code import load_own
 
 
 def run(arguments: list[str], about: str) -> int:
     """Run the command; ``about`` heads its help."""
-    from warpgs.pipeline.train.config import PRESETS
+    from warpgs.pipeline.train.presets import PRESETS
 
     base = study_flags()
 
     @dataclass(frozen=True, kw_only=True)
     class Compare(base):
         presets: str = ",".join(PRESETS)
-        """Names of presets with commas between; the others are compared with the first."""
+        """Presets as `warpgs fit --preset` takes them, with commas between; the others are compared with the first."""
 
-    a = parse_flags(Compare, arguments, "warpgs compare", about)
+    a = parse_flags(Compare, arguments, "warpgs compare", f"{about}\n\n{listed('presets', PRESETS.described())}")
     from warpgs.pipeline.study.compare import preset_variants
 
     names = [n.strip() for n in a.presets.split(",") if n.strip()]
-    return run_study_of(a, preset_variants(names, a.steps), {})
+    return run_study_of(a, load_own("preset", a.presets, lambda: preset_variants(names, a.steps)), {})

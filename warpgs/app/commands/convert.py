@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from warpgs.app.flags import either, parse_flags
+from warpgs.app.flags import parse_flags
 from warpgs.runtime.terminal import say
 
 
@@ -11,28 +11,20 @@ def run(arguments: list[str], about: str) -> int:
     """Run the command; ``about`` heads its help."""
     import tyro
 
-    @dataclass(frozen=True)
-    class Convert:
-        source: tyro.conf.Positional[Path]
-        """File to read: .ply, .compressed.ply, .splat, .spz, .sog, .glb or .gltf; or cameras: cameras.json, transforms.json,
-        or a folder of COLMAP."""
-        target: tyro.conf.Positional[Path]
-        """File to write, of the same formats; cameras.json, transforms.json or sparse for cameras."""
-        crop: str | None = None
-        """Box to keep, in units of the scene's files: x,y,z,X,Y,Z, or a .json file such as the one that the viewer saves."""
-        clean: tyro.conf.FlagCreatePairsOff[bool] = False
-        """Remove what only disturbs: Gaussians larger than the scene, and long needles. Done unless the target is a .ply."""
-        no_clean: tyro.conf.FlagCreatePairsOff[bool] = False
-        """Keep these, too."""
-        sh_degree: int | None = None
-        """Highest degree of harmonics; 0 for colours that are the same from all sides. All where not given."""
-        rotate: str | None = None
-        """Turn the model about the origin: x,y,z,degrees."""
+    from warpgs.app.format_flags import chosen_formats, filters_of, format_flags, format_lines
 
-    a = parse_flags(Convert, arguments, "warpgs convert", about)
-    from warpgs.pipeline.runs.export_filters import Filters
+    base = format_flags(arguments)
+
+    @dataclass(frozen=True, kw_only=True)
+    class Convert(base):
+        source: tyro.conf.Positional[Path]
+        """File of Gaussians to read; or cameras: cameras.json, transforms.json, or a folder of COLMAP."""
+        target: tyro.conf.Positional[Path]
+        """File to write; cameras.json, transforms.json or sparse for cameras."""
+
+    a = parse_flags(Convert, arguments, "warpgs convert", f"{about}\n\n{format_lines()}")
     from warpgs.pipeline.runs.export_model import convert
 
-    for line in convert(a.source, a.target, Filters(a.crop, either(a, "clean"), a.sh_degree, a.rotate)):
+    for line in convert(a.source, a.target, filters_of(a), chosen_formats(a, a.target)):
         say(line)
     return 0

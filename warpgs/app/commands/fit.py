@@ -5,23 +5,25 @@ there are, are looked up first. Parses, calls, prints; no logic.
 """
 
 import dataclasses
-import os
-import re
-import traceback
+import inspect
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from warpgs.app.flags import MAX_THREADS, check_range, flags_of, parse_flags, settings_of, word_after
-from warpgs.errors import UsageError, WarpgsError
-from warpgs.io.decoding import MAX_PIXELS
+from warpgs.app.flags import MAX_THREADS, check_range, flags_of, listed, parse_flags, settings_of, word_after
+from warpgs.app.own_code import load_own
+from warpgs.app.scene_flags import scene_flags, scene_of
+from warpgs.errors import UsageError
 from warpgs.io.readers import READERS
+from warpgs.kernels.cameras.base import CAMERA_MODELS
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest
-from warpgs.pipeline.train.config import DEFAULT_PRESET, PRESET_NOTES, PRESETS, FitConfig
+from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LOSS_TERMS
+from warpgs.pipeline.train.presets import PRESETS, origin_note, preset_settings
 from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.pipeline.train.time_budget import check_budget
-from warpgs.plugins import Registry
+from warpgs.pipeline.train.view_modules.base import VIEW_MODULES
+from warpgs.plugins import Registry, flag_group
 from warpgs.render.rule_costs import select_rule
 from warpgs.runtime.byte_units import parse_bytes
 from warpgs.runtime.imports import fast_imports
@@ -35,23 +37,11 @@ CONTINUING = {"--out": 1, "--resume": 0, "--device": 1, "--threads": 1, "--view"
 
 def _request_type() -> type:
     """Return the dataclass of the flags that are no settings of a fit: its input, output and machine."""
-    import tyro
 
     @dataclass(frozen=True, kw_only=True)
     class Request:
-        scene: tyro.conf.Positional[Path]
-        """Scene folder: COLMAP, transforms.json, LLFF, DTU or Middlebury; or photographs or a video without cameras."""
         out: Path
         """Run folder to fill; must not exist yet."""
-        split: str | None = None
-        """Views to hold out for scores: llff:K, mip360:K, dtu:3|6|9, blender:8, every:N, all (trains on all, as without this
-        flag), or train=NAMES;test=NAMES."""
-        downscale: int | None = None
-        """Factor by which both image sides shrink; with it, images keep what it leaves of them."""
-        max_side: int | None = None
-        """Longest side that an image keeps [px], 0 for no limit; without this and --downscale 1600, or 800 on a CPU."""
-        reader: str | None = None
-        """Name of the scene's format, or a reader of your own: module:Class or path/to/file.py:Class."""
         device: str = "auto"
         """auto, cpu or cuda."""
         threads: int = 0
@@ -59,20 +49,6 @@ def _request_type() -> type:
         resume: bool = False
         """Continue the run in --out from its last checkpoint; `warpgs fit --out RUN --resume` takes all else but
         --lpips-weights from the run."""
-        strict: bool = False
-        """A frame without an image file is an error."""
-        allow_outside: bool = False
-        """Let names and links of the scene lead to images and masks outside its folder."""
-        masks: str = "ignore"
-        """Fate of pixels that a mask file does not keep: ignore (they do not count) or cutout (they are transparent)."""
-        mask_keeps: str = "white"
-        """Colour of a mask file that keeps a pixel: white or black."""
-        black_is_empty: bool = True
-        """Dark pixels around an object are transparent, where every image shows one on black."""
-        max_pixels: int = MAX_PIXELS
-        """Largest number of pixels that an image or a mask may have as stored."""
-        score_masks: Path | None = None
-        """Folder of object masks for scoring, matched by image id; the scene's idrmasks where not given."""
         lpips_weights: Path | None = None
         """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
         max_error: float | None = None
@@ -88,62 +64,63 @@ def _request_type() -> type:
 
 
 def _load(registry: Registry[Any], name: str) -> type[Any]:
-    """Return the class of a plug-in, importing code of the user's own where it is named by module or file.
-
-    Raises:
-        UsageError: There is no such class, or its code does not run; the message names the line.
-    """
-    try:
-        return registry.load(name)
-    except WarpgsError:
-        raise
-    except Exception as e:  # whatever a user's module raises
-        last = traceback.extract_tb(e.__traceback__)[-1]
-        where = f"{e.filename}, line {e.lineno}" if isinstance(e, SyntaxError) else f"{last.filename}, line {last.lineno}"
-        raise UsageError(
-            f"the {registry.kind} {name!r} cannot be loaded: {type(e).__name__}: {e} ({where}); fix that code, or leave it out"
-        ) from e
+    """Return the class of a plug-in, importing code of the user's own where it is named by module or file."""
+    return load_own(registry.kind, name, lambda: registry.load(name))
 
 
-def _group(name: str) -> str:
-    """Return the name of the flags of a plug-in's own settings: ``my.module:MyStrategy`` has the group ``my_strategy``."""
-    word = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name.rpartition(":")[2])
-    return re.sub(r"\W", "_", word).lower()
+Parts = dict[str, Any]
+"""Loss terms or view modules by the name of their flags."""
 
 
-def _terms(arguments: list[str], base: FitConfig) -> dict[str, Any]:
-    """Return the loss terms that a command line names, with default settings, by the name of their flags."""
-    given = word_after(arguments, "--loss-terms")
+def _parts(registry: Registry[Any], flag: str, arguments: list[str], base: tuple[Any, ...]) -> Parts:
+    """Return the parts of a registry that a command line names after a flag, with default settings; ``base`` without it."""
+    given = word_after(arguments, flag)
     if given is None:
-        return {_group(t.name): t for t in base.loss_terms}
-    terms: dict[str, Any] = {}
+        return {flag_group(p.name): p for p in base}
+    parts: Parts = {}
     for name in filter(None, (n.strip() for n in ("" if given == "none" else given).split(","))):
-        if _group(name) in terms:
-            raise UsageError(f"--loss-terms {given}: two terms have the flags --{_group(name)}; leave one out")
-        kind = _load(LOSS_TERMS, name)
+        if flag_group(name) in parts:
+            raise UsageError(f"{flag} {given}: two of them have the flags --{flag_group(name)}; leave one out")
+        kind = _load(registry, name)
         try:
-            terms[_group(name)] = kind()
+            parts[flag_group(name)] = kind()
         except TypeError as e:
-            raise UsageError(f"the loss term {name!r} has a setting without a default ({e}); give every field one") from e
-    return terms
+            raise UsageError(f"the {registry.kind} {name!r} has a setting without a default ({e}); give every field one") from e
+    return parts
 
 
-def _preset(arguments: list[str]) -> FitConfig:
-    """Return the settings that the flags start from."""
-    name = word_after(arguments, "--preset") or DEFAULT_PRESET
-    if name not in PRESETS:
-        raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
-    base = PRESETS[name]
+def _view_modules(arguments: list[str], base: FitConfig) -> Parts:
+    """Return the view modules that a command line names; each of ours has a flag of its name, too."""
+    modules = _parts(VIEW_MODULES, "--view-modules", arguments, base.view_modules)
+    for name in VIEW_MODULES.names():
+        flag = name.replace("_", "-")
+        words = [w for w in (a.replace("_", "-") for a in arguments) if w in (f"--{flag}", f"--no-{flag}")]
+        if words and words[-1] == f"--{flag}":
+            modules.setdefault(name, VIEW_MODULES.find(name)())
+        elif words:
+            modules.pop(name, None)
+    return modules
+
+
+def _preset(arguments: list[str]) -> tuple[FitConfig, str]:
+    """Return the settings that the flags start from, and words on where they come from."""
+    name = word_after(arguments, "--preset")
+    base, origin = load_own("preset", str(name), lambda: preset_settings(name))
     strategy = word_after(arguments, "--strategy")
     if strategy is None or strategy == base.strategy:
-        return base
+        return base, origin
     own = _load(STRATEGIES, strategy).Config
-    return dataclasses.replace(base, strategy=strategy, strategy_config=None if own is None else own())
+    return dataclasses.replace(base, strategy=strategy, strategy_config=None if own is None else own()), origin
 
 
-def _presets() -> str:
-    """Return the presets and what they are, for people."""
-    return "presets:\n" + "\n".join(f"  {name}: {note}" for name, note in PRESET_NOTES.items())
+def _choices() -> str:
+    """Return what there is to choose from by name, for people."""
+    plug_ins: dict[str, Registry[Any]] = {
+        "strategies": STRATEGIES, "loss terms": LOSS_TERMS, "readers": READERS, "camera models": CAMERA_MODELS,
+        "view modules": VIEW_MODULES,
+    }  # fmt: skip
+    lines = {"presets": PRESETS.described(), **{title: registry.described() for title, registry in plug_ins.items()}}
+    return "\n\n".join(listed(title, about) for title, about in lines.items())
 
 
 def _size() -> Any:
@@ -157,44 +134,56 @@ def _size() -> Any:
     )  # fmt: skip
 
 
-def _names(terms: dict[str, Any]) -> Any:
-    """Return the specification of the flag that names loss terms; their settings are flags of their own."""
+def _names(parts: Parts) -> Any:
+    """Return the specification of a flag that names parts of a registry; their settings are flags of their own."""
     import tyro
 
     return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1, metavar="NAME,...", instance_from_str=lambda words: tuple(terms.values()),
+        nargs=1, metavar="NAME,...", instance_from_str=lambda words: tuple(parts.values()),
         is_instance=lambda value: isinstance(value, tuple),
         str_from_instance=lambda value: [",".join(t.name for t in value) or "none"],
     )  # fmt: skip
 
 
-def _flags(base: FitConfig, terms: dict[str, Any]) -> type:
-    """Return the dataclass of all flags: the request, the settings ``base``, and those of the strategy and of loss terms."""
+def _flags(base: FitConfig, terms: Parts, modules: Parts) -> type:
+    """Return the dataclass of all flags: the request, ``base``, the settings of strategy, loss terms and view modules."""
     import tyro
 
     special = {
-        "memory_limit": (_size(),), "loss_terms": (_names(terms),), "priors": (tyro.conf.OmitArgPrefixes,),
-        "strategy_config": (tyro.conf.Fixed, tyro.conf.Suppress),
+        "memory_limit": (_size(),), "loss_terms": (_names(terms),), "view_modules": (_names(modules),),
+        "priors": (tyro.conf.OmitArgPrefixes,), "strategy_config": (tyro.conf.Fixed, tyro.conf.Suppress),
     }  # fmt: skip
-    kind, default = flags_of(FitConfig, dataclasses.replace(base, loss_terms=tuple(terms.values())), special)
+    chosen = dataclasses.replace(base, loss_terms=tuple(terms.values()), view_modules=tuple(modules.values()))
+    kind, default = flags_of(FitConfig, chosen, special)
     fields: list[tuple[str, Any, Any]] = [("config", Annotated[kind, tyro.conf.arg(name="")], field(default=default))]
-    own = {} if base.strategy_config is None else {_group(base.strategy): base.strategy_config}
-    taken = {f.name for kind in (FitConfig, _request_type()) for f in dataclasses.fields(kind)} | {"config"}
-    for name, settings in [*own.items(), *terms.items()]:
+    own = {} if base.strategy_config is None else {flag_group(base.strategy): base.strategy_config}
+    reading, unread = scene_flags(positional=True)
+    fields.append(("reading", Annotated[reading, tyro.conf.arg(name="")], field(default=unread)))
+    kinds = (FitConfig, SceneRequest, _request_type())
+    taken = {f.name for kind in kinds for f in dataclasses.fields(kind)} | {"config", "reading"}
+    for name, settings in [*own.items(), *terms.items(), *modules.items()]:
         if name in taken:
             raise UsageError(f"a plug-in has the name {name}, whose flags --{name} there are already; call it something else")
         taken.add(name)
         group, default = flags_of(type(settings), settings)
-        fields.append((name, group, field(default=default)))
+        fields.append((f"{name}_settings", Annotated[group, tyro.conf.arg(name=name)], field(default=default)))
+    for name in VIEW_MODULES.names():
+        about = (inspect.getdoc(VIEW_MODULES.find(name)) or "").partition("\n\n")[0]
+        fields.append((name, Annotated[bool, tyro.conf.arg(help=about)], field(default=name in modules)))
     return dataclasses.make_dataclass("Fit", fields, bases=(_request_type(),), frozen=True, kw_only=True)
 
 
-def _config(a: Any, base: FitConfig, terms: dict[str, Any]) -> FitConfig:
+def _config(a: Any, base: FitConfig, terms: Parts, modules: Parts) -> FitConfig:
     """Return the settings that parsed flags stand for."""
+
+    def settings(name: str, part: Any) -> Any:
+        return settings_of(type(part), getattr(a, f"{name}_settings"))
+
     config, own = settings_of(FitConfig, a.config), base.strategy_config
     if own is not None:
-        config = dataclasses.replace(config, strategy_config=settings_of(type(own), getattr(a, _group(base.strategy))))
-    return dataclasses.replace(config, loss_terms=tuple(settings_of(type(t), getattr(a, n)) for n, t in terms.items()))
+        config = dataclasses.replace(config, strategy_config=settings(flag_group(base.strategy), own))
+    found, learned = (tuple(settings(n, p) for n, p in parts.items()) for parts in (terms, modules))
+    return dataclasses.replace(config, loss_terms=found, view_modules=learned)
 
 
 def _chosen(a: Any, arguments: list[str], config: FitConfig) -> tuple[FitConfig, tuple[str, ...]]:
@@ -267,23 +256,19 @@ def request_of(arguments: list[str], about: str) -> FitRequest:
     if _names_a_run_alone(arguments):
         return _continued(arguments, about)
     arguments = ["--help" if word == "--help-all" else word for word in arguments]  # tyro has one help, that of all flags
-    base = _preset(arguments)
-    terms = _terms(arguments, base)
-    a: Any = parse_flags(_flags(base, terms), arguments, "warpgs fit", f"{about}\n\n{_presets()}")
-    if a.reader is not None:
-        _load(READERS, a.reader)
+    base, origin = _preset(arguments)
+    parts = _parts(LOSS_TERMS, "--loss-terms", arguments, base.loss_terms), _view_modules(arguments, base)
+    a: Any = parse_flags(_flags(base, *parts), arguments, "warpgs fit", f"{about}\n\n{_choices()}")
+    scene = scene_of(a.reading, a.reading.path)
     check_range("--threads", a.threads, 0, MAX_THREADS)
     check_range("--view-port", a.view_port, 0, 65535)
     if a.threads:
         set_threads(a.threads)
-    config, notes = _chosen(a, arguments, _config(a, base, terms))
+    config = dataclasses.replace(_config(a, base, *parts), preset=base.preset)
+    config, chosen = _chosen(a, arguments, config)
+    notes = (origin_note(origin, base, config), *chosen)
     if word_after(arguments, "--preset") is None:
-        say(f"preset {base.preset}: {PRESET_NOTES[base.preset]}")
-    masks = None if a.score_masks is None else os.path.realpath(a.score_masks)
-    scene = SceneRequest(
-        str(a.scene), a.split, a.downscale, a.strict, a.allow_outside, a.masks, a.mask_keeps, a.black_is_empty, masks, a.reader,
-        a.max_pixels, a.max_side,
-    )  # fmt: skip
+        say(f"preset {base.preset}: {PRESETS.described()[base.preset]}")
     view_port = a.view_port if a.view else None
     return FitRequest(scene, a.out, config, a.device, a.resume, a.lpips_weights, a.time_budget, notes, view_port)
 

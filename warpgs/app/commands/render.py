@@ -19,7 +19,7 @@ def run(arguments: list[str], about: str) -> int:
     @dataclass(frozen=True)
     class Render:
         run: tyro.conf.Positional[Path]
-        """Run folder of `warpgs fit`, or a file of Gaussians trained anywhere: .ply, .spz, .sog, .glb and others."""
+        """Run folder of `warpgs fit`, or a file of Gaussians trained anywhere, in a format of `warpgs convert`."""
         cameras: Path | None = None
         """Cameras that a file of Gaussians is seen through: cameras.json, transforms.json, COLMAP's folder, or a scene."""
         rule: str | None = None

@@ -1,7 +1,8 @@
 """`warpgs compare` and `warpgs ablate`: what they share. Parses, calls, prints; no logic."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
+from typing import Annotated
 
 from warpgs.runtime.terminal import say
 
@@ -10,7 +11,9 @@ def study_flags() -> type:
     """Return the dataclass of the flags that `compare` and `ablate` share."""
     import tyro
 
-    from warpgs.io.decoding import MAX_PIXELS
+    from warpgs.app.scene_flags import scene_flags
+
+    reading, unread = scene_flags(positional=False)
 
     @dataclass(frozen=True, kw_only=True)
     class Study:
@@ -20,16 +23,6 @@ def study_flags() -> type:
         """Folder of the study; the same command on it goes on where it stopped."""
         seeds: int = 5
         """Runs of each setting on each scene, seeds 0, 1, ..."""
-        split: str | None = None
-        """As in `warpgs fit`, for all scenes; where not given, every 8th view or the middle one is held out."""
-        downscale: int | None = None
-        """Factor by which both image sides shrink; with it, images keep what it leaves of them."""
-        max_side: int | None = None
-        """Longest side that an image keeps [px], 0 for no limit; without this and --downscale 1600, or 800 on a CPU."""
-        allow_outside: bool = False
-        """Let names and links of the scenes lead to images and masks outside their folders."""
-        max_pixels: int = MAX_PIXELS
-        """Largest number of pixels that an image or a mask may have as stored."""
         steps: int | None = None
         """Optimisation steps of every run; as in `warpgs fit` where not given."""
         device: str = "auto"
@@ -42,18 +35,18 @@ def study_flags() -> type:
         lpips_weights: Path | None = None
         """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
 
-    return Study
+    hint = Annotated[reading, tyro.conf.arg(name="")]
+    return make_dataclass("Study", [("reading", hint, field(default=unread))], bases=(Study,), frozen=True, kw_only=True)
 
 
 def run_study_of(a, variants: dict, marks: dict) -> int:
     """Run the study that parsed flags ask for."""
+    from warpgs.app.scene_flags import scene_of
     from warpgs.pipeline.farm.run import EngineRequest
-    from warpgs.pipeline.runs.request import SceneRequest
     from warpgs.pipeline.study.compare import run_study
     from warpgs.pipeline.study.study import StudyRequest
 
-    options = {"allow_outside": a.allow_outside, "max_pixels": a.max_pixels, "max_side": a.max_side}
-    scenes = tuple(SceneRequest(str(s), a.split, a.downscale, **options) for s in a.scenes)
+    scenes = tuple(scene_of(a.reading, str(s)) for s in a.scenes)
     farm = (
         None
         if a.slots is None and a.per_gpu is None

@@ -13,7 +13,7 @@ def run(arguments: list[str], about: str) -> int:
     @dataclass(frozen=True)
     class View:
         what: tyro.conf.Positional[Path]
-        """Run folder of `warpgs fit`, also while it goes on; or a file of Gaussians: .ply, .spz, .sog, .glb and others."""
+        """Run folder of `warpgs fit`, also while it goes on; or a file of Gaussians, in a format of `warpgs convert`."""
         port: int = 8080
         """Port that this machine's browser finds the viewer at; 0 for any free one."""
         device: str = "auto"

@@ -1,0 +1,87 @@
+"""Flags of the commands that write Gaussians: the filters, the format, and the options of each format."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from warpgs.app.flags import either, flags_of, listed, settings_of, word_after
+from warpgs.app.own_code import load_own
+from warpgs.errors import UsageError
+from warpgs.export.base import FORMATS, Format
+from warpgs.export.formats import all_formats, find_format
+from warpgs.pipeline.runs.export_filters import Filters
+from warpgs.plugins import flag_group
+
+
+def format_lines() -> str:
+    """Return the formats by suffix and what they are, for people."""
+    return listed("formats", {f.suffix: f.description for f in all_formats()})
+
+
+def format_flags(arguments: list[str]) -> type:
+    """Return the dataclass of the flags that `export` and `convert` share, those of a format that is named included."""
+    import tyro
+
+    @dataclass(frozen=True, kw_only=True)
+    class Shared:
+        format: str | None = None
+        """Format of your own, as module:Class or path/to/file.py:Class; without it the suffix says the format."""
+        crop: str | None = None
+        """Box to keep, in units of the scene's files: x,y,z,X,Y,Z, or a .json file such as the one that the viewer saves."""
+        clean: tyro.conf.FlagCreatePairsOff[bool] = False
+        """Remove floaters and needles: Gaussians that no training view of a run sees, larger than the scene, or long and thin.
+        Done unless the file is a .ply."""
+        no_clean: tyro.conf.FlagCreatePairsOff[bool] = False
+        """Keep these, too."""
+        sh_degree: int | None = None
+        """Highest degree of harmonics; 0 for colours that are the same from all sides. All where not given."""
+        rotate: str | None = None
+        """Turn the model about the origin: x,y,z,degrees; of a run also level (up as the cameras say)."""
+
+    fields: list[tuple[str, Any, Any]] = []
+    for name, kind in _with_options(word_after(arguments, "--format")).items():
+        flags, default = flags_of(kind, kind())
+        fields.append((name, Annotated[flags, tyro.conf.arg(name=name)], field(default=default)))
+    return dataclasses.make_dataclass("Formatted", fields, bases=(Shared,), frozen=True, kw_only=True)
+
+
+def _with_options(own: str | None) -> dict[str, type]:
+    """Return the options of formats by the group of their flags, those of the user's ``own`` format included."""
+    kinds = [type(f) for f in all_formats()]
+    if own is not None and (kind := type(_found(own))) not in kinds:
+        kinds.append(kind)
+    return {flag_group(k.name): k.Config for k in kinds if k.Config is not None}
+
+
+def _found(choice: str) -> Format:
+    """Return the format that --format names."""
+    load_own(FORMATS.kind, choice, lambda: FORMATS.load(choice))
+    return find_format(choice)
+
+
+def chosen_formats(a: Any, target: Path) -> list[Format]:
+    """Return the formats that parsed flags name, and that of the file to write with its options.
+
+    Args:
+        a: Parsed flags of `format_flags`.
+        target: The file to write.
+
+    Raises:
+        UsageError: There is no such format, or options are given of a format that is not written.
+    """
+    named = [] if a.format is None else [_found(a.format)]
+    written = next((type(f) for f in [*named, *all_formats()] if f.fits(target)), Format)
+    for group, config in _with_options(a.format).items():
+        if settings_of(config, getattr(a, group)) != config() and config is not written.Config:
+            flag = group.replace("_", "-")
+            raise UsageError(f"--{flag}.* are options of another format than that of {target}; leave them out")
+    if written.Config is None:
+        return named
+    made = written(settings_of(written.Config, getattr(a, flag_group(written.name))))
+    return [made, *(f for f in named if type(f) is not written)]
+
+
+def filters_of(a: Any) -> Filters:
+    """Return the filters that parsed flags of `format_flags` stand for."""
+    return Filters(a.crop, either(a, "clean"), a.sh_degree, a.rotate)

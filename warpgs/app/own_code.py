@@ -1,0 +1,32 @@
+"""Loading of code of the user's own that a command line names."""
+
+import traceback
+from collections.abc import Callable
+from typing import TypeVar
+
+from warpgs.errors import UsageError, WarpgsError
+
+Loaded = TypeVar("Loaded")
+
+
+def load_own(kind: str, spec: str, load: Callable[[], Loaded]) -> Loaded:
+    """Return what ``load`` returns; an error of the code that it imports becomes one sentence.
+
+    Args:
+        kind: What is loaded, for messages.
+        spec: Name, ``module:NAME`` or ``path/to/file.py:NAME``.
+        load: Function that loads it.
+
+    Raises:
+        UsageError: It is not there, or its code does not run; the message names the line.
+    """
+    try:
+        return load()
+    except WarpgsError:
+        raise
+    except Exception as e:  # whatever a user's module raises
+        last = traceback.extract_tb(e.__traceback__)[-1]
+        where = f"{e.filename}, line {e.lineno}" if isinstance(e, SyntaxError) else f"{last.filename}, line {last.lineno}"
+        raise UsageError(
+            f"the {kind} {spec!r} cannot be loaded: {type(e).__name__}: {e} ({where}); fix that code, or leave it out"
+        ) from e

@@ -1,0 +1,39 @@
+"""Flags of how a scene is read: those of `SceneRequest`, for every command that reads one."""
+
+import dataclasses
+import os
+from typing import Any
+
+from warpgs.app.flags import flags_of, settings_of
+from warpgs.app.own_code import load_own
+from warpgs.io.readers import READERS
+from warpgs.pipeline.runs.request import SceneRequest
+
+
+def scene_flags(*, positional: bool) -> tuple[type, Any]:
+    """Return the dataclass of the flags, and their defaults.
+
+    Args:
+        positional: Whether the folder is one of them, without a flag; else the command names its scenes itself.
+    """
+    import tyro
+
+    if positional:
+        path, shown = tyro.MISSING, (tyro.conf.Positional, tyro.conf.arg(metavar="SCENE"))
+    else:
+        path, shown = "", (tyro.conf.Fixed, tyro.conf.Suppress)
+    return flags_of(SceneRequest, SceneRequest(path), {"path": shown})
+
+
+def scene_of(flags: Any, path: str) -> SceneRequest:
+    """Return the request for a scene folder that parsed flags stand for; a reader of the user's own is loaded.
+
+    Raises:
+        UsageError: There is no such reader.
+    """
+    asked = settings_of(SceneRequest, flags)
+    if asked.reader is not None:
+        reader = asked.reader
+        load_own(READERS.kind, reader, lambda: READERS.load(reader))
+    masks = None if asked.score_masks is None else os.path.realpath(asked.score_masks)
+    return dataclasses.replace(asked, path=path, score_masks=masks)

@@ -1,0 +1,128 @@
+"""The interface of a file format of Gaussians, and the formats by name.
+
+One module of `warpgs.export` holds one format and registers it. A format of your own is one class in one file, named as
+``module:Class`` or ``path/to/file.py:Class``.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, BinaryIO, ClassVar
+
+import numpy as np
+
+from warpgs.coordinates import checked_normalization, convert_gaussians
+from warpgs.errors import DataError, UsageError
+from warpgs.export.arrays import Arrays, arrays_of, check_finite, gaussians_of, malformed
+from warpgs.files import write_bytes
+from warpgs.input_files import open_input, read_input, unread_reason
+from warpgs.plugins import Registry
+from warpgs.scene import Gaussians, Normalization
+
+_BROKEN = (
+    struct.error, zlib.error, zipfile.BadZipFile, EOFError, ValueError, KeyError, TypeError, IndexError, OverflowError,
+    NotImplementedError, RecursionError, RuntimeError, OSError,
+)  # fmt: skip
+"""What the decoders of the standard library, zstandard and our own raise about content that makes no sense: zipfile reports
+encryption as RuntimeError, methods it does not know as NotImplementedError, and seeks before the start as OSError."""
+
+
+class Format:
+    """A file format of Gaussians. One of your own derives from this and defines `encode`, `decode` or both."""
+
+    name: ClassVar[str] = ""
+    """Name that it is registered by."""
+    suffix: ClassVar[str] = ""
+    """End of the names of its files in lower case, with the dot, such as ``.spz``."""
+    description: ClassVar[str] = ""
+    """One line about it for the help."""
+    Config: ClassVar[type | None] = None
+    """Frozen dataclass of its options for writing, None for none. They become flags, grouped under the format's name."""
+    cleaned: ClassVar[bool] = True
+    """True where exports are cleaned of floaters and needles unless asked otherwise."""
+    sorted: ClassVar[bool] = False
+    """True where Gaussians that are near each other in space should be so in the file."""
+    archive: ClassVar[bool] = False
+    """True where `decode` gets the open file instead of its bytes, because it holds other files."""
+    max_degree: ClassVar[int] = 3
+    """Highest degree of spherical harmonics that it holds."""
+    note: ClassVar[str] = ""
+    """Sentence for users on its axes, where programs disagree on them."""
+
+    def __init__(self, config: Any = None):
+        """Take its options, an instance of ``Config``; None for their defaults."""
+        self.config: Any = self.Config() if config is None and self.Config is not None else config
+        """The options."""
+
+    def encode(self, arrays: Arrays) -> Iterable[bytes]:
+        """Return the bytes of a file, in pieces.
+
+        Args:
+            arrays: The tensors of `Gaussians` by name, as finite numpy arrays: means [N, 3] and log scales [N, 3] in file
+                units, quats wxyz of any length [N, 4], logit opacities [N], spherical harmonics [N, K, 3].
+
+        Raises:
+            UsageError: The format does not define it.
+        """
+        raise UsageError(f"{self.suffix} files are read here, not written: {type(self).__name__} defines no encode")
+
+    def decode(self, path: Path, data: Any) -> Arrays:
+        """Return the arrays that `encode` takes.
+
+        Args:
+            path: The file, for messages.
+            data: Its bytes; of an ``archive`` the open file.
+
+        Raises:
+            UsageError: The format does not define it.
+        """
+        raise UsageError(f"{path}: {self.suffix} files are written here, not read: {type(self).__name__} defines no decode")
+
+    def fits(self, path: str | os.PathLike[str]) -> bool:
+        """Return whether a file's name ends as those of the format."""
+        return Path(path).name.lower().endswith(self.suffix)
+
+    def write(self, path: Path, gaussians: Gaussians, normalization: Normalization | None, units: str) -> None:
+        """Write Gaussians as `warpgs.export.formats.write_gaussians` is asked to.
+
+        Raises:
+            DataError: There is none, or a number is not finite or cannot be held.
+        """
+        if not len(gaussians):
+            raise DataError(f"{path}: not written, the model holds no Gaussian. Use .ply for an empty model")
+        normalization = checked_normalization(normalization, units, f"{path}: not written")
+        for g in (gaussians, convert_gaussians(gaussians, normalization, units, "file")):
+            arrays = arrays_of(g)
+            check_finite(path, arrays)
+        if self.max_degree == 0:
+            arrays["sh"] = arrays["sh"][:, :1]
+        write_bytes(path, *self.encode(arrays))
+
+    def read(self, path: Path, normalization: Normalization | None, units: str) -> Gaussians:
+        """Read Gaussians as `warpgs.export.formats.read_gaussians` is asked to.
+
+        Raises:
+            DataError: The file is missing or malformed.
+        """
+        normalization = checked_normalization(normalization, units, str(path))
+        try:
+            data: BinaryIO = open_input(path) if self.archive else io.BytesIO(read_input(path))
+        except OSError as e:
+            raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
+        try:
+            with data, np.errstate(all="ignore"):  # infinities and NaN of a broken file are named below, with their Gaussian
+                arrays = self.decode(path, data if self.archive else data.read())
+        except _BROKEN as e:
+            raise malformed(path, f"its content makes no sense ({type(e).__name__}: {str(e)[:80]})") from e
+        return convert_gaussians(gaussians_of(path, arrays), normalization, "file", units)
+
+
+FORMATS: Registry[Format] = Registry("format", Format, __package__)
+"""File formats of Gaussians by name; the modules of this folder are ours."""
+register = FORMATS.register
