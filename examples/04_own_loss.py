@@ -12,13 +12,14 @@ import dataclasses
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
 from PIL import Image
 
 import warpgs
-from warpgs.pipeline.train.loss import Target, register
+from warpgs.pipeline.train.loss import LossInputs, register
 
 
 def roughness(depth: torch.Tensor, alpha: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
@@ -44,12 +45,13 @@ def roughness(depth: torch.Tensor, alpha: torch.Tensor, image: torch.Tensor) -> 
 class DepthSmoothness(warpgs.LossTerm):
     """Edge-aware smoothness of the rendered inverse depth."""
 
+    needs_outputs: ClassVar[tuple[str, ...]] = ("alpha", "depth")
     weight: float = 0.5
     """Weight of the term."""
 
-    def __call__(self, render: warpgs.Render, target: Target, gaussians: warpgs.Gaussians) -> torch.Tensor:
+    def __call__(self, inputs: LossInputs) -> torch.Tensor:
         """Return the weighted roughness of the step's view."""
-        return self.weight * roughness(render.depth, render.alpha, target.image)
+        return self.weight * roughness(inputs.outputs["depth"], inputs.outputs["alpha"], inputs.target.image)
 
 
 def main(arguments: list[str] | None = None) -> float:

@@ -58,11 +58,11 @@ class Sprout(warpgs.Strategy):
 
     def due(self, step: int) -> bool:
         """Return whether the set changes after a step; the last fifth of the fit is left alone."""
-        return step % self.config.every == 0 and step <= 0.8 * self.trainer.steps
+        return step % self.config.every == 0 and step <= 0.8 * self.context.steps
 
     def update(self, step: int) -> Iterator[DensityUpdate]:
         """Add and remove."""
-        t = self.trainer
+        t = self.context
         g, pull = t.gaussians, t.table.columns["pull"]
         count = max(0, min(int(self.config.growth * len(g)), t.capacity - len(g)))
         parents = pull.topk(count).indices

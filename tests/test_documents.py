@@ -4,8 +4,6 @@ import re
 from pathlib import Path
 from types import SimpleNamespace
 
-import pytest
-
 from warpgs import PRESETS
 from warpgs.pipeline.train.by_views import settings_by_views
 
@@ -13,10 +11,6 @@ ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 """Decisions and the changelog are left out: they tell what was, too."""
 HOMES = [ROOT, ROOT / "tests", ROOT / "warpgs", ROOT / "warpgs/pipeline"]
-CODE = " ".join(
-    p.read_text("utf-8") for folder in ("warpgs", "bench", "tools", "tests", "examples") for p in (ROOT / folder).rglob("*.py")
-)
-KNOWN = set(re.findall(r"\w+", CODE))
 
 
 def named_files(text: str) -> set[tuple[str, str]]:
@@ -25,26 +19,30 @@ def named_files(text: str) -> set[tuple[str, str]]:
     return {(name, test) for name, test in found if not name.endswith(("/X.py", "_X.py"))}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
-def test_named_files_and_tests_are_there(page):
+def test_named_files_and_tests_are_there():
     """Every path of code leads to a file, and every test named behind it is in that file."""
     missing = []
-    for name, test in sorted(named_files(page.read_text("utf-8"))):
+    for page, (name, test) in ((p, named) for p in PAGES for named in sorted(named_files(p.read_text("utf-8")))):
         found = [home / name for home in HOMES if (home / name).is_file()]
         if not found:
-            missing.append(name)
+            missing.append(f"{page.name}: {name}")
         elif test and f"def {test}(" not in found[0].read_text("utf-8"):
-            missing.append(f"{name}::{test}")
-    assert not missing, f"{page.name} names what is not there: {', '.join(missing)}"
+            missing.append(f"{page.name}: {name}::{test}")
+    assert not missing, f"pages name what is not there: {', '.join(missing)}"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
-def test_named_flags_are_there(page):
+def test_named_flags_are_there():
     """Every flag in code font or in a command has a name that the code knows."""
-    flags = set(re.findall(r"(?<![\w-])--([a-z][a-z0-9.-]*[a-z0-9])", page.read_text("utf-8")))
-    parts = {flag: [part.replace("-", "_") for part in flag.split(".")] for flag in flags}
-    missing = sorted(f for f, names in parts.items() if not all(n in KNOWN or n.removeprefix("no_") in KNOWN for n in names))
-    assert not missing, f"{page.name} names flags that no command has: {', '.join(missing)}"
+    folders = ("warpgs", "bench", "tools", "tests", "examples")
+    known = {w for folder in folders for p in (ROOT / folder).rglob("*.py") for w in re.findall(r"\w+", p.read_text("utf-8"))}
+    missing = []
+    for page in PAGES:
+        flags = set(re.findall(r"(?<![\w-])--([a-z][a-z0-9.-]*[a-z0-9])", page.read_text("utf-8")))
+        parts = {flag: [part.replace("-", "_") for part in flag.split(".")] for flag in flags}
+        missing += [
+            f"{page.name}: --{f}" for f, names in sorted(parts.items()) if not {n.removeprefix("no_") for n in names} <= known
+        ]
+    assert not missing, f"pages name flags that no command has: {', '.join(missing)}"
 
 
 def test_the_page_on_presets_says_what_the_rule_chooses():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from warpgs.app.commands.fit import request_of
 from warpgs.synthetic.demo import write_demo
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -18,6 +19,7 @@ SMALL = {
     "04_own_loss": (["--steps", "20", "--width", "48", "--weight", "5"], "smooth.png", lambda left: left < 0.9),
     "05_own_strategy": (["--steps", "200", "--width", "48", "--start", "100"], "sprout.png", lambda gain: gain > 0.2),
     "07_rasterizer_in_another_trainer": (["--steps", "40", "--width", "48"], "render.png", lambda gain: gain > 1),
+    "08_feature_field": (["--steps", "40", "--count", "150", "--size", "40"], "features.png", lambda gain: gain > 0.7),
 }
 """Flags for a test, an image that is written, and what the returned figure must fulfil."""
 
@@ -56,3 +58,12 @@ def test_every_example_says_how_it_is_run():
         text = path.read_text("utf-8")
         assert re.match(r"\d\d_\w+\.py$", path.name) and f"python examples/{path.name}" in text.split('"""')[1], path.name
         assert '"--out"' in text and ('"--steps"' in text or "optim" not in text), path.name
+
+
+@pytest.mark.parametrize("path", sorted((EXAMPLES / "loss_terms").glob("*.py")), ids=lambda p: p.stem)
+def test_loss_terms_are_taken_from_their_files(path, monkeypatch):
+    """By the command that the docstring shows, with a setting as a flag."""
+    monkeypatch.chdir(EXAMPLES.parent)
+    (command,) = re.findall(r"^ +warpgs fit (.*)$", path.read_text("utf-8").split('"""')[1], re.MULTILINE)
+    (term,) = request_of(command.split(), "").config.loss_terms
+    assert f"examples/loss_terms/{path.name}:{type(term).__name__}" in command and term.weight == float(command.split()[-1])

@@ -65,6 +65,53 @@ def test_points_come_back_from_pixels_and_depths():
         assert np.allclose(found.numpy(), points, atol=1e-12)
 
 
+def plane_depth(cam: Camera, normal: torch.Tensor, distance: float) -> torch.Tensor:
+    """Depth [H, W] of the plane of the world points x with normal . x = distance."""
+    y, x = torch.meshgrid(torch.arange(cam.height) + 0.5, torch.arange(cam.width) + 0.5, indexing="ij")
+    R, t = cam.viewmat[:3, :3], cam.viewmat[:3, 3]
+    rays = torch.stack([(x - cam.K[0, 2]) / cam.K[0, 0], (y - cam.K[1, 2]) / cam.K[1, 1], torch.ones_like(x)], -1).double()
+    return (distance + normal @ R.T @ t) / (rays @ R @ normal)
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1.0, 1e12])
+def test_normals_of_a_plane(dtype, unit):
+    """The plane's own, towards the camera, in any unit of length; zero at the border and around pixels without depth."""
+    cam = camera(40, 30, cameras=4)
+    normal = torch.nn.functional.normalize(torch.tensor([0.3, -0.5, 1.2], dtype=torch.float64), dim=0)
+    for viewmat, K in zip(cam.viewmat, cam.K):
+        viewmat = torch.cat([viewmat[:, :3], viewmat[:, 3:] * torch.tensor([[unit]] * 3 + [[1.0]])], 1)
+        one = Camera(viewmat, K, 40, 30)
+        depth = plane_depth(one, normal, 4 * unit)
+        assert bool((depth > 0).all())
+        depth[10, 20] = 0
+        normals = geometry.depth_normals(dataclasses.replace(one, viewmat=viewmat.to(dtype), K=K.to(dtype)), depth.to(dtype))
+        none = torch.zeros(30, 40, dtype=torch.bool)
+        none[[0, -1]], none[:, [0, -1]] = True, True
+        none[9:12, 20], none[10, 19:22] = True, True
+        assert bool((normals[none] == 0).all())
+        assert torch.allclose(normals[~none], -normal.to(dtype), atol=1e-12 if dtype == torch.float64 else 1e-3)
+
+
+def test_gradient_of_normals():
+    """By depth and camera, in float64 against central differences; none, not NaN, where there is no depth."""
+    cam = camera(7, 6)
+    depth = 3 + torch.rand(6, 7, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    depth[2, 3] = 0
+
+    def normals(depth, viewmat, K):
+        return geometry.depth_normals(dataclasses.replace(cam, viewmat=viewmat, K=K), depth)
+
+    inputs = [t.clone().requires_grad_() for t in (depth, cam.viewmat, cam.K)]
+    assert torch.autograd.gradcheck(lambda v, K: normals(depth, v, K), inputs[1:], eps=1e-6, atol=1e-8)
+    held = depth == 0  # a step there would give it depth
+    assert torch.autograd.gradcheck(lambda d: normals(torch.where(held, 0, d), *inputs[1:]), inputs[0], eps=1e-6, atol=1e-8)
+    (gradient,) = torch.autograd.grad(normals(*inputs)[..., 0].sum(), inputs[0])
+    assert float(gradient[2, 3]) == 0 and bool(gradient.isfinite().all()) and bool(gradient.any())
+    depth[4, 4] = torch.nan
+    assert bool(normals(depth, cam.viewmat, cam.K).isnan().any())
+    assert not bool(geometry.depth_normals(cam, depth[:2]).any())
+
+
 def test_other_camera_models_are_refused():
     """Their projection is known to the kernels alone: an error, not wrong points."""
     cam = camera()

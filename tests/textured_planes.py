@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from tests.scenes import ring
-from warpgs.scene import PointCloud, View
+from warpgs.scene import View
 
 SUPER = 3
 """Rays along each side of a pixel."""
@@ -43,39 +43,3 @@ def photos(
         image = fine.reshape(height, SUPER, width, SUPER, 3).mean((1, 3))
         views.append(View(f"{i:02d}.png", c, (np.round(255 * image) / 255).astype(np.float32)))
     return views
-
-
-def points(count: int = 400, half: tuple[float, float] = HALF) -> PointCloud:
-    """Gray points on the card."""
-    generator = np.random.default_rng(1)
-    at = generator.uniform(-1, 1, (count, 3)) * [*half, 0]
-    return PointCloud(at, np.full((count, 3), 0.5, np.float32))
-
-
-def plain(x: np.ndarray, y: np.ndarray, place: float) -> np.ndarray:
-    """One colour."""
-    return np.broadcast_to([0.8, 0.3, 0.2], (*x.shape, 3))
-
-
-def smooth(x: np.ndarray, y: np.ndarray, place: float) -> np.ndarray:
-    """A slow gradient of colour."""
-    return np.stack([0.5 + 0.3 * np.sin(2 * x), 0.5 + 0.3 * np.cos(3 * y), 0.4 + 0.2 * x * y], -1)
-
-
-def waves(x: np.ndarray, y: np.ndarray, place: float) -> np.ndarray:
-    """Slow waves in several directions."""
-    red = 0.5 + 0.2 * np.sin(1.3 * x + 0.7 * y) + 0.15 * np.cos(2.1 * y - 1.1 * x)
-    return np.stack([red, 0.45 + 0.25 * np.cos(1.7 * x - 0.4 * y), 0.5 + 0.2 * np.sin(2.3 * y) * np.cos(0.9 * x)], -1)
-
-
-def rings(x: np.ndarray, y: np.ndarray, place: float) -> np.ndarray:
-    """Slow rings around the middle."""
-    r = np.sqrt(x * x + y * y + 0.05)
-    return np.stack([0.5 + 0.3 * np.cos(2.2 * r), 0.5 + 0.25 * np.sin(1.8 * r + 0.5), 0.35 + 0.2 * np.cos(1.2 * r - 0.3)], -1)
-
-
-def half_mirror(x: np.ndarray, y: np.ndarray, place: float) -> np.ndarray:
-    """Left a matt pattern, right a pattern whose brightness goes with the direction it is seen from."""
-    pattern = 0.5 + 0.25 * np.sin(25 * x) * np.cos(25 * y)
-    right = np.clip(pattern + 0.35 * place, 0, 1)
-    return np.stack([np.where(x > 0, right, pattern)] * 3, -1)

@@ -10,17 +10,18 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
+from warpgs.version import __version__ as __version__
+
 # Between its loops torch's OpenMP keeps its threads spinning, on cores that our own launches need: two threads then blend no
 # faster than one. OpenMP reads this once, when torch is imported; whoever set it, or imported torch before us, has their way.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-
-__version__ = "0.2.0"
 
 __all__ = [
     "PRESETS",
     "Camera",
     "FitConfig",
     "FitResult",
+    "Format",
     "Gaussians",
     "LossTerm",
     "Model",
@@ -35,6 +36,7 @@ __all__ = [
     "Strategy",
     "View",
     "ViewMetrics",
+    "ViewModule",
     "clear_graph_cache",
     "evaluate",
     "fit",
@@ -50,6 +52,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from warpgs.export.base import Format
     from warpgs.export.ply import read_ply, write_ply
     from warpgs.io.load import load_scene
     from warpgs.io.readers import Reader
@@ -58,10 +61,12 @@ if TYPE_CHECKING:
     from warpgs.pipeline.model.model_file import Model, load, save
     from warpgs.pipeline.runs.fit import FitResult, fit
     from warpgs.pipeline.runs.folder import StoredRun, open_run
-    from warpgs.pipeline.train.config import PRESETS, FitConfig
+    from warpgs.pipeline.train.config import FitConfig
     from warpgs.pipeline.train.loss import LossTerm
+    from warpgs.pipeline.train.presets import PRESETS
     from warpgs.pipeline.train.step_report import StepReport
     from warpgs.pipeline.train.strategies.base import Strategy
+    from warpgs.pipeline.train.view_modules.base import ViewModule
     from warpgs.render.graphed import clear_graph_cache
     from warpgs.render.rasterize import RasterizeOptions, rasterize
     from warpgs.render.rule_costs import select_rule
@@ -70,6 +75,7 @@ if TYPE_CHECKING:
 _HOMES = {
     name: module
     for module, names in {
+        "warpgs.export.base": ("Format",),
         "warpgs.export.ply": ("read_ply", "write_ply"),
         "warpgs.io.load": ("load_scene",),
         "warpgs.io.readers": ("Reader",),
@@ -78,9 +84,11 @@ _HOMES = {
         "warpgs.pipeline.runs.folder": ("StoredRun", "open_run"),
         "warpgs.pipeline.model.model_file": ("Model", "load", "save"),
         "warpgs.pipeline.films.film": ("render_path",),
-        "warpgs.pipeline.train.config": ("FitConfig", "PRESETS"),
+        "warpgs.pipeline.train.config": ("FitConfig",),
         "warpgs.pipeline.train.loss": ("LossTerm",),
+        "warpgs.pipeline.train.presets": ("PRESETS",),
         "warpgs.pipeline.train.strategies.base": ("Strategy",),
+        "warpgs.pipeline.train.view_modules.base": ("ViewModule",),
         "warpgs.pipeline.train.step_report": ("StepReport",),
         "warpgs.render.graphed": ("clear_graph_cache",),
         "warpgs.render.rasterize": ("RasterizeOptions", "rasterize"),

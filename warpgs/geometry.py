@@ -157,6 +157,46 @@ def back_project_tensors(camera: Camera, pixels: torch.Tensor, depths: torch.Ten
     return (moved[:, :, None] * viewmat[:3, :3]).sum(1)
 
 
+def depth_normals(camera: Camera, depth: torch.Tensor) -> torch.Tensor:
+    """Compute the normals of the surface that a depth map shows, from finite differences of its back-projected pixels.
+
+    A normal is perpendicular to the differences between the neighbours right and left, and below and above: exact for a plane.
+    Differentiable in ``depth``, and in ``camera.viewmat`` and ``camera.K`` where those require gradients. Nothing is read back
+    from the device. A depth that is NaN makes normals NaN.
+
+    Args:
+        camera: Its tensors, of one camera, have the type and device of ``depth``.
+        depth: z-depths [u], above 0 where there is a surface, shape [H, W].
+
+    Returns:
+        Unit normals in the axes of the world, towards the camera, shape [H, W, 3]; 0 at the border of the image, and where the
+        pixel or one of its four neighbours has no depth.
+
+    Raises:
+        UsageError: The camera is no pinhole.
+    """
+    import torch
+
+    check_pinhole(camera)
+    height, width = depth.shape
+    if min(height, width) < 3:
+        return depth.new_zeros(height, width, 3)
+    rows, columns = (torch.arange(n, dtype=depth.dtype, device=depth.device) + 0.5 for n in (height, width))
+    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).view(-1, 2)
+    shown = ~(depth <= 0)  # of a NaN too: it must not vanish
+    depth = torch.where(shown, depth, 1)
+    points = back_project_tensors(camera, pixels, depth.reshape(-1)).view(height, width, 3)
+    size = (depth / camera.K[0, 0]).detach()[1:-1, 1:-1, None]  # of a pixel: in any unit of length, lengths are around 1
+    right = (points[1:-1, 2:] - points[1:-1, :-2]) / size
+    down = (points[2:, 1:-1] - points[:-2, 1:-1]) / size
+    normals = torch.linalg.cross(down, right)
+    square = normals.square().sum(-1, keepdim=True)
+    # the root in float64: float32's has other last digits on other processors (MKL)
+    normals = normals / torch.where(square == 0, 1, square).double().sqrt().to(depth.dtype)
+    inner = shown[1:-1, 1:-1] & shown[1:-1, 2:] & shown[1:-1, :-2] & shown[2:, 1:-1] & shown[:-2, 1:-1]
+    return torch.nn.functional.pad(torch.where(inner[..., None], normals, 0), (0, 0, 1, 1, 1, 1))
+
+
 def in_image(camera: Camera, points: np.ndarray, near: float = 0.0) -> np.ndarray:
     """Return a mask [N], True where a world point [N, 3] is beyond ``near`` [u] and inside the camera's image."""
     pixels, z = project_points(camera, points)

@@ -232,7 +232,7 @@ class Render:
     """Result of the rasterizer for one camera (no leading axis) or for a batch of C cameras (leading axis C)."""
 
     rgb: torch.Tensor
-    """Colour over the background, shape [..., H, W, 3]; not clamped."""
+    """Colour over the background, shape [..., H, W, 3]; not clamped. Of D channels where ``RasterizeOptions.colors`` has D."""
     alpha: torch.Tensor
     """Accumulated opacity in [0, 1], shape [..., H, W]."""
     depth: torch.Tensor
@@ -251,6 +251,8 @@ class Render:
     median_depth: torch.Tensor | None = None
     """z-depth [u] of the Gaussian at which transmittance falls to one half, shape [..., H, W]; 0 where alpha is below 1/2. No
     gradients flow into it; only where it was requested."""
+    features: torch.Tensor | None = None
+    """Channels of ``RasterizeOptions.features`` over their background, shape [..., H, W, D]; only where those were given."""
 
     @property
     def visible(self) -> torch.Tensor:

@@ -30,7 +30,8 @@ from warpgs.pipeline.farm.local import LocalEngine, Slot
 from warpgs.pipeline.farm.record import LOG, PLY, file_digest
 from warpgs.pipeline.farm.run import EngineRequest, make_engine
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest
-from warpgs.pipeline.train.config import PRESETS, FitConfig
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.presets import PRESETS
 from warpgs.synthetic.demo import split_spec, write_demo
 
 VIEWS, WIDTH, HEIGHT = 8, 126, 94

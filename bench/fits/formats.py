@@ -17,7 +17,7 @@ from bench.lib.arguments import parse
 from bench.lib.scorer import Scorer
 from warpgs.export import spz
 from warpgs.export.arrays import arrays_of
-from warpgs.export.formats import FORMATS, read_gaussians
+from warpgs.export.formats import read_gaussians, suffixes
 from warpgs.pipeline.runs.export_filters import Filters
 from warpgs.pipeline.runs.export_model import export
 
@@ -29,7 +29,7 @@ def rows_of(folder: Path) -> list[dict]:
     scorer, rows = Scorer(folder), []
     known = {"run": folder.name, "of": len(scorer.run.gaussians()), "psnr": scorer.own}
     with tempfile.TemporaryDirectory() as name:
-        for suffix in FORMATS:
+        for suffix in suffixes():
             for clean in (False, True):
                 file = Path(name) / f"model{suffix}"
                 start = time.perf_counter()

@@ -23,8 +23,8 @@ from bench.lib.arguments import SCENE, parse
 from bench.lib.refined_views import refined
 from bench.lib.tables import mean_sd
 from warpgs.io.images import Lens, load_image
-from warpgs.pipeline.runs.cameras_after_fit import similar_cameras
 from warpgs.pipeline.runs.request import choose_device
+from warpgs.pipeline.train.view_modules.poses import similar_cameras
 from warpgs.poses.find import find_poses
 from warpgs.scene import Camera, Scene, View
 

@@ -27,9 +27,9 @@ from warpgs import load_scene
 from warpgs.io.splits import split_views
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.request import choose_device
-from warpgs.pipeline.train.config import PRESETS
 from warpgs.pipeline.train.loop import train_views
-from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.runtime.ranks import Ranks, join
 from warpgs.scene import Camera, PointCloud, View

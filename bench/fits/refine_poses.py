@@ -22,10 +22,9 @@ from bench.lib.arguments import SCENE, parse
 from bench.lib.refined_views import refined
 from warpgs.geometry import camera_extent, matmul
 from warpgs.io.splits import split_views
-from warpgs.pipeline.runs.cameras_after_fit import similar_cameras
 from warpgs.pipeline.runs.request import choose_device
-from warpgs.pipeline.train.config import PRESETS
-from warpgs.pipeline.train.refine_poses import increments
+from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.view_modules.poses import RefinePoses, increments, similar_cameras
 from warpgs.runtime.terminal import say
 from warpgs.scene import Camera, Scene
 
@@ -87,7 +86,7 @@ def main() -> None:
         config = config if a.steps is None else dataclasses.replace(config, steps=a.steps)
         off = noisy_scene(scene, split.train, a.degrees, a.shift, seed)
         for name, data, refine in (("given", scene, False), ("noisy", off, False), ("refined", off, True)):
-            used = dataclasses.replace(config, refine_poses=refine)
+            used = dataclasses.replace(config, view_modules=(RefinePoses(),) if refine else ())
             fit = warpgs.fit(data, used, split=a.split, device=device, verbose=False)
             rows.append({"poses": name, "seed": seed, "preset": a.preset, **figures(fit, scene, split.train, split.test)})
             say(f"seed {seed}, {name}: {rows[-1]}")

@@ -24,7 +24,8 @@ from warpgs.pipeline.metrics.evaluate import render_view, score
 from warpgs.pipeline.runs.prune import prune
 from warpgs.pipeline.runs.request import SceneRequest
 from warpgs.pipeline.runs.results import options_for
-from warpgs.pipeline.train.config import PRESETS, FitConfig, preset_config
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.presets import PRESETS
 from warpgs.scene import Scene, View
 
 PEER, PEER_POINTS = "gsplat", "gsplat-points"
@@ -70,7 +71,6 @@ def config_of(preset: str, seed: int = 0) -> FitConfig:
         UsageError: The preset or a setting is unknown, or a value is out of range.
     """
     name, _, changes = preset.removeprefix(PRUNED).partition(":")
-    name = preset_config(None).preset if name == "default" else name
     if name not in PRESETS:
         raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
     values = PRESETS[name].to_json() | {"seed": seed}

@@ -7,13 +7,17 @@ from collections.abc import Callable
 
 import torch
 
-from warpgs.pipeline.model.parameter_bounds import model_bytes as bytes_of
+from warpgs.kernels.step_buffers import Setting
+from warpgs.pipeline.model.sh_degrees import model_bytes as bytes_of
 from warpgs.pipeline.model.table import DensityUpdate, Table
+from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.complexity import complexity_figures
 from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.context import StrategyContext
+from warpgs.pipeline.train.learned_views import LearnedViews
 from warpgs.pipeline.train.loop import run
-from warpgs.pipeline.train.loss import LossConfig, built_in_terms
-from warpgs.pipeline.train.schedule import OptimizerConfig
+from warpgs.pipeline.train.loss_terms.built_in import LossConfig, built_in_terms
+from warpgs.pipeline.train.schedule import OptimizerConfig, plan_phases
 from warpgs.pipeline.train.step import MAX_STEPS, Learned, StepBuffers, StepGraphs, StepPlan, eager_renderer, step
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.trainer import Trainer
@@ -31,7 +35,7 @@ def make_trainer(
     views: list[View], points: PointCloud | None, config: FitConfig, device: torch.device, background=BLACK, ranks=ALONE
 ) -> Trainer:
     """Return a trainer at step 0."""
-    return Trainer(views, points, config, device, background, ranks=ranks)
+    return Trainer(views, points, settings_by_views(config, views, device.type)[0], device, background, ranks=ranks)
 
 
 def set_gaussians(trainer: Trainer, gaussians: Gaussians) -> None:
@@ -109,12 +113,6 @@ def step_parts(trainer: Trainer) -> tuple[View, dict[str, torch.Tensor], Callabl
     return trainer.views[0], parameters, lambda: table.adam_step(gradients, lrs, going)
 
 
-class _Settings:
-    """All that the base strategy asks of a trainer."""
-
-    config = FitConfig()
-
-
 class Steps:
     """Training steps of given Gaussians on one image: image, L1 and SSIM, backward pass, Adam, as a fit takes them.
 
@@ -131,9 +129,20 @@ class Steps:
         self.rule, self.lr, self.background = rule, lr, torch.zeros(3, device=device)
         self.table = Table.of_gaussians(gaussians, {})
         self.buffers = StepBuffers(device, 3 * len(self.table.params))
-        self._settings = _Settings()  # the strategy holds it by proxy
-        strategy = Strategy(self._settings)  # of the base class: it changes nothing
-        self.learned = Learned(self.table, Table({}, {}, device, 1), strategy, None, torch.zeros(1, 3, device=device))
+        config = FitConfig()
+        context = StrategyContext(
+            config.groups(),
+            None,
+            self.table,
+            torch.Generator(),
+            0,
+            plan_phases(config.phases, MAX_STEPS),
+            1.0,
+            rule,
+            self.background,
+        )
+        strategy = Strategy(context)  # of the base class: it changes nothing
+        self.learned = Learned(self.table, LearnedViews((), (), device, 0), strategy, None, torch.zeros(1, 3, device=device))
         numbers = torch.zeros(1, dtype=torch.int64, device=device)
         self.views = ViewStack(
             camera.viewmat, camera.K, camera.K.new_empty(1, 0), camera.model, target[None], None, {}, numbers
@@ -147,7 +156,8 @@ class Steps:
         fixed = None if self.lr is None else dict.fromkeys(self.table.params, self.lr)
         lrs, heads = (config.lrs(0.0, 1.0), config.head_lrs) if fixed is None else (fixed, {})
         rows = [self.table.lr_row(lrs, k, heads) for k in steps]
-        self.buffers.load([0] * len(steps), rows, [(0.0, k, lrs["means"], 0.0, 0.0, 0.0) for k in steps])
+        settings = [Setting.row(dropout=0.0, number=k, step=k, means_lr=lrs["means"], shift=(0.0, 0.0, 0.0)) for k in steps]
+        self.buffers.load([0] * len(steps), rows, settings)
 
     def eager(self) -> None:
         """Take the first step of a batch from Python, again and again: the same work each time."""

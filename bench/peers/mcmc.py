@@ -25,7 +25,8 @@ from bench.lib.training import make_trainer, with_cap
 from warpgs import load_scene
 from warpgs.io.splits import split_views
 from warpgs.pipeline.runs.request import choose_device
-from warpgs.pipeline.train.config import PRESETS, FitConfig
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.presets import PRESETS
 from warpgs.scene import Scene, View
 
 WHAT = "held-out PSNR of preset 3dgs, of preset mcmc and of gsplat's MCMC under the same cap, by seed"

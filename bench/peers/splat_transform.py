@@ -26,13 +26,13 @@ from bench.lib.columns import STATISTICS, difference, statistics
 from bench.lib.scorer import Scorer
 from warpgs.export import spz
 from warpgs.export.arrays import arrays_of, gaussians_of, half_turn
-from warpgs.export.formats import FORMATS, read_gaussians
+from warpgs.export.formats import read_gaussians, suffixes
 from warpgs.pipeline.runs.export_filters import Filters
 from warpgs.pipeline.runs.export_model import export
 from warpgs.scene import Gaussians
 
 WHAT = "differences between what splat-transform and this program read of the same files, and loss of PSNR of its own files"
-READ = tuple(s for s in FORMATS if s not in (".glb", ".gltf"))
+READ = tuple(s for s in suffixes() if s not in (".glb", ".gltf"))
 """Formats of ours that it reads; of glTF it writes only."""
 WRITTEN = (
     (".compressed.ply", ()), (".spz", ("--spz-version", "3")), (".spz", ("--spz-version", "4")), (".sog", ("-g", "cpu")),

@@ -11,6 +11,7 @@ each: what takes long to import is there already. It answers with the exit code 
 import contextlib
 import ctypes
 import hashlib
+import importlib
 import itertools
 import json
 import os
@@ -20,13 +21,17 @@ import tempfile
 from pathlib import Path
 from unittest import mock
 
+import numpy as np
+
 from tests.faults.calls import Call, numbered
-from warpgs.app.cli import main
+from warpgs.app.cli import COMMANDS, main
 from warpgs.pipeline.farm.engine import Event
 from warpgs.pipeline.farm.job import job_text
 from warpgs.pipeline.farm.work import run_job
-from warpgs.pipeline.runs import results
+from warpgs.pipeline.runs import plot, results
+from warpgs.pipeline.study import compare
 from warpgs.poses import mapping
+from warpgs.report.images import png
 from warpgs.temporary import temporary_folder
 
 SUBREAPER = 36
@@ -50,6 +55,11 @@ class OneProcess:
 
     def close(self) -> None:
         """Do nothing."""
+
+
+def plain_plot(contents: object, size: tuple[int, int], background: str) -> bytes:
+    """Stand in for the renderer of plots, which takes seconds."""
+    return png(np.zeros((*size[::-1], 3), np.float32))
 
 
 def overview(*_: object) -> tuple[None, str]:
@@ -95,7 +105,8 @@ def run_one(words: list[str]) -> int:
 
 def run(root: Path, at: int, trace: Path, commands: list[list[str]]) -> int:
     """Run commands; returns the exit code of the first that fails, or 0."""
-    results.render_overview = overview
+    results.render_overview, plot.render_plot = overview, plain_plot
+    compare.ABLATION_ROWS = {name: compare.ABLATION_ROWS[name] for name in ("full", "no events")}
     with trace.open("wb", buffering=0) as log:
         for words in commands:
             if words[0] == "keep":
@@ -130,10 +141,10 @@ def run_words(words: list[str]) -> int:
 def serve() -> None:
     """Fork for each line of stdin, and answer with exit codes."""
     import warpgs.viewer.watch  # noqa: F401  (and all that commands import late)
-    from warpgs.app.commands import compare, convert, eval, export, farm, fit, mesh, poses, prune, render, view  # noqa: F401
-    from warpgs.pipeline.runs import commands, export_model  # noqa: F401
-    from warpgs.pipeline.study import compare as study  # noqa: F401
+    from warpgs.pipeline.runs import commands, export_model, preview  # noqa: F401
 
+    for name in COMMANDS:
+        importlib.import_module(f"warpgs.app.commands.{name.replace('-', '_')}")
     if sys.platform.startswith("linux"):
         ctypes.CDLL(None).prctl(SUBREAPER, 1, 0, 0, 0)
     for line in sys.stdin:

@@ -15,6 +15,7 @@ from tests.faults.targets import Target, not_finite, register
 from tests.io import scenes
 from tests.priors import networks as nw
 from warpgs.export import ply
+from warpgs.export.formats import read_gaussians
 from warpgs.export.ply_header import parse_header, ply_error
 from warpgs.files import write_json
 from warpgs.io.load import load_scene
@@ -23,7 +24,7 @@ from warpgs.pipeline.metrics import lpips_weights
 from warpgs.pipeline.model import model_file
 from warpgs.pipeline.runs import checkpoint, folder
 from warpgs.pipeline.runs.request import SceneRequest
-from warpgs.pipeline.train.config import PRESETS
+from warpgs.pipeline.train.presets import PRESETS
 from warpgs.priors import flow, onnx_file, preprocess
 from warpgs.scene import Gaussians, Normalization
 
@@ -75,7 +76,7 @@ def ply_files(root: Path) -> list[Path]:
 
 PLY = (ply.read_ply, parse_header, ply._locate_vertices, ply._check_properties, ply._assemble, ply_error)
 PLY_CHANGES = (ply_header(text_number), ply_header(text_line), ply_body, ply_body)
-register(Target("ply", ply_files, lambda root, path: ply.read_ply(path), PLY, PLY_CHANGES, nonsense=nonsense))
+register(Target("ply", ply_files, lambda root, path: read_gaussians(path), PLY, PLY_CHANGES, nonsense=nonsense))
 
 # ---- safetensors -----------------------------------------------------------------------------------------------------
 

@@ -24,7 +24,9 @@ from warpgs.files import write_json
 from warpgs.pipeline.farm import ensure_run, listing, record, work
 from warpgs.pipeline.films import keyframes
 from warpgs.pipeline.runs import failed_step, folder, schemas
-from warpgs.pipeline.train.config import PRESETS, FitConfig
+from warpgs.pipeline.train import overrides, presets
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.presets import PRESETS
 from warpgs.poses import record as poses_record
 from warpgs.report import events
 from warpgs.runtime import folder_lock
@@ -80,7 +82,7 @@ SCORES = {
         "resolution": ["16 x 12"], "score_masks": 0},
     "photographs": [{"name": "a.png", "compared_with": 2, "sharpness": 1.5, "brightness": None,
          "channels": [1.0, 0.5, 2.0], "moved": 0.25}],
-    "poses": {"views": [{"name": "a.png", "degrees": 0.5, "units": 0.25}], "summary": "moved a little"},
+    "view_modules": {"refine_poses": {"views": [{"name": "a.png", "degrees": 0.5}], "summary": "moved a little"}},
     "coverage": {"classes": CLASSES, "views": [{"name": "a.png", "classes": CLASSES}], "tolerance": 0.01,
         "depth_differences": [0.5], "photo_psnr": [None, 20.5], "summary": "all seen"},
 }  # fmt: skip
@@ -103,7 +105,7 @@ add(
 
 LINES = (
     {"scene": "a", "steps": 500, "strategy": "mcmc"}, {"scene": "b", "name": "second", "strict": True, "split": "llff:8"},
-    {"scene": "c", "optimizer.pose_rotation_lr": 0.5},
+    {"scene": "c", "optimizer.scales_lr": 0.5},
 )  # fmt: skip
 
 
@@ -228,8 +230,8 @@ def failed_steps(root: Path) -> list[Path]:
     tensors = {"image": torch.rand(4, 5, 3), "viewmat": torch.eye(4), "K": torch.eye(3), "background": torch.zeros(3)}
     tensors |= {f"params.{n}": t for n, t in gaussians().tensors().items()}
     plain = {
-        "config": PRESETS["quick"].to_json(), "step": 7, "view": "a.png", "width": 5, "height": 4, "degree": 1,
-        "settings": [1, 0, 0, 0, 0, 0], "dropout_seed": 5,
+        "config": PRESETS["quick"].to_json(), "step": 7, "view": "a.png", "number": 0, "camera_model": "pinhole", "degree": 1,
+        "settings": [1, 0, 0, 0, 0, 0, 7], "cutout": False, "dropout_seed": 5,
     }  # fmt: skip
     path = root / failed_step.FILE
     failed_step.save_failed_step(path, (tensors, plain))
@@ -243,6 +245,38 @@ register(
         (failed_step.read_failed_step,), (tensors_header, tensors_header, tensors_body),
     )
 )  # fmt: skip
+
+# ---- presets -----------------------------------------------------------------------------------------------------------
+
+PRESET = """base = "mcmc"
+steps = 40
+memory-limit = "2GiB"
+loss-terms = "alpha"
+depth-model = "d.onnx"
+depth-mean = [0.5, 0.5, 0.5]
+init.opacity = 0.25
+cuda-graph = true
+
+[alpha]
+weight = 0.5
+[mcmc]
+noise-lr = 1e4
+"""
+
+
+def preset_file(root: Path) -> list[Path]:
+    (root / "my.toml").write_text(PRESET, "utf-8")
+    return [root / "my.toml"]
+
+
+def settings_of_preset(root: Path, path: Path) -> FitConfig:
+    config, origin = presets.preset_settings(path)
+    assert config.preset == path.name and str(path) in origin
+    return FitConfig.from_json(json.loads(json.dumps(config.to_json(), allow_nan=False)))
+
+
+PRESET_PARSER = (presets._read, presets._config_of_file, presets._config_of, overrides.with_settings, overrides._typed)
+register(Target("preset", preset_file, settings_of_preset, PRESET_PARSER, LINE_CHANGES, lines=0.7))
 
 # ---- images of a run ---------------------------------------------------------------------------------------------------
 

@@ -21,7 +21,7 @@ from tests.faults.tiny_runs import OWN, SAME_BYTES, STEPS, VIEWS, check_whole, d
 from warpgs.app.cli import main
 from warpgs.errors import ResourceError
 from warpgs.pipeline.runs.checkpoint import load_checkpoint
-from warpgs.pipeline.train.config import PRESETS
+from warpgs.pipeline.train.presets import PRESETS
 from warpgs.synthetic.demo import split_spec
 
 pytestmark = pytest.mark.fault

@@ -17,7 +17,7 @@ import warpgs
 from tests.io import scenes
 from tests.test_input_files import special
 from warpgs.errors import WarpgsError
-from warpgs.export.formats import FORMATS, read_gaussians
+from warpgs.export.formats import read_gaussians, suffixes
 from warpgs.files import read_file
 from warpgs.io import camera_files, folders, images
 from warpgs.io.load import load_scene
@@ -81,7 +81,7 @@ def weights(path):
 
 
 DOORS = {
-    **{f"a{suffix}": ("export.formats", read_gaussians) for suffix in FORMATS},
+    **{f"a{suffix}": ("export.formats", read_gaussians) for suffix in suffixes()},
     "b.ply": ("export.ply", warpgs.read_ply),
     "cameras.json": ("io.camera_files", camera_files.read_cameras),
     "transforms.json": ("io.transforms", camera_files.read_cameras),
@@ -288,4 +288,4 @@ def test_every_module_that_opens_files_is_tried():
 
 
 def test_formats_are_all_tried():
-    assert {f"a{s}" for s in (*FORMATS, *images.SUFFIXES, *video.SUFFIXES)} <= DOORS.keys()
+    assert {f"a{s}" for s in (*suffixes(), *images.SUFFIXES, *video.SUFFIXES)} <= DOORS.keys()

@@ -15,10 +15,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
 from warpgs.export.formats import read_gaussians
 from warpgs.export.ply import read_ply
 from warpgs.files import LOCK, OWN_NAMES
+from warpgs.pipeline.metrics.lpips_weights import NETS
 from warpgs.pipeline.runs.checkpoint import load_checkpoint
 from warpgs.report.film import _decoded_sizes
 from warpgs.synthetic import raycast
@@ -31,7 +33,7 @@ HALF_WAY = 33
 COMMANDS = (
     "fit", "resume", "render", "export", "convert", "mesh", "prune", "eval", "view", "compare", "worker", "farm", "poses",
 )  # fmt: skip
-"""The commands; ``worker`` is a farm whose jobs run in its own process, so that their calls are seen."""
+"""The commands that are killed; ``worker`` is a farm whose jobs run in its own process, so that their calls are seen."""
 NEEDS = {"view": "viser", "poses": "pycolmap"}
 """Modules that a command needs and that may be missing."""
 SAME_BYTES = (".ply", ".spz", ".glb", ".png", ".jpg", ".mp4", ".safetensors")
@@ -44,9 +46,10 @@ OWN = {
     "fit": ("run/",), "resume": ("run/",), "eval": ("run/eval.json", "run/renders/", "run/depth/"), "render": ("film/",),
     "prune": ("run-pruned/",), "export": ("a.ply",), "convert": ("b.spz",), "mesh": ("m.glb",),
     "view": ("run/crop.json", "run/path.json"), "compare": ("study/",), "worker": ("results/",), "farm": ("results/",),
-    "poses": ("posed/",),
+    "poses": ("posed/",), "plot": ("run/plot.png",), "priors": ("sheets/",), "ablate": ("ablation/",), "demo": ("made/",),
+    "convert-lpips": ("lpips.safetensors",),
 }  # fmt: skip
-"""Beginnings of the paths that a command writes."""
+"""Beginnings of the paths that a command writes, for all commands that write; doctor reads alone."""
 
 
 def can_run(command: str) -> bool:
@@ -86,7 +89,15 @@ def words_of(command: str, scene: Path, work: Path) -> list[str]:
         "farm": ["farm", *farm],
         "worker": ["worker", *farm],
         "poses": ["poses", str(scene.parent / "photographs"), "--out", str(work / "posed"), "--threads", "1"],
-    }[command]
+        "plot": ["plot", run, *cpu],
+        "priors": ["priors", "show", str(scene), "--split", split_spec(VIEWS), "--out", str(work / "sheets")],
+        "ablate": ["ablate", str(scene), "--out", str(work / "ablation"), "--seeds", "1", *short],
+        "demo": ["demo", str(work / "made"), "--views", "8", "--width", "32", "--height", "32"],
+        "convert-lpips": [
+            "convert-lpips", "--backbone", str(scene.parent / "alexnet.pth"), "--heads", str(scene.parent / "alex.pth"),
+            "--out", str(work / "lpips.safetensors"),
+        ],
+    }[command]  # fmt: skip
 
 
 def environment() -> dict[str, str]:
@@ -237,6 +248,13 @@ def write_photographs(folder: Path) -> None:
         cv2.imwrite(str(folder / f"{i}.png"), np.round(255 * image[..., ::-1]).astype(np.uint8))
 
 
+def write_lpips_sources(folder: Path) -> None:
+    """Write the two files that LPIPS weights are made of, of a smallest network's shapes."""
+    state = {name: torch.ones(shape) for name, shape in NETS["alex"].shapes().items()}
+    torch.save({k: v for k, v in state.items() if k.startswith("features")}, folder / "alexnet.pth")
+    torch.save({k: v for k, v in state.items() if k.startswith("lin")}, folder / "alex.pth")
+
+
 def build_reference(folder: Path) -> None:
     """Run every command once, and keep what there was before and after it."""
     scene, work = folder / "scene", folder / "work"
@@ -244,6 +262,7 @@ def build_reference(folder: Path) -> None:
     for name in ("s0", "s1"):
         shutil.copytree(scene, folder / "scenes" / name)
     write_photographs(folder / "photographs")
+    write_lpips_sources(folder)
 
     def words(command: str) -> list[str]:
         return words_of(command, scene, work)
@@ -264,7 +283,7 @@ def build_reference(folder: Path) -> None:
     # older results of the same commands: what they replace must not get lost
     older = [*(words(c) for c in ("render", "export", "convert", "mesh", "eval")), keep("interrupted")]
     # convert comes first, since export replaces what it reads
-    last = ["convert", "render", "export", "mesh", "prune", "eval", "view", "compare", "poses"]
+    last = ["convert", *(c for c in OWN if c not in ("convert", "resume", *alone))]
     last = [c for c in last if can_run(c)]
     done = succeeded(child(work, *older, words("resume"), keep("finished"), *map(words, last)))
     calls = done.calls | alone | {"resume": done.calls["fit"]}

@@ -13,7 +13,8 @@ from warpgs.io.load import load_scene
 from warpgs.pipeline.runs.commands import scene_of
 from warpgs.pipeline.runs.folder import open_run
 from warpgs.pipeline.train.background import choose_background, color_of, over_background
-from warpgs.pipeline.train.config import PRESETS, FitConfig
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.presets import PRESETS
 
 
 @pytest.mark.parametrize(

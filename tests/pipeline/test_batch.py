@@ -14,9 +14,10 @@ from warpgs.kernels.step_buffers import Setting
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.train.batch import BatchSteps
 from warpgs.pipeline.train.by_views import settings_by_views
-from warpgs.pipeline.train.config import PRESETS, FitConfig
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.slots import Tree
-from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.runtime.ranks import ALONE
 from warpgs.scene import View
@@ -40,7 +41,7 @@ def test_a_batch_of_one_view_is_a_step_of_one_view():
     """Through dropout, sampling events, layers and protection: the same bits by way of the sums."""
     views = photos(3)
     one, batch = (Trainer(views, seeds(61), METHOD, CPU, priors=priors(views)) for _ in range(2))
-    batch.batched = BatchSteps(batch.learned, batch.buffers, METHOD.rule, batch.background, Tree(1, ALONE))
+    batch.taker.batched = BatchSteps(batch.learned, batch.buffers, METHOD.rule, batch.background, Tree(1, ALONE))
     advanced(one, 24), advanced(batch, 24)
     assert len(one.strategy.events) > 1 and same_bits(one, batch)
 
@@ -66,6 +67,7 @@ def test_rates_follow_the_square_root_of_the_batch():
     assert row[:3] == scheduled_lrs(2 * lrs["means"], 3, (0.9**4, 0.999**4))
     assert (fit.settings(3)[Setting.NUMBER], fit.settings(3)[Setting.MEANS_LR]) == (3, 2 * lrs["means"])
     assert [fit.settings(3, slot)[Setting.NUMBER] for slot in range(4)] == [9, 10, 11, 12]
+    assert [fit.settings(3, slot)[Setting.STEP] for slot in range(4)] == [3] * 4
 
 
 def test_a_fit_with_batches_continues_with_the_same_bits():

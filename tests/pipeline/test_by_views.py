@@ -9,7 +9,7 @@ import pytest
 
 from warpgs.pipeline.runs.request import SceneRequest
 from warpgs.pipeline.train.by_views import settings_by_views
-from warpgs.pipeline.train.config import PRESETS
+from warpgs.pipeline.train.presets import PRESETS
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])

@@ -11,7 +11,7 @@ from tests.parallel_camera import NAME
 from tests.scenes import photos, ring, seeds, three_gaussians
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.failed_step import _rendered, failed_step
+from warpgs.pipeline.runs.failed_step import failed_step, repeated
 from warpgs.pipeline.runs.folder import _camera, camera_values
 from warpgs.pipeline.train import step
 from warpgs.pipeline.train.config import FitConfig
@@ -124,9 +124,8 @@ def test_half_size_views_and_stacks_keep_the_model(fit):
 def test_a_failed_step_is_rendered_again_by_the_model(fit):
     """The file of a step whose loss was not finite holds model and coefficients."""
     tensors, plain = failed_step(fit, 1, "01.png")
-    plain = json.loads(json.dumps(plain))
-    found = _rendered(fit.gaussians, (tensors, plain), fit.config).rgb
-    assert torch.equal(found, rendered_alone(fit, 1))
+    inputs = repeated((tensors, json.loads(json.dumps(plain))))[1].inputs
+    assert torch.equal(inputs.outputs["rgb"], rendered_alone(fit, 1)) and inputs.camera.model == NAME
 
 
 def test_run_folders_keep_the_model():

@@ -29,9 +29,9 @@ from warpgs.pipeline.runs.request import CPU_MAX_SIDE, FitRequest, SceneRequest,
 from warpgs.pipeline.study.compare import ABLATION_ROWS, _places, ablation_variants, preset_variants, run_study
 from warpgs.pipeline.study.statistics import paired_difference
 from warpgs.pipeline.study.study import FILES, SWITCHES, StudyRequest, run_folder
-from warpgs.pipeline.train import config
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
+from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.strategies.sampling_event import MethodConfig
 from warpgs.synthetic.demo import split_spec, write_demo
 
 A = FitConfig(steps=8, init=InitConfig(source="random", random_count=200))
@@ -287,7 +287,7 @@ def test_ablation_rows_switch_off_one_part_each():
 
 def test_command_ablates(scene, tmp_path, capsys, monkeypatch):
     """`warpgs ablate` from flags to a table with check marks; two of the nine rows, for time."""
-    monkeypatch.setitem(config.PRESETS, "whole", FULL)
+    monkeypatch.setitem(PRESETS._made, "whole", FULL)
     monkeypatch.setattr("warpgs.pipeline.study.compare.ABLATION_ROWS", {n: ABLATION_ROWS[n] for n in ("full", "no pm")})
     monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "cache"))
     asked = []
@@ -322,7 +322,7 @@ def test_requests_that_make_no_sense(scene, tmp_path):
     with pytest.raises(UsageError, match="preset 'x' is not one of"):
         preset_variants(["x"], None)
     with pytest.raises(UsageError, match="named twice"):
-        preset_variants([next(iter(config.PRESETS))] * 2, None)
+        preset_variants([next(iter(PRESETS))] * 2, None)
     with pytest.raises(DataError, match="no view is held out"):
         run_study(StudyRequest((dataclasses.replace(scene, split="all"),), {"a": A, "b": B}, 1, tmp_path / "x", "cpu"))
     assert not (tmp_path / "x").exists()
@@ -330,8 +330,8 @@ def test_requests_that_make_no_sense(scene, tmp_path):
 
 def test_command_compares_presets(scene, tmp_path, capsys, monkeypatch):
     """`warpgs compare` from flags to files; one seed is said to prove nothing."""
-    monkeypatch.setitem(config.PRESETS, "a", A)
-    monkeypatch.setitem(config.PRESETS, "b", B)
+    monkeypatch.setitem(PRESETS._made, "a", A)
+    monkeypatch.setitem(PRESETS._made, "b", B)
     flags = ["--presets", "a,b", "--seeds", "1", "--steps", "2", "--device", "cpu", "--out", str(tmp_path / "out")]
     assert main(["compare", scene.path, "--split", scene.split, *flags]) == 0
     out = capsys.readouterr().out

@@ -9,18 +9,22 @@ import torch
 from tests.scenes import ring, seeds, three_gaussians
 from warpgs.errors import UsageError
 from warpgs.geometry import look_at
+from warpgs.kernels.step_buffers import SHIFT
 from warpgs.pipeline.metrics.region import fitted_region
 from warpgs.pipeline.model import init
 from warpgs.pipeline.model.hull import carve, hull_points, in_empty_region, silhouettes
 from warpgs.pipeline.model.init import InitConfig, initial_points, random_points
 from warpgs.pipeline.runs.failed_step import failed_step, findings
+from warpgs.pipeline.train.background import over, random_shift
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import AlphaDifference, LossConfig, Target, over, random_shift
-from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.loss import LossInputs, Target
+from warpgs.pipeline.train.loss_terms.built_in import LossConfig
+from warpgs.pipeline.train.loss_terms.opacity import AlphaDifference
+from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView, half_size, stack_views, with_alpha
 from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.scene import Camera, PointCloud, Render, View
+from warpgs.scene import Camera, PointCloud, View
 
 CPU = torch.device("cpu")
 WHITE = (1.0, 1.0, 1.0)
@@ -98,12 +102,14 @@ def test_alpha_term_is_a_mean_absolute_difference(masked):
     """Over the pixels that count; views without an opacity have none, and weights beyond reason are refused."""
     rendered, true, kept = torch.rand(3, 9, 11, generator=torch.Generator().manual_seed(0))
     mask = (kept > 0.3).float() if masked else None
-    render = Render(rendered[..., None].expand(-1, -1, 3), rendered, rendered, rendered, rendered)
     image = torch.zeros(9, 11, 3)
-    value = AlphaDifference(0.5)(render, Target(image, mask, {}, {}, true), None)
+
+    def term(alpha: torch.Tensor | None) -> float:
+        target = Target(image, mask, {}, alpha)
+        return float(AlphaDifference(0.5)(LossInputs({"alpha": rendered}, target, None, None, torch.ones(()))))
+
     expected = (rendered - true).abs()[mask > 0].mean() if masked else (rendered - true).abs().mean()
-    assert float(value) == pytest.approx(0.5 * float(expected), rel=1e-5)
-    assert float(AlphaDifference(0.5)(render, Target(image, mask, {}, {}), None)) == 0
+    assert term(true) == pytest.approx(0.5 * float(expected), rel=1e-5) and term(None) == 0
     with pytest.raises(UsageError, match="alpha: weight"):
         AlphaDifference(-1.0)
     with pytest.raises(UsageError, match="alpha weight"):
@@ -131,7 +137,7 @@ def test_a_continued_fit_equals_an_uninterrupted_one():
         other.advance()
     assert all(torch.equal(a, b) for a, b in zip(whole.gaussians.tensors().values(), other.gaussians.tensors().values()))
     opaque = fitted([dataclasses.replace(v, alpha=None) for v in cutouts()], LossConfig(), 1)
-    assert opaque.settings(5)[3:] == (0, 0, 0) != whole.settings(5)[3:]
+    assert opaque.settings(5)[SHIFT] == (0, 0, 0) != whole.settings(5)[SHIFT]
     assert [t.name for t in opaque.terms] == ["photometric"]
 
 
@@ -139,7 +145,7 @@ def test_an_estimated_opacity_is_no_target():
     """It says where Gaussians start and are sampled; the loss is that of opaque views."""
     views = [dataclasses.replace(v, alpha_estimated=True) for v in cutouts()]
     fit = fitted(views, LossConfig(), 1)
-    assert [t.name for t in fit.terms] == ["photometric"] and fit.settings(5)[3:] == (0, 0, 0)
+    assert [t.name for t in fit.terms] == ["photometric"] and fit.settings(5)[SHIFT] == (0, 0, 0)
     assert fit.views[0].countable is not None and fit.layout.cutout
 
 

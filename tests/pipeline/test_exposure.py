@@ -13,9 +13,10 @@ from warpgs.app.cli import main
 from warpgs.errors import UsageError
 from warpgs.pipeline.metrics.matched_psnr import matched_psnr
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.exposure import EXPOSURE, exposed, exposure_of
-from warpgs.pipeline.train.strategies.holdout_blocks import rendered
+from warpgs.pipeline.train.held_out_blocks import rendered
 from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.train.view_modules.exposure import EXPOSURE, Exposure, exposed, exposure_of
+from warpgs.pipeline.train.view_modules.poses import RefinePoses
 from warpgs.pipeline.train.views import half_size
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.synthetic.demo import split_spec, write_demo
@@ -43,7 +44,7 @@ def dimmed(views, gains):
 
 def test_photographs_of_many_exposures_make_one_model(tmp_path):
     """Held-out views, of the mean exposure, score better than without; the gains that are found are those that were made."""
-    write_demo(tmp_path, views=12, width=64, height=48)
+    write_demo(tmp_path, views=12, width=48, height=36)
     scene = warpgs.load_scene(tmp_path)
     gains = 0.6 + 0.4 * np.array([[0.5, 0.4, 0.6], [0, 0, 0], [1, 1, 1], [0.2, 0.3, 0.1], [0.8, 0.7, 0.9], [0.5, 0.6, 0.4]])
     gains = np.concatenate([gains, gains[::-1]])[:, None, None]
@@ -52,13 +53,13 @@ def test_photographs_of_many_exposures_make_one_model(tmp_path):
     views = tuple(v for pair in zip(off[::2], half[1]) for v in pair)
     scene = dataclasses.replace(scene, views=views)
     split = f"train={','.join(v.name for v in views[::2])};test={','.join(v.name for v in views[1::2])}"
-    config = FitConfig(steps=300, half_resolution=0.5)
+    config = FitConfig(steps=200, half_resolution=0.5)
     plain, found = (
-        warpgs.fit(scene, dataclasses.replace(config, exposure=e), split=split, device="cpu", verbose=False)
-        for e in (False, True)
+        warpgs.fit(scene, dataclasses.replace(config, view_modules=m), split=split, device="cpu", verbose=False)
+        for m in ((), (Exposure(),))
     )
     assert found.metrics["test"]["psnr"] > plain.metrics["test"]["psnr"] + 0.5
-    figures = found.metrics["exposure"]
+    figures = found.metrics["view_modules"]["exposure"]
     made = gains[::2, 0, 0].mean(-1) / gains[::2].mean()
     np.testing.assert_allclose([r["gain"] for r in figures["views"]], made, atol=0.05)
 
@@ -73,7 +74,7 @@ def fitted(views, steps, config):
 @pytest.mark.slow
 def test_steps_on_any_number_of_threads_and_continued_ones_have_the_same_bits():
     views, whole = dimmed(scenes.photos(4), [0.6, 1, 0.8, 0.9]), None
-    config = FitConfig(steps=40, half_resolution=0.25, exposure=True, refine_poses=True)
+    config = FitConfig(steps=40, half_resolution=0.25, view_modules=(Exposure(), RefinePoses()))
     before = torch.get_num_threads()
     for threads in (1, 2):
         torch.set_num_threads(threads)
@@ -96,16 +97,16 @@ def test_steps_on_any_number_of_threads_and_continued_ones_have_the_same_bits():
 def test_strategies_see_the_exposures_of_now():
     """Held-out blocks are compared with renders under the exposure of their view: else growth would end too early."""
     views = dimmed(scenes.photos(4), [0.6, 1, 0.8, 0.9])
-    trainer = Trainer(views, scenes.seeds(), FitConfig(steps=40, exposure=True, half_resolution=0.0), CPU)
-    shown = [v.exposure for v in trainer.views]
+    trainer = Trainer(views, scenes.seeds(), FitConfig(steps=40, view_modules=(Exposure(),), half_resolution=0.0), CPU)
+    shown = [v.learned.values[EXPOSURE] for v in trainer.views]
     assert not torch.stack(shown).any()
-    trainer.view_table.params[EXPOSURE].data[0] = 0.3
+    trainer.learned.views.table.params[EXPOSURE].data[0] = 0.3
     trainer.show_learned()
     assert torch.stack(shown).abs().min() > 0.05 and torch.stack(shown).mean(0).abs().max() < 1e-6
     options = RasterizeOptions(background=trainer.background)
     plain = rasterize(trainer.gaussians, trainer.views[0].camera, options).rgb
     assert torch.equal(rendered(trainer.gaussians, trainer.views[0], options), exposed(plain, shown[0]))
-    assert half_size(trainer.views[0]).exposure is shown[0]
+    assert half_size(trainer.views[0]).learned.values[EXPOSURE] is shown[0]
 
 
 def test_runs_tell_their_exposures(tmp_path):
@@ -115,7 +116,7 @@ def test_runs_tell_their_exposures(tmp_path):
     words = ["fit", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), *flags, "--split", split_spec(8), "--exposure"]
     assert main(words) == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    rows, summary = metrics["exposure"]["views"], metrics["exposure"]["summary"]
+    rows, summary = (metrics["view_modules"]["exposure"][key] for key in ("views", "summary"))
     assert len(rows) == 6 and np.shape(rows[0]["affine"]) == (3, 4) and rows[0]["gain"] != 1
     assert "every score is of renders without an exposure" in summary
     assert summary in (tmp_path / "run" / "report.html").read_text()
@@ -123,13 +124,13 @@ def test_runs_tell_their_exposures(tmp_path):
     scores = json.loads((tmp_path / "run" / "eval.json").read_text())
     assert scores["test"] == metrics["test"] and scores["train"] == metrics["train"]
     assert main([*words, "--resume"]) == 0
-    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["exposure"] == metrics["exposure"]
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["view_modules"] == metrics["view_modules"]
 
 
 def test_views_that_know_their_opacity_have_no_exposure():
     views = [dataclasses.replace(v, alpha=np.ones(v.image.shape[:2], np.float32)) for v in scenes.photos(3)]
     with pytest.raises(UsageError, match=r"--exposure is for opaque photographs, and 00.png knows its opacity"):
-        Trainer(views, scenes.seeds(), FitConfig(steps=4, exposure=True), CPU)
+        Trainer(views, scenes.seeds(), FitConfig(steps=4, view_modules=(Exposure(),)), CPU)
 
 
 def test_matched_colours_score_as_equal():

@@ -14,6 +14,8 @@ from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
 from warpgs.pipeline.runs.failed_step import FILE, failed_step, findings, read_failed_step, save_failed_step
 from warpgs.pipeline.train.loss import LossTerm, register
 from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.train.view_modules.exposure import Exposure
+from warpgs.pipeline.train.view_modules.poses import RefinePoses
 from warpgs.scene import Scene
 
 CPU = torch.device("cpu")
@@ -22,15 +24,13 @@ CPU = torch.device("cpu")
 @register("nan_later")
 @dataclasses.dataclass(frozen=True)
 class NanLater(LossTerm):
-    """A term that is no number from some step on."""
+    """A term on depth that is no number from some step on, by the number on the device."""
 
+    needs_outputs = ("depth",)
     first: int = 15
 
-    def active(self, step, steps):
-        return step >= self.first
-
-    def __call__(self, render, target, gaussians):
-        return render.rgb.mean() * float("nan")
+    def __call__(self, inputs):
+        return inputs.outputs["depth"].mean() * torch.where(inputs.step < self.first, 0.0, float("nan"))
 
 
 def test_the_state_before_is_kept_and_the_step_repeats(tmp_path):
@@ -48,6 +48,8 @@ def test_the_state_before_is_kept_and_the_step_repeats(tmp_path):
     lines = findings(bundle)
     assert "loss term nan_later: nan" in "\n".join(lines) and not any("NOT FINITE" in line for line in lines)
     assert any(line.startswith("  loss term photometric: 0.") for line in lines)
+    assert any(line.startswith("  rendered depth: ") for line in lines) and not any("rendered alpha" in line for line in lines)
+    assert any("its gradient by means is not finite" in line for line in lines)
     with pytest.raises(NotFiniteError) as again:
         warpgs.fit(scene, config, out=tmp_path / "run", resume=True, **run)
     assert str(again.value) == str(found.value)
@@ -56,17 +58,15 @@ def test_the_state_before_is_kept_and_the_step_repeats(tmp_path):
 @pytest.mark.parametrize("learned", [False, True], ids=["", "with poses and exposures"])
 def test_the_loss_is_that_of_the_fit(learned):
     """The file's loss is the loss that the next step reports: with the poses and exposures of now, where they are learned."""
-    rates = dataclasses.replace(BUSY.optimizer, pose_rotation_lr=0.01, exposure_lr=0.05)
-    config = dataclasses.replace(BUSY, dropout=0.3, refine_poses=learned, exposure=learned, optimizer=rates)
+    modules = (RefinePoses(rotation_lr=0.01), Exposure(lr=0.05)) if learned else ()
+    config = dataclasses.replace(BUSY, dropout=0.3, view_modules=modules)
     fit = Trainer(photos(4), seeds(), config, CPU)
     for _ in range(20):
         fit.advance()
-    view = fit.order[-1] if fit.order else None
-    while view is None:
+    while not fit.order or fit.order[-1] == 0:  # the first view's pose is not refined
         fit.advance()
-        view = fit.order[-1] if fit.order else None
-    bundle = failed_step(fit, view, "x")
-    terms = [line for line in findings(bundle) if "loss term" in line]
+    bundle = failed_step(fit, fit.order[-1], "x")
+    terms = [line for line in findings(bundle) if "loss term" in line or "view module" in line]
     (report,) = fit.advance()
     assert len(terms) == 1 + learned and sum(float(t.split(": ")[1]) for t in terms) == pytest.approx(report.loss, rel=1e-5)
 

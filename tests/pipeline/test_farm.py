@@ -27,8 +27,8 @@ from warpgs.pipeline.farm.record import CHECKED, LOG, PLY, RECORD, THUMBNAIL, fi
 from warpgs.pipeline.farm.slurm import SlurmEngine
 from warpgs.pipeline.farm.work import run_job
 from warpgs.pipeline.runs.fit import fit_request
-from warpgs.pipeline.train.config import PRESETS
 from warpgs.pipeline.train.loss import LOSS_TERMS
+from warpgs.pipeline.train.presets import PRESETS
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.runtime.listening import is_loopback, listeners
 from warpgs.runtime.subprocesses import run_python

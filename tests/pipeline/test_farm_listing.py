@@ -26,9 +26,9 @@ def test_a_scene_is_no_folder_of_scenes(tmp_path):
 def test_lines_are_flags_of_fit(tmp_path):
     """Relative paths are from the file; booleans are switches, in groups too."""
     path = tmp_path / "jobs.jsonl"
-    path.write_text('{"scene": "x", "steps": 5, "refine_poses": true, "holdout.bounds": false}\n\n{"scene": "/y", "name": "z"}')
+    path.write_text('{"scene": "x", "steps": 5, "refine_poses": true, "method.pm": false}\n\n{"scene": "/y", "name": "z"}')
     first, second = list_jobs(str(path))
-    assert first.scene == tmp_path / "x" and first.flags == ("--steps=5", "--refine-poses", "--holdout.no-bounds")
+    assert first.scene == tmp_path / "x" and first.flags == ("--steps=5", "--refine-poses", "--method.no-pm")
     assert (second.name, second.flags) == ("z", ())
 
 
@@ -44,6 +44,7 @@ def test_lines_are_flags_of_fit(tmp_path):
         ('{"scene": "a", "out": "/b"}', "cannot be set for one job"),
         ('{"scene": "a", "allow_outside": true}', "cannot be set"),
         ('{"scene": "a", "strategy": "evil.py:Evil"}', "names code of your own"),
+        ('{"scene": "a", "view_modules": "evil.py:Evil"}', "names code of your own"),
         ('{"scene": "a", "steps": [1]}', "must be text"),
         ('{"scene": "a", "--steps": 1}', "cannot be set"),
         ('{"scene": "a\\u0000"}', "without a zero byte"),

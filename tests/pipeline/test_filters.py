@@ -122,7 +122,7 @@ def test_convert_says_what_it_did(tmp_path):
     assert float(read_gaussians(tmp_path / "c.ply").means[:, :2].abs().max()) <= 1
     convert(tmp_path / "a.ply", tmp_path / "d.ply")
     assert (tmp_path / "d.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
-    assert any("splat holds none" in line for line in convert(tmp_path / "a.ply", tmp_path / "e.splat"))
+    assert any(".splat files hold none" in line for line in convert(tmp_path / "a.ply", tmp_path / "e.splat"))
     with pytest.raises(DataError, match="no Gaussian is left"):
         convert(tmp_path / "a.ply", tmp_path / "f.glb", Filters(crop="90,90,90,91,91,91"))
     assert not (tmp_path / "f.glb").exists()

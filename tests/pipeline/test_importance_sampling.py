@@ -15,18 +15,17 @@ from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
-from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.importance_sampling import (
-    COARSE,
+from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
+from warpgs.pipeline.train.strategies.importance_sampling import COARSE, NOT_SAMPLED
+from warpgs.pipeline.train.strategies.sampler import SamplerConfig
+from warpgs.pipeline.train.strategies.sampling_event import (
     FINE,
-    NOT_SAMPLED,
     Event,
     MethodConfig,
     ProtectConfig,
     sample_view,
     sampling_event,
 )
-from warpgs.pipeline.train.strategies.sampler import SamplerConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.rasterize import RasterizeOptions
 
@@ -97,7 +96,7 @@ def test_protected_gaussian_survives_its_protection_and_no_step_longer():
     logits, going = fit.table.params["logit_opacities"].detach(), torch.ones(1, dtype=torch.bool)
     for step in range(8, 16):
         logits[:] = -10.0
-        settings = torch.tensor(Setting.row(dropout=0.0, number=step, means_lr=0.0, shift=(0.0, 0.0, 0.0)))
+        settings = torch.tensor(Setting.row(dropout=0.0, number=step, step=step, means_lr=0.0, shift=(0.0, 0.0, 0.0)))
         fit.strategy.after_step(fit.strategy.phase(step), settings, ~going)
         assert logits.tolist() == [-10.0] * 3
         fit.strategy.after_step(fit.strategy.phase(step), settings, going)
@@ -249,7 +248,7 @@ def test_dropout_falls_with_the_number_of_views():
     plain = dataclasses.replace(CONFIG, strategy="clone_split", method=MethodConfig())
     few, many = (Trainer(photos(n), seeds(), plain, CPU) for n in (3, 6))
     assert few.dropout == pytest.approx(0.2) and many.dropout == pytest.approx(0.1)
-    assert few.strategy.dropout(1) == 0 and few.strategy.dropout(40) == pytest.approx(0.2)
+    assert few.settings(1)[Setting.DROPOUT] == 0 and few.settings(40)[Setting.DROPOUT] == pytest.approx(0.2)
 
 
 def test_auto_start_sweeps_few_views():

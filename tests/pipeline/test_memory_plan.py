@@ -8,19 +8,21 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.allocations import Allocations
+from tests.example_terms import DepthCorrelation
 from tests.gaussians import camera, cloud, leaves
 from tests.scenes import photos, priors, seeds
 from warpgs.app.cli import main
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import LossConfig
 from warpgs.pipeline.train.memory_plan import Layout, instance_bytes, most_instances, plan
 from warpgs.pipeline.train.schedule import PhaseConfig
-from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.holdout_blocks import HoldoutConfig
-from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
+from warpgs.pipeline.train.stopping import StoppingConfig
+from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig
+from warpgs.pipeline.train.strategies.sampling_event import MethodConfig
 from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.train.view_modules.exposure import Exposure
+from warpgs.pipeline.train.view_modules.poses import RefinePoses
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import View
 from warpgs.synthetic.demo import split_spec, write_demo
@@ -62,11 +64,12 @@ def measured(fit: Trainer, steps: int) -> int:
     return allocations.peak
 
 
-@pytest.mark.parametrize("views", [photos(2), masked(photos(2)), photos(2, 400, 300), masked(photos(2, 400, 300))])
+@pytest.mark.parametrize("change", [list, masked])
+@pytest.mark.parametrize("size", [(40, 32), (400, 300)])
 @pytest.mark.parametrize("count", [60, 5000])
-def test_plan_covers_a_step_and_not_much_more(views, count):
+def test_plan_covers_a_step_and_not_much_more(change, size, count):
     """From few Gaussians on many pixels to many on few, with and without masks."""
-    fit = Trainer(views, seeds(count), STEADY, CPU)
+    fit = Trainer(change(photos(2, *size)), seeds(count), STEADY, CPU)
     fit.advance()
     found = measured(fit, 2)
     planned = fit.layout.step(count, instances(fit))
@@ -83,10 +86,11 @@ def test_plan_covers_the_sums_of_several_views(batch):
     assert fit.layout.sums == {3: 1, 8: 3}[batch] and found <= planned <= 1.1 * found
 
 
-@pytest.mark.parametrize("views", [photos(2, 400, 300), masked(photos(2, 400, 300))], ids=["all", "masked"])
-def test_plan_covers_the_depth_term(views):
+@pytest.mark.parametrize("change", [list, masked])
+def test_plan_covers_the_depth_term(change):
     """A disparity a pixel that stays, and what a correlation and its gradient take."""
-    config = dataclasses.replace(STEADY, loss=LossConfig(depth_weight=0.1))
+    views = change(photos(2, 400, 300))
+    config = dataclasses.replace(STEADY, loss_terms=(DepthCorrelation(0.1),))
     fit = Trainer(views, seeds(60), config, CPU, priors=priors(views))
     fit.advance()
     found = measured(fit, 2)
@@ -94,10 +98,10 @@ def test_plan_covers_the_depth_term(views):
     assert fit.layout.depth_supervised and found <= planned <= 1.25 * found + 20_000
 
 
-@pytest.mark.parametrize(("learned", "size", "count"), [("refine_poses", (40, 32), 20_000), ("exposure", (400, 300), 60)])
-def test_plan_covers_what_is_learned_of_views(learned, size, count):
+@pytest.mark.parametrize(("module", "size", "count"), [(RefinePoses(), (40, 32), 20_000), (Exposure(), (400, 300), 60)])
+def test_plan_covers_what_is_learned_of_views(module, size, count):
     """A gradient of the camera for each Gaussian, and renders with and without their exposure."""
-    fit = Trainer(photos(2, *size), seeds(count), dataclasses.replace(STEADY, **{learned: True}), CPU)
+    fit = Trainer(photos(2, *size), seeds(count), dataclasses.replace(STEADY, view_modules=(module,)), CPU)
     fit.advance()
     found = measured(fit, 2)
     planned = fit.layout.step(count, instances(fit))
@@ -138,17 +142,20 @@ def bytes_of_tensors(tensors) -> int:
     return sum({s._cdata: s.nbytes() for s in (t.untyped_storage() for t in tensors)}.values())
 
 
-@pytest.mark.parametrize("strategy", ["clone_split", "importance_sampling", "holdout", "mcmc"])
-def test_plan_counts_what_lasts(strategy):
-    """To the byte: every column of a strategy, each view once though steps take it from a stack, and holdout's whole views."""
+@pytest.mark.parametrize("stops", [False, True])
+@pytest.mark.parametrize("strategy", ["clone_split", "importance_sampling", "mcmc"])
+def test_plan_counts_what_lasts(strategy, stops):
+    """To the byte: every column of a strategy, each view once though a stack has it, whole views beside hidden ones."""
     views = masked(photos(4, 200, 150))
     config = dataclasses.replace(
         STEADY, steps=60, strategy=strategy, strategy_config=None, method=MethodConfig(events=True), phases=PhaseConfig(4, 6),
-        loss=LossConfig(depth_weight=0.1), half_resolution=0.0 if strategy == "holdout" else 0.5,
+        loss_terms=(DepthCorrelation(0.1),), half_resolution=0.0 if stops else 0.5,
+        stopping=StoppingConfig(min_gain_db=0.1 * stops),
     )  # fmt: skip
     fit = Trainer(views, seeds(500), config, CPU, priors=priors(views))
+    assert fit.stopping.active == stops
     tensors = list(fit.table.state().values())
-    for v in (*fit.views, *fit.stacks.values(), *(fit.strategy.whole if strategy == "holdout" else ())):
+    for v in (*fit.views, *fit.stacks.values(), *fit.stopping.whole):
         for name, value in (*vars(v).items(), *v.maps.items()):
             if name not in ("viewmats", "Ks", "numbers"):
                 tensors += [t for t in (value if isinstance(value, tuple) else [value]) if isinstance(t, torch.Tensor)]
@@ -156,22 +163,21 @@ def test_plan_counts_what_lasts(strategy):
     assert fit.layout.held(500) == bytes_of_tensors(tensors)
 
 
-@pytest.mark.parametrize("levels", [4, pytest.param(8, marks=pytest.mark.slow)])
-def test_plan_covers_held_out_blocks(levels):
-    """Whole views beside those without their blocks, bounds and levels, through growth, its end and trims."""
+def test_plan_covers_held_out_blocks():
+    """Whole views beside those without their blocks, through growth and its end."""
     views = photos(4, 200, 150)
-    config = dataclasses.replace(GROWING, steps=30, strategy="holdout", sh_every=15, holdout=HoldoutConfig(levels=levels))
+    config = dataclasses.replace(GROWING, steps=30, sh_every=15, stopping=StoppingConfig(min_gain_db=50.0))
     fit = Trainer(views, seeds(1500), config, CPU)
     fit.advance()
-    assert fit.strategy.measuring
+    assert fit.stopping.active
     planned = found = 0
-    while fit.step < 30:
+    while fit.step < fit.steps:
         before = len(fit.gaussians)
         found = max(found, measured(fit, 1))
         after = len(fit.gaussians)
         event = fit.layout.held(after) + fit.layout.event(before, max(before, after))
         planned = max(planned, fit.layout.step(max(before, after), instances(fit)), event)
-    assert fit.strategy.closed is not None and found <= planned
+    assert fit.stopping.ended is not None and found <= planned
 
 
 @pytest.mark.parametrize("most", [400, 3000])
@@ -181,7 +187,7 @@ def test_plan_covers_chunks(most):
     fit = Trainer(views, seeds(800), STEADY, CPU)
     fit.advance()
     assert instances(fit) > most
-    fit.max_instances = most
+    fit.context.max_instances = most
     found = measured(fit, 2)
     assert found <= fit.layout.step(800, most, chunked=True) <= 1.3 * found
 
@@ -225,7 +231,9 @@ def test_fit_keeps_to_its_limit(tmp_path):
     assert 1200 < len(limited.gaussians) <= limited.memory.cap
     ends = []
     for fit in (free, limited):
-        renders = [rasterize(fit.gaussians, v.camera, RasterizeOptions(max_instances=fit.max_instances)).rgb for v in views]
+        renders = [
+            rasterize(fit.gaussians, v.camera, RasterizeOptions(max_instances=fit.context.max_instances)).rgb for v in views
+        ]
         ends.append(np.mean([-10 * np.log10(np.mean((r.numpy() - v.image) ** 2)) for r, v in zip(renders, views)]))
     assert abs(ends[0] - ends[1]) < 1.0
 

@@ -1,9 +1,8 @@
-"""Parts of a user's own in a fit: a loss term with parameters of each view, and a density strategy."""
+"""Parts of a user's own in a fit: loss terms, and a density strategy."""
 
 import dataclasses
 from dataclasses import dataclass
 
-import numpy as np
 import pytest
 import torch
 
@@ -12,10 +11,9 @@ from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm, ViewParameter
+from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
 from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.scene import View
 
 CPU = torch.device("cpu")
 PLAIN = FitConfig(steps=40, sh_every=15, init=InitConfig(source="points", max_sh_degree=0))
@@ -41,103 +39,62 @@ def same_bits(a: Trainer, b: Trainer) -> bool:
 
 
 @dataclass(frozen=True)
-class Exposure(LossTerm):
-    """Squared difference of the photograph and the render times a gain that each view learns."""
+class Gray(LossTerm):
+    """Mean squared difference of the render from a gray."""
 
     weight: float = 20.0
-    lr: float = 0.05
 
-    def view_parameters(self):
-        """A gain that starts at 1."""
-        return {"gain": ViewParameter((1.0,), self.lr)}
-
-    def __call__(self, render, target, gaussians):
+    def __call__(self, inputs):
         """See the class."""
-        return self.weight * (render.rgb.detach() * target.params["gain"] - target.image).square().mean()
-
-
-def exposed() -> list[View]:
-    """Two views, of which the second has half the light."""
-    bright, dark = photos(2)
-    return [bright, dataclasses.replace(dark, image=np.float32(0.5) * dark.image)]
-
-
-@pytest.mark.parametrize("half_resolution", [0.0, 0.5])
-def test_views_learn_parameters_of_their_own(tmp_path, half_resolution):
-    """Gains tell the exposures apart, also where both sizes of a view share one; a checkpoint has them, and goes on from them.
-
-    The Gaussians do not follow the term here, so that they are, bit for bit, those of a fit without it.
-    """
-    LOSS_TERMS.register("exposure")(Exposure)
-    gray = dataclasses.replace(PLAIN, loss_terms=(Exposure(),), half_resolution=half_resolution)
-    fit = Trainer(exposed(), seeds(), gray, CPU)
-    assert fit.view_table.params["gain"].tolist() == [[1.0], [1.0]]
-    advanced(fit, 40)
-    tensors, _ = fit.state()
-    bright, dark = tensors["views.params.gain"][:, 0].tolist()
-    assert bright > dark + 0.2 and {"views.exp_avg.gain", "views.exp_avg_sq.gain"} <= tensors.keys()
-
-    without = advanced(Trainer(exposed(), seeds(), dataclasses.replace(gray, loss_terms=()), CPU), 40)
-    assert all(torch.equal(t, without.gaussians.tensors()[n]) for n, t in fit.gaussians.tensors().items())
-
-    save_checkpoint(tmp_path, *advanced(Trainer(exposed(), seeds(), gray, CPU), 13).state())
-    stored, values = load_checkpoint(tmp_path)
-    assert stored["views.params.gain"].shape == (2, 1) and bool((stored["views.params.gain"] != 1).all())
-    resumed = Trainer(exposed(), seeds(), FitConfig.from_json(values["config"]), CPU)
-    resumed.load(stored, values)
-    assert same_bits(advanced(resumed, 40), fit)
+        return self.weight * (inputs.outputs["rgb"] - 0.5).square().mean()
 
 
 def test_a_term_that_is_not_active_changes_no_bit():
-    """Nor do its parameters move."""
+    """One that is active does."""
 
-    class Never(Exposure):
+    class Never(Gray):
         def active(self, step, steps):
             return False
 
-    term = LOSS_TERMS.register("never")(Never)()
-    fit = advanced(Trainer(exposed(), seeds(), dataclasses.replace(PLAIN, loss_terms=(term,)), CPU), 6)
-    plain = advanced(Trainer(exposed(), seeds(), PLAIN, CPU), 6)
-    assert fit.view_table.params["gain"].tolist() == [[1.0], [1.0]]
-    assert all(torch.equal(t, plain.gaussians.tensors()[n]) for n, t in fit.gaussians.tensors().items())
+    plain, active, never = (
+        advanced(Trainer(photos(2), seeds(), dataclasses.replace(PLAIN, loss_terms=terms), CPU), 6).gaussians.tensors()
+        for terms in ((), (LOSS_TERMS.register("gray")(Gray)(),), (LOSS_TERMS.register("never")(Never)(),))
+    )
+    assert all(torch.equal(t, never[n]) for n, t in plain.items()) and not torch.equal(active["sh"], plain["sh"])
 
 
 def test_a_term_without_a_name_of_its_own_is_refused():
     """A run folder could not tell it: never registered, or only by the name of the class that it derives from."""
-    with pytest.raises(UsageError, match=r"the loss term Exposure has no name of its own.*register"):
-        dataclasses.replace(PLAIN, loss_terms=(Exposure(),))
-    LOSS_TERMS.register("exposure")(Exposure)
+    with pytest.raises(UsageError, match=r"the loss term Gray has no name of its own.*register"):
+        dataclasses.replace(PLAIN, loss_terms=(Gray(),))
+    LOSS_TERMS.register("gray")(Gray)
 
-    class Stronger(Exposure):
+    class Stronger(Gray):
         """Another class, which inherits the name."""
 
     with pytest.raises(UsageError, match="Stronger has no name of its own"):
         dataclasses.replace(PLAIN, loss_terms=(Stronger(),))
     with pytest.raises(UsageError, match=r"0\.5 is no loss term"):
         dataclasses.replace(PLAIN, loss_terms=(0.5,))
-    config = dataclasses.replace(PLAIN, loss_terms=(Exposure(3.0),))
+    config = dataclasses.replace(PLAIN, loss_terms=(Gray(3.0),))
     assert FitConfig.from_json(config.to_json()) == config
 
 
-@pytest.mark.parametrize("what", ["map", "view parameter"])
-def test_two_terms_with_one_name_for_a_part_are_refused(what):
+def test_two_terms_with_one_name_for_a_map_are_refused():
     """The message names both, where one would have silently read what the other asked for."""
 
     @LOSS_TERMS.register("first")
     @dataclass(frozen=True)
     class First(LossTerm):
         def needs(self, view, prior):
-            return {"shared": view.image[..., 0]} if what == "map" else {}
-
-        def view_parameters(self):
-            return {"shared": ViewParameter((1.0,), 0.1)} if what != "map" else {}
+            return {"shared": view.image[..., 0]}
 
     @LOSS_TERMS.register("second")
     class Second(First):
         pass
 
     config = dataclasses.replace(PLAIN, loss_terms=(First(), Second()))
-    with pytest.raises(UsageError, match=f"'first' and 'second' both have a {what} 'shared'; rename"):
+    with pytest.raises(UsageError, match="'first' and 'second' both have a map 'shared'; rename"):
         Trainer(photos(2), seeds(), config, CPU)
 
 
@@ -152,7 +109,8 @@ def test_a_term_sees_the_maps_that_it_asked_for():
             assert prior is None
             return {"red": view.image[..., 0], "pair": view.image[..., 1:]}
 
-        def __call__(self, render, target, gaussians):
+        def __call__(self, inputs):
+            target, gaussians = inputs.target, inputs.gaussians
             seen.append(tuple(target.image.shape))
             assert torch.allclose(target.maps["red"], target.image[..., 0], atol=1e-6)
             assert torch.allclose(target.maps["pair"], target.image[..., 1:], atol=1e-6)
@@ -182,13 +140,13 @@ class OneMore(Strategy):
         return {"came": Column(0, torch.int32, inherited=False)}
 
     def setup(self):
-        self.asked = len(self.trainer.table), len(self.trainer.views)
+        self.asked = len(self.context.table), len(self.context.views)
 
     def due(self, step):
         return step % self.config.every == 0
 
     def update(self, step):
-        t = self.trainer
+        t = self.context
         keep = torch.arange(len(t.table), device=t.device)
         added = {n: row[:1] for n, row in t.gaussians.tensors().items()}
         yield DensityUpdate(keep, added, keep[:1], {"came": step})

@@ -7,6 +7,7 @@ import pytest
 import torch
 import warp as wp
 
+from tests.example_terms import DepthCorrelation
 from tests.scenes import photos, priors, seeds
 from warpgs.app.cli import main
 from warpgs.pipeline.metrics.evaluate import render_view, score
@@ -14,11 +15,10 @@ from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs import precompile
 from warpgs.pipeline.runs.precompile import fit_kernels
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import LossConfig
 from warpgs.pipeline.train.schedule import PhaseConfig
-from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
+from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig
+from warpgs.pipeline.train.strategies.sampling_event import MethodConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.runtime import interop
@@ -47,7 +47,7 @@ def test_a_fit_launches_nothing_else(device, strategy, recorded, monkeypatch):
     config = FitConfig(
         steps=20, dropout=0.2, cuda_graph=recorded, init=InitConfig(source="points"),
         strategy=strategy, method=method,
-        loss=LossConfig(depth_weight=0.1, depth_until=0.5),
+        loss_terms=(DepthCorrelation(0.1, 0.5),),
         density=DensityConfig(start=2, every=2), phases=PhaseConfig(4, 6, every=2),
     )  # fmt: skip
     fit = Trainer(views, seeds(), config, device, priors=priors(views))

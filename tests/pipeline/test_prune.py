@@ -169,5 +169,5 @@ def test_only_the_mirror_keeps_its_harmonics():
     def accepted(model) -> bool:
         return all(float((rasterize(model, c).rgb - p).square().mean()) < 1e-6 for c, p in zip(cameras, photos))
 
-    degrees = needed_degrees(g, view_set.coverage(g).supported_degree(), view_set, accepted)
+    degrees = needed_degrees(g, view_set, accepted)
     assert bool((degrees[~right] == 0).all()) and float(degrees[right].float().mean()) > 0.8

@@ -10,14 +10,22 @@ import torch
 import warpgs
 from tests import scenes
 from warpgs.app.cli import main
-from warpgs.errors import DataError
 from warpgs.geometry import matmul
-from warpgs.pipeline.runs.cameras_after_fit import _similarity, pose_figures, refined_cameras
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.refine_poses import ROTATION, TRANSLATION, increments, moved
-from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.train.view_modules.poses import (
+    ROTATION,
+    TRANSLATION,
+    RefinePoses,
+    increments,
+    moved,
+    pose_figures,
+    refined_cameras,
+    similarity,
+)
+from warpgs.pipeline.train.views import current
 from warpgs.render.rasterize import rasterize
+from warpgs.scene import Camera
 from warpgs.synthetic.demo import split_spec, write_demo
 
 CPU = torch.device("cpu")
@@ -37,7 +45,9 @@ def noisy(views, degrees=0.6, shift=0.02, seed=0):
 
 def errors(views, truth):
     """Mean angle [degrees] and distance of centres [u] between the poses of views."""
-    rows = pose_figures({v.name: v.camera for v in truth}, {v.name: v.camera for v in views}, [v.name for v in views], [], 1.0)
+    rows = pose_figures(
+        {v.name: v.camera for v in truth}, {v.name: v.camera for v in views}, [v.name for v in views], False, 1.0
+    )
     return np.mean([(r["degrees"], r["units"]) for r in rows["views"][1:]], axis=0)
 
 
@@ -51,12 +61,16 @@ def test_increments_are_rigid_and_their_gradients_are_right():
         expected = torch.linalg.matrix_exp(torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64))
         torch.testing.assert_close(m[:3, :3], expected)
         assert torch.equal(m[:3, 3], b) and m[3].tolist() == [0, 0, 0, 1]
-    numbers = torch.tensor([0, 1, 2])
     w[1] = 0
     w.requires_grad_(), t.requires_grad_()
-    assert torch.autograd.gradcheck(lambda w, t: moved(V, numbers, w, t), (w, t))
-    assert torch.equal(moved(V, numbers, w, t)[0], V[0])
-    torch.testing.assert_close(moved(V, numbers, w, t)[1:], increments(w, t)[1:] @ V[1:])
+
+    def rendered_from(w, t):
+        values = RefinePoses().values({ROTATION: w, TRANSLATION: t}, torch.tensor([0, 1, 2]))
+        return RefinePoses().before_render(Camera(V, None, 1, 1), values).viewmat
+
+    assert torch.autograd.gradcheck(rendered_from, (w, t))
+    assert torch.equal(rendered_from(w, t)[0], V[0])
+    torch.testing.assert_close(rendered_from(w, t)[1:], increments(w, t)[1:] @ V[1:])
 
 
 def test_a_gradient_through_the_rasterizer_is_that_of_differences():
@@ -66,7 +80,7 @@ def test_a_gradient_through_the_rasterizer_is_that_of_differences():
     weights = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
     def value(p):
-        now = moved(V[None], torch.tensor([1]), p[None, :3], p[None, 3:])[0]
+        now = moved(V[None], p[None, :3], p[None, 3:])[0]
         return (rasterize(gaussians, dataclasses.replace(camera, viewmat=now, K=K)).rgb * weights).sum()
 
     p = torch.tensor([0.01, -0.02, 0.015, 0.02, 0.01, -0.03], dtype=torch.float64, requires_grad=True)
@@ -88,8 +102,7 @@ def similar(camera):
 
 
 def fitted_config(steps):
-    rates = OptimizerConfig(pose_rotation_lr=2e-3, pose_translation_lr=2e-3)
-    return FitConfig(steps=steps, half_resolution=0.25, refine_poses=True, optimizer=rates)
+    return FitConfig(steps=steps, half_resolution=0.25, view_modules=(RefinePoses(rotation_lr=2e-3, translation_lr=2e-3),))
 
 
 def fitted(views, steps=240):
@@ -106,16 +119,16 @@ def test_a_fit_finds_poses_back(tmp_path):
     scene = warpgs.load_scene(tmp_path)
     truth = list(scene.views)
     given, names = noisy(truth), [v.name for v in truth]
-    trainer = Trainer(given, scene.points, FitConfig(steps=400, half_resolution=0.25, refine_poses=True), CPU)
+    trainer = Trainer(given, scene.points, FitConfig(steps=400, half_resolution=0.25, view_modules=(RefinePoses(),)), CPU)
     while trainer.step < 400:
         trainer.advance()
-    cameras = refined_cameras({v.name: v.camera for v in given}, names, (), trainer.view_table.params)
+    cameras = refined_cameras({v.name: v.camera for v in given}, names, (), trainer.learned.views.table.params)
     assert np.array_equal(cameras[names[0]].viewmat, given[0].camera.viewmat)
     found = [dataclasses.replace(v, camera=cameras[v.name]) for v in given]
     before, after = errors(given, truth), errors(found, truth)
     assert (after < 0.8 * before).all(), (before, after)
     for name in (ROTATION, TRANSLATION):
-        assert not trainer.view_table.params[name][0].any()
+        assert not trainer.learned.views.table.params[name][0].any()
 
 
 def test_steps_on_any_number_of_threads_and_continued_ones_have_the_same_bits():
@@ -144,11 +157,12 @@ def test_strategies_see_the_poses_of_now_and_steps_count_from_the_given_ones():
     trainer = fitted(given, 30)
     trainer.show_learned()
     shown = [v.camera.viewmat.clone() for v in trainer.views]
-    assert torch.equal(shown[0], trainer.poses.viewmats[0]) and not torch.equal(shown[1], trainer.poses.viewmats[1])
+    first = torch.stack([torch.as_tensor(v.camera.viewmat, dtype=torch.float32) for v in given])
+    assert torch.equal(shown[0], first[0]) and not torch.equal(shown[1], first[1])
     trainer.set_views(trainer.views)
     for stack in trainer.stacks.values():
-        assert torch.equal(stack.viewmats, trainer.poses.viewmats[stack.numbers])
-        now = trainer.learned.posed(stack)  # by which a captured step finds its capacity
+        assert torch.equal(stack.viewmats, first[stack.numbers])
+        now = current(stack, trainer.learned.views)  # by which a captured step finds its capacity
         assert torch.equal(now.viewmats, torch.stack(shown)[stack.numbers])
     trainer.show_learned()
     assert all(torch.equal(v.camera.viewmat, a) for v, a in zip(trainer.views, shown))
@@ -165,13 +179,11 @@ def test_held_out_cameras_follow_the_similarity_of_the_training_cameras():
     found = refined_cameras(cameras, train, ("3",), tensors)
     assert np.array_equal(found["0"].viewmat, cameras["0"].viewmat)
     # cameras that turn about their own centres leave the similarity a mean turn: between none and the largest
-    row = pose_figures(cameras, found, ["3"], [], 1.0)["views"][0]
-    assert 0 < row["degrees"] < max(r["degrees"] for r in pose_figures(cameras, found, train, [], 1.0)["views"])
-    R, scale, t = _similarity(list(cameras.values()), [similar(c) for c in cameras.values()])
+    row = pose_figures(cameras, found, ["3"], False, 1.0)["views"][0]
+    assert 0 < row["degrees"] < max(r["degrees"] for r in pose_figures(cameras, found, train, False, 1.0)["views"])
+    R, scale, t = similarity(list(cameras.values()), [similar(c) for c in cameras.values()])
     np.testing.assert_allclose(R, TURN, atol=1e-12)
     np.testing.assert_allclose([scale, *t], [1.1, 0.3, -0.2, 0.1], atol=1e-12)
-    with pytest.raises(DataError, match=r"pose_rotation and pose_translation must be \[4, 3\]"):
-        refined_cameras(cameras, train, (), {ROTATION: w[:2], TRANSLATION: w})
 
 
 def test_runs_keep_refined_poses(tmp_path):
@@ -181,13 +193,13 @@ def test_runs_keep_refined_poses(tmp_path):
     words = ["fit", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), *flags, "--split", split_spec(8), "--refine-poses"]
     assert main(words) == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    rows, summary = metrics["poses"]["views"], metrics["poses"]["summary"]
+    rows, summary = (metrics["view_modules"]["refine_poses"][key] for key in ("views", "summary"))
     assert rows[0]["degrees"] < 1e-9 and rows[0]["units"] < 1e-9 and all(r["degrees"] > 0 for r in rows[1:])
     assert "held-out views are moved by the one similarity" in summary
     assert summary in (tmp_path / "run" / "report.html").read_text()
     run, scene = warpgs.open_run(tmp_path / "run", "cpu"), warpgs.load_scene(tmp_path / "scene")
     given = {v.name: v.camera for v in scene.views}
-    again = pose_figures(given, run.scene_cameras, run.train, run.test, run.normalization.scale)
+    again = pose_figures(given, run.scene_cameras, run.train, True, run.normalization.scale)
     assert again["views"] == rows
     assert main(["eval", str(tmp_path / "run"), "--device", "cpu"]) == 0
     scores = json.loads((tmp_path / "run" / "eval.json").read_text())
@@ -196,4 +208,4 @@ def test_runs_keep_refined_poses(tmp_path):
     pruned = warpgs.open_run(tmp_path / "pruned", "cpu").scene_cameras
     assert all(np.array_equal(pruned[n].viewmat, c.viewmat) for n, c in run.scene_cameras.items())
     assert main([*words, "--resume"]) == 0
-    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["poses"]["views"] == rows
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["view_modules"]["refine_poses"]["views"] == rows

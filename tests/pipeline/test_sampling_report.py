@@ -22,9 +22,9 @@ from warpgs.pipeline.runs.sampling_report import (
 )
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
-from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig, ProtectConfig
+from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig
+from warpgs.pipeline.train.strategies.sampling_event import MethodConfig, ProtectConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.report.contact_sheet import DOT, GAP, HEAD, MARGIN, TITLE_SIZE
 from warpgs.report.images import colored, webp

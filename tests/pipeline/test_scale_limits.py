@@ -14,7 +14,6 @@ from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.model.scale_limits import (
     LimitConfig,
     Limits,
-    decayed,
     long_axes,
     scene_radius,
     shape_figures,
@@ -23,7 +22,7 @@ from warpgs.pipeline.model.scale_limits import (
 from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.schedule import OptimizerConfig
-from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.scene import Gaussians, PointCloud
 
@@ -40,11 +39,11 @@ def test_axes_are_cut_and_needles_thickened():
     """The middle axis follows the longest, the shortest stays; what is within the limits stays as it is; twice is as once."""
     found = params(torch.log(torch.tensor([[900.0, 1e-6, 1.0], [2.0, 1.0, 1e-9], [1e-3, 3.0, 0.05], [40.0, 40.0, 40.0]])))
     limits = Limits(30.0, 30.0)
-    limits.apply(found, CENTERS, YES)
+    limits.hold(found, CENTERS, YES)
     expected = torch.tensor([[30.0, 1e-6, 1.0], [2.0, 1.0, 1e-9], [1e-3, 3.0, 0.1], [30.0, 30.0, 30.0]])
     assert torch.allclose(found["log_scales"].exp(), expected, rtol=1e-5)
     once = found["log_scales"].clone()
-    limits.apply(found, CENTERS, YES)
+    limits.hold(found, CENTERS, YES)
     assert torch.equal(found["log_scales"], once)
 
 
@@ -60,13 +59,13 @@ def test_any_order_of_the_axes():
 
 
 def test_a_step_that_is_not_taken_changes_nothing():
-    """Neither axes nor opacities, where the step is stopped; and NaN is not hidden where it is taken."""
+    """No axis, where the step is stopped; and NaN is not hidden where it is taken."""
     found = params(torch.tensor([[9.0, 0.0, 0.0], [math.nan, 0.0, 1.0]]))
     before = {n: t.clone() for n, t in found.items()}
-    limits = Limits(1.0, 2.0, 0.5)
-    limits.apply(found, CENTERS, NO)
+    limits = Limits(1.0, 2.0)
+    limits.hold(found, CENTERS, NO)
     assert all(torch.equal(t.nan_to_num(7), before[n].nan_to_num(7)) for n, t in found.items())
-    limits.apply(found, CENTERS, YES)
+    limits.hold(found, CENTERS, YES)
     assert bool(found["log_scales"][1].isnan().any()) and float(found["log_scales"][0].max()) == 0
 
 
@@ -75,7 +74,7 @@ def test_no_gaussian_reaches_a_camera():
     found = params(torch.log(torch.tensor([[9.0, 1.0, 1e-3], [0.5, 0.2, 0.1], [math.inf, 1.0, 1.0]])))
     found["means"] = torch.tensor([[0.0, 0, 6], [0, 0, 6], [0, 0, 6]])
     limits, centers = LimitConfig(max_ratio=0).at(1.0, 100.0), torch.tensor([[0.0, 0, 0], [0, 0, 20]])
-    limits.apply(found, centers, YES)
+    limits.hold(found, centers, YES)
     sizes = found["log_scales"].exp()
     assert torch.allclose(sizes[:2], torch.tensor([[2.0, 1.0, 1e-3], [0.5, 0.2, 0.1]])) and sizes[2, 0].isinf()
     model = Gaussians(**(cloud(2).tensors() | {n: t[:2] for n, t in found.items()}))
@@ -83,14 +82,6 @@ def test_no_gaussian_reaches_a_camera():
     over = shape_figures(model, LimitConfig(), 100.0, 1.0, cameras)["largest_over_distance"]
     nearest = min(np.linalg.norm(c.center - [0, 0, 6]) for c in cameras)
     assert over == pytest.approx(2 / nearest, rel=1e-5)
-
-
-def test_opacities_decay():
-    """Each opacity is multiplied by the factor, from one in a million to all but one in a million."""
-    logits = torch.linspace(-14, 14, 101)
-    lower = decayed(logits, 0.995).double().sigmoid()
-    assert torch.allclose(lower, 0.995 * logits.double().sigmoid(), rtol=2e-6)
-    assert float(decayed(torch.tensor([1e4]), 0.5)) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_the_radius_holds_cameras_and_nine_tenths_of_the_points():
@@ -131,7 +122,9 @@ def test_a_fit_ends_within_its_limits(strategy):
         fit = Trainer(VIEWS, seeds(), c, CPU)
         while fit.step < c.steps:
             fit.advance()
-        beyond.append(shape_figures(fit.gaussians, config.limits, fit.radius, fit.extent, [v.camera for v in VIEWS])["beyond"])
+        beyond.append(
+            shape_figures(fit.gaussians, config.limits, fit.radius, fit.context.extent, [v.camera for v in VIEWS])["beyond"]
+        )
     assert beyond[0] == 0 < beyond[1]
 
 
@@ -150,7 +143,7 @@ def test_what_a_change_of_the_set_adds_is_within_the_limits():
     fit.advance()
     fit.advance()
     assert len(fit.gaussians) == len(seeds()) + 1
-    assert shape_figures(fit.gaussians, config.limits, fit.radius, fit.extent, [v.camera for v in VIEWS])["beyond"] == 0
+    assert shape_figures(fit.gaussians, config.limits, fit.radius, fit.context.extent, [v.camera for v in VIEWS])["beyond"] == 0
 
 
 def test_the_ratio_is_held_from_its_time_on_and_at_the_last_step():
@@ -164,7 +157,6 @@ def test_the_ratio_is_held_from_its_time_on_and_at_the_last_step():
         {"max_reach": -1},
         {"max_ratio": 0.5},
         {"ratio_from": 1.1},
-        {"opacity_decay": 0},
         {"max_size": math.nan},
     ):
         with pytest.raises(UsageError, match="limits"):

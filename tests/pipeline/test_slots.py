@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from warpgs.errors import UsageError
-from warpgs.pipeline.train.slots import SlotSums, Tree, check_batch, own_slots
+from warpgs.pipeline.train.slots import SlotSums, Tree, check_ranks, check_renders, own_slots
 from warpgs.runtime.ranks import ALONE, Ranks
 
 SHAPES = [(7, 3), (7,), (5,)]
@@ -83,6 +83,6 @@ def test_every_slot_is_in_one_process_and_one_node(batch, ranks):
 def test_a_process_without_a_view_is_refused():
     """And so are fits whose renders cannot be numbered."""
     with pytest.raises(UsageError, match="give --batch 4 or a multiple"):
-        check_batch(3, 10, Thread(0, 4, [], threading.Barrier(1)))
+        check_ranks(3, Thread(0, 4, [], threading.Barrier(1)))
     with pytest.raises(UsageError, match="renders; lower --steps or --batch"):
-        check_batch(1000, 20_000, ALONE)
+        check_renders(1000, 20_000)

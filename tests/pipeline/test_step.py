@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from tests.example_terms import DepthCorrelation
 from tests.pipeline.test_importance_sampling import CONFIG as METHOD
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import NotFiniteError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.train import step
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import LossConfig
-from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.scene import View
 
@@ -35,6 +35,11 @@ def fitted(views: list[View], recorded: bool, config: FitConfig = BUSY) -> tuple
     return fit, reports
 
 
+def four() -> list[View]:
+    """Views of one size."""
+    return photos(4)
+
+
 def sizes() -> list[View]:
     """Views of two sizes, one of them with a mask."""
     views = photos(2) + photos(2, 24, 20)
@@ -51,11 +56,11 @@ def cut_out() -> list[View]:
     return [dataclasses.replace(v, alpha=np.broadcast_to(alpha, v.image.shape[:2]).copy()) for v in views]
 
 
-@pytest.mark.parametrize("views", [photos(4), sizes(), cut_out()], ids=["one size", "two sizes and a mask", "cut out"])
-def test_recorded_steps_equal_single_steps(views):
+@pytest.mark.parametrize("make", [four, sizes, cut_out])
+def test_recorded_steps_equal_single_steps(make):
     """Through densification, opacity resets and changes of degree: the same Gaussians and the same reports, bit for bit."""
-    single, said = fitted(views, recorded=False)
-    recorded, reports = fitted(views, recorded=True)
+    single, said = fitted(make(), recorded=False)
+    recorded, reports = fitted(make(), recorded=True)
     a, b = single.state()[0], recorded.state()[0]
     assert len(single.gaussians) != 61
     assert all(torch.equal(a[k], b[k]) for k in a)
@@ -72,12 +77,12 @@ def test_recorded_method_equals_single_steps():
     assert all(torch.equal(a[k], b[k]) for k in a) and [r.count for r in said] == [r.count for r in reports]
 
 
-@pytest.mark.parametrize("views", [photos(4), sizes(), cut_out()], ids=["one size", "two sizes and a mask", "cut out"])
-def test_recorded_batches_equal_single_ones(views):
+@pytest.mark.parametrize("make", [four, sizes, cut_out])
+def test_recorded_batches_equal_single_ones(make):
     """Of three views each, whose graphs follow one another in a step: the same bits, through densification and resets."""
     config = dataclasses.replace(BUSY, batch=3, dropout=0.2, steps=40)
-    single, said = fitted(views, recorded=False, config=config)
-    recorded, reports = fitted(views, recorded=True, config=config)
+    single, said = fitted(make(), recorded=False, config=config)
+    recorded, reports = fitted(make(), recorded=True, config=config)
     a, b = single.state()[0], recorded.state()[0]
     assert len(single.gaussians) != 61 and recorded.layout.graphs > 0
     assert all(torch.equal(a[k], b[k]) for k in a) and [r.count for r in said] == [r.count for r in reports]
@@ -90,7 +95,7 @@ def test_recordings_do_not_pile_up(monkeypatch):
     fit, _ = fitted(photos(4), recorded=True)
     held = []
     for _ in range(40):
-        fit.graphs.clear()
+        fit.taker.clear()
         fit.step -= 1
         fit.advance(1)
         held.append(torch.cuda.memory_reserved())
@@ -124,14 +129,13 @@ def test_loss_that_is_no_number_stops_before_it_harms():
     assert fit.step < 4 and all(bool(torch.isfinite(t).all()) for t in fit.gaussians.tensors().values())
 
 
-@pytest.mark.parametrize("views", [photos(4), sizes()], ids=["one size", "two sizes and a mask"])
-def test_recorded_depth_term_equals_single_steps(views):
+@pytest.mark.parametrize("make", [four, sizes])
+def test_recorded_depth_term_equals_single_steps(make):
     """Halved at first, then whole, then without the term: the same bits, and others than without it throughout."""
-    loss = LossConfig(depth_weight=0.3, depth_until=0.7)
-    config = dataclasses.replace(BUSY, loss=loss, half_resolution=0.3)
-    single, _ = fitted(views, recorded=False, config=config)
-    recorded, _ = fitted(views, recorded=True, config=config)
-    without, _ = fitted(views, recorded=True, config=dataclasses.replace(config, loss=LossConfig()))
+    config = dataclasses.replace(BUSY, loss_terms=(DepthCorrelation(0.3, 0.7),), half_resolution=0.3)
+    single, _ = fitted(make(), recorded=False, config=config)
+    recorded, _ = fitted(make(), recorded=True, config=config)
+    without, _ = fitted(make(), recorded=True, config=dataclasses.replace(config, loss_terms=()))
     a, b = single.state()[0], recorded.state()[0]
     assert all(torch.equal(a[k], b[k]) for k in a)
     assert not torch.equal(recorded.gaussians.means[:10], without.gaussians.means[:10])

@@ -6,7 +6,6 @@ import torch
 from tests.gaussians import cloud
 from tests.pipeline.tables import adam_step
 from warpgs.errors import DataError, UsageError
-from warpgs.pipeline.model.compress import rows_of
 from warpgs.pipeline.model.table import Column, DensityUpdate, Table
 from warpgs.scene import Gaussians
 
@@ -95,23 +94,6 @@ def test_rows_are_reordered_together():
     made.reorder(order)
     assert all(torch.equal(t, before[n][order]) for n, t in made.state().items())
     assert all(t.requires_grad and t.is_leaf for t in made.params.values())
-
-
-def test_merged_rows_take_moments_together_and_the_columns_of_the_first():
-    """First moments in their sum, second ones as the square of the sum of roots; those of what was removed are gone."""
-    g = cloud(4)
-    made = table(gaussians=g)
-    for name, t in made.params.items():
-        values = torch.arange(1.0, 5).reshape(4, *[1] * (t.dim() - 1)).expand_as(t)
-        made.exp_avg[name], made.exp_avg_sq[name] = values.clone(), values.square()
-    new = rows_of(g, torch.tensor([2, 0]))
-    made.merge(new, torch.tensor([1, -1, 0, 1]))
-    assert len(made) == 2 and made.columns["age"].tolist() == [12, 10] and made.columns["seen"].tolist() == [2, 0]
-    for name, t in new.tensors().items():
-        assert torch.equal(made.params[name], t) and made.params[name].requires_grad
-        for moments, wanted in ((made.exp_avg, [3.0, 5.0]), (made.exp_avg_sq, [9.0, 25.0])):
-            found = moments[name].reshape(2, -1)
-            assert torch.allclose(found, torch.tensor(wanted)[:, None].expand_as(found))
 
 
 def test_opacity_reset_caps_and_forgets():

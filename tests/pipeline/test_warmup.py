@@ -13,8 +13,9 @@ from warpgs.pipeline.model import init
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.train import setup
 from warpgs.pipeline.train import warmup as warmups
-from warpgs.pipeline.train.config import PRESETS
+from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.loop import run
+from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.setup import prepare
 from warpgs.pipeline.train.strategies.importance_sampling import ImportanceSampling
 from warpgs.pipeline.train.trainer import Trainer
@@ -22,24 +23,26 @@ from warpgs.pipeline.train.warmup import POINTS, STEPS, background_warmup, warm_
 from warpgs.scene import ViewDepth
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
+CHOSEN = {name: settings_by_views(config, photos(3), "cpu")[0] for name, config in PRESETS.items()}
+"""Presets with every setting chosen, as a fit has them."""
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_part_of_a_fit_is_used(preset, monkeypatch):
     """Every step is taken, Gaussians are added by refinement, events sample where the preset has any, and a view is scored."""
-    scored, config = [], PRESETS[preset]
+    scored, config = [], CHOSEN[preset]
     score = warmups.score
     monkeypatch.setattr(warmups, "score", lambda view, image: scored.append(score(view, image)))
     fit = warm_up(config, CPU)
     assert fit.step == STEPS and len(fit.gaussians) > POINTS
     assert isinstance(fit.strategy, ImportanceSampling) == config.method.events
     assert not config.method.events or len(fit.strategy.events) == 1
-    assert len(scored) == 1 and 0 < scored[0].psnr < 30 and fit.graphs is None
+    assert len(scored) == 1 and 0 < scored[0].psnr < 30 and fit.taker.graphs is None
 
 
 def test_limits_of_the_real_fit_do_not_stop_it():
     """A memory limit is for the real fit alone; a bound on Gaussians holds."""
-    fit = warm_up(dataclasses.replace(PRESETS["quick"], memory_limit=1, half_resolution=0.5, max_gaussians=50), CPU)
+    fit = warm_up(dataclasses.replace(CHOSEN["quick"], memory_limit=1, half_resolution=0.5, max_gaussians=50), CPU)
     assert fit.step == STEPS and len(fit.gaussians) <= 50
 
 
@@ -85,7 +88,7 @@ def test_nothing_goes_on_after_the_block(monkeypatch):
 def test_a_warmup_that_nobody_waits_for_stops():
     """Between its steps."""
     with pytest.raises(KeyboardInterrupt):
-        warm_up(PRESETS["quick"], CPU, lambda: True)
+        warm_up(CHOSEN["quick"], CPU, lambda: True)
 
 
 @pytest.mark.parametrize("changes", [{}, {"memory_limit": 10**9}, {"init": InitConfig(source="random")}])
@@ -120,8 +123,8 @@ def test_only_fits_that_sweep_warm_up_a_sweep(preset, monkeypatch):
     """And none under a memory limit, which leaves the sweep to the CPU."""
     swept = []
     monkeypatch.setattr(warmups, "sweep_depths", lambda views, *_: swept.append(len(views)))
-    warm_up(PRESETS[preset], CPU)
-    warm_up(dataclasses.replace(PRESETS[preset], memory_limit=10**9), CPU)
+    warm_up(CHOSEN[preset], CPU)
+    warm_up(dataclasses.replace(CHOSEN[preset], memory_limit=10**9), CPU)
     assert swept == ([2] if preset == "default" else [])
 
 
@@ -129,7 +132,7 @@ def test_only_fits_that_sweep_warm_up_a_sweep(preset, monkeypatch):
 def test_a_fit_is_the_same_after_a_background_warmup():
     """Bit for bit that of a fit without one."""
     device, views = torch.device("cuda"), photos(3)
-    config = dataclasses.replace(PRESETS["quick"], steps=20)
+    config = dataclasses.replace(CHOSEN["quick"], steps=20)
     fits = []
     for warmed_up in (False, True):
         with background_warmup(config, device if warmed_up else CPU) as ready:

@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import json
+import os
 import threading
 from types import SimpleNamespace
 
@@ -193,6 +194,29 @@ def test_keyframes_are_bounded(window, monkeypatch):
     for _ in range(MAX_KEYFRAMES + 3):
         append(SimpleNamespace(client=None))
     assert len(panel.keyframes) == MAX_KEYFRAMES and told == ["a path has at most 1,000 keyframes"] * 3
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need a right that users often lack")
+@pytest.mark.parametrize("linked", ["000006.png", "."])
+def test_no_image_of_a_run_is_read_through_a_link(window, tmp_path, monkeypatch, linked):
+    """The sheet of a run that somebody else made may lead to an image of the user's; a note says so, and nothing is shown."""
+    run, own, pressed, shown, told = tmp_path / "run", tmp_path / "own", [], [], []
+    for folder in (run, own):
+        folder.mkdir()
+    Image.new("RGB", (8, 8)).save(own / "000006.png")
+    if linked == ".":
+        (run / "sampling").symlink_to(own)
+    else:
+        (run / "sampling").mkdir()
+        (run / "sampling" / linked).symlink_to(own / linked)
+    content = dataclasses.replace(window.content, stem=run, sheet=run / "sampling" / "000006.png")
+    monkeypatch.setattr(window.panel, "content", content)
+    monkeypatch.setattr(window.panel, "explain", told.append)
+    button = SimpleNamespace(on_click=pressed.append)
+    monkeypatch.setattr(window.panel.server.gui, "add_button", lambda *_, **__: button)
+    window.panel._add_importance()
+    pressed[0](SimpleNamespace(client=SimpleNamespace(gui=SimpleNamespace(add_modal=lambda _: shown.append(1)))))
+    assert not shown and len(told) == 1 and "is a link" in told[0]
 
 
 def test_a_ply_and_what_is_neither(folder, tmp_path):

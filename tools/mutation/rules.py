@@ -47,6 +47,7 @@ EXTREMES, LAYERS = "numerics/test_extreme_projection.py", "numerics/test_extreme
 OPS = {
     "adam": ["kernels/test_adam.py", LIMITS, "pipeline/test_table.py"],
     "blend": ["kernels/test_blend.py", "render/test_rasterize.py", LIMITS_BLEND],
+    "blend_channels": ["kernels/test_blend_channels.py", "render/test_channels.py"],
     "blend_cpu": ["kernels/test_blend.py", LIMITS_BLEND, RECORDS, LAYERS, "render/test_window.py"],
     "blend_cuda": ["kernels/test_blend.py", "render/test_rasterize.py", LIMITS_BLEND, RECORDS, LAYERS, "render/test_window.py"],
     "cameras/": ["kernels/test_project.py", LIMITS_PROJECT, EXTREMES, "kernels/test_cameras.py"],
@@ -76,7 +77,7 @@ OPS = {
 """The tests of a file by the beginning of its name (of cameras: folder/name), the longest that fits; soonest failing first."""
 
 CUDA_OPS = {
-    "adam": [GUARDS, "pipeline/test_step.py"], "blend_cuda": [BODIES, GUARDS], "cameras/": [GUARDS],
+    "adam": [GUARDS, "pipeline/test_step.py"], "blend_cuda": [BODIES, GUARDS, "render/test_channels.py"], "cameras/": [GUARDS],
     "cuda_graph": ["render/test_graphed_cuda.py", "pipeline/test_step.py"],
     "interop": [BODIES, "kernels/test_project.py", "pipeline/test_step.py"],
     "median_depth": [GUARDS], "native": [BODIES, GUARDS], "project": [GUARDS],
@@ -139,7 +140,7 @@ def sides(node: ast.AST) -> tuple[bool, bool]:
     if not isinstance(node, ast.If | ast.IfExp):
         return False, False
     test = ast.unparse(node.test)
-    if "== 'cuda'" in test or re.fullmatch(r"native|wp\.static\(native\)|_native\(\w+\)", test):
+    if "== 'cuda'" in test or re.fullmatch(r"native|wp\.static\(native\)|is_native\(\w+\)", test):
         return True, False
     return False, "== 'cpu'" in test or "blocked" in test
 

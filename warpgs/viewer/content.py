@@ -18,7 +18,7 @@ from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
 from warpgs.pipeline.runs.commands import scene_of
 from warpgs.pipeline.runs.folder import StoredRun, open_run
 from warpgs.pipeline.runs.model_and_cameras import RULE
-from warpgs.pipeline.train.strategies.importance_sampling import FINE
+from warpgs.pipeline.train.strategies.sampling_event import FINE
 from warpgs.scene import Normalization, View
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from warpgs.errors import WarpgsError
-from warpgs.files import readable, remove_leftovers, write_json
+from warpgs.files import read_file, readable, remove_leftovers, write_json
 from warpgs.geometry import rotation_matrices
 from warpgs.io.decoding import decode
 from warpgs.runtime.terminal import say
@@ -116,13 +116,13 @@ class Panel:
 
     def _add_importance(self) -> None:
         """Offer the fit's own image of where importance placed Gaussians."""
-        sheet = self.content.sheet
+        sheet, run = self.content.sheet, self.content.stem
         if sheet is None:
             return
 
         def show(event: Any) -> None:
             try:
-                image = np.round(255 * decode(sheet)[0]).astype(np.uint8)
+                image = np.round(255 * decode(sheet, data=read_file(sheet, run))[0]).astype(np.uint8)
             except WarpgsError as e:
                 return self.explain(str(e))
             with event.client.gui.add_modal("Where importance placed Gaussians") as modal:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from warpgs.errors import DataError, WarpgsError
-from warpgs.export.formats import FORMATS
+from warpgs.export.formats import suffixes
 from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.runs.folder import CONFIG, read_record
 from warpgs.pipeline.runs.request import choose_device
@@ -34,7 +34,7 @@ def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None 
     """Show a run folder or a file of Gaussians until Ctrl-C; checkpoints of a fit that goes on are shown as they come.
 
     Args:
-        path: Run folder, of a fit that goes on, too; or a file of any format in `FORMATS`.
+        path: Run folder, of a fit that goes on, too; or a file of any registered format.
         port: Port to listen at; 0 for any free one.
         device: Device that renders images: auto, cpu or cuda.
         reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
@@ -47,8 +47,8 @@ def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None 
     choose_device(device)
     if path.is_dir():
         read_record(path)
-    elif not path.name.lower().endswith(tuple(FORMATS)) or not path.is_file():
-        known = ", ".join(FORMATS)
+    elif not path.name.lower().endswith(tuple(suffixes())) or not path.is_file():
+        known = ", ".join(suffixes())
         raise DataError(
             f"{path}: is neither a run folder ({CONFIG} in it) nor a file of Gaussians ({known}); give one of these"
         )

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from warpgs import __version__, schema
+from warpgs import schema
 from warpgs.errors import DataError, FolderHeldError, ResourceError, UsageError, WarpgsError
 from warpgs.files import LOCK, is_empty, move_folder
 from warpgs.io.splits import Split
@@ -19,6 +19,7 @@ from warpgs.pipeline.runs.request import FitRequest
 from warpgs.pipeline.runs.schemas import METRICS
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.runtime.folder_lock import hold_folder
+from warpgs.version import __version__
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from warpgs.pipeline.runs.request import FitRequest, SceneRequest
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LOSS_TERMS
 from warpgs.pipeline.train.strategies.base import STRATEGIES
+from warpgs.pipeline.train.view_modules.base import VIEW_MODULES
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,8 @@ def job_of(text: str) -> FarmJob:
     STRATEGIES.load(config["strategy"])
     for term in config["loss_terms"]:
         LOSS_TERMS.load(term["name"])
+    for module in config["view_modules"]:
+        VIEW_MODULES.load(module["name"])
     weights = None if r["lpips_weights"] is None else Path(r["lpips_weights"])
     request = FitRequest(
         scene, Path(r["out"]), FitConfig.from_json(config), r["device"], lpips_weights=weights, notes=tuple(r["notes"])

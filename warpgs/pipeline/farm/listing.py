@@ -20,7 +20,7 @@ MOST_BYTES = 200
 """Longest name of a job: file systems take 255 bytes, and names that begin with it, such as NAME.old1, must fit too."""
 OWN_FILES = ("index.html", "results.csv")
 """Names in a results folder that are no job's."""
-PLUGINS = ("strategy", "loss-terms", "reader")
+PLUGINS = ("preset", "strategy", "loss-terms", "view-modules", "reader")
 """Flags that can name code: a file of jobs may name only that of warpgs."""
 FARM_FLAGS = (
     "out", "resume", "view", "view-port", "device", "threads", "time-budget", "allow-outside", "help", "help-all", "h",

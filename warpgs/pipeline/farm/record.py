@@ -8,12 +8,13 @@ import os
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from warpgs import __version__, schema
+from warpgs import schema
 from warpgs.errors import ResourceError
 from warpgs.files import write_json
 from warpgs.input_files import input_digest, unread_reason
 from warpgs.pipeline.farm.job import FarmJob
 from warpgs.pipeline.runs.folder import CONFIG
+from warpgs.version import __version__
 
 RECORD = "job.json"
 LOG = "log.txt"

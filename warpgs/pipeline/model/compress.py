@@ -9,7 +9,7 @@ import torch
 
 from warpgs.pipeline.model.coverage import Coverage, coverage, fisher
 from warpgs.pipeline.model.merge import Merges, merges
-from warpgs.pipeline.model.parameter_bounds import truncated
+from warpgs.pipeline.model.sh_degrees import truncated
 from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.scene import Camera, Gaussians
@@ -139,8 +139,8 @@ def cheapest(gaussians: Gaussians, pairs: Merges, accepted: Callable[[Gaussians]
 
 def merge_neighbours(
     gaussians: Gaussians, kinds: torch.Tensor, view_set: ViewSet, accepted: Callable[[Gaussians, float], bool]
-) -> tuple[Gaussians, torch.Tensor]:
-    """Merge pairs, cheapest first, in rounds: again and again while it is worthwhile.
+) -> Gaussians:
+    """Merge pairs, cheapest first, in rounds: again and again while it is worthwhile; return the smaller set.
 
     Args:
         gaussians: The set.
@@ -148,27 +148,19 @@ def merge_neighbours(
         view_set: Training views.
         accepted: Test whether a model is good enough when a fraction in [0, 1] of the allowed loss may be spent. The fraction
             grows over the first `RAMP` rounds: the cheapest pairs of the second are cheaper than the dearest of the first.
-
-    Returns:
-        The smaller set, and the row of it that each Gaussian went into, int64 [N].
     """
-    idle, into = 0, torch.arange(len(gaussians), device=gaussians.means.device)
+    idle = 0
     for number in range(PASSES):
         part = min(1.0, (number + 1) / RAMP)
         pairs = merges(gaussians, view_set.coverage(gaussians).maxima, kinds, odd=bool(number % 2), shift=number / PASSES)
         taken = cheapest(gaussians, pairs, lambda g, part=part: accepted(g, part))
         if taken:
             change = pairs.change(len(gaussians), taken)
-            place = torch.empty_like(kinds, dtype=torch.int64)
-            place[change.keep] = torch.arange(len(change.keep), device=place.device)
-            for half in (pairs.first, pairs.second):
-                place[half[:taken]] = len(change.keep) + torch.arange(taken, device=place.device)
-            into = place[into]
             gaussians, kinds = changed(gaussians, change), torch.cat([kinds[change.keep], kinds[change.parents]])
         idle = 0 if taken > WORTHWHILE * len(gaussians) else idle + 1
         if (idle >= 2 and part == 1) or len(gaussians) < 2:
             break
-    return gaussians, into
+    return gaussians
 
 
 def dispensable(gaussians: Gaussians, view_set: ViewSet, accepted: Callable[[Gaussians], bool]) -> torch.Tensor:
@@ -177,14 +169,11 @@ def dispensable(gaussians: Gaussians, view_set: ViewSet, accepted: Callable[[Gau
     return keep_last(order, largest_fraction(lambda s: accepted(rows_of(gaussians, keep_last(order, s)))))
 
 
-def needed_degrees(
-    gaussians: Gaussians, highest: torch.Tensor, view_set: ViewSet, accepted: Callable[[Gaussians], bool]
-) -> torch.Tensor:
-    """Return the degree of each Gaussian: 0 for as many as ``accepted`` allows, the others keep up to ``highest``.
+def needed_degrees(gaussians: Gaussians, view_set: ViewSet, accepted: Callable[[Gaussians], bool]) -> torch.Tensor:
+    """Return the degree of each Gaussian: 0 for as many as ``accepted`` allows, the others keep theirs.
 
     Args:
         gaussians: N Gaussians.
-        highest: Degree that each may keep, int, shape [N].
         view_set: Training views.
         accepted: Test whether a model is good enough.
 
@@ -192,7 +181,7 @@ def needed_degrees(
         Degrees, int32, shape [N].
     """
     order = degree_order(gaussians, view_set.coverage(gaussians))
-    degrees = torch.minimum(stored_degrees(gaussians.sh), highest.to(torch.int32))
+    degrees = stored_degrees(gaussians.sh)
 
     def lowered(fraction: float) -> torch.Tensor:
         result = degrees.clone()
@@ -210,8 +199,6 @@ class Pruned:
     """Sorted by degree, ascending."""
     degrees: torch.Tensor
     """Degree of each, int32, shape [N], ascending."""
-    into: torch.Tensor
-    """Row that each Gaussian of the larger model went into, -1 where it was removed, int64, shape [N]."""
 
 
 def prune_model(
@@ -230,14 +217,11 @@ def prune_model(
     """
     degrees, model = stored_degrees(gaussians.sh), gaussians
     if bool((degrees > 0).any()):
-        model = with_degrees(model, needed_degrees(model, degrees, view_set, lambda g: accepted(g, DEGREES_FRACTION)))
+        model = with_degrees(model, needed_degrees(model, view_set, lambda g: accepted(g, DEGREES_FRACTION)))
 
     begin = DEGREES_FRACTION
-    model, into = merge_neighbours(model, kinds, view_set, lambda g, part: accepted(g, begin + part * (MERGE_FRACTION - begin)))
+    model = merge_neighbours(model, kinds, view_set, lambda g, part: accepted(g, begin + part * (MERGE_FRACTION - begin)))
     keep = dispensable(model, view_set, lambda g: accepted(g, 1.0))
     degrees = stored_degrees(model.sh[keep])
     order = torch.argsort(degrees, stable=True)
-    keep, degrees = keep[order], degrees[order]
-    place = torch.full((len(model),), -1, dtype=torch.int64, device=keep.device)
-    place[keep] = torch.arange(len(keep), device=keep.device)
-    return Pruned(rows_of(model, keep), degrees, place[into])
+    return Pruned(rows_of(model, keep[order]), degrees[order])

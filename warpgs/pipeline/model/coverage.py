@@ -1,8 +1,7 @@
-"""Coverage of a model by the training views: contribution, viewing directions and sensitivity of each Gaussian."""
+"""Coverage of a model by the training views: contribution and sensitivity of each Gaussian."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,9 +11,6 @@ from warpgs.scene import Camera, Gaussians
 
 SEEN = 4 / 255
 """Least blending weight at which a view sees a Gaussian: below, it changes no pixel by more than four of 255 levels."""
-CONE = math.radians(5)
-"""Least angle of the cone of view directions for each band of harmonics. Over a smaller one the band changes by less than a
-twelfth of its range, and its coefficients answer for the noise of the photographs instead."""
 PROBES = 2
 """Random images per view for the Fisher sensitivity."""
 
@@ -27,14 +23,6 @@ class Coverage:
     """Largest blending weight over all pixels of all views (RadSplat, arXiv 2403.13806; a sum is small for thin Gaussians)."""
     views: torch.Tensor
     """Number of views with a weight of at least `SEEN`, int64."""
-    cone: torch.Tensor
-    """Full opening angle of the cone around the mean direction that holds the directions to those views [rad]."""
-    footprint: torch.Tensor
-    """Width of a pixel at the Gaussian in the nearest of those views [u]; 0 where no view sees it."""
-
-    def supported_degree(self) -> torch.Tensor:
-        """Return the highest degree that the views can tell apart, int64 [N]: d needs d + 1 views in a cone of d `CONE`."""
-        return torch.minimum((self.views - 1).clamp_min(0), (self.cone / CONE).long()).clamp_max(3)
 
 
 @torch.no_grad()
@@ -48,30 +36,11 @@ def coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOpti
     """
     count, means = len(gaussians), gaussians.means
     maxima, views = means.new_zeros(count), torch.zeros(count, dtype=torch.int64, device=means.device)
-    footprint, total = means.new_full((count,), torch.inf), torch.zeros_like(means)
-    seen = []
     for c in cameras:
         weights = rasterize(gaussians, c, replace(options, contributions=True)).weight_maxima[0]
         maxima = torch.maximum(maxima, weights)
-        sees = weights >= SEEN
-        seen.append(sees)
-        views += sees
-        depth = means @ c.viewmat[2, :3] + c.viewmat[2, 3]
-        footprint = torch.where(sees, torch.minimum(footprint, depth / (c.K[0, 0] * c.K[1, 1]).sqrt()), footprint)
-        total += torch.where(sees[:, None], _directions(means, c), 0)
-    middle = torch.nn.functional.normalize(total, dim=1)
-    widest = means.new_zeros(count)
-    for c, sees in zip(cameras, seen):
-        # from the distance of the unit vectors: the arc cosine of their product knows no small angles in float32
-        angle = 2 * torch.asin((0.5 * (_directions(means, c) - middle).norm(dim=1)).clamp(max=1))
-        widest = torch.where(sees, torch.maximum(widest, angle), widest)
-    widest = torch.where(views > 1, widest, 0)  # of a single direction only its rounding is left
-    return Coverage(maxima, views, 2 * widest, torch.where(torch.isfinite(footprint), footprint, 0))
-
-
-def _directions(means: torch.Tensor, camera: Camera) -> torch.Tensor:
-    center = -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]
-    return torch.nn.functional.normalize(center - means, dim=1)
+        views += weights >= SEEN
+    return Coverage(maxima, views)
 
 
 @torch.enable_grad()  # whoever asks may have switched gradients off, as the trainer does when the set changes

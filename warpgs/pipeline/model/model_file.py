@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from warpgs import __version__, schema
+from warpgs import schema
 from warpgs.coordinates import checked_normalization, convert_camera, convert_gaussians
 from warpgs.errors import DataError, UsageError
 from warpgs.files import write_bytes
@@ -18,6 +18,7 @@ from warpgs.input_files import read_input, unread_reason
 from warpgs.pipeline.metrics.evaluate import options_for
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Normalization
+from warpgs.version import __version__
 
 FORMAT = "warpgs-model-1"
 SH_COUNTS = (1, 4, 9, 16)

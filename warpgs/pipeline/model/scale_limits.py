@@ -33,8 +33,6 @@ class Limits:
     """Largest standard deviation of an axis [u]."""
     ratio: float = math.inf
     """Largest ratio of the longest axis to the middle one."""
-    decay: float = 1.0
-    """Factor of every opacity, in (0, 1]."""
     reach: float = 0.0
     """Largest standard deviation of an axis, as a fraction of the distance to the nearest camera; 0 for no such limit."""
 
@@ -43,7 +41,12 @@ class Limits:
         """Bring logarithms of axes [N, 3] within the limits, in place; a second time changes nothing.
 
         Axes are cut to the largest size; where the longest is then too long for the middle one, the middle one grows. A flat
-        disk stays one. Arguments are those of `apply`; ``going`` None stands for True.
+        disk stays one. Moments of Adam stay. It may be part of a captured step.
+
+        Args:
+            params: ``means`` [N, 3] and ``log_scales`` [N, 3] of `Gaussians`.
+            centers: Positions of training cameras [u], as `camera_centers` gives them, shape [C, 3].
+            going: Whether the step is taken, bool, shape [1]; where it is not, nothing changes. None stands for True.
         """
         if self.largest == math.inf and self.ratio == math.inf and self.reach == 0:
             return
@@ -57,22 +60,6 @@ class Limits:
             new = torch.where(new == middle, torch.maximum(new, longest - math.log(self.ratio)), new)
         old.copy_(new if going is None else torch.where(going, new, old))
 
-    @torch.no_grad()
-    def apply(self, params: dict[str, torch.Tensor], centers: torch.Tensor, going: torch.Tensor) -> None:
-        """Bring parameters within the limits, and lower opacities, in place; it may be part of a captured step.
-
-        Moments of Adam stay.
-
-        Args:
-            params: ``means`` [N, 3], ``log_scales`` [N, 3] and ``logit_opacities`` [N] of `Gaussians`.
-            centers: Positions of training cameras [u], as `camera_centers` gives them, shape [C, 3].
-            going: Whether the step is taken, bool, shape [1]; where it is not, nothing changes.
-        """
-        self.hold(params, centers, going)
-        if self.decay < 1:
-            old = params["logit_opacities"].detach()
-            old.copy_(torch.where(going, decayed(old, self.decay), old))
-
 
 NO_LIMITS = Limits()
 """Limits that change nothing."""
@@ -80,7 +67,7 @@ NO_LIMITS = Limits()
 
 @dataclass(frozen=True)
 class LimitConfig:
-    """Limits of every Gaussian of a fit, and the decay of opacities."""
+    """Limits of every Gaussian of a fit."""
 
     max_size: float = 1.0
     """Largest standard deviation of an axis, as a fraction of the scene's radius; 0 for no limit."""
@@ -91,8 +78,6 @@ class LimitConfig:
     a third, three of them reach no camera; larger ones beside or behind training cameras are a fog before other views."""
     ratio_from: float = 0.7
     """Fraction of the steps after which that ratio is held, in [0, 1]. Long Gaussians help the first steps."""
-    opacity_decay: float = 1.0
-    """Factor of every opacity after each step, above 0 and at most 1; 1 for none, 0.995 in Binocular3DGS (arXiv 2410.18822)."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.max_size <= 1e6:
@@ -103,8 +88,6 @@ class LimitConfig:
             raise UsageError(f"limits max-reach must be 0, for no limit, or at most 1e6, not {self.max_reach}")
         if not 0 <= self.ratio_from <= 1:
             raise UsageError(f"limits ratio-from must lie between 0 and 1, not {self.ratio_from}")
-        if not 0 < self.opacity_decay <= 1:
-            raise UsageError(f"limits opacity-decay must be above 0 and at most 1, not {self.opacity_decay}")
 
     def at(self, progress: float, radius: float) -> Limits:
         """Return the limits of a step.
@@ -115,7 +98,7 @@ class LimitConfig:
         """
         held = self.max_ratio > 0 and (progress > self.ratio_from or progress == 1)
         largest = self.max_size * radius if self.max_size > 0 else math.inf
-        return Limits(largest, self.max_ratio if held else math.inf, self.opacity_decay, self.max_reach)
+        return Limits(largest, self.max_ratio if held else math.inf, self.max_reach)
 
 
 def camera_centers(cameras: Sequence[Camera], device: torch.device) -> torch.Tensor:
@@ -129,16 +112,6 @@ def long_axes(log_scales: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     a, b, c = log_scales.unbind(1)
     low, high = torch.minimum(a, b), torch.maximum(a, b)
     return torch.maximum(high, c), torch.maximum(low, torch.minimum(high, c))
-
-
-def decayed(logits: torch.Tensor, factor: float) -> torch.Tensor:
-    """Return the logits [N] of opacities times a factor in (0, 1): l + ln d - ln(1 + (1 - d) e^l) for a logit l.
-
-    No opacity near 1 is rounded on the way.
-    """
-    exact = logits.double()  # float32's exponential has other last digits on other processors
-    lower = exact + math.log(factor) - torch.nn.functional.softplus(exact + math.log1p(-factor))
-    return lower.to(logits.dtype)
 
 
 def scene_radius(cameras: list[Camera], cloud: PointCloud) -> float:

@@ -1,6 +1,6 @@
 """One table of what training learns: parameters, their Adam moments and named columns, one row each.
 
-A fit has a table of Gaussians. A second one, of its training views, has a row a view; it is empty unless a loss term asks for
+A fit has a table of Gaussians. A second one, of its training views, has a row a view; it is empty unless view modules ask for
 parameters of each view.
 """
 
@@ -71,9 +71,15 @@ class Table:
         self.params = {n: t.detach().clone().contiguous().requires_grad_() for n, t in params.items()}
         self.exp_avg = {n: torch.zeros_like(t) for n, t in self.params.items()}
         self.exp_avg_sq = {n: torch.zeros_like(t) for n, t in self.params.items()}
-        self.kinds = dict(columns)
-        self.columns = {n: torch.full((count,), c.fill, dtype=c.dtype, device=device) for n, c in columns.items()}
+        self.kinds: dict[str, Column] = {}
+        self.columns: dict[str, torch.Tensor] = {}
         self.count = count
+        self.add_columns(columns)
+
+    def add_columns(self, columns: Mapping[str, Column]) -> None:
+        """Add columns by name, filled."""
+        self.kinds |= columns
+        self.columns |= {n: torch.full((self.count,), c.fill, dtype=c.dtype, device=self.device) for n, c in columns.items()}
 
     def __len__(self) -> int:
         """Number of rows."""
@@ -177,32 +183,6 @@ class Table:
     def sort_along_curve(self) -> None:
         """Put the Gaussians in Morton order, so that neighbours in space are neighbours in memory."""
         self.reorder(torch.argsort(morton_codes(self.params["means"].detach()), stable=True))
-
-    @torch.no_grad()
-    def merge(self, rows: Gaussians, into: torch.Tensor) -> None:
-        """Replace the set by one whose Gaussians each stand for some of the old.
-
-        First moments add up as the gradients do, second ones as if the gradients had all had one sign: a step is then rather
-        too short than too long. Summed in float64 on the CPU, where the order is the same every time. Columns are those of the
-        first of the old rows.
-
-        Args:
-            rows: The new set, M rows.
-            into: Row of the new set that each old one went into, -1 for none, int64, shape [N].
-        """
-        went, old = into >= 0, torch.arange(self.count, device=into.device)
-        first = old.new_full((len(rows),), self.count).scatter_reduce(0, into[went], old[went], "amin")
-        for name in self.columns:
-            self.columns[name] = self.columns[name][first]
-        into = into.cpu()
-        sources = torch.nonzero(into >= 0).squeeze(1)
-        for name, new in rows.tensors().items():
-            for moments, power in ((self.exp_avg, 1.0), (self.exp_avg_sq, 0.5)):
-                each = moments[name].double().cpu()[sources] ** power
-                total = each.new_zeros(new.shape).index_add_(0, into[sources], each)
-                moments[name] = (total ** (1 / power)).to(moments[name])
-            self.params[name] = new.detach().to(self.params[name].dtype).contiguous().requires_grad_()
-        self.count = len(rows)
 
     def reset_opacities(self, opacity: float) -> None:
         """Lower every opacity to at most this, in (0, 1), and forget the moments of all opacities (the classic reset)."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from warpgs.errors import UsageError
 from warpgs.pipeline.runs.request import SceneRequest
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.slots import check_batch, own_slots
+from warpgs.pipeline.train.slots import check_ranks, own_slots
 from warpgs.poses.find import needs_poses
 from warpgs.runtime.ranks import Ranks
 from warpgs.scene import Scene
@@ -29,7 +29,7 @@ def check_batched(
         UsageError: A step has fewer views than there are processes, or each process would choose settings or find poses of its
             own.
     """
-    check_batch(config.batch, config.steps, ranks)
+    check_ranks(config.batch, ranks)
     if ranks.count == 1:
         return
     path = None if isinstance(scene, Scene) else Path(scene.path if isinstance(scene, SceneRequest) else scene)

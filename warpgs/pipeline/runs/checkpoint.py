@@ -11,10 +11,11 @@ from typing import Any
 
 import torch
 
-from warpgs import __version__, schema
+from warpgs import schema
 from warpgs.errors import DataError, NotFiniteError
 from warpgs.files import write_bytes
 from warpgs.input_files import open_input, unread_reason
+from warpgs.version import __version__
 
 TENSORS = "checkpoint.safetensors"
 FORMAT = 2

@@ -16,10 +16,10 @@ from warpgs.pipeline.films.film import COVERAGE, FILM, render_film, sheet_path
 from warpgs.pipeline.films.plan import FilmSettings, plan_film
 from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.model.model_file import FittedModel
-from warpgs.pipeline.runs.cameras_after_fit import with_cameras
 from warpgs.pipeline.runs.coverage_report import coverage_lines, coverage_of_run
 from warpgs.pipeline.runs.failed_step import findings, read_failed_step
 from warpgs.pipeline.runs.folder import IMAGE_FOLDERS, StoredRun, open_run
+from warpgs.pipeline.runs.learned_views import with_cameras
 from warpgs.pipeline.runs.model_and_cameras import open_file
 from warpgs.pipeline.runs.request import choose_device, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, protocol_of, score_line
@@ -51,7 +51,7 @@ def scene_of(
     scene, _, _ = read_scene(stored.scene_request(reader), tell)
     if scene.fingerprint != stored.record["fingerprint"]:
         raise DataError(f"{scene.path}: its images or cameras are not those that {stored.folder} was fitted to; restore them")
-    if stored.record["config"].get("refine_poses"):
+    if stored.record["config"]["view_modules"]:
         scene = with_cameras(scene, stored.scene_cameras)
     scene, split = over_background(scene, stored.background), Split(stored.train, stored.test)
     return scene, train_views(scene, split.train), train_views(scene, split.test)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
 from warpgs.errors import DataError, UsageError
+from warpgs.export.base import Format
 from warpgs.export.cameras import holds_cameras, write_cameras
-from warpgs.export.formats import Format, format_of, read_gaussians, write_gaussians
+from warpgs.export.formats import find_format, format_of, read_gaussians, write_gaussians
 from warpgs.io.camera_files import read_cameras
 from warpgs.kernels.knn import morton_codes
 from warpgs.pipeline.model.filters import limit_degree, select
@@ -30,47 +32,57 @@ ROUNDING = 1e-4
 """Change of a log scale below which nothing is said: a hundredth of a percent."""
 
 
-def convert(source: Path, target: Path, filters: Filters = NO_FILTERS) -> list[str]:
+def convert(
+    source: Path, target: Path, filters: Filters = NO_FILTERS, formats: Sequence[str | type[Format] | Format] = ()
+) -> list[str]:
     """Write a file of Gaussians, or of cameras, in another format; returns lines for the user.
 
     Args:
         source: The file to read; of cameras also a folder with a COLMAP reconstruction.
         target: The file to write; its name says the format.
         filters: Filters; cameras are rotated only.
+        formats: Formats that are taken where a file's name ends as their files do, as in `write_gaussians`, before any other.
 
     Raises:
         DataError: The file cannot be read or is malformed, or nothing is left of it.
         ResourceError: Another process writes into the target's folder, or it cannot be written.
-        UsageError: A suffix is unknown, a filter makes no sense, or needs the cameras of a run.
+        UsageError: A suffix is unknown, a given format is that of neither file, a filter makes no sense, or needs the cameras
+            of a run.
     """
     if holds_cameras(target):
-        _check_for_cameras(filters)
+        _check_for_cameras(filters, formats)
         found, notes = read_cameras(source)
         return [*notes, *_cameras_written(list(found.values()), list(found.values()), target, filters)]
-    kind, read = format_of(target), format_of(source)
+    given = [find_format(f) for f in formats]
+    for unused in (f for f in given if not (f.fits(source) or f.fits(target))):
+        format_of(target, unused)  # says that its name is another
+    read, kind = (format_of(p, next((f for f in given if f.fits(p)), None)) for p in (source, target))
     rotation_of(filters.rotate, None)  # before anything is read
-    lines = _written(read_gaussians(source), None, target, kind, filters)
+    lines = _written(read_gaussians(source, format=read), None, target, kind, filters)
     return [read.note, *lines] if read.note and not kind.note else lines
 
 
-def export(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> list[str]:
+def export(
+    folder: Path, target: Path, filters: Filters = NO_FILTERS, format: str | type[Format] | Format | None = None
+) -> list[str]:
     """Write a run's Gaussians, or its cameras, to a file, in the units of the scene's files; returns lines for the user.
 
     Args:
         folder: The run folder.
         target: The file to write; its name says the format.
         filters: Filters; cameras are rotated only.
+        format: Format to write, as in `write_gaussians`; None for the one that the name says.
 
     Raises:
         DataError: The folder is no run, or nothing is left of its model.
         ResourceError: Another process writes into the target's folder, or it cannot be written.
-        UsageError: The name says no format, or a filter makes no sense.
+        UsageError: The name says no format, or not the given one, or a filter makes no sense.
     """
     if holds_cameras(target):
-        _check_for_cameras(filters)
+        _check_for_cameras(filters, () if format is None else (format,))
         stored = open_run(folder, torch.device("cpu"))
         return _cameras_written(list(stored.cameras("file").values()), training_cameras(stored), target, filters)
-    kind = format_of(target)
+    kind = format_of(target, format)
     stored = open_run(folder, torch.device("cpu"))
     return _written(file_gaussians(stored), stored, target, kind, filters)
 
@@ -81,7 +93,7 @@ def _written(gaussians: Gaussians, stored: StoredRun | None, target: Path, kind:
     if not len(gaussians):
         raise DataError(f"{target}: not written, no Gaussian is left. Give a larger box, or --no-clean")
     if kind.max_degree < gaussians.sh_degree:
-        lines.append(f"harmonics above degree {kind.max_degree} are left out, {kind.name} holds none")
+        lines.append(f"harmonics above degree {kind.max_degree} are left out, {kind.suffix} files hold none")
         gaussians = limit_degree(gaussians, kind.max_degree)
     if stored is not None and any(stored.background):
         color = "".join(f"{round(255 * v):02x}" for v in stored.background)
@@ -89,15 +101,15 @@ def _written(gaussians: Gaussians, stored: StoredRun | None, target: Path, kind:
     if kind.sorted:
         gaussians = select(gaussians, torch.argsort(morton_codes(gaussians.means), stable=True))
     with hold_folder(target.parent) as notes:
-        write_gaussians(target, gaussians, units="file")
-    lines += _changes(target, gaussians) if kind.encode is not None else []
+        write_gaussians(target, gaussians, units="file", format=kind)
+    lines += _changes(target, gaussians, kind) if type(kind).decode is not Format.decode else []
     lines += [kind.note] if kind.note else []
     return [*notes, *lines, f"{len(gaussians):,} Gaussians in {target}, {target.stat().st_size / 2**20:.2f} MiB"]
 
 
-def _changes(target: Path, gaussians: Gaussians) -> list[str]:
+def _changes(target: Path, gaussians: Gaussians, kind: Format) -> list[str]:
     """Return a line on what the format rounded, from the file itself; none for what float32 rounds."""
-    back = read_gaussians(target)
+    back = read_gaussians(target, format=kind)
     moved = float((back.means.double() - gaussians.means.double()).abs().max())
     scales = (back.log_scales.double() - gaussians.log_scales.double()).abs().amax(1)
     if moved == 0 and float(scales.max()) < ROUNDING:
@@ -107,12 +119,14 @@ def _changes(target: Path, gaussians: Gaussians) -> list[str]:
     return [text + (f"; {other:,} Gaussians have an axis that is off by more than a tenth" if other else "")]
 
 
-def _check_for_cameras(filters: Filters) -> None:
+def _check_for_cameras(filters: Filters, formats: Sequence[object]) -> None:
     """Check that only a rotation is asked for.
 
     Raises:
-        UsageError: Another filter is, which cameras do not have.
+        UsageError: Another filter is, which cameras do not have, or a format of Gaussians.
     """
+    if formats:
+        raise UsageError("--format is for Gaussians, and cameras are written by the names of their files; leave it out")
     if any(v is not None for v in (filters.crop, filters.clean, filters.sh_degree)):
         raise UsageError("--crop, --clean and --sh-degree are for Gaussians; cameras are turned by --rotate only")
 

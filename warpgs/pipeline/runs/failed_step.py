@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +11,15 @@ import torch
 from warpgs.errors import DataError
 from warpgs.files import write_bytes
 from warpgs.input_files import open_input
-from warpgs.kernels.dropout import opacity_dropout
-from warpgs.kernels.step_buffers import SHIFT
 from warpgs.pipeline.runs.checkpoint import safetensors_chunks
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.exposure import EXPOSURE, exposed, exposure_of
-from warpgs.pipeline.train.loss import Target, over
+from warpgs.pipeline.train.learned_views import LearnedViews
+from warpgs.pipeline.train.loss import term_values
 from warpgs.pipeline.train.setup import terms_of
+from warpgs.pipeline.train.step import Forward, StepBuffers, StepPlan, eager_renderer, forward
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.pipeline.train.views import half_size
-from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.scene import Camera, Gaussians, Render
+from warpgs.pipeline.train.views import ViewStack
+from warpgs.scene import Gaussians
 
 FILE = "not_finite.safetensors"
 """Name of the file in a run folder."""
@@ -40,31 +37,25 @@ def failed_step(trainer: Trainer, view: int, name: str, slot: int = 0) -> Bundle
         name: Its name.
         slot: Its number among the views of the step.
     """
-    trainer.show_learned()
-    number, shown = trainer.step + 1, trainer.views[view]
+    number = trainer.step + 1
     plan = trainer.plan_of(number)
-    if plan.half_size:
-        shown = half_size(shown)
-    camera, settings = shown.camera, list(trainer.settings(number, slot))
-    image, background = shown.image, trainer.background
-    if shown.alpha is not None:  # over the colour that the step had behind it
-        shift = torch.tensor(settings[SHIFT], dtype=torch.float32, device=image.device)
-        image, background = over(image, shown.alpha, shift), background + shift
-    tensors = {"image": image, "viewmat": camera.viewmat, "K": camera.K, "background": background}
-    if camera.distortion is not None:
-        tensors["distortion"] = camera.distortion
+    kind, row = trainer.places[view + plan.half_size * len(trainer.views)]
+    stack = trainer.stacks[kind]
+    tensors = {"image": stack.images[row], "viewmat": stack.viewmats[row], "K": stack.Ks[row], "background": trainer.background}
+    if stack.distortions.numel():
+        tensors["distortion"] = stack.distortions[row]
+    if stack.masks is not None:
+        tensors["mask"] = stack.masks[row]
+    if stack.alphas is not None:
+        tensors["alpha"] = stack.alphas[row]
+    tensors |= {f"maps.{n}": t[row] for n, t in stack.maps.items()}
     tensors |= {f"params.{n}": t for n, t in trainer.gaussians.tensors().items()}
-    tensors |= {f"maps.{n}": t for n, t in shown.maps.items()}
-    tensors |= {f"own.{n}": t.detach()[view] for n, t in trainer.view_table.params.items()}
-    if (own := trainer.view_table.params.get(EXPOSURE)) is not None:
-        tensors[f"own.{EXPOSURE}"] = exposure_of(own, own[view]).detach()
-    if shown.mask is not None:
-        tensors["mask"] = shown.mask
-    if shown.alpha is not None:
-        tensors["alpha"] = shown.alpha
+    learned = trainer.learned.views
+    tensors |= {f"views.{m.name}.{n}": t.detach() for m in learned.modules for n, t in learned.params_of(m).items()}
     plain = {
-        "config": trainer.config.to_json(), "step": number, "view": name, "width": camera.width, "height": camera.height,
-        "camera_model": camera.model, "degree": plan.degree, "settings": settings, "dropout_seed": trainer.learned.dropout_seed,
+        "config": trainer.config.to_json(), "step": number, "view": name, "number": view, "camera_model": stack.model,
+        "degree": plan.degree, "settings": list(trainer.settings(number, slot)), "cutout": trainer.cutout,
+        "dropout_seed": trainer.learned.dropout_seed,
     }  # fmt: skip
     return tensors, plain
 
@@ -94,6 +85,31 @@ def read_failed_step(path: Path, device: torch.device) -> Bundle:
         raise DataError(f"{path}: is no step that failed ({e}); give the {FILE} of a run folder") from e
 
 
+def repeated(bundle: Bundle) -> tuple[StepPlan, Forward]:
+    """Take the forward pass of a failed step again; returns the step's plan, and what was computed."""
+    tensors, plain = bundle
+    config = FitConfig.from_json(plain["config"])
+    gaussians = Gaussians(**{n: tensors[f"params.{n}"].requires_grad_() for n in Gaussians.__dataclass_fields__})
+    device, K = gaussians.means.device, tensors["K"][None]
+
+    def group(name: str) -> dict[str, torch.Tensor]:
+        return {n.removeprefix(f"{name}."): t for n, t in tensors.items() if n.startswith(f"{name}.")}
+
+    mask, alpha = (None if n not in tensors else tensors[n][None] for n in ("mask", "alpha"))
+    distortions = tensors["distortion"][None] if "distortion" in tensors else K.new_empty(1, 0)
+    views = ViewStack(
+        tensors["viewmat"][None], K, distortions, plain["camera_model"], tensors["image"][None], mask,
+        {n: t[None] for n, t in group("maps").items()}, torch.tensor([plain["number"]], device=device), alpha,
+    )  # fmt: skip
+    terms = tuple(t for t in terms_of(config, plain["cutout"]) if t.active(plain["step"], config.steps))
+    buffers, render = StepBuffers(device, 1, 1), eager_renderer(config.rule, tensors["background"], None)
+    buffers.load([0], [[0.0]], [tuple(plain["settings"])])
+    plan = StepPlan(plain["degree"], False, terms, None)
+    own = [group(f"views.{m.name}") for m in config.view_modules]
+    learned = LearnedViews(config.view_modules, own, device, max((len(t) for o in own for t in o.values()), default=0))
+    return plan, forward(gaussians, learned, plain["dropout_seed"], views, buffers, plan, render)
+
+
 def findings(bundle: Bundle) -> list[str]:
     """Compute a failed step again; returns a line for everything that it reads and computes, and whether that is finite.
 
@@ -105,44 +121,23 @@ def findings(bundle: Bundle) -> list[str]:
     """
     tensors, plain = bundle
     try:
-        config = FitConfig.from_json(plain["config"])
-        gaussians = Gaussians(**{n: tensors[f"params.{n}"].requires_grad_() for n in Gaussians.__dataclass_fields__})
-        parts = {p: {n.removeprefix(f"{p}."): t for n, t in tensors.items() if n.startswith(f"{p}.")} for p in ("maps", "own")}
-        target = Target(tensors["image"], tensors.get("mask"), parts["maps"], parts["own"], tensors.get("alpha"))
-        lines = [
-            f"step {plain['step']} on {plain['view']}, {plain['width']} x {plain['height']} px, {len(gaussians):,} Gaussians"
-        ]
+        plan, found = repeated(bundle)
+        inputs = found.inputs
+        size, params = f"{inputs.camera.width} x {inputs.camera.height} px", inputs.gaussians.tensors()
+        lines = [f"step {plain['step']} on {plain['view']}, {size}, {len(inputs.gaussians):,} Gaussians"]
         lines += [f"  {name}: {_state(t)}" for name, t in tensors.items()]
-        render = _rendered(gaussians, bundle, config)
-        lines += [f"  rendered {n}: {_state(getattr(render, n))}" for n in ("rgb", "alpha", "depth")]
-        if config.exposure:
-            render = replace(render, rgb=exposed(render.rgb, parts["own"][EXPOSURE]))
-        for term in terms_of(config, "alpha" in tensors):
-            if term.active(plain["step"], config.steps):
-                value = term(render, target, gaussians)
-                lines.append(f"  loss term {term.name}: {float(value.detach()):g}")
-                if not value.requires_grad:  # of the view's own parameters alone
-                    continue
-                of = torch.autograd.grad(value, list(gaussians.tensors().values()), retain_graph=True, allow_unused=True)
-                broken = [n for n, g in zip(gaussians.tensors(), of) if g is not None and not bool(torch.isfinite(g).all())]
-                lines += [f"    its gradient by {n} is not finite" for n in broken]
-    except (KeyError, TypeError, ValueError, RuntimeError) as e:
+        lines += [f"  rendered {name}: {_state(t)}" for name, t in inputs.outputs.items()]
+        for term, value in zip(plan.terms, term_values(plan.terms, inputs), strict=True):
+            lines.append(f"  loss term {term.name}: {float(value.detach()):g}")
+            if not value.requires_grad:  # of the view's own parameters alone
+                continue
+            of = torch.autograd.grad(value, list(params.values()), retain_graph=True, allow_unused=True)
+            broken = [n for n, g in zip(params, of) if g is not None and not bool(torch.isfinite(g).all())]
+            lines += [f"    its gradient by {n} is not finite" for n in broken]
+        lines += [f"  view module {n}: {float(t.detach()):g}" for n, t in found.of_views.items()]
+    except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as e:
         raise DataError(f"the failed step is not whole ({e!r}); fit again to have it written anew") from e
     return lines
-
-
-def _rendered(gaussians: Gaussians, bundle: Bundle, config: FitConfig) -> Render:
-    tensors, plain = bundle
-    factors = None
-    if plain["dropout_seed"] is not None:
-        settings = torch.tensor(plain["settings"], dtype=torch.float32, device=gaussians.means.device)
-        factors = opacity_dropout(len(gaussians), settings, plain["dropout_seed"])
-    options = RasterizeOptions(
-        rule=config.rule, sh_degree=plain["degree"], background=tensors["background"], opacity_factors=factors
-    )
-    size, model = (plain["width"], plain["height"]), plain.get("camera_model", "pinhole")
-    camera = Camera(tensors["viewmat"], tensors["K"], *size, model, tensors.get("distortion"))
-    return rasterize(gaussians, camera, options)
 
 
 def _state(values: torch.Tensor) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,15 +23,22 @@ from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.model.scale_limits import shape_figures, shape_summary
 from warpgs.pipeline.runs.batched import batched_notes, check_batched
-from warpgs.pipeline.runs.cameras_after_fit import refined_scene
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.runs.coverage_report import coverage_of_run
-from warpgs.pipeline.runs.exposure_report import exposure_figures
 from warpgs.pipeline.runs.failed_step import FILE as FAILED
 from warpgs.pipeline.runs.failed_step import failed_step, save_failed_step
-from warpgs.pipeline.runs.folder import CONFIG, check_checkpoint, check_same, read_record, record_of, run_folder
+from warpgs.pipeline.runs.folder import (
+    CONFIG,
+    camera_values,
+    check_checkpoint,
+    check_same,
+    read_record,
+    record_of,
+    run_folder,
+)
 from warpgs.pipeline.runs.job import FitJob
-from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device, choose_split, read_scene
+from warpgs.pipeline.runs.learned_views import cameras_of, learned_cameras, learned_figures, with_cameras
+from warpgs.pipeline.runs.request import FitRequest, SceneRequest, check_overrides, choose_device, choose_split, read_scene
 from warpgs.pipeline.runs.results import evaluate_run, overview_of, protocol_of, result_lines, write_report
 from warpgs.pipeline.runs.rule_report import rule_report_of
 from warpgs.pipeline.runs.sampling_report import event_figures, images_kept, sampling_report_of
@@ -39,9 +46,10 @@ from warpgs.pipeline.runs.with_poses import lost_lines, with_poses
 from warpgs.pipeline.train.background import choose_background, over_background
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.complexity import complexity_figures, complexity_summary
-from warpgs.pipeline.train.config import FitConfig, preset_config
-from warpgs.pipeline.train.exposure import EXPOSURE
+from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loop import run
+from warpgs.pipeline.train.presets import chosen_settings
+from warpgs.pipeline.train.slots import check_renders
 from warpgs.pipeline.train.step_report import StepReport
 from warpgs.pipeline.train.time_budget import within_budget
 from warpgs.pipeline.train.trainer import Trainer
@@ -79,7 +87,7 @@ class FitResult(FittedModel):
 
 def fit(
     scene: Scene | SceneRequest | str | Path,
-    config: FitConfig | str | None = None,
+    preset: FitConfig | Mapping[str, Any] | str | Path | None = None,
     *,
     split: str | None = None,
     out: str | Path | None = None,
@@ -92,6 +100,7 @@ def fit(
     verbose: bool | Literal["progress"] = True,
     on_model: Callable[[FittedModel], object] | None = None,
     ranks: Ranks = ALONE,
+    **overrides: object,
 ) -> FitResult:
     """Fit Gaussians to a scene: the same code as `warpgs fit`.
 
@@ -99,28 +108,35 @@ def fit(
 
     Args:
         scene: A scene, its folder, or a folder with the options it is read with.
-        config: Settings, the name of a preset, or None for the default one.
+        preset: Settings to start from: the name of a preset; the path of a .toml file; a `FitConfig` or a mapping, itself or as
+            ``module:NAME`` or ``file.py:NAME``, which runs that code; None for the default preset.
         split: Views to fit and to hold out, as in `warpgs fit --split`; None for all to fit.
         out: Run folder to fill with configuration, log, checkpoints, PLY, images, scores and report; None to write nothing.
         device: auto, cpu, cuda, or one of torch's.
         on_step: Called after every step with its number, loss, PSNR, number of Gaussians and time.
         resume: Continue the run in ``out`` from its last checkpoint.
         lpips_weights: File of `warpgs convert-lpips`; None to leave LPIPS out.
-        time_budget: Time that the fit may take [s], by which its steps are chosen; None for those of ``config``.
+        time_budget: Time that the fit may take [s], by which its steps are chosen; None for those of the settings.
         notes: Choices made before, to be printed and recorded with the fit's own.
         verbose: True to print, False to print nothing, "progress" to print what is being done and no choice or result.
         on_model: Called after every step with the model as it is, for those who look on: the next step overwrites its tensors.
         ranks: Processes that fit together, from `warpgs.runtime.ranks.join`, all with the same arguments. The first alone
             prints, writes and scores; the others return a result without metrics.
+        **overrides: Settings that replace those of the preset, by the names of their flags with underscores, such as
+            ``steps=300`` or ``init_max_sh_degree=1``; or a group as a mapping, ``init={"max_sh_degree": 1}``. `FitConfig` lists
+            them, and `warpgs fit --help-all`.
 
     Raises:
-        UsageError: Settings, a preset or a split cannot be, ``out`` holds something already, or ``resume`` comes without it.
+        DataError: The file of a preset cannot be read.
+        UsageError: A setting is unknown, of another type or out of range, a preset or a split cannot be, ``out`` holds
+            something already, or ``resume`` comes without it.
         WarpgsError: Anything else that a user can fix; before the first step wherever it can be known by then.
     """
     out = None if out is None else Path(out)
     if resume and out is None:
         raise UsageError("resume needs the run folder that it continues: give out")
-    config = preset_config(config)
+    check_overrides(overrides)
+    config, origin = chosen_settings(preset, overrides)
     spec = scene.split if split is None and isinstance(scene, SceneRequest) else split
     if spec is not None:
         check_spec(spec)
@@ -137,9 +153,10 @@ def fit(
         began = time.perf_counter()
         lpips = None if lpips_weights is None else load_lpips(Path(lpips_weights), where[0])
         request, read, parts, found = _scene_of(scene, split, out, where[0].type, progress)
-        notes = (*notes, *held, *found, *([] if out is None else renaming_notes(image_names(v.name for v in read.views))))
+        renamed = [] if out is None else renaming_notes(image_names(v.name for v in read.views))
+        own_notes = [*notes, *origin, *held, *found, *renamed]
         job = FitJob(
-            read, request, parts, config, *where, own, lpips, [*notes], verbose, on_step, began, progress, on_model, ranks,
+            read, request, parts, config, *where, own, lpips, own_notes, verbose, on_step, began, progress, on_model, ranks,
             compiled,
         )  # fmt: skip
         if time_budget is not None:
@@ -148,6 +165,7 @@ def fit(
         _set_background(job)
         job.config, chosen = settings_by_views(job.config, job.train, job.device.type)
         job.notes += chosen
+        check_renders(job.config.batch, job.config.steps or 0)
         trainer, state, record = _prepare(job, out if resume else None)
         result = _finish(job, trainer, state, record, resume)
     ranks.leave()
@@ -239,13 +257,14 @@ def _finish(job: FitJob, trainer: Trainer, state: State | None, record: dict[str
     job.ranks.part()
     if not job.ranks.first:
         return FitResult(*_model_fields(job, trainer), job.config, {}, tuple(job.notes), None)
-    poses = _refined(job, trainer)
+    given = cameras_of(job.scene)
+    job.scene = with_cameras(job.scene, learned_cameras(job.scene, job.split, trainer.learned.views))
     if job.out is not None:
         write_ply(job.out / "point_cloud.ply", drop_unused_sh(trainer.gaussians), job.scene.normalization)
     with ThreadPoolExecutor(1) as beside:
         # its process takes seconds, in which views are scored here
         overview = beside.submit(overview_of(trainer.gaussians, job.train, job.test)) if job.out is not None else None
-        metrics = _score(job, trainer, {"setup": setup, "training": training}) | poses
+        metrics = _score(job, trainer, {"setup": setup, "training": training}, given)
         if job.out is not None and overview is not None:
             job.progress("making the report")
             write_json(job.out / "metrics.json", metrics)
@@ -266,46 +285,35 @@ def _model_fields(
     job: FitJob, trainer: Trainer
 ) -> tuple[Gaussians, Normalization, dict[str, Camera], Names, Names, str, tuple[float, float, float], int]:
     """Return the fields of the `FittedModel` that a fit has by now."""
-    cameras = {v.name: v.camera for v in job.scene.views}
+    cameras = cameras_of(job.scene)
     names, rule = (job.split.train, job.split.test), job.config.rule
     return trainer.gaussians, job.scene.normalization, cameras, *names, rule, job.scene.background, trainer.step
 
 
-def _refined(job: FitJob, trainer: Trainer) -> dict[str, Any]:
-    """Give the scene its refined poses, and tell of them; returns their entry of metrics.json, if any."""
-    if not job.config.refine_poses:
-        return {}
-    job.scene, figures = refined_scene(job.scene, job.split, trainer.view_table.params)
-    job.note(figures["summary"])
-    return {"poses": figures}
-
-
-def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float]) -> dict[str, Any]:
-    """Score the finished fit; returns the contents of metrics.json."""
+def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict[str, Camera]) -> dict[str, Any]:
+    """Score the finished fit, whose views had ``given`` cameras before it; returns the contents of metrics.json."""
     c, scene, train, test, gaussians = job.config, job.scene, job.train, job.test, trainer.gaussians
     on_cuda = job.device.type == "cuda"
     peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(job.device)} if on_cuda else {}
     names = image_names(v.name for v in scene.views)
     scored, tell = (job.out, gaussians, train, test, c.rule, scene.background), job.progress
-    metrics = evaluate_run(*scored, job.lpips, trainer.max_instances, names=names, tell=tell)
+    metrics = evaluate_run(*scored, job.lpips, trainer.context.max_instances, names=names, tell=tell)
     if test:
-        metrics["coverage"] = coverage_of_run(*scored, trainer.max_instances, names=names, tell=tell)
+        metrics["coverage"] = coverage_of_run(*scored, trainer.context.max_instances, names=names, tell=tell)
     tell("comparing renders with float64")
     rule = rule_report_of(
         gaussians, train, c.rule, scene.background, seed=c.seed, half_resolution=trainer.half_resolution,
-        max_instances=trainer.max_instances,
+        max_instances=trainer.context.max_instances,
     )  # fmt: skip
-    shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.extent, [v.camera for v in train])
-    options = options_for(c.rule, scene.background, gaussians, trainer.max_instances)
+    shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.context.extent, [v.camera for v in train])
+    options = options_for(c.rule, scene.background, gaussians, trainer.context.max_instances)
     shown = counted(train, job.progress, "looking for what moved", "views")
     fractions = moved_fractions(train, (Rendered(*render_view(gaussians, v, options)) for v in shown))
     moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
-    complexity, exposures = complexity_figures(trainer), {}
-    if c.exposure:
-        rows = trainer.view_table.params[EXPOSURE]
-        exposures = {"exposure": exposure_figures(job.split.train, rows, test, gaussians, options)}
+    complexity = complexity_figures(trainer)
+    learned = learned_figures(trainer.learned.views, scene, job.split, given, test, gaussians, options)
     details = [rule["summary"], shape_summary(shape), complexity_summary(complexity)]
-    for note in [*map(Detail, details), *moved_notes(moved), *(e["summary"] for e in exposures.values())]:
+    for note in [*map(Detail, details), *moved_notes(moved), *(e["summary"] for e in learned.values())]:
         job.note(note)
     compiling = {"compiling": sum(job.compiled)} if job.compiled else {}
     return metrics | {
@@ -315,7 +323,7 @@ def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float]) -> dict[str
         "config_hash": c.fingerprint(), "fingerprint": scene.fingerprint, "device": job.where.removeprefix("on "),
         "seconds": {**seconds, **compiling, "total": time.perf_counter() - job.began}, **peak,
         "memory": trainer.memory.to_json(), "rule": rule, "shape": shape,
-        **event_figures(trainer), **complexity, **exposures,
+        **event_figures(trainer), **complexity, "view_modules": learned,
         "photographs": [p.to_json() | {"moved": moved.get(p.name)} for p in job.photographs],
     }  # fmt: skip
 
@@ -330,6 +338,9 @@ def _train(job: FitJob, trainer: Trainer, images_written: Callable[[], None]) ->
             log.flush()
             images_written()
             tensors, state = current.state()
+            if current.config.view_modules:  # by which a run is opened without their code
+                cameras = learned_cameras(job.scene, job.split, current.learned.views)
+                state["cameras"] = {n: camera_values(c) for n, c in cameras.items()}
             save_checkpoint(out, tensors, state | {"fingerprint": job.scene.fingerprint, "train": job.split.train})
 
     def restore(current: Trainer) -> bool:

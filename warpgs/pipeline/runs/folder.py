@@ -14,22 +14,21 @@ from typing import Any
 import numpy as np
 import torch
 
-from warpgs import __version__, schema
+from warpgs import schema
 from warpgs.errors import DataError, UsageError
 from warpgs.files import is_empty, plain
 from warpgs.io.splits import Split
 from warpgs.kernels.cameras.base import check_camera
 from warpgs.pipeline.model.model_file import FittedModel, checked_gaussians
-from warpgs.pipeline.model.parameter_bounds import unpack
-from warpgs.pipeline.runs.cameras_after_fit import refined_cameras
+from warpgs.pipeline.model.sh_degrees import unpack
 from warpgs.pipeline.runs.checkpoint import FORMAT, TENSORS, load_checkpoint
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device
 from warpgs.pipeline.runs.schemas import MODEL_STATE, check_record
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.refine_poses import ROTATION
 from warpgs.poses.record import JSON as POSES
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Camera, Gaussians, Normalization, Scene
+from warpgs.version import __version__
 
 CONFIG = "config.json"
 IMAGE_FOLDERS = ("renders", "depth", "coverage", "sampling")
@@ -91,6 +90,14 @@ def _camera(values: dict[str, Any]) -> Camera:
     camera = Camera(**(values | arrays))
     check_camera(camera)
     return camera
+
+
+def _cameras(stored: dict[str, Any], path: Path) -> dict[str, Camera]:
+    """Return cameras by name that a file holds; DataError where a model is not there."""
+    try:
+        return {n: _camera(c) for n, c in stored.items()}
+    except UsageError as e:
+        raise DataError(f"{path}: {e}") from e
 
 
 def record_of(
@@ -188,7 +195,9 @@ def _check_named_again(now: dict[str, Any], then: dict[str, Any], out: Path) -> 
     """Raise a UsageError where a run used code from outside warpgs that is not named again."""
 
     def outside(config: dict[str, Any]) -> dict[str, list[str]]:
-        names = {"--strategy": [config.get("strategy")], "--loss-terms": [t["name"] for t in config.get("loss_terms", [])]}
+        names = {"--strategy": [config.get("strategy")]}
+        for field in ("loss_terms", "view_modules"):
+            names[f"--{field.replace('_', '-')}"] = [part["name"] for part in config.get(field, [])]
         return {flag: [n for n in found if isinstance(n, str) and ":" in n] for flag, found in names.items()}
 
     for flag, names in outside(then).items():
@@ -273,21 +282,12 @@ def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredR
     folder = Path(folder)
     where, _ = choose_device(device)
     record = read_record(folder)
-    try:
-        cameras = {n: _camera(c) for n, c in record["cameras"].items()}
-    except UsageError as e:
-        raise DataError(f"{folder / CONFIG}: {e}") from e
     offset, scale = record["normalization"]["offset"], record["normalization"]["scale"]
     red, green, blue = map(float, record["background"])
     tensors, state = load_checkpoint(folder)
     gaussians, step = _model_of(tensors, state, folder / TENSORS)
+    cameras = _cameras(record["cameras"], folder / CONFIG) | _cameras(state.get("cameras", {}), folder / TENSORS)
     train, test, rule = tuple(record["train"]), tuple(record["test"]), record["config"]["rule"]
-    own = {n.removeprefix("views.params."): t for n, t in tensors.items() if n.startswith("views.params.")}
-    if ROTATION in own:
-        try:
-            cameras = refined_cameras(cameras, train, test, own)
-        except DataError as e:
-            raise DataError(f"{folder / TENSORS}: {e}") from e
     return StoredRun(
         Gaussians(**{n: t.to(where) for n, t in gaussians.tensors().items()}),
         Normalization(np.array(offset, np.float64), float(scale)),

@@ -28,6 +28,7 @@ from warpgs.kernels import (
     ssim_cuda,
     step_buffers,
     tiles,
+    tiles_emit,
 )
 from warpgs.kernels.native import BLOCK
 from warpgs.pipeline.train.strategies import mcmc
@@ -50,8 +51,10 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     real = wp.float32
     common = [
         (project.make_forward(real, cuda, CAMERA_MODEL), THREADS), (project.make_backward(real, cuda, CAMERA_MODEL), BLOCK),
-        (tiles.make_kernels(real, cuda).pack_counts, THREADS), (tiles.make_kernels(real, cuda).find_ranges, THREADS),
-        (tiles.make_emit(real, cuda), THREADS), (knn.make_kernels(real).search, THREADS), (dropout.make_kernel(), THREADS),
+        (tiles.make_kernels(real, cuda).pack_counts, THREADS),
+        *((tiles_emit.make_emit(real, cuda, slotted), THREADS) for slotted in (True, False)),
+        *((tiles_emit.make_find_ranges(slotted), THREADS) for slotted in (True, False)),
+        (knn.make_kernels(real).search, THREADS), (dropout.make_kernel(), THREADS),
         (camera_reach.make_kernel(), THREADS),
         (step_buffers.make_kernels().end_step, THREADS), (mcmc.make_kernel(), THREADS),
     ]  # fmt: skip
@@ -67,9 +70,10 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         ]  # fmt: skip
         return [(kernel, 1) for kernel in [*(k for k, _ in common), *own]]
     blending, warps = blend_cuda.make_kernels(TILE_SIZE), 32 * blend_cuda.WARPS
-    own = [(blending.forward, warps), (blending.order_tiles, 1024), (blending.contributions, TILE_SIZE * TILE_SIZE)]
+    own = [(blend_cuda.make_forward(TILE_SIZE, save, per), warps) for save in (True, False) for per in (1, 2)]
+    own += [(blending.order_tiles, 1024), (blending.contributions, TILE_SIZE * TILE_SIZE)]
     own += [(blend.make_segments(real).gather_weights, THREADS), (scanlines.make_kernel(), scanlines.BLOCK)]
-    for depth, chunk in itertools.product((False, True), blend_cuda.CHUNKS):  # with a depth term, and without
+    for depth, chunk in itertools.product((False, True), blend_cuda.CHUNKS):  # with a loss term that reads depth, and without
         passes = blend_cuda.make_backward(TILE_SIZE, depth, chunk, False)
         own += [(passes.backward, warps), (passes.gather, THREADS)]
     own += [(ssim_cuda.make_kernels().forward, ssim_cuda.THREADS), (adam.make_scheduled_kernel(), THREADS)]

@@ -18,7 +18,7 @@ from warpgs.pipeline.metrics.evaluate import render_view, to_8_bit
 from warpgs.pipeline.metrics.psnr import psnr
 from warpgs.pipeline.metrics.region import scored_region
 from warpgs.pipeline.model import compress
-from warpgs.pipeline.model.parameter_bounds import model_bytes, pack
+from warpgs.pipeline.model.sh_degrees import model_bytes, pack
 from warpgs.pipeline.runs.checkpoint import save_checkpoint
 from warpgs.pipeline.runs.commands import scene_of
 from warpgs.pipeline.runs.folder import CONFIG, StoredRun, camera_values, open_run

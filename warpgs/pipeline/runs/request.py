@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import torch
@@ -29,9 +29,11 @@ class SceneRequest:
     """A scene folder and the options it is read with."""
 
     path: str
-    """Folder of the scene; empty where it was passed from Python."""
+    """Scene folder, in a format that one of the readers knows; or photographs or a video without cameras."""
+    # empty where a scene was passed from Python
     split: str | None = None
-    """Views to fit and to hold out, as in `warpgs fit --split`; None for all to fit."""
+    """Views to hold out for scores: llff:K, mip360:K, dtu:3|6|9, blender:8, every:N, all (trains on all), or
+    train=NAMES;test=NAMES. None: all train; a study holds out every 8th view or the middle one."""
     downscale: int | None = None
     """Factor by which both image sides shrink; None for 1."""
     strict: bool = False
@@ -45,14 +47,14 @@ class SceneRequest:
     black_is_empty: bool = True
     """Dark pixels around an object are transparent, where every image shows one on black."""
     score_masks: str | None = None
-    """Folder of object masks for scoring, matched by image id; None for the scene's own `idrmasks`, if any."""
+    """Folder of object masks for scoring, matched by image id; None for the scene's own idrmasks, if any."""
     reader: str | None = None
-    """Name of the reader, ``module:Class`` or ``path/to/file.py:Class``; None to ask every built-in reader."""
+    """Name of the scene's format, or a reader of your own: module:Class or path/to/file.py:Class; None to ask every reader."""
     max_pixels: int = MAX_PIXELS
     """Largest number of pixels that an image or a mask may have as stored."""
     max_side: int | None = None
-    """Longest side that an image keeps [px], 0 for no limit; None for 0 where ``downscale`` is given, else for 1600, or 800
-    in a fit on a CPU."""
+    """Longest side that an image keeps [px], 0 for no limit; None for 0 where a factor is given, else for 1600, or 800 in a fit
+    on a CPU."""
 
     def with_scale(self, device: str) -> SceneRequest:
         """Return this request with its size of images in numbers, as a run on ``device``, cpu or cuda, remembers it."""
@@ -81,6 +83,16 @@ class FitRequest:
     """Choices made for the user while the request was read."""
     view_port: int | None = None
     """Port at which the command line shows the model while it trains; None for no viewer."""
+
+
+def check_overrides(overrides: Mapping[str, object]) -> None:
+    """Check that keywords of a fit are no options of reading a scene.
+
+    Raises:
+        UsageError: One is.
+    """
+    for name in overrides.keys() & {f.name for f in fields(SceneRequest)}:
+        raise UsageError(f"warpgs.fit: {name} says how a scene is read; give it to warpgs.load_scene and fit its result")
 
 
 def choose_device(name: str | torch.device) -> tuple[torch.device, str]:

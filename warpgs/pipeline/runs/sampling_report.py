@@ -15,8 +15,9 @@ from warpgs.errors import ResourceError
 from warpgs.files import make_folder, read_file, write_bytes
 from warpgs.io.decoding import decode
 from warpgs.pipeline.train.schedule import Phases
-from warpgs.pipeline.train.strategies.importance_sampling import Event, ImportanceSampling, MethodConfig, SampledView
+from warpgs.pipeline.train.strategies.importance_sampling import ImportanceSampling
 from warpgs.pipeline.train.strategies.sampler import SUPPORT
+from warpgs.pipeline.train.strategies.sampling_event import Event, MethodConfig, SampledView
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.report.contact_sheet import Tile, contact_sheet

@@ -51,13 +51,14 @@ _SCENE = fields(
     {"max_pixels": whole(1), "max_side": whole(0)},
     others=False,
 )  # fmt: skip
+_PARTS = items(fields({"name": text}))
 _RECORD = fields(
     {
         "scene": _SCENE, "fingerprint": text, "train": items(_view_name), "test": items(_view_name), "notes": items(text),
         "normalization": fields({"offset": items(number(), 3), "scale": number(above=0)}),
         "background": items(number(), 3), "config_hash": text, "device": text, "versions": mapping(text),
         "config": fields(
-            {"rule": one_of(*RULES), "seed": whole(0), "strategy": text, "loss_terms": items(fields({"name": text}))}
+            {"rule": one_of(*RULES), "seed": whole(0), "strategy": text, "loss_terms": _PARTS, "view_modules": _PARTS}
         ),
         "cameras": mapping(_CAMERA, _view_name),
     },
@@ -79,7 +80,7 @@ def check_record(record: Any) -> None:
             raise SchemaError(f"cameras lacks the view {name[:60]!r}")
 
 
-MODEL_STATE = fields({"step": whole(0)})
+MODEL_STATE = fields({"step": whole(0)}, {"cameras": mapping(_CAMERA, _view_name)})
 """Schema of the plain values in a checkpoint that a model is read from."""
 _SHAPE = fields(
     {n: number(0) for n in ("largest", "largest_over_radius", "largest_over_extent", "largest_over_distance")}
@@ -112,13 +113,7 @@ METRICS = fields(
     {
         "gaussians": whole(0), "batch": whole(1), "ranks": whole(1), "seconds": fields({"total": number(0)}), "shape": _SHAPE,
         "photographs": items(_PHOTOGRAPH),
-        "poses": fields({
-            "views": items(fields({"name": _view_name, "degrees": number(0), "units": number(0)})), "summary": text,
-        }),
-        "exposure": fields({
-            "views": items(fields({"name": _view_name, "affine": items(items(number(), 4), 3), "gain": number()})),
-            "matched_psnr": or_null(real), "summary": text,
-        }),
+        "view_modules": mapping(fields({"summary": text})),
         "coverage": fields({
             "classes": _COVERED, "views": items(fields({"name": text, "classes": _COVERED})), "tolerance": number(0),
             "depth_differences": items(number(0)), "photo_psnr": or_null(items(or_null(real))), "summary": text,

@@ -18,8 +18,9 @@ from warpgs.pipeline.runs.request import FitRequest, choose_device, read_scene
 from warpgs.pipeline.runs.results import summary_line
 from warpgs.pipeline.study.study import FILES, SWITCHES, Place, Runs, StudyRequest, run_folder, scene_name, write_study
 from warpgs.pipeline.train.by_views import settings_by_views
-from warpgs.pipeline.train.config import PRESETS, FitConfig
+from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loop import train_views
+from warpgs.pipeline.train.presets import preset_settings, preset_word
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.runtime.terminal import say
 
@@ -30,15 +31,20 @@ ABLATION_ROWS: dict[str, dict[str, bool]] = {"full": {}, **{f"no {name}": {name:
 def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]:
     """Return presets as the variants of a study, in the order named; ``steps`` replaces the steps of all.
 
+    Args:
+        names: Presets as `warpgs.fit` takes them; a file or an object is called by the last word of its name.
+        steps: Steps of each run; None for those of its preset.
+
     Raises:
-        UsageError: A preset is unknown or named twice.
+        DataError: The file of a preset cannot be read.
+        UsageError: A preset is unknown, or two are called the same.
     """
-    for name in names:
-        if name not in PRESETS:
-            raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
-        if names.count(name) > 1:
-            raise UsageError(f"preset {name!r} is named twice")
-    return {n: PRESETS[n] if steps is None else dataclasses.replace(PRESETS[n], steps=steps) for n in names}
+    words = [preset_word(n) for n in names]
+    for word in words:
+        if words.count(word) > 1:
+            raise UsageError(f"preset {word!r} is named twice; give each a name of its own")
+    found = {word: preset_settings(n)[0] for word, n in zip(words, names, strict=True)}
+    return found if steps is None else {n: dataclasses.replace(c, steps=steps) for n, c in found.items()}
 
 
 def ablation_variants(base: FitConfig) -> tuple[dict[str, FitConfig], dict[str, tuple[bool, ...]]]:

@@ -1,11 +1,13 @@
-"""Colour behind a scene: that of its files, the mean of its photographs, or one that the user names."""
+"""Colour behind a scene: that of its files, the mean of its photographs, or one that the user names; and behind each step."""
 
 from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Sequence
 
 import numpy as np
+import torch
 
 from warpgs.errors import UsageError
 from warpgs.pipeline.metrics.region import counted_region
@@ -16,6 +18,8 @@ Color = tuple[float, float, float]
 NAMED: dict[str, Color] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 CHOSEN = ("auto", "mean", "scene")
 """Names of colours that follow from the scene."""
+BEHIND = 0x62616B67
+"""Key that sets random backgrounds apart from other random numbers of a fit."""
 LEVELS = 2**16 - 1
 """Levels that colours are rounded to before they are added: sums of whole numbers are exact in any order."""
 
@@ -98,6 +102,17 @@ def over_background(scene: Scene, color: Color) -> Scene:
         return dataclasses.replace(v, image=np.clip(v.image + (1 - v.alpha[..., None]) * shift, 0, 1))
 
     return dataclasses.replace(scene, background=color, views=tuple(map(moved, scene.views)))
+
+
+def over(image: torch.Tensor, alpha: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
+    """Return an image [H, W, 3] of opacity ``alpha`` [H, W] over another background, its own plus ``shift`` [3]."""
+    return image + (1 - alpha)[..., None] * shift
+
+
+def random_shift(seed: int, step: int, background: Sequence[float]) -> tuple[float, float, float]:
+    """Return the colour behind a step's view less the scene's background [3]: uniform in [0, 1], by seed and step alone."""
+    red, green, blue = (b - a for a, b in zip(background, np.random.default_rng([seed, step, BEHIND]).random(3).tolist()))
+    return red, green, blue
 
 
 def _words(color: Color) -> str:

@@ -24,8 +24,6 @@ HALF_RESOLUTION, HALF_VIEWS = 0.5, 4
 DEGREES = (5, 9, 12)
 """Training views from which colours have spherical harmonics of degree 1, 2 and 3. With fewer they have none: four photographs
 cannot tell a colour that changes with direction from an error of the shape."""
-QUICK_STEPS = 600
-"""Most steps of preset `quick`."""
 CPU_PIXELS = 1e6
 """Pixels that two cores of a processor of 2.5 GHz train a second: 190 ms a step at 504 x 378 px."""
 CPU_SECONDS = 45.0, 4.0, 1200.0
@@ -71,7 +69,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         half = float(f"{HALF_RESOLUTION * min(1.0, HALF_VIEWS / views):.2g}")
     steps = config.steps
     if steps is None:
-        steps = min(steps_by_views(views), QUICK_STEPS if config.preset == "quick" else MAX_STEPS)
+        steps = min(steps_by_views(views), config.max_steps)
     each = f" of {config.batch} views" if config.batch > 1 else ""
     chosen = {
         f"at most {steps:,} steps{each}": config.steps, f"colours of degree {init.max_sh_degree}": config.init.max_sh_degree,

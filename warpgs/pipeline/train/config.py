@@ -1,4 +1,4 @@
-"""All settings of a fit, composed of the dataclasses that live beside the code which reads them; and the presets."""
+"""All settings of a fit, composed of the dataclasses that live beside the code which reads them."""
 
 from __future__ import annotations
 
@@ -14,13 +14,16 @@ from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.model.scale_limits import LimitConfig
 from warpgs.pipeline.train.background import color_of
-from warpgs.pipeline.train.loss import LOSS_TERMS, LossConfig, LossTerm, check_terms
+from warpgs.pipeline.train.context import Settings
+from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm, check_terms
+from warpgs.pipeline.train.loss_terms.built_in import LossConfig
 from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
+from warpgs.pipeline.train.stopping import StoppingConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES, find_strategy
-from warpgs.pipeline.train.strategies.clone_split import DensityConfig
-from warpgs.pipeline.train.strategies.holdout_blocks import HoldoutConfig
-from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
-from warpgs.pipeline.train.strategies.sampler import SamplerConfig
+from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
+from warpgs.pipeline.train.strategies.sampling_event import MethodConfig
+from warpgs.pipeline.train.view_modules.base import VIEW_MODULES, ViewModule, check_modules
+from warpgs.plugins import Registry
 from warpgs.priors.view_prior import PriorConfig
 from warpgs.schema import SchemaError, anything, mapping, of_type
 
@@ -30,9 +33,12 @@ class FitConfig:
     """All settings of a fit."""
 
     preset: str = "3dgs"
-    """Named set of settings that the others start from: default, quick, 3dgs, mcmc or paper-literal."""
+    """Preset that the other settings start from: a name; a .toml file of settings; or module:NAME or path/to/file.py:NAME of a
+    FitConfig or a mapping of your own."""
     steps: int | None = 7000
-    """Number of optimisation steps; strategy holdout may end earlier. None: by the number of views."""
+    """Number of optimisation steps; early stopping may end the fit before. None: by the number of views."""
+    max_steps: int = 30_000
+    """Largest number of steps where they follow from the number of views."""
     batch: int = 1
     """Views that each step renders; its gradient is their mean. Learning rates are those of one view times the square root of
     this (docs/many-gpus.md). Several GPUs share the views of a step."""
@@ -61,12 +67,6 @@ class FitConfig:
     before a step would exceed it, and images are rendered in chunks where a whole one would."""
     cuda_graph: bool = True
     """CUDA graphs: a step is captured once and replayed; the same kernels and the same bytes as without, in less time."""
-    refine_poses: bool = False
-    """Learn an increment of each training camera but the first with the Gaussians, for poses that are a little off
-    (docs/your-photos.md)."""
-    exposure: bool = False
-    """Learn an affine map of colours for each training view with the Gaussians, for photographs that differ in brightness or
-    white balance; no held-out view has one (docs/your-photos.md)."""
     max_gaussians: int = 1_000_000
     """Largest number of Gaussians, from the start on."""
     background: str = "scene"
@@ -74,16 +74,17 @@ class FitConfig:
     show no object on black, else as scene), mean, scene (that of the files: white for Blender, else black), black, white,
     #rrggbb, or r,g,b in [0, 1]."""
     strategy: str = "clone_split"
-    """Density strategy, which adds and removes Gaussians: clone_split, importance_sampling, holdout (held-out blocks of the
-    training views decide how many there are and of which degree, docs/complexity.md), mcmc, or your own as module:Class or
-    path/to/file.py:Class."""
+    """Density strategy, which adds and removes Gaussians: a name, or your own as module:Class or path/to/file.py:Class."""
     strategy_config: Any = None
-    """Own settings of the strategy, an instance of its ``Config``; None for their defaults. Those of clone_split,
-    importance_sampling and holdout are the groups ``density``, ``method`` and ``holdout``."""
+    """Own settings of the strategy, an instance of its ``Config``; None for their defaults. Those of clone_split
+    and importance_sampling are the groups ``density`` and ``method``."""
     loss_terms: tuple[LossTerm, ...] = ()
     """Loss terms beside those of ``loss``; the class of each is registered by a name."""
-    holdout: HoldoutConfig = field(default_factory=HoldoutConfig)
-    """Settings of strategy holdout."""
+    view_modules: tuple[ViewModule, ...] = ()
+    """View modules, which learn parameters of each training view with the Gaussians (docs/your-photos.md); the class of each is
+    registered by a name, and each of ours has a flag of its name."""
+    stopping: StoppingConfig = field(default_factory=StoppingConfig)
+    """Early stopping by held-out blocks of the training views, with any strategy (docs/complexity.md)."""
     init: InitConfig = field(default_factory=InitConfig)
     """Source and first values of the Gaussians."""
     loss: LossConfig = field(default_factory=LossConfig)
@@ -91,18 +92,18 @@ class FitConfig:
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     """Learning rates."""
     density: DensityConfig = field(default_factory=DensityConfig)
-    """Settings of cloning, splitting and pruning (strategies clone_split, importance_sampling and holdout)."""
+    """Settings of cloning, splitting and pruning (strategies clone_split and importance_sampling)."""
     limits: LimitConfig = field(default_factory=LimitConfig)
     """Limits of the size and the shape of every Gaussian."""
     phases: PhaseConfig = field(default_factory=PhaseConfig)
     """Lengths of the three phases, and times of sampling."""
     method: MethodConfig = field(default_factory=MethodConfig)
-    """Settings of strategies importance_sampling and holdout."""
+    """Settings of strategy importance_sampling."""
     priors: PriorConfig = field(default_factory=PriorConfig)
     """Networks that priors of the views come from."""
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "sh_every", "checkpoint_every", "dropout_views", "max_gaussians"):
+        for name in ("steps", "max_steps", "batch", "sh_every", "checkpoint_every", "dropout_views", "max_gaussians"):
             if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise UsageError(f"{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
         if not 0 <= self.seed < 2**31:
@@ -119,16 +120,21 @@ class FitConfig:
             raise UsageError(f"rule {self.rule!r} is not one of {', '.join(RULES)}")
         color_of(self.background)
         check_terms(self.loss_terms)
+        check_modules(self.view_modules)
         if isinstance(self.strategy, type):
             object.__setattr__(self, "strategy", STRATEGIES.name_of(self.strategy))
         own = find_strategy(self.strategy).Config if STRATEGIES.knows(self.strategy) else None
         if own is not None and self.strategy_config is None:
             object.__setattr__(self, "strategy_config", own())
 
+    def groups(self) -> Settings:
+        """Return the groups of settings by their class, as parts of a fit read them."""
+        return Settings(value for value in vars(self).values() if dataclasses.is_dataclass(value))
+
     def to_json(self) -> dict[str, Any]:
         """Return nested plain values, as stored in a run folder."""
-        terms = [{"name": t.name, **dataclasses.asdict(t)} for t in self.loss_terms]
-        return dataclasses.asdict(dataclasses.replace(self, loss_terms=())) | {"loss_terms": terms}
+        parts = {n: [{"name": p.name, **dataclasses.asdict(p)} for p in getattr(self, n)] for n in _PARTS}
+        return dataclasses.asdict(dataclasses.replace(self, loss_terms=(), view_modules=())) | parts
 
     @staticmethod
     def from_json(values: dict[str, Any]) -> FitConfig:
@@ -141,13 +147,13 @@ class FitConfig:
         mapping(anything)(values, "config")
         try:
             values = dict(values)
-            terms = tuple(_term(dict(t)) for t in values.pop("loss_terms"))
+            parts = {n: tuple(_part(registry, dict(p), n) for p in values.pop(n)) for n, registry in _PARTS.items()}
             own = values.pop("strategy_config")
             kind = find_strategy(values["strategy"]).Config
             if own is not None and kind is None:
                 raise SchemaError(f"strategy_config must be null for strategy {values['strategy']}")
             own = own if kind is None or own is None else _compose(kind, own, "strategy_config")
-            config: FitConfig = _compose(FitConfig, values | {"loss_terms": terms, "strategy_config": own}, "config")
+            config: FitConfig = _compose(FitConfig, values | parts | {"strategy_config": own}, "config")
             return config
         except (TypeError, KeyError) as e:
             raise UsageError(f"the stored configuration is of another version of warpgs ({e})") from e
@@ -157,9 +163,13 @@ class FitConfig:
         return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:12]
 
 
-def _term(values: dict[str, Any]) -> LossTerm:
-    term: LossTerm = _compose(LOSS_TERMS.find(values.pop("name")), values, "loss_terms")
-    return term
+_PARTS: dict[str, Registry[Any]] = {"loss_terms": LOSS_TERMS, "view_modules": VIEW_MODULES}
+"""Fields of `FitConfig` that hold parts of a registry, each with its settings."""
+
+
+def _part(registry: Registry[Any], values: dict[str, Any], field: str) -> Any:
+    """Return a part of a registry from its stored name and settings."""
+    return _compose(registry.find(values.pop("name")), values, field)
 
 
 def _compose(kind: type, values: dict[str, Any], place: str) -> Any:
@@ -174,66 +184,10 @@ def _compose(kind: type, values: dict[str, Any], place: str) -> Any:
         where, of = f"{place}.{name}", kinds.get(name, Any)
         if isinstance(of, type) and dataclasses.is_dataclass(of):
             composed[name] = _compose(of, value, where)
-        elif name not in ("loss_terms", "strategy_config"):  # these two are composed before
+        elif name not in (*_PARTS, "strategy_config"):  # these are composed before
             of_type(of)(list(value) if isinstance(value, tuple) else value, where)
             listed = any(typing.get_origin(part) is tuple for part in (of, *typing.get_args(of)))
             composed[name] = tuple(value) if listed and isinstance(value, list) else value
         else:
             composed[name] = value
     return kind(**composed)
-
-
-_DEFAULT = FitConfig(
-    preset="default", background="auto", steps=None, half_resolution=None, sh_every=500, dropout=0.6, strategy="holdout",
-    phases=PhaseConfig(coarse=2000, stable=3000, least=20),
-    init=InitConfig(sweep_up_to=1000, max_sh_degree=None, merge_px=8, fill_px=32),
-    optimizer=OptimizerConfig(scales_lr=None, scales_decay=0.1, opacities_lr=None), density=DensityConfig(gradient=5e-4),
-    holdout=HoldoutConfig(bounds=False, degrees=False, trim_db=0, levels=12, stop_db=0.1),
-    method=MethodConfig(
-        events=True, hier=True,
-        sampler=SamplerConfig(depth="consistent", fraction=0.02, footprint=3.0, gate_quantile=0.0, max_fraction=2.0),
-    ),
-)  # fmt: skip
-
-PRESETS: dict[str, FitConfig] = {
-    "default": _DEFAULT,
-    "quick": dataclasses.replace(_DEFAULT, preset="quick"),
-    "3dgs": FitConfig(limits=LimitConfig(max_size=0, max_ratio=0, max_reach=0)),
-    "mcmc": FitConfig(
-        preset="mcmc", strategy="mcmc", init=InitConfig(opacity=0.5, scale_factor=0.1),
-        optimizer=OptimizerConfig(scales_lr=0.005), limits=LimitConfig(max_size=0, max_ratio=0, max_reach=0),
-    ),
-    "paper-literal": FitConfig(
-        preset="paper-literal", strategy="importance_sampling", steps=30_000, sh_every=500,
-        init=InitConfig(source="flow", merge_px=0, fill_px=0), optimizer=OptimizerConfig(scales_lr=0.03),
-        density=DensityConfig(gradient=5e-4, stop_fraction=1.0, reset_every=3000, reset_opacity=0.05, prune_size=0),
-        phases=PhaseConfig(coarse=2000, stable=3000), method=MethodConfig(events=True, hier=True),
-    ),
-}  # fmt: skip
-"""Presets by name; `PRESET_NOTES` describes them."""
-
-DEFAULT_PRESET = "default"
-"""Preset where the user names none."""
-
-PRESET_NOTES: dict[str, str] = {
-    "default": "any capture: steps, degree and rates follow from the number of views, and the fit ends when it gains no more",
-    "quick": "a first look: the same in at most 600 steps",
-    "3dgs": "a baseline: Kerbl et al. 2023 without opacity resets, which cost decibels when views are few",
-    "mcmc": "a baseline: Kheradmand et al. 2024, which fills a given number of Gaussians, from the same points as 3dgs",
-    "paper-literal": "the paper to the letter, with first proposals for what it leaves open; slow",
-}
-"""One description of each preset."""
-
-
-def preset_config(config: FitConfig | str | None) -> FitConfig:
-    """Return the settings for a preset's name, for settings themselves, or for None: the default preset.
-
-    Raises:
-        UsageError: There is no such preset.
-    """
-    if isinstance(config, FitConfig):
-        return config
-    name = DEFAULT_PRESET if config is None else config
-    if name not in PRESETS:
-        raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
-    return PRESETS[name]

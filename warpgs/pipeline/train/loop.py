@@ -61,7 +61,7 @@ def run(
             continue
         for report in reports:
             on_step(report)
-        stop = trainer.agreed(stopped())
+        stop = trainer.taker.agreed(stopped())
         due = trainer.step % every == 0 and time.monotonic() - saved >= trainer.config.checkpoint_seconds
         if stop or due or trainer.step == trainer.steps:
             save(trainer)

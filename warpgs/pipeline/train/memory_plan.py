@@ -18,6 +18,7 @@ from warpgs.kernels import blend, blend_cuda
 from warpgs.kernels.project import PROJECTED_SIZE
 from warpgs.kernels.tiles import LIST_BYTES, MAX_INSTANCES, grid
 from warpgs.pipeline.model.table import Table
+from warpgs.pipeline.train.view_modules.base import ViewModule
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.render.compose import count_instances, inputs_of, settings_of
 from warpgs.runtime.byte_units import format_bytes
@@ -26,8 +27,6 @@ from warpgs.scene import Camera, Gaussians
 
 FLOAT = 4
 """Bytes of a float32 or int32."""
-CAMERA = 16 + 9
-"""Numbers of the gradient of view matrix and intrinsics, which each Gaussian has until they are summed."""
 SAMPLED = 8
 """Largest number of views that a sampling event samples in (`importance_sampling.MAX_VIEWS`)."""
 SUMMED = 2
@@ -57,7 +56,7 @@ class Layout:
     height: int
     """Height of the largest view [px]."""
     view_bytes: int
-    """Bytes of all views, those included that the strategy keeps beside them (`view_bytes`)."""
+    """Bytes of all views, those included that are kept beside them (`view_bytes`)."""
     column_bytes: int = 0
     """Bytes of the strategy's columns for each Gaussian."""
     views: int = 1
@@ -67,7 +66,7 @@ class Layout:
     scored: bool = False
     """True where views have scores, by which fine Gaussians are sampled."""
     depth_supervised: bool = False
-    """True where the loss has its depth term."""
+    """True where a loss term reads depth."""
     cuda: bool = False
     """True on a CUDA device."""
     graphs: int = 0
@@ -76,12 +75,8 @@ class Layout:
     """True where views know their opacity."""
     sums: int = 0
     """Sums of gradients and statistics that a step of several views keeps (`warpgs.pipeline.train.slots`)."""
-    trimmed: bool = False
-    """True where the strategy trims the model: with lower degrees, merged and tried, it then stands there three times more."""
-    refined: bool = False
-    """True where poses are refined: each Gaussian has a gradient of the camera until these are summed."""
-    exposed: bool = False
-    """True where views have exposures: the render stands there with and without."""
+    modules: tuple[ViewModule, ...] = ()
+    """View modules, which count what steps take for them."""
 
     @property
     def row(self) -> int:
@@ -112,7 +107,7 @@ class Layout:
         # three partials for each colour and the gradient; masked copies; the two maps that are correlated, with gradients
         # the difference of opacities and its gradient
         loss = FLOAT * pixels * ((19 if self.masked else 12) + 4 * self.depth_supervised + 3 * self.cutout)
-        loss += FLOAT * pixels * 3 * self.exposed
+        loss += self._of_modules("loss", count)
         if not self.cuda:
             loss += 5 * FLOAT * (3 * self.width + 30) * -(-self.height // 8)
         # an event keeps image, scores and gate of each view until its end
@@ -140,7 +135,11 @@ class Layout:
 
     def _projection(self, count: int) -> int:
         """Return the bytes of projected Gaussians, of their gradient and its copy for statistics, and of other gradients."""
-        return (FLOAT * (3 * PROJECTED_SIZE + 1 + CAMERA * self.refined) + self.row) * count
+        return (FLOAT * (3 * PROJECTED_SIZE + 1) + self.row) * count + self._of_modules("projection", count)
+
+    def _of_modules(self, moment: str, count: int) -> int:
+        """Return the bytes that view modules take at a moment of a step."""
+        return sum(m.bytes(count, self.width * self.height).get(moment, 0) for m in self.modules)
 
     def event(self, before: int, after: int) -> int:
         """Return the bytes on top of ``held(after)`` while Gaussians are added: new rows, and one tensor before and after."""
@@ -151,7 +150,7 @@ class Layout:
     def step(self, count: int, instances: int, chunked: bool = False) -> int:
         """Return the bytes at the heaviest moment of a step; each CUDA graph keeps memory of its own."""
         heaviest = max(1, self.graphs) * max(self.moments(count, instances, chunked).values())
-        return self.held(count) + heaviest + 3 * self.row * count * self.trimmed
+        return self.held(count) + heaviest
 
     def smallest(self, count: int) -> int:
         """Return the bytes of the smallest step: a tile is not divided, and has at most as many instances as Gaussians."""
@@ -245,9 +244,7 @@ def layout_of(
     scored: bool = False,
     captured: bool = False,
     depth_supervised: bool = False,
-    trimmed: bool = False,
-    refined: bool = False,
-    exposed: bool = False,
+    modules: tuple[ViewModule, ...] = (),
     sums: int = 0,
 ) -> Layout:
     """Return the layout of steps of a fit.
@@ -255,13 +252,11 @@ def layout_of(
     Args:
         table: The Gaussians with their columns.
         views: Training views, those at half their size included.
-        kept: Views that the strategy keeps beside them.
+        kept: Views that are kept beside them.
         scored: True where fine Gaussians are sampled by scores.
         captured: True to capture steps as CUDA graphs where the device can.
-        depth_supervised: True where the loss has its depth term.
-        trimmed: True where the strategy trims the model.
-        refined: True where poses are refined.
-        exposed: True where views have exposures.
+        depth_supervised: True where a loss term reads depth.
+        modules: View modules of the fit.
         sums: Sums of gradients that a step of several views keeps.
     """
     largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
@@ -270,7 +265,7 @@ def layout_of(
         table.gaussians.sh.shape[1], largest.width, largest.height, view_bytes([*views, *kept]),
         sum(c.element_size() for c in table.columns.values()), len(views), any(v.mask is not None for v in views),
         scored, depth_supervised, cuda, len({v.kind for v in views}) if cuda and captured else 0,
-        any(v.alpha is not None for v in views), sums, trimmed, refined, exposed,
+        any(v.alpha is not None for v in views), sums, modules,
     )  # fmt: skip
 
 

@@ -23,6 +23,17 @@ MAX_LR = 1e6
 """Largest learning rate: far above what trains, far below what overflows within a fit."""
 
 
+def check_lrs(of: str, **rates: float | None) -> None:
+    """Check learning rates and factors of them by name, of which None is left to choose; ``of`` names their settings.
+
+    Raises:
+        UsageError: One is not positive, or above `MAX_LR`.
+    """
+    for name, value in rates.items():
+        if value is not None and not 0 < value <= MAX_LR:
+            raise UsageError(f"{of} {name} must be positive and at most {MAX_LR:g}, not {value}")
+
+
 @dataclass(frozen=True)
 class OptimizerConfig:
     """Learning rates of the reference implementation of Kerbl et al. 2023, but for the scales."""
@@ -45,25 +56,9 @@ class OptimizerConfig:
     """Learning rate of the constant colour coefficient."""
     sh_rest_factor: float = 0.05
     """Fraction of that for the other coefficients."""
-    pose_start: float = 0.2
-    """Fraction of the steps before poses are refined, in [0, 1): the first Gaussians tell nothing of them."""
-    pose_rotation_lr: float = 2e-4
-    """Learning rate of the training cameras' rotations [rad] from then on, where poses are refined."""
-    pose_translation_lr: float = 2e-4
-    """The same of their translations, times the scene's extent."""
-    pose_decay: float = 0.1
-    """Fraction of both that is left at the last step; log-linear between."""
-    exposure_lr: float = 5e-3
-    """Learning rate of the training views' exposures at the start, where these are learned."""
-    exposure_decay: float = 0.1
-    """Fraction of it that is left at the last step; log-linear between."""
 
     def __post_init__(self):
-        for name, value in vars(self).items():
-            if name != "pose_start" and value is not None and not 0 < value <= MAX_LR:
-                raise UsageError(f"optimizer {name} must be positive and at most {MAX_LR:g}, not {value}")
-        if not 0 <= self.pose_start < 1:
-            raise UsageError(f"optimizer pose_start must be at least 0 and less than 1, not {self.pose_start}")
+        check_lrs("optimizer", **vars(self))
 
     def lrs(self, progress: float, extent: float, stable_start: float = 0.0) -> dict[str, float]:
         """Return the learning rate of each parameter.
@@ -82,16 +77,6 @@ class OptimizerConfig:
             "logit_opacities": self.opacities_lr,
             "sh": self.sh_lr * self.sh_rest_factor,
         }
-
-    def pose_lrs(self, progress: float, extent: float) -> tuple[float, float]:
-        """Return the learning rates of rotations [rad] and translations [u] of cameras; arguments are those of `lrs`."""
-        begun = (progress - self.pose_start) / (1 - self.pose_start)
-        left = log_linear(1.0, self.pose_decay, begun) if begun >= 0 else 0.0
-        return self.pose_rotation_lr * left, self.pose_translation_lr * extent * left
-
-    def exposure_lr_at(self, progress: float) -> float:
-        """Return the learning rate of exposures at a fraction of the fit, in [0, 1]."""
-        return self.exposure_lr * log_linear(1.0, self.exposure_decay, progress)
 
     @property
     def head_lrs(self) -> dict[str, float]:
@@ -147,9 +132,9 @@ class Phases:
         begun = (self.stable_start - 1) / planned
         return begun + (1 - begun) * (step - self.stable_start) / (self.steps - self.stable_start)
 
-    def stable_from(self, step: int) -> Phases:
-        """Return the phases of which the third begins after ``step``, before its time: shorter by as much as the first two."""
-        length = round((self.planned - self.stable_start) * step / max(1, self.stable_start))
+    def stable_from(self, step: int, planned_start: int) -> Phases:
+        """Return the phases of which the third begins after ``step``, not ``planned_start``, and is as much shorter."""
+        length = round((self.planned - planned_start) * step / max(1, planned_start))
         return replace(self, stable_start=step, steps=min(self.planned, step + max(1, length)))
 
 

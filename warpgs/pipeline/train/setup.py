@@ -10,16 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from warpgs.errors import UsageError
 from warpgs.kernels.cameras.base import check_camera
 from warpgs.pipeline.metrics.region import fitted_region
 from warpgs.pipeline.model.init import Start, check_points, initial_points, subsample
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.exposure import ExposurePenalty, first_exposures
-from warpgs.pipeline.train.loss import LossTerm, built_in_terms, collect
-from warpgs.pipeline.train.refine_poses import first_increments
+from warpgs.pipeline.train.loss import LossTerm, collect
+from warpgs.pipeline.train.loss_terms.built_in import built_in_terms
 from warpgs.pipeline.train.strategies.base import find_strategy
-from warpgs.pipeline.train.strategies.importance_sampling import scored
+from warpgs.pipeline.train.strategies.sampling_event import scored
 from warpgs.pipeline.train.views import TrainingView, with_alpha
 from warpgs.priors.cache import cache_folder
 from warpgs.priors.view_prior import view_priors
@@ -43,7 +41,7 @@ def prepare(
     train: list[View], points: PointCloud | None, config: FitConfig, generator: np.random.Generator, device: torch.device,
     priors: list[Prior] | None, ready: Callable[[], object], progress: Callable[[str], object] = lambda line: None,
 ) -> Preparation:  # fmt: skip
-    """Find the first points, and priors where they are not given and sampling or the depth term asks for them.
+    """Find the first points, and priors where they are not given and sampling or a loss term asks for them.
 
     Args:
         train: The views to fit.
@@ -88,32 +86,19 @@ def prepare(
     return Preparation(found, priors, [*(Detail(n.strip()) if n.startswith(" ") else n for n in lines), *notes])
 
 
+def samples(config: FitConfig) -> bool:
+    """Return whether the strategy samples by importance, for which views need priors and scores."""
+    return find_strategy(config.strategy).samples(config.groups())
+
+
 def needs_priors(config: FitConfig) -> bool:
     """Return whether sampling or a loss term needs the priors of the views."""
-    return find_strategy(config.strategy).samples(config) or any(t.needs_priors for t in terms_of(config))
+    return samples(config) or any(t.needs_priors for t in terms_of(config))
 
 
 def terms_of(config: FitConfig, cutout: bool = False) -> tuple[LossTerm, ...]:
     """Return all loss terms of a fit by its settings; ``cutout`` says that its views know their opacity."""
-    exposure = (ExposurePenalty(config.loss.exposure_weight),) if config.exposure else ()
-    return (*built_in_terms(config.loss, cutout), *exposure, *config.loss_terms)
-
-
-def view_parameters(
-    terms: tuple[LossTerm, ...], config: FitConfig, views: int, device: torch.device
-) -> tuple[dict[str, torch.Tensor], dict[str, float]]:
-    """Return the parameters of as many training views before the first step, [V, ...] by name, and learning rates of terms'.
-
-    Raises:
-        UsageError: Two loss terms, or a loss term and the fit itself, use one name.
-    """
-    own = collect(terms, lambda t: t.view_parameters(), "view parameter")
-    first = {n: torch.tensor(p.initial, dtype=torch.float32, device=device).repeat(views, 1) for n, p in own.items()}
-    fit = first_increments(views, device) if config.refine_poses else {}
-    fit |= first_exposures(views, device) if config.exposure else {}
-    for name in own.keys() & fit.keys():
-        raise UsageError(f"a loss term and the fit itself both have a view parameter {name!r}; rename the term's")
-    return first | fit, {n: p.lr for n, p in own.items()}
+    return (*built_in_terms(config.loss, cutout), *config.loss_terms)
 
 
 def prepared_views(
@@ -122,14 +107,14 @@ def prepared_views(
     """Return the training views on the device, with their scores and the maps of loss terms.
 
     Also returns each view's disparity, relative inverse depth in [0, 1], shape [H, W], where views are scored: only images of
-    events show it. A note on the depth term is appended to the preparation's.
+    events show it.
 
     Raises:
         UsageError: Two loss terms ask for a map of one name.
     """
     views, disparities = [TrainingView.of(v, device) for v in with_alpha(train)], []
     priors = made.priors or [None] * len(train)
-    if find_strategy(config.strategy).samples(config):
+    if samples(config):
         disparities = [p.disparity for p in priors]
         depths = made.start.depths or [None] * len(train)
         views = [scored(v, p, d, config.method) for v, p, d in zip(views, priors, depths, strict=True)]
@@ -137,8 +122,4 @@ def prepared_views(
     for view, prior in zip(views, priors, strict=True):
         maps = collect(terms, lambda term, view=view, prior=prior: term.needs(view, prior), "map")
         found.append(dataclasses.replace(view, maps=maps))
-    if config.loss.depth_weight > 0:
-        known = sum(bool(p.disparity.any()) for p in priors)
-        more = "" if known else "; --depth-model, or a start by --init.source sweep or flow, makes priors"
-        made.notes.append(Detail(f"depth term: in {known} of {len(views)} views, those whose prior knows a depth{more}"))
     return found, disparities

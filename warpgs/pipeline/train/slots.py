@@ -25,23 +25,26 @@ MAX_RENDERS = 2**24
 """Number of renders that a fit must stay below: it is a float32, from which each takes its random numbers."""
 
 
-def check_batch(batch: int, steps: int | None, ranks: Ranks) -> None:
-    """Check that every process has a view in each step, and that the views of all steps can be numbered.
-
-    Args:
-        batch: Views in a step.
-        steps: Steps of the fit; None where they are not known yet.
-        ranks: The processes.
+def check_ranks(batch: int, ranks: Ranks) -> None:
+    """Check that every process has a view in each step of ``batch`` views.
 
     Raises:
-        UsageError: There are fewer views than processes, or too many steps.
+        UsageError: There are fewer views than processes.
     """
     if batch < ranks.count:
         raise UsageError(
             f"{ranks.count} ranks share the views of a step, and --batch {batch} gives it {batch}: give --batch {ranks.count} "
             "or a multiple of it, or start fewer ranks"
         )
-    if batch > 1 and steps is not None and steps * batch >= MAX_RENDERS:
+
+
+def check_renders(batch: int, steps: int) -> None:
+    """Check that the views of all ``steps``, each of ``batch`` views, can be numbered.
+
+    Raises:
+        UsageError: There are too many.
+    """
+    if batch > 1 and steps * batch >= MAX_RENDERS:
         raise UsageError(f"{steps:,} steps of {batch} views are more than {MAX_RENDERS:,} renders; lower --steps or --batch")
 
 

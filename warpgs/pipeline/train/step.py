@@ -21,11 +21,11 @@ from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES
 from warpgs.pipeline.metrics.psnr import masked_mse
 from warpgs.pipeline.model.scale_limits import NO_LIMITS, Limits
 from warpgs.pipeline.model.table import Table
-from warpgs.pipeline.train.exposure import EXPOSURE, exposed, exposure_of
-from warpgs.pipeline.train.loss import LossTerm, Target, over
-from warpgs.pipeline.train.refine_poses import ROTATION, TRANSLATION, moved
+from warpgs.pipeline.train.background import over
+from warpgs.pipeline.train.learned_views import LearnedViews, seen
+from warpgs.pipeline.train.loss import LossInputs, LossTerm, Target, outputs_of, term_values
 from warpgs.pipeline.train.strategies.base import Strategy
-from warpgs.pipeline.train.views import Kind, Rows, ViewStack
+from warpgs.pipeline.train.views import Kind, Rows, ViewStack, current
 from warpgs.render.compose import InstanceMemory, compose, count_instances, inputs_of, settings_of
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.runtime.cuda_graph import CapturedGraph, GraphMemory
@@ -80,7 +80,7 @@ class StepBuffers:
         """Gradient of the loss."""
 
     def load(self, rows: list[int], lrs: list[list[float]], settings: list[tuple[float, ...]]) -> None:
-        """Upload view rows, learning rates and settings (6 each) of the next steps, at most `MAX_STEPS`."""
+        """Upload view rows, learning rates and settings (7 each) of the next steps, at most `MAX_STEPS`."""
         self.counter.zero_()
         self.stop.zero_()
         self.view_rows[: len(rows)] = torch.tensor(rows).to(self.device)
@@ -93,7 +93,7 @@ class StepBuffers:
         return done, stop, self.history[: done + 1].tolist()
 
     def begin(self, views: ViewStack) -> tuple[torch.Tensor, ...]:
-        """Return learning rates, settings [6], viewmat [1, 4, 4], K [1, 3, 3] and image [H, W, 3] of the current step.
+        """Return learning rates, settings [7], viewmat [1, 4, 4], K [1, 3, 3] and image [H, W, 3] of the current step.
 
         The coefficients of its camera are `of_view` of the stack's.
         """
@@ -159,8 +159,8 @@ class Learned:
 
     table: Table
     """The Gaussians."""
-    views: Table
-    """Parameters of each training view, one row each; often none."""
+    views: LearnedViews
+    """View modules with their parameters; often none."""
     strategy: Strategy
     """Density strategy, which gathers gradients and follows updates."""
     dropout_seed: int | None
@@ -168,27 +168,37 @@ class Learned:
     centers: torch.Tensor
     """Positions of training cameras [u], which limits of sizes refer to, shape [C, 3]."""
 
-    @torch.no_grad()
-    def posed(self, views: ViewStack) -> ViewStack:
-        """Return the views with their poses as they are now, where these are refined."""
-        rows = [self.views.params[n].index_select(0, views.numbers) for n in (ROTATION, TRANSLATION) if n in self.views.params]
-        return replace(views, viewmats=moved(views.viewmats, views.numbers, *rows)) if rows else views
-
 
 @dataclass(frozen=True)
 class ViewGradients:
     """Contribution of one view to a step."""
 
     gradients: list[torch.Tensor]
-    """Gradients of the loss by the parameters of the Gaussians, then by those of the views, in the order of the tables."""
+    """Gradients of the loss by the parameters of the Gaussians, then by those of view modules, in the order of the tables."""
     statistics: Mapping[str, torch.Tensor]
     """Result of `Strategy.statistics`."""
     lrs: torch.Tensor
     """Learning rates of the step, shape [R]."""
     settings: torch.Tensor
-    """Settings of the step, shape [6]."""
+    """Settings of the step, shape [7]."""
     going: torch.Tensor
     """True where nothing stops the step, bool, shape [1]."""
+
+
+@dataclass(frozen=True)
+class Forward:
+    """Forward pass of a step, up to what the loss is computed from."""
+
+    rendered: Render
+    """The render, in the colours that the view shows."""
+    inputs: LossInputs
+    """Inputs of the terms of the loss."""
+    of_views: Mapping[str, torch.Tensor]
+    """Terms that view modules add, by module name, shape [] each."""
+    lrs: torch.Tensor
+    """Learning rates of the step, shape [R]."""
+    settings: torch.Tensor
+    """Settings of the step, shape [7]."""
 
 
 def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer) -> None:
@@ -213,35 +223,56 @@ def view_gradients(learned: Learned, views: ViewStack, buffers: StepBuffers, pla
     Arguments are those of `step`.
     """
     table, strategy = learned.table, learned.strategy
+    found = forward(table.gaussians, learned.views, learned.dropout_seed, views, buffers, plan, render)
+    loss = total_loss(plan, found.inputs, strategy, tuple(found.of_views.values()))
+
+    rendered, target = found.rendered, found.inputs.target
+    params = [*table.params.values(), *learned.views.table.params.values()]
+    *gradients, v_projected = torch.autograd.grad(loss, [*params, rendered.projected], buffers.one, materialize_grads=True)
+    with torch.no_grad():
+        mse = masked_mse(rendered.rgb, target.image, target.mask)
+        going = end_step(loss, mse, buffers.counter, buffers.stop, buffers.history)
+        statistics = strategy.statistics(plan.phase, v_projected, rendered.visible & going, views.size)
+    return ViewGradients(gradients, statistics, found.lrs, found.settings, going)
+
+
+def forward(
+    gaussians: Gaussians, learned: LearnedViews, dropout_seed: int | None, views: ViewStack, buffers: StepBuffers,
+    plan: StepPlan, render: Renderer,
+) -> Forward:  # fmt: skip
+    """Render the next view, and gather what the terms of the loss are computed from.
+
+    Args:
+        gaussians: The Gaussians.
+        learned: View modules with their parameters.
+        dropout_seed: Seed of the opacity dropout; None for none.
+        views: Views of one kind.
+        buffers: Settings of the steps.
+        plan: Choices that the step is made of.
+        render: Renderer.
+    """
     lrs, settings, viewmat, K, image = buffers.begin(views)
     mask = None if views.masks is None else buffers.of_view(views.masks)
     number = buffers.of_view(views.numbers).view(1)
-    own = {n: t.index_select(0, number)[0] for n, t in learned.views.params.items()}  # not t[number], which reads it back
-    if ROTATION in own:
-        viewmat = moved(viewmat, number, own[ROTATION][None], own[TRANSLATION][None])
-    if EXPOSURE in own:
-        own[EXPOSURE] = exposure_of(learned.views.params[EXPOSURE], own[EXPOSURE])
+    values = learned.values(number)
     alpha = shift = None
     if views.alphas is not None:
         alpha, shift = buffers.of_view(views.alphas), settings[SHIFT]
         image = over(image, alpha, shift)
-    target = Target(image, mask, {n: buffers.of_view(t) for n, t in views.maps.items()}, own, alpha)
+    target = Target(image, mask, {n: buffers.of_view(t) for n, t in views.maps.items()}, alpha)
     factors = None
-    if learned.dropout_seed is not None:
-        factors = opacity_dropout(len(table), settings, learned.dropout_seed)
-    camera = views.camera(viewmat, K, buffers.of_view(views.distortions)[None] if views.distortions.numel() else None)
-    rendered = render(table.gaussians, camera, plan.degree, factors, shift)
-    if EXPOSURE in own:
-        rendered = replace(rendered, rgb=exposed(rendered.rgb, own[EXPOSURE]))
-    loss = total_loss(plan, rendered, target, table.gaussians, strategy)
-
-    projected = rendered.projected
-    params = [*table.params.values(), *learned.views.params.values()]
-    *gradients, v_projected = torch.autograd.grad(loss, [*params, projected], buffers.one, materialize_grads=True)
-    with torch.no_grad():
-        going = end_step(loss, masked_mse(rendered.rgb, image, mask), buffers.counter, buffers.stop, buffers.history)
-        statistics = strategy.statistics(plan.phase, v_projected, rendered.visible & going, views.size)
-    return ViewGradients(gradients, statistics, lrs, settings, going)
+    if dropout_seed is not None:
+        factors = opacity_dropout(len(gaussians), settings, dropout_seed)
+    given = views.camera(viewmat, K, buffers.of_view(views.distortions)[None] if views.distortions.numel() else None)
+    camera = learned.before_render(given, values)
+    rendered = render(gaussians, camera, plan.degree, factors, shift)
+    own = {n: t[0] for n, t in values.items()}
+    rendered = replace(rendered, rgb=seen(learned.modules, rendered.rgb, own))
+    outputs = {n: getattr(rendered, n) for n in outputs_of(plan.terms)}
+    lens = None if camera.distortion is None else camera.distortion[0]
+    single = replace(camera, viewmat=camera.viewmat[0], K=camera.K[0], distortion=lens)
+    inputs = LossInputs(outputs, target, gaussians, single, settings[Setting.STEP])
+    return Forward(rendered, inputs, learned.regularisation(own), lrs, settings)
 
 
 @torch.no_grad()
@@ -251,17 +282,17 @@ def update(learned: Learned, plan: StepPlan, found: ViewGradients, stop: torch.T
     count, split = len(table.params), 3 * len(table.params)
     own, of_views = found.gradients[:count], found.gradients[count:]
     table.adam_step(dict(zip(table.params, own)), found.lrs[:split], stop, strategy.lr_factors(plan.phase))
-    learned.views.adam_step(dict(zip(learned.views.params, of_views)), found.lrs[split:], stop)
+    learned.views.table.adam_step(dict(zip(learned.views.table.params, of_views)), found.lrs[split:], stop)
     strategy.after_step(plan.phase, found.settings, found.going)
-    plan.limits.apply(table.params, learned.centers, found.going)
+    plan.limits.hold(table.params, learned.centers, found.going)
     for name, value in found.statistics.items():
         table.columns[name] += value
 
 
-def total_loss(plan: StepPlan, rendered: Render, target: Target, gaussians: Gaussians, strategy: Strategy) -> torch.Tensor:
-    """Return the sum of the terms and of the strategy's regularisation, shape []."""
-    values = [term(rendered, target, gaussians) for term in plan.terms]
-    extra = strategy.regularisation(plan.phase, gaussians)
+def total_loss(plan: StepPlan, inputs: LossInputs, strategy: Strategy, of_views: Sequence[torch.Tensor] = ()) -> torch.Tensor:
+    """Return the sum of the terms, of what view modules add (``of_views`` [] each), and of the strategy's part, shape []."""
+    values = [*term_values(plan.terms, inputs), *of_views]
+    extra = strategy.regularisation(plan.phase, inputs.gaussians)
     total = values[0]
     for value in values[1:] if extra is None else [*values[1:], extra]:
         total = total + value
@@ -321,7 +352,8 @@ class StepGraphs:
             if (kind, plan) in self._graphs:
                 continue
             views = stacks[kind]
-            capacity = instance_capacity(self.learned.table.gaussians, self.learned.posed(views), plan.degree, self.rule)
+            now = current(views, self.learned.views)
+            capacity = instance_capacity(self.learned.table.gaussians, now, plan.degree, self.rule)
             if max_instances is not None and capacity > max_instances:
                 raise OverLimitError(
                     f"a captured step would need capacity for {capacity:,} instances, the limit allows {max_instances:,}"

@@ -12,7 +12,7 @@ from warpgs.schema import Schema, SchemaError, anything, fields, items, mapping,
 
 
 def check_state(
-    tensors: Mapping[str, torch.Tensor], plain: dict[str, Any], *, views: int, steps: int, strategy: Schema
+    tensors: Mapping[str, torch.Tensor], plain: dict[str, Any], *, views: int, steps: int, strategy: Schema, stopping: Schema
 ) -> None:
     """Check the parts of a stored state that do not go by row; `Table.load` checks those that do.
 
@@ -22,13 +22,14 @@ def check_state(
         views: Number of training views.
         steps: Number of steps of the fit.
         strategy: Schema of the strategy's own values.
+        stopping: Schema of the values of early stopping.
 
     Raises:
         DataError: Something is missing, or is not what a fit stores.
     """
     state = fields({
         "step": whole(0, steps), "order": items(whole(0, views - 1)), "extent": number(above=0), "notes": items(text),
-        "strategy": mapping(anything), "stable_start": whole(0, steps), "steps": whole(1, steps),
+        "strategy": mapping(anything), "stopping": stopping, "stable_start": whole(0, steps), "steps": whole(1, steps),
     })  # fmt: skip
     try:
         state(plain, "")

@@ -11,7 +11,8 @@ import torch
 from warpgs.errors import UsageError
 from warpgs.pipeline.train.by_views import steps_by_views
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import LossConfig, photometric_loss
+from warpgs.pipeline.train.loss_terms.built_in import LossConfig
+from warpgs.pipeline.train.loss_terms.photometric import photometric_loss
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians, View
 

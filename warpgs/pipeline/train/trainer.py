@@ -17,31 +17,21 @@ from warpgs.pipeline.metrics.psnr import psnr_of
 from warpgs.pipeline.model.init import initial_gaussians, scene_extent
 from warpgs.pipeline.model.scale_limits import camera_centers, scene_radius
 from warpgs.pipeline.model.table import Table
-from warpgs.pipeline.train.batch import BatchSteps
-from warpgs.pipeline.train.by_views import settings_by_views
+from warpgs.pipeline.train.background import random_shift
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.exposure import EXPOSURE, check_exposure, exposed_views, show_exposures
-from warpgs.pipeline.train.loss import random_shift
+from warpgs.pipeline.train.context import StrategyContext
+from warpgs.pipeline.train.learned_views import LearnedViews
+from warpgs.pipeline.train.loss import outputs_of
 from warpgs.pipeline.train.memory_plan import Layout, layout_of, most_instances, plan
-from warpgs.pipeline.train.refine_poses import ROTATION, TRANSLATION, GivenPoses
-from warpgs.pipeline.train.schedule import plan_phases
-from warpgs.pipeline.train.setup import prepare, prepared_views, terms_of, view_parameters
-from warpgs.pipeline.train.slots import Tree, check_batch
-from warpgs.pipeline.train.step import (
-    CAPACITY_FACTOR,
-    MAX_STEPS,
-    Learned,
-    OverLimitError,
-    StepBuffers,
-    StepGraphs,
-    StepPlan,
-    eager_renderer,
-    step,
-)
+from warpgs.pipeline.train.schedule import Phases, plan_phases, sh_degree
+from warpgs.pipeline.train.setup import prepare, prepared_views, samples, terms_of
+from warpgs.pipeline.train.step import CAPACITY_FACTOR, MAX_STEPS, Learned, OverLimitError, StepBuffers, StepPlan
 from warpgs.pipeline.train.step_report import StepReport
+from warpgs.pipeline.train.stopping import STATE, Stopping
 from warpgs.pipeline.train.stored_state import check_state
 from warpgs.pipeline.train.strategies.base import find_strategy
-from warpgs.pipeline.train.views import Kind, TrainingView, half_size, stack_views
+from warpgs.pipeline.train.take_steps import StepTaker
+from warpgs.pipeline.train.views import Kind, TrainingView, half_size, show_learned, stack_views, with_learned
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.device_memory import available_bytes, is_out_of_memory, no_memory_message
 from warpgs.runtime.ranks import ALONE, Ranks
@@ -66,7 +56,7 @@ class Trainer:
         Args:
             train: The views to fit, at least one.
             points: The reconstruction's points, or None.
-            config: Settings.
+            config: Settings, of which none is left open: `warpgs.pipeline.train.by_views.settings_by_views` chooses those.
             device: Device of the fit.
             background: Colour behind the scene.
             priors: Prior of each view; None to compute them where sampling or a loss term needs them.
@@ -77,30 +67,26 @@ class Trainer:
         Raises:
             DataError: There is nothing to start from.
             UsageError: A camera cannot be rendered, the memory limit is below what the smallest step needs, a plug-in is not
-                there, two loss terms share the name of a map or a parameter, or views with an opacity were to have exposures.
+                there, two loss terms share the name of a map, two view modules that of a parameter, or the views cannot have
+                what a view module learns.
         """
         if not train:
             raise DataError("there is no training view; name at least one in --split")
-        if config.exposure:
-            check_exposure(train)
-        config, chosen = settings_by_views(config, train, device.type)
-        check_batch(config.batch, config.steps, ranks)
+        for module in config.view_modules:
+            module.check(train)
         self.config, self.device, self.ranks, self.batch = config, device, ranks, config.batch
         self.generator = torch.Generator().manual_seed(config.seed)
         made = prepare(train, points, config, np.random.default_rng(config.seed), device, priors, ready, progress)
-        made.notes[:0] = chosen
         self.notes: list[str] = made.notes
         """Sentences on what was chosen for the user before the first step."""
         self.messages: list[str] = []
         """Sentences for the user that were not shown yet."""
         cloud, cameras = made.start.cloud, [v.camera for v in train]
-        self.extent = scene_extent(cameras, cloud)
-        """Size of the scene [u], as `scene_extent` measures it."""
+        extent = scene_extent(cameras, cloud)
         self.radius = scene_radius(cameras, cloud)
         """Radius of the scene [u], as `scene_radius` measures it."""
         self.scene_background, self.background = background, torch.tensor(background, dtype=torch.float32, device=device)
         assert config.steps is not None and config.half_resolution is not None  # `settings_by_views` has chosen
-        self.phases = plan_phases(config.phases, config.steps)
         self.half_resolution = config.half_resolution
         """Fraction of the planned steps, from the first, in which views are half their size."""
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
@@ -113,37 +99,46 @@ class Trainer:
         self.order: list[int] = []
         """Views that are still to come before any comes again, the next one last."""
 
-        self.strategy = find_strategy(config.strategy)(self)
-        self.table = Table.of_gaussians(initial_gaussians(cloud, config.init, self.extent, device), self.strategy.columns())
-        self.poses: GivenPoses | None = None
-        """Training poses as given, where they are refined."""
-        first, self.view_lrs = view_parameters(self.terms, config, len(train), device)
-        self.view_table = Table(first, {}, device, len(train))
-        self.table.batch = self.view_table.batch = self.batch
-        self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(first)))
+        self.table = Table.of_gaussians(initial_gaussians(cloud, config.init, extent, device), {})
+        self.context = StrategyContext(
+            config.groups(), config.strategy_config, self.table, self.generator, config.seed,
+            plan_phases(config.phases, config.steps), extent, config.rule, self.background,
+        )  # fmt: skip
+        """What the strategy sees of the fit; views, phases and the scene's size have their place there."""
+        self.strategy, self.stopping = find_strategy(config.strategy)(self.context), Stopping(config.stopping)
+        self.table.add_columns(self.strategy.columns())
+        of_views = LearnedViews.first(config.view_modules, train, device)
+        self.table.batch = of_views.table.batch = self.batch
+        self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(of_views.table.params)))
         dropout_seed, centers = config.seed if self.dropout > 0 else None, camera_centers(cameras, device)
-        self.learned = Learned(self.table, self.view_table, self.strategy, dropout_seed, centers)
-        own = (self.learned, self.buffers, config.rule, self.background)
-        self.graphs = StepGraphs(*own) if device.type == "cuda" else None
-        self.batched = BatchSteps(*own, Tree(self.batch, ranks)) if self.batch > 1 else None
+        self.learned = Learned(self.table, of_views, self.strategy, dropout_seed, centers)
+        self.taker = StepTaker(self.learned, self.buffers, config.rule, self.background, self.batch, ranks)
         self.layout: Layout
-        self.max_instances: int | None = None
         views, self.disparities = prepared_views(train, made, config, self.terms, device)
-        if config.refine_poses:
-            views, self.poses = GivenPoses.owned(views), GivenPoses(views)
-        views = exposed_views(views) if config.exposure else views
+        self._begin(with_learned(views, of_views))
+
+    def _begin(self, views: list[TrainingView]) -> None:
+        """Train on these views, or on what early stopping leaves of them."""
         self.set_views(views)
         self.strategy.setup()
+        self.notes += self.stopping.begin(self.context, self.strategy, self.half_resolution)
+        if self.stopping.active:
+            self.set_views(self.stopping.hidden())
 
     @property
     def gaussians(self) -> Gaussians:
         """The current Gaussians, detached."""
-        return Gaussians(**{n: t.detach() for n, t in self.table.params.items()})
+        return self.context.gaussians
 
     @property
-    def capacity(self) -> int:
-        """Number of Gaussians that the settings and the memory limit allow."""
-        return min(self.config.max_gaussians, self.memory.cap)
+    def views(self) -> list[TrainingView]:
+        """Views that are trained on."""
+        return self.context.views
+
+    @property
+    def phases(self) -> Phases:
+        """Phases of the fit as they are now."""
+        return self.context.phases
 
     @property
     def steps(self) -> int:
@@ -154,10 +149,11 @@ class Trainer:
         """Return the fraction of the fit that is done before a step, in [0, 1]."""
         return self.phases.progress(step)
 
-    def end_growth(self) -> None:
-        """Begin phase 3 after the step that was just taken, where it is not there yet."""
-        if self.step < self.phases.stable_start < self.phases.planned:
-            self.phases = self.phases.stable_from(self.step)
+    def degree(self, step: int) -> int:
+        """Return the degree of the harmonics in use at a step."""
+        highest = self.config.init.max_sh_degree
+        assert highest is not None  # `settings_by_views` has chosen
+        return sh_degree(step, self.stopping.sh_every(self.config.sh_every, highest), highest)
 
     def plan_of(self, step: int) -> StepPlan:
         """Return the plan of a step, counted from 1."""
@@ -165,7 +161,7 @@ class Trainer:
         terms = tuple(t for t in self.terms if t.active(step, self.phases.planned))
         strategy, half = self.strategy, step <= self.half_resolution * self.phases.planned
         limits = c.limits.at(1.0 if step >= self.steps else self.progress(step), self.radius)
-        return StepPlan(strategy.sh_degree(step), half, terms, strategy.phase(step), limits)
+        return StepPlan(self.degree(step), half, terms, strategy.phase(step), limits)
 
     def next_view(self) -> int:
         """Return the number of the next view; they come in random order, each once before any comes again."""
@@ -205,7 +201,7 @@ class Trainer:
         Raises:
             ResourceError: Not even the smallest step fits.
         """
-        self.forget_graphs()
+        self.taker.clear()
         if self.device.type == "cuda":
             torch.cuda.empty_cache()
         held = self.layout.held(len(self.table))
@@ -229,11 +225,11 @@ class Trainer:
         """Take steps as `advance` does."""
         begin, first = time.perf_counter(), self.step + 1
         plan, count = self.plan_of(first), 1
-        if self.layout.graphs and self.batched is None:
+        if self.layout.graphs and self.taker.batched is None:
             while (
                 count < min(limit, MAX_STEPS, self.steps - self.step)
                 and self.plan_of(first + count) == plan
-                and not self.strategy.due(first + count - 1)
+                and not self.is_due(first + count - 1)
             ):
                 count += 1
         chosen = [self.next_view() for _ in range(count * self.batch)]
@@ -252,11 +248,11 @@ class Trainer:
         self.step += done
         if stop == NOT_FINITE:
             error = NotFiniteError(f"the loss became {history[done][0]} at step {self.step + 1}")
-            error.slot = 0 if self.batched is None else self.batched.result()[0]
+            error.slot = self.taker.stopped_slot
             error.view = chosen[done + error.slot]
             raise error
         if stop:
-            self.forget_graphs()  # they are captured anew with more capacity
+            self.taker.clear()  # they are captured anew with more capacity
         counts = [len(self.table)] * done
         if done == count:
             self._update()
@@ -269,20 +265,13 @@ class Trainer:
 
     def _take(self, places: list[tuple[Kind, int]], plan: StepPlan) -> bool:
         """Take steps with views at these places; return False, and take none, where graphs would need too much memory."""
-        kinds, captured = [kind for kind, _ in places], self.layout.graphs > 0
         try:
-            if self.batched is not None:
-                settings = [self.settings(self.step + 1, slot) for slot in range(self.batch)]
-                self.batched.take(places, settings, self.stacks, plan, self.max_instances, captured=captured)
-            elif captured and self.graphs is not None:
-                for graph in self.graphs.capture_all(kinds, self.stacks, plan, self.max_instances):
-                    graph.replay()
-            else:
-                render = eager_renderer(self.config.rule, self.background, self.max_instances)
-                for kind in kinds:
-                    step(self.learned, self.stacks[kind], self.buffers, plan, render)
+            self.taker.take(
+                places, lambda: [self.settings(self.step + 1, slot) for slot in range(self.batch)],
+                self.stacks, plan, self.context.max_instances, captured=self.layout.graphs > 0,
+            )  # fmt: skip
         except OverLimitError as e:
-            self.forget_graphs()
+            self.taker.clear()
             self.layout = dataclasses.replace(self.layout, graphs=0)
             self.count_changed()
             self.messages.append(f"memory: steps are taken one by one from here on, because {e}")
@@ -291,26 +280,14 @@ class Trainer:
 
     def _lr_row(self, step: int) -> list[float]:
         row = self.table.lr_row(self.lrs(step), step, self.config.optimizer.head_lrs)
-        lrs, optimizer = dict(self.view_lrs), self.config.optimizer
-        if self.poses is not None:
-            rates = optimizer.pose_lrs(self.progress(step), self.extent)
-            lrs |= {ROTATION: rates[0], TRANSLATION: rates[1]}
-        if self.config.exposure:
-            lrs[EXPOSURE] = optimizer.exposure_lr_at(self.progress(step))
-        return row + self.view_table.lr_row(lrs, step, {})
-
-    def agreed(self, stopped: bool) -> bool:
-        """Return whether to end after the last step, as all processes do: one that was told to is heard in its next step."""
-        if self.batched is None or self.ranks.count == 1:
-            return stopped
-        self.batched.told_to_stop = stopped
-        return self.batched.result()[1]
+        views = self.learned.views
+        return row + views.table.lr_row(views.lrs(self.progress(step), self.context.extent), step, {})
 
     def lrs(self, step: int) -> dict[str, float]:
         """Return the learning rate of each parameter of the Gaussians at a step."""
         c, phases = self.config, self.phases
-        stable_start = phases.stable_start / phases.planned if phases.stable_start < phases.planned else 0.0
-        return c.optimizer.lrs(self.progress(step), self.extent, stable_start)
+        stable_start = phases.stable_start / phases.planned if c.phases.stable and phases.stable_start < phases.planned else 0.0
+        return c.optimizer.lrs(self.progress(step), self.context.extent, stable_start)
 
     def settings(self, step: int, slot: int | None = None) -> tuple[float, ...]:
         """Return the settings of a step (`Setting`), or of one of its slots, which has its own number and random numbers."""
@@ -318,66 +295,66 @@ class Trainer:
         shifted = self.cutout and self.config.loss.random_background
         shift = random_shift(self.config.seed, number, self.scene_background) if shifted else (0.0, 0.0, 0.0)
         means_lr = math.sqrt(self.batch) * self.lrs(step)["means"]
-        return Setting.row(dropout=self.strategy.dropout(step), number=number, means_lr=means_lr, shift=shift)
+        return Setting.row(dropout=self.dropout * self.progress(step), number=number, step=step, means_lr=means_lr, shift=shift)
+
+    def is_due(self, step: int) -> bool:
+        """Return whether the set of Gaussians changes, or held-out blocks are measured, after a step."""
+        return self.stopping.due(step) or (self.stopping.ended is None and self.strategy.due(step))
 
     def _update(self) -> None:
-        """Have the strategy change the set of Gaussians after the step that was just taken, where that is due."""
-        if not self.strategy.due(self.step):
+        """Change the set of Gaussians after the step that was just taken, where that is due."""
+        if not self.is_due(self.step):
             return
-        self.forget_graphs()
+        self.taker.clear()
         self.show_learned()
-        for change in self.strategy.update(self.step):
+        stopping, step = self.stopping, self.step
+        for change in stopping.changes(step, self.strategy, self.context, self.degree(step)):
             self.table.apply(change)
             self.count_changed()
+        if stopping.ended == step:
+            self.set_views(stopping.whole)
+            stopping.whole = self.views
+            words = f"stopping: growth ended at step {step} with {len(self.table):,} Gaussians, because {stopping.why}"
+            self.messages.append(Detail(f"{words}; all pixels are trained on from here"))
         self.plan_of(self.step).limits.hold(self.table.params, self.learned.centers)
 
     def show_learned(self) -> None:
-        """Let the views show their poses and exposures as they are now, where these are learned."""
-        if self.poses is not None:
-            self.poses.show(self.views, self.view_table.params)
-        if self.config.exposure:
-            show_exposures(self.views, self.view_table.params[EXPOSURE])
-
-    def forget_graphs(self) -> None:
-        """Drop all CUDA graphs; they are captured anew."""
-        for graphs in (self.graphs, self.batched):
-            if graphs is not None:
-                graphs.clear()
+        """Let the views show what view modules have learned by now."""
+        show_learned(self.views, self.stacks, self.places, self.learned.views)
 
     def set_views(self, views: list[TrainingView]) -> None:
         """Train on these views from here on, and plan the memory that steps need."""
         c = self.config
-        self.forget_graphs()
+        self.taker.clear()
         shown = [*views, *(half_size(v) for v in views if self.half_resolution > 0)]
         shown, self.stacks, self.places = stack_views(shown, len(views))
-        self.views = shown[: len(views)]
-        if self.poses is not None:
-            self.poses.restore(self.stacks.values())
+        self.context.views = shown[: len(views)]
         layout = layout_of(
-            self.table, shown, kept=self.strategy.kept_views(), scored=self.strategy.samples(c), captured=self.captured,
-            depth_supervised=c.loss.depth_weight > 0, trimmed=self.strategy.shrinks(c), refined=c.refine_poses,
-            exposed=c.exposure, sums=0 if self.batched is None else self.batched.tree.buffers,
+            self.table, shown, kept=self.stopping.whole, scored=samples(c), captured=self.captured,
+            depth_supervised="depth" in outputs_of(self.terms), modules=c.view_modules, sums=self.taker.sums,
         )  # fmt: skip
         most = most_instances(self.gaussians, [v.camera for v in shown], c.rule)
         self.memory, self.layout = plan(
             layout, count=len(self.table), instances=most, most=c.max_gaussians, limit=self.memory_limit,
             available=available_bytes(self.device), capacity_factor=CAPACITY_FACTOR,
         )  # fmt: skip
+        self.context.capacity = min(c.max_gaussians, self.memory.cap)
         self.count_changed()
 
     def count_changed(self) -> None:
         """Set how many instances a step may have at a time, None for no limit: it depends on the number of Gaussians."""
         limit = self.memory_limit
-        self.max_instances = None if limit is None else self.layout.most_instances(len(self.table), limit)
+        self.context.max_instances = None if limit is None else self.layout.most_instances(len(self.table), limit)
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Return tensors by name, of any shape [...], and plain values from which the fit continues with the same bits."""
-        tensors, strategy = self.strategy.state()
-        views = {f"views.{n}": t for n, t in self.view_table.state().items()}
-        tensors = {**self.table.state(), **views, **tensors, "generator": self.generator.get_state()}
+        (tensors, strategy), (errors, stopping) = self.strategy.state(), self.stopping.state()
+        views = {f"views.{n}": t for n, t in self.learned.views.table.state().items()}
+        tensors = {**self.table.state(), **views, **tensors, **errors, "generator": self.generator.get_state()}
         plain = {
-            "step": self.step, "order": self.order, "extent": self.extent, "notes": self.notes, "strategy": strategy,
-            "config": self.config.to_json(), "stable_start": self.phases.stable_start, "steps": self.steps,
+            "step": self.step, "order": self.order, "extent": self.context.extent, "notes": self.notes, "strategy": strategy,
+            "stopping": stopping, "config": self.config.to_json(), "steps": self.steps,
+            "stable_start": self.phases.stable_start,
         }  # fmt: skip
         return tensors, plain
 
@@ -387,12 +364,17 @@ class Trainer:
         Raises:
             DataError: They are not what `state` returns.
         """
-        check_state(tensors, plain, views=len(self.views), steps=self.phases.planned, strategy=self.strategy.STATE)
+        check_state(
+            tensors, plain, views=len(self.views), steps=self.phases.planned, strategy=self.strategy.STATE, stopping=STATE
+        )
         self.step, self.order = plain["step"], list(plain["order"])
-        self.phases = dataclasses.replace(self.phases, stable_start=plain["stable_start"], steps=plain["steps"])
-        self.extent, self.notes = plain["extent"], [*map(Detail, plain["notes"])]  # they were shown when the fit began
+        self.context.phases = dataclasses.replace(self.phases, stable_start=plain["stable_start"], steps=plain["steps"])
+        self.context.extent = plain["extent"]
+        self.notes = [*map(Detail, plain["notes"])]  # shown when the fit began
         self.table.load(tensors)
-        self.view_table.load({n.removeprefix("views."): t for n, t in tensors.items() if n.startswith("views.")})
+        of_views = {n.removeprefix("views."): t for n, t in tensors.items() if n.startswith("views.")}
+        self.learned.views.table.load(of_views)
         self.strategy.load(tensors, plain["strategy"])
-        self.set_views(self.views)
+        self.stopping.load(tensors, plain["stopping"])
+        self.set_views(self.views if self.stopping.ended is None else self.stopping.whole)
         self.generator.set_state(tensors["generator"])

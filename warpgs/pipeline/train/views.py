@@ -11,6 +11,7 @@ import torch
 from torch.nn.functional import interpolate
 
 from warpgs.pipeline.metrics.region import OPAQUE
+from warpgs.pipeline.train.learned_views import LearnedView, LearnedViews, seen
 from warpgs.scene import Camera, View
 
 Kind = tuple[int, int, bool, str]
@@ -22,7 +23,7 @@ class TrainingView:
     """A training view on the device of the fit."""
 
     camera: Camera
-    """Camera with float32 tensors on the device."""
+    """Camera with float32 tensors on the device, as it is now; overwritten in place where it is learned."""
     image: torch.Tensor
     """Colours in [0, 1], shape [H, W, 3]."""
     mask: torch.Tensor | None = None
@@ -37,8 +38,8 @@ class TrainingView:
     """Maps that loss terms asked for, by name, each of shape [H, W] or [H, W, C]."""
     alpha: torch.Tensor | None = None
     """Opacity of what was photographed, in [0, 1], shape [H, W]; None where no training view has one (`with_alpha`)."""
-    exposure: torch.Tensor | None = None
-    """Exposure as it is now, rows of [A - 1 | b], shape [12], overwritten in place; None where none are learned."""
+    learned: LearnedView | None = None
+    """Part of the view in the view modules of the fit; None without view modules."""
 
     @staticmethod
     def of(view: View, device: torch.device) -> TrainingView:
@@ -57,6 +58,15 @@ class TrainingView:
     def kind(self) -> Kind:
         """Width, height, presence of a mask and camera model, which the views of one stack share."""
         return self.camera.width, self.camera.height, self.mask is not None, self.camera.model
+
+    @property
+    def given(self) -> Camera:
+        """Camera before anything was learned of it."""
+        return self.camera if self.learned is None else self.learned.given
+
+    def seen(self, rgb: torch.Tensor) -> torch.Tensor:
+        """Return rendered colours [H, W, 3] as the view shows them, by what its view modules have learned."""
+        return rgb if self.learned is None else seen(self.learned.modules, rgb, self.learned.values)
 
     @property
     def countable(self) -> torch.Tensor | None:
@@ -97,7 +107,8 @@ def half_size(view: TrainingView) -> TrainingView:
 
     mask = None if view.mask is None else (mean(view.mask[None])[0] > 1 - 1e-4).to(view.mask.dtype)
     maps, alpha = {n: smaller(t) for n, t in view.maps.items()}, None if view.alpha is None else smaller(view.alpha)
-    return TrainingView(camera, smaller(view.image), mask, maps=maps, alpha=alpha, exposure=view.exposure)
+    learned = None if view.learned is None else replace(view.learned, given=half_size_camera(view.learned.given))
+    return TrainingView(camera, smaller(view.image), mask, maps=maps, alpha=alpha, learned=learned)
 
 
 Rows = torch.Tensor | tuple[torch.Tensor, ...]
@@ -109,9 +120,9 @@ class ViewStack:
     """Training views of one kind, stacked, from which a step takes its own."""
 
     viewmats: torch.Tensor
-    """camera_from_world, shape [V, 4, 4]."""
+    """camera_from_world as given, shape [V, 4, 4]."""
     Ks: torch.Tensor
-    """Intrinsics [px], shape [V, 3, 3]."""
+    """Intrinsics [px] as given, shape [V, 3, 3]."""
     distortions: torch.Tensor
     """Coefficients of the camera model, shape [V, P]."""
     model: str
@@ -191,8 +202,8 @@ def stack_views(
         same = [views[i] for i in numbers]
         device = same[0].image.device
         stack = ViewStack(
-            torch.stack([v.camera.viewmat for v in same]), torch.stack([v.camera.K for v in same]),
-            torch.stack([_coefficients(v.camera) for v in same]), kind[3],
+            torch.stack([v.given.viewmat for v in same]), torch.stack([v.given.K for v in same]),
+            torch.stack([_coefficients(v.given) for v in same]), kind[3],
             stacked([v.image for v in same]), stacked([v.mask for v in same]) if kind[2] else None,
             {n: stacked([v.maps[n] for v in same]) for n in same[0].maps},
             torch.tensor([i % count for i in numbers], device=device),
@@ -210,3 +221,49 @@ def stack_views(
         places.append((k, seen[k]))
         seen[k] += 1
     return shared, stacks, places
+
+
+def with_learned(views: list[TrainingView], learned: LearnedViews) -> list[TrainingView]:
+    """Return the views with cameras and values of their own, which `show_learned` overwrites."""
+    if not learned.modules:
+        return views
+    values, found = learned.values(torch.arange(len(views), device=views[0].image.device)), []
+    for i, v in enumerate(views):
+        camera = replace(v.camera, viewmat=v.camera.viewmat.clone(), K=v.camera.K.clone())
+        own = LearnedView(learned.modules, v.camera, {n: t[i].detach().clone() for n, t in values.items()})
+        found.append(replace(v, camera=camera, learned=own))
+    return found
+
+
+@torch.no_grad()
+def current(stack: ViewStack, learned: LearnedViews) -> ViewStack:
+    """Return a stack with the cameras that its views have now."""
+    if not learned.modules:
+        return stack
+    camera = stack.camera(stack.viewmats, stack.Ks, stack.distortions if stack.distortions.numel() else None)
+    camera = learned.before_render(camera, learned.values(stack.numbers))
+    return replace(stack, viewmats=camera.viewmat, Ks=camera.K)
+
+
+@torch.no_grad()
+def show_learned(
+    views: list[TrainingView], stacks: Mapping[Kind, ViewStack], places: list[tuple[Kind, int]], learned: LearnedViews
+) -> None:
+    """Write what is learned now into views of `with_learned`, from which density strategies render.
+
+    Args:
+        views: Training views.
+        stacks: Their stacks by kind.
+        places: Kind and row of each in its stack; more may follow.
+        learned: View modules with their parameters.
+    """
+    if not learned.modules:
+        return
+    now = {kind: current(stack, learned) for kind, stack in stacks.items()}
+    values = learned.values(torch.arange(len(views), device=views[0].image.device))
+    for i, (view, (kind, row)) in enumerate(zip(views, places, strict=False)):
+        view.camera.viewmat.copy_(now[kind].viewmats[row])
+        view.camera.K.copy_(now[kind].Ks[row])
+        assert view.learned is not None
+        for name, value in view.learned.values.items():
+            value.copy_(values[name][i])

@@ -73,7 +73,7 @@ def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool]
     fit = Trainer(views, cloud, small, device, black, [Prior(*maps, "noise", "noise") for _ in views])
     run(fit, lambda _: None, lambda _: None, stopped)
     score(views[0], render_view(fit.gaussians, views[0], RasterizeOptions(rule=small.rule, background=fit.background))[0])
-    fit.forget_graphs()  # their memory is for the fit that follows
+    fit.taker.clear()  # their memory is for the fit that follows
     return fit
 
 

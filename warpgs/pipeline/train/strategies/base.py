@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import weakref
-from collections.abc import Hashable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from collections.abc import Hashable, Iterator, Mapping
+from typing import Any, ClassVar
 
 import torch
 
 from warpgs.pipeline.model.table import Column, DensityUpdate
-from warpgs.pipeline.train.schedule import sh_degree
+from warpgs.pipeline.train.context import Growth, Settings, StrategyContext
+from warpgs.pipeline.train.views import TrainingView
 from warpgs.plugins import Registry
+from warpgs.scene import Gaussians
 from warpgs.schema import anything
-
-if TYPE_CHECKING:
-    from warpgs.pipeline.train.config import FitConfig
-    from warpgs.pipeline.train.trainer import Trainer
-    from warpgs.pipeline.train.views import TrainingView
-    from warpgs.scene import Gaussians
 
 
 class Strategy:
@@ -38,26 +33,19 @@ class Strategy:
     STATE: ClassVar[staticmethod[[Any, str], None]] = staticmethod(anything)
     """Schema (`warpgs.schema`) of the plain values that `state` returns: `load` gets no others, whatever a file holds."""
 
-    def __init__(self, trainer: Trainer):
-        """Keep the trainer, whose table, views and settings the strategy works with; nothing is trained yet.
+    def __init__(self, context: StrategyContext):
+        """Keep the context, which the strategy works with; nothing is trained yet.
 
         Args:
-            trainer: The trainer. Its table exists, its views do not: see `setup`.
+            context: Parts of the fit. Its table exists, without columns, its views do not: see `setup`.
         """
-        # by proxy: with a cycle, a finished fit would keep its memory until Python looks for garbage
-        self.trainer: Trainer = weakref.proxy(trainer)
-        own = trainer.config.strategy_config
-        self.config: Any = self.Config() if own is None and self.Config is not None else own
+        self.context = context
+        self.config: Any = self.Config() if context.own is None and self.Config is not None else context.own
         """The strategy's own settings."""
 
     @classmethod
-    def samples(cls, config: FitConfig) -> bool:
-        """Return whether it samples by importance, for which views need priors and scores."""
-        return False
-
-    @classmethod
-    def shrinks(cls, config: FitConfig) -> bool:
-        """Return whether the model is made smaller by tries, for which the memory plan counts copies of it."""
+    def samples(cls, settings: Settings) -> bool:
+        """Return whether it samples by importance, for which views need priors and scores; settings are those of the fit."""
         return False
 
     @classmethod
@@ -72,23 +60,13 @@ class Strategy:
     def setup(self) -> None:
         """Begin; the table, the training views and the memory plan exist by now."""
 
-    def kept_views(self) -> Sequence[TrainingView]:
-        """Return views that the strategy keeps beside those in training, whose memory counts."""
-        return ()
+    def growth(self) -> Growth:
+        """Return when Gaussians are added, by which early stopping measures; up to phase 3 if not overridden."""
+        return Growth(self.context.phases.refine, self.context.phases.stable_start)
 
     def phase(self, step: int) -> Hashable:
         """Return a value for what the strategy does in a step; steps of equal phases share a CUDA graph."""
         return None
-
-    def sh_degree(self, step: int) -> int:
-        """Return the spherical-harmonics degree in use at a step."""
-        highest = self.trainer.config.init.max_sh_degree
-        assert highest is not None  # `settings_by_views` has chosen
-        return sh_degree(step, self.trainer.config.sh_every, highest)
-
-    def dropout(self, step: int) -> float:
-        """Return the probability that a Gaussian is hidden in a step, in [0, 1); asked only if `FitConfig.dropout` is not 0."""
-        return self.trainer.dropout * self.trainer.progress(step)
 
     def regularisation(self, phase: Hashable, gaussians: Gaussians) -> torch.Tensor | None:
         """Return a term that is added to the loss of every step, shape []; None for none.
@@ -108,7 +86,7 @@ class Strategy:
 
         Args:
             phase: Value of `phase` for the step.
-            settings: Settings of the step, by the columns of `warpgs.kernels.step_buffers.Setting`, float32, shape [6].
+            settings: Settings of the step, by the columns of `warpgs.kernels.step_buffers.Setting`, float32, shape [7].
             going: Whether the step is taken, bool, shape [1]; where it is not, nothing may change.
         """
 
@@ -129,11 +107,21 @@ class Strategy:
         return {}
 
     def due(self, step: int) -> bool:
-        """Return whether `update` has anything to do after a step."""
+        """Return whether `update` has anything to do after a step; not asked once early stopping has ended growth."""
         return False
 
     def update(self, step: int) -> Iterator[DensityUpdate]:
         """Yield changes of the set of Gaussians after a step; each has been applied to the table when the next is asked for."""
+        return iter(())
+
+    def catch_up(self, step: int, views: list[TrainingView], held: int) -> Iterator[DensityUpdate]:
+        """Yield changes for pixels that early stopping has held out so far, when it ends growth.
+
+        Args:
+            step: Steps done.
+            views: Training views, masked so that nothing but those pixels counts.
+            held: Number of those pixels, over all views.
+        """
         return iter(())
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
@@ -145,10 +133,6 @@ class Strategy:
 
     def load(self, tensors: Mapping[str, torch.Tensor], plain: dict[str, Any]) -> None:
         """Load what `state` returned."""
-
-    def figures(self) -> dict[str, Any]:
-        """Return what the report says of the strategy, plain values for metrics.json."""
-        return {}
 
 
 STRATEGIES: Registry[Strategy] = Registry("strategy", Strategy, __package__)

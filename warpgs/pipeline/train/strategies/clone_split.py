@@ -1,234 +1,58 @@
-"""Clone, split and prune (Kerbl et al. 2023, section 5.2)."""
+"""Clone, split and prune (Kerbl et al. 2023, section 5.2), all through the fit."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Hashable, Iterator, Mapping
-from dataclasses import dataclass
 
-import torch
-
-from warpgs import geometry, schema
-from warpgs.errors import UsageError
+from warpgs import schema
 from warpgs.pipeline.model.table import Column, DensityUpdate
+from warpgs.pipeline.train.context import Growth
 from warpgs.pipeline.train.strategies.base import Strategy, register
-from warpgs.scene import Gaussians
-
-RESET_FREE_STEPS = 500
-"""Steps before the last event in which no opacity is reset any more: what is transparent then stays so."""
-
-
-@dataclass(frozen=True)
-class DensityConfig:
-    """Thresholds and times of densification."""
-
-    start: int = 500
-    """First step after which Gaussians are added and removed."""
-    every: int = 100
-    """Steps between two such events."""
-    stop_fraction: float = 0.5
-    """Fraction of the fit after which the set is left alone."""
-    gradient: float = 2e-4
-    """Mean gradient of the projected mean, in half image widths and heights, above which a Gaussian is densified."""
-    clone_size: float = 0.01
-    """Gaussians smaller than this fraction of the scene's extent are cloned, larger ones split."""
-    prune_opacity: float = 0.005
-    """Gaussians below this opacity are removed."""
-    prune_size: float = 0.1
-    """Gaussians larger than this fraction of the extent are removed once an opacity reset has happened, but not where more
-    than half of all are larger; 0 for never."""
-    reset_every: int = 0
-    """Steps between opacity resets, 3000 in Kerbl et al. 2023; 0 for none. With few views a reset costs decibels that the
-    rest of the fit does not win back (docs/decisions/002-no-opacity-reset.md)."""
-    reset_opacity: float = 0.01
-    """Largest opacity after a reset."""
-    morton_order: bool = True
-    """Order the Gaussians along a Morton curve after each event (docs/decisions/009-morton-order.md)."""
-
-    def __post_init__(self):
-        if self.every < 1 or self.start < 0 or self.reset_every < 0:
-            raise UsageError("density: every must be at least 1, start and reset every at least 0")
-        for name in ("stop_fraction", "prune_opacity"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise UsageError(f"density {name.replace('_', ' ')} {getattr(self, name)} must lie between 0 and 1")
-        for name in ("gradient", "clone_size", "prune_size"):
-            if not getattr(self, name) >= 0:
-                raise UsageError(f"density {name.replace('_', ' ')} must be at least 0, not {getattr(self, name)}")
-        if not 0 < self.reset_opacity < 1:
-            raise UsageError(f"density reset opacity {self.reset_opacity} must lie between 0 and 1")
-
-    def times(self, steps: int) -> tuple[int, int, int]:
-        """Return first event, interval and last event [steps] of a fit; a short one starts after a quarter of its length."""
-        return min(self.start, steps // 4), self.every, int(self.stop_fraction * steps)
-
-    def due(self, step: int, steps: int, until: int) -> tuple[bool, bool]:
-        """Return whether the set is refined, and opacities reset, after a step; ``until`` is the last step for either."""
-        start, every, _ = self.times(steps)
-        refines = start < step <= until and step % every == 0
-        return refines, self.reset_every > 0 and step <= until - RESET_FREE_STEPS and step % self.reset_every == 0
-
-
-def _exp(x: torch.Tensor) -> torch.Tensor:
-    """Return e^x by way of float64: float32's has other last digits on other processors (MKL)."""
-    return x.double().exp().to(x.dtype)
-
-
-def _split(gaussians: dict[str, torch.Tensor], ids: torch.Tensor, generator: torch.Generator) -> dict[str, torch.Tensor]:
-    """Return two children of each Gaussian, sampled from its own distribution and 1.6 times smaller (Kerbl et al. 2023)."""
-    pair = ids.repeat(2)
-    rows = {n: t[pair] for n, t in gaussians.items()}
-    noise = torch.randn(len(pair), 3, generator=generator).to(ids.device) * _exp(rows["log_scales"])
-    w, *vector = (rows["quats"] / rows["quats"].norm(dim=1, keepdim=True)).unbind(1)
-    axis = torch.stack(vector, 1)
-    cross = 2 * torch.linalg.cross(axis, noise)
-    rows["means"] = rows["means"] + noise + w[:, None] * cross + torch.linalg.cross(axis, cross)
-    rows["log_scales"] = rows["log_scales"] - math.log(1.6)
-    return rows
-
-
-def refine(
-    gaussians: Gaussians,
-    pull: torch.Tensor,
-    config: DensityConfig,
-    *,
-    extent: float,
-    capacity: int,
-    after_reset: bool,
-    generator: torch.Generator,
-    growing: torch.Tensor | None = None,
-    protected: torch.Tensor | None = None,
-) -> DensityUpdate:
-    """Clone small Gaussians and split large ones where the gradient of the mean is large; prune the transparent and the huge.
-
-    Args:
-        gaussians: The current set, N rows.
-        pull: Mean norm of the gradient of each projected mean, in half image widths and heights, shape [N].
-        config: Thresholds.
-        extent: Size of the scene [u].
-        capacity: Largest number of Gaussians after the change.
-        after_reset: True once opacities were reset; only then are huge Gaussians pruned.
-        generator: CPU generator of the children's positions, the same numbers on every device.
-        growing: Gaussians that may be cloned and split, bool, shape [N]; None for all.
-        protected: Gaussians that are not pruned, bool, shape [N]; None for none.
-
-    Returns:
-        The change; at least one Gaussian, the most opaque, always stays.
-    """
-    with torch.no_grad():
-        tensors = {n: t.detach() for n, t in gaussians.tensors().items()}
-        scales = _exp(tensors["log_scales"].amax(1))
-        logits = tensors["logit_opacities"]  # torch's sigmoid depends on the number of threads in its last digit
-        grows = pull > config.gradient
-        if growing is not None:
-            grows &= growing
-            pull = torch.where(growing, pull, 0)
-        free = max(0, capacity - len(gaussians))
-        if int(grows.sum()) > free:
-            strongest = torch.topk(pull, free).indices
-            grows = torch.zeros_like(grows).index_fill(0, strongest, True) & grows
-        small = scales <= config.clone_size * extent
-        faint = ~(logits >= geometry.logit(config.prune_opacity))
-        if after_reset and config.prune_size > 0:
-            huge = scales > config.prune_size * extent
-            if 2 * int(huge.sum()) <= len(gaussians):  # else it is the extent that is small: the cameras stand close together
-                faint |= huge
-        if protected is not None:
-            faint &= ~protected
-        if len(gaussians) > 0 and bool(faint.all()):
-            faint[logits.argmax()] = False
-        cloned = torch.nonzero(grows & small & ~faint).squeeze(1)
-        split = torch.nonzero(grows & ~small & ~faint).squeeze(1)
-        remove = faint.clone()
-        remove[split] = True
-        children = _split(tensors, split, generator)
-        added = {n: torch.cat([t[cloned], children[n]]) for n, t in tensors.items()}
-        return DensityUpdate(torch.nonzero(~remove).squeeze(1), added, torch.cat([cloned, split.repeat(2)]))
+from warpgs.pipeline.train.strategies.gradient_growth import GradientGrowth
 
 
 @register("clone_split")
 class CloneSplit(Strategy):
     """Cloning and splitting by the gradient of projected means, pruning of the transparent and the huge; the default."""
 
-    def __init__(self, trainer):
+    STATE = staticmethod(schema.fields(GradientGrowth.STATE))
+
+    def __init__(self, context):
         """Begin without statistics, and before the first opacity reset."""
-        super().__init__(trainer)
-        self.was_reset = False
-        """True once opacities were reset, after which huge Gaussians are pruned."""
+        super().__init__(context)
+        self.gradients = GradientGrowth(context)
 
     def columns(self) -> Mapping[str, Column]:
-        """Return the sum of the gradient norms of each projected mean, and the number of renders that it was seen in."""
-        return {"grad_sum": Column(0.0, inherited=False), "seen_count": Column(0.0, inherited=False)}
+        """Return the columns in which gradients are gathered."""
+        return self.gradients.columns()
 
-    @property
-    def densify_until(self) -> int:
-        """Last step after which the set may be refined."""
-        c, phases = self.trainer.config, self.trainer.phases
-        return phases.stable_start if c.phases.coarse + c.phases.stable > 0 else c.density.times(c.steps)[2]
+    def growth(self) -> Growth:
+        """Return the times of refinement."""
+        return Growth(self.gradients.times.after, self.gradients.times.until)
 
     def phase(self, step: int) -> Hashable:
         """Return whether gradients are gathered in a step."""
-        return step <= self.densify_until
+        return self.gradients.gathers(step)
 
     def statistics(self, phase, v_projected, visible, size):
-        """Return the norm of each projected mean's gradient, and 1 for each that the view sees, shape [N] each.
-
-        The unit is half image widths and heights; ``v_projected`` has shape [1, N, 12], ``visible`` [1, N].
-        """
-        if not phase:
-            return {}
-        # a product with a tensor of the two sizes would copy them to the device, which a captured step must not
-        norms = torch.hypot(v_projected[..., 0] * (0.5 * size[0]), v_projected[..., 1] * (0.5 * size[1]))
-        # not times visible: 0 times NaN is NaN
-        return {"grad_sum": torch.where(visible, norms, 0).sum(0), "seen_count": visible.sum(0)}
-
-    def _due(self, step: int) -> tuple[bool, bool]:
-        return self.trainer.config.density.due(step, self.trainer.config.steps, self.densify_until)
+        """Return what is gathered of gradients, [N] each; ``v_projected`` has shape [1, N, 12], ``visible`` [1, N]."""
+        return self.gradients.statistics(v_projected, visible, size) if phase else {}
 
     def due(self, step: int) -> bool:
         """Return whether the set is refined or opacities are reset after a step."""
-        return any(self._due(step))
+        return self.gradients.due(step)
 
     def update(self, step: int) -> Iterator[DensityUpdate]:
         """Refine, then reset opacities, where it is time for either."""
-        refines, resets = self._due(step)
-        if refines:
-            yield from self.refine(step)
-        if resets:
-            self.trainer.table.reset_opacities(self.trainer.config.density.reset_opacity)
-            self.was_reset = True
+        if self.gradients.refines(step):
+            yield from self.gradients.refine()
+        if self.gradients.resets(step):
+            self.gradients.reset_opacities()
 
-    def refine(
-        self, step: int, growing: torch.Tensor | None = None, protected: torch.Tensor | None = None
-    ) -> Iterator[DensityUpdate]:
-        """Yield the change by `refine`, then order the Gaussians and begin to gather anew.
-
-        Args:
-            step: Steps done.
-            growing: Gaussians that may be cloned and split, bool, shape [N]; None for all.
-            protected: Gaussians that are not pruned, bool, shape [N]; None for none.
-        """
-        t = self.trainer
-        columns, c = t.table.columns, t.config.density
-        pull = columns["grad_sum"] / columns["seen_count"].clamp_min(1)
-        yield refine(
-            t.gaussians, pull, c, extent=t.extent, capacity=t.capacity, after_reset=self.was_reset, generator=t.generator,
-            growing=growing, protected=protected,
-        )  # fmt: skip
-        if c.morton_order:
-            t.table.sort_along_curve()
-        self.forget()
-
-    def forget(self) -> None:
-        """Reset the statistics of gradients."""
-        for name in ("grad_sum", "seen_count"):
-            self.trainer.table.columns[name].zero_()
-
-    STATE = staticmethod(schema.fields({"was_reset": schema.flag}))
-
-    def state(self) -> tuple[dict[str, torch.Tensor], dict]:
-        """Return no tensors, shape [...], and whether opacities were reset."""
-        return {}, {"was_reset": self.was_reset}
+    def state(self):
+        """Return no tensors [...], and whether opacities were reset."""
+        return {}, self.gradients.state()
 
     def load(self, tensors, plain):
         """Load whether opacities were reset; ``tensors`` [...] are not read."""
-        self.was_reset = plain["was_reset"]
+        self.gradients.load(plain)

@@ -17,7 +17,9 @@ import warp as wp
 from warpgs.errors import UsageError
 from warpgs.kernels.step_buffers import Setting
 from warpgs.pipeline.model.table import DensityUpdate
+from warpgs.pipeline.train.context import Growth
 from warpgs.pipeline.train.strategies.base import Strategy, register
+from warpgs.pipeline.train.strategies.event_times import EventTimes
 from warpgs.runtime import interop
 from warpgs.scene import Gaussians
 
@@ -125,7 +127,7 @@ def perturb(
 
     Args:
         gaussians: N Gaussians, float32.
-        settings: Settings of the step (`Setting`), of which number and learning rate are read, float32, shape [6].
+        settings: Settings of the step (`Setting`), of which number and learning rate are read, float32, shape [7].
         going: Nothing changes where this is False, bool, shape [1].
         seed: Any 32-bit integer.
         noise_lr: Factor of the learning rate.
@@ -150,6 +152,16 @@ class MCMC(Strategy):
         """Return the settings with an event after every step."""
         return dataclasses.replace(own, start=0, every=1)
 
+    @property
+    def times(self) -> EventTimes:
+        """Times of relocation and addition."""
+        c = self.config
+        return EventTimes.of_fit(c.start, c.every, c.stop_fraction, self.context.phases.planned)
+
+    def growth(self) -> Growth:
+        """Return the times of relocation and addition."""
+        return Growth(self.times.after, self.times.until)
+
     def regularisation(self, phase, gaussians):
         """Return the weighted mean opacity plus the weighted mean axis length, shape [], by which unneeded Gaussians die."""
         c = self.config
@@ -158,18 +170,17 @@ class MCMC(Strategy):
         return (c.opacity_weight * opacity + c.scale_weight * scale).to(gaussians.log_scales.dtype)
 
     def after_step(self, phase, settings, going):
-        """Perturb the means; nothing changes where ``going`` [1] is False. ``settings`` has shape [6]."""
-        t = self.trainer
-        perturb(t.table.gaussians, settings, going, seed=t.config.seed ^ NOISE_STREAM, noise_lr=self.config.noise_lr)
+        """Perturb the means; nothing changes where ``going`` [1] is False. ``settings`` has shape [7]."""
+        t = self.context
+        perturb(t.table.gaussians, settings, going, seed=t.seed ^ NOISE_STREAM, noise_lr=self.config.noise_lr)
 
     def due(self, step: int) -> bool:
         """Return whether Gaussians are relocated and added after a step."""
-        c, steps = self.config, self.trainer.config.steps
-        return min(c.start, steps // 4) < step <= c.stop_fraction * steps and step % c.every == 0
+        return self.times.due(step)
 
     def update(self, step: int) -> Iterator[DensityUpdate]:
         """Relocate dead Gaussians, then add new ones."""
-        t = self.trainer
+        t = self.context
         opacities = t.gaussians.logit_opacities.sigmoid()
         dead = torch.nonzero(opacities <= self.config.min_opacity).squeeze(1)
         if 0 < len(dead) < len(t.table):
@@ -180,7 +191,7 @@ class MCMC(Strategy):
 
     def _copied(self, weights: torch.Tensor, count: int, onto: torch.Tensor | None) -> DensityUpdate:
         """Return the change that samples ``count`` Gaussians by weight [N] and copies each, onto rows or as new rows."""
-        t = self.trainer
+        t = self.context
         # on the CPU, where the numbers are the same for every device
         sampled = torch.multinomial(weights.cpu().double(), count, replacement=True, generator=t.generator).to(t.device)
         sources, place, times = torch.unique(sampled, return_inverse=True, return_counts=True)

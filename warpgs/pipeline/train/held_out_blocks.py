@@ -1,4 +1,4 @@
-"""Held-out blocks of pixels, and the gain on them with its noise, by which the size of a model is chosen (docs/complexity.md).
+"""Held-out blocks of pixels, and the gain on them with its noise, by which a fit ends (docs/complexity.md).
 
 To leave views or pixels out to choose a size is VGNC's idea (arXiv 2504.14548), here without its generative model.
 """
@@ -10,9 +10,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from warpgs.errors import UsageError
 from warpgs.pipeline.metrics.psnr import psnr_of
-from warpgs.pipeline.train.exposure import seen_in
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Gaussians
@@ -22,56 +20,10 @@ FLOOR = (2 / 255) ** 2
 SIDES = 16, 32
 """Least and largest side of a block [px]; between them a sixteenth of the image's shorter side. In images of which an
 eighth is less than the least, it is that eighth."""
-MAX_COST_FACTOR = 3
-"""Largest loss within the noise, as a multiple of the loss that is allowed."""
 MIN_BLOCKS = 12
 """Fewest blocks over all views with which a gain can be told from noise."""
 MAX_FRACTION = 0.1
 """Largest fraction of the pixels that small images hold out to reach `MIN_BLOCKS`, where less was asked for."""
-
-
-@dataclass(frozen=True)
-class HoldoutConfig:
-    """Settings of strategy holdout."""
-
-    fraction: float = 0.03
-    """Fraction of the pixels that is held out until growth ends."""
-    levels: int = 4
-    """Number of levels of growth, of equal length; after each its gain is measured."""
-    noise: float = 1.0
-    """Standard errors of the mean gain over the blocks that count as its noise."""
-    least_db: float = 0.02
-    """Gain of a level, its noise added, below which growth ends early [dB]."""
-    stop_db: float = 0.0
-    """Gain by growth and training in the last third of the steps, its noise added, below which growth ends [dB], in place of
-    `least_db`: where the fit has phases, the third begins then, and the fit ends earlier. Not before a third of the time of
-    growth, nor while views are half their size. 0: growth ends by its own gain, and the fit takes the planned steps."""
-    bounds: bool = True
-    """Bound the degree and the least width of each Gaussian by what views resolve, and grow none that one view alone sees."""
-    degrees: bool = True
-    """Lower degrees: each Gaussian keeps only the harmonics that its views can resolve and the held-out blocks need."""
-    keep_db: float = 0.1
-    """PSNR that lower degrees may cost on the held-out blocks when growth ends, before training recovers some of it [dB]; a
-    cost within its noise is accepted up to `MAX_COST_FACTOR` times this."""
-    trims: int = 8
-    """Number of trims, at equal distances from the end of growth to the last step. Those before the last step happen only
-    where the fit is above `enough_db` or near it; training recovers some of what they cost."""
-    trim_db: float = 0.1
-    """PSNR on the training views that a trim may take below what the fit has, or below `enough_db` where it has more [dB];
-    before the last step also part of what training will probably recover. 0 for no trims."""
-    enough_db: float = 36.0
-    """PSNR on the training views, `FLOOR` included, above which quality is traded for fewer Gaussians [dB]. The default is
-    37.2 dB without `FLOOR`, an error of 3.5 levels of an 8-bit photograph; 42.1 is no error at all, so that above it nothing is
-    traded."""
-
-    def __post_init__(self):
-        if not 0 < self.fraction <= 0.5:
-            raise UsageError(f"holdout fraction {self.fraction} must lie above 0 and be at most 0.5")
-        if self.levels < 1 or self.trims < 1:
-            raise UsageError(f"holdout: levels {self.levels} and trims {self.trims} must be at least 1")
-        for name in ("noise", "least_db", "stop_db", "keep_db", "trim_db", "enough_db"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise UsageError(f"holdout {name.replace('_', '-')} must be 0 or more and finite, not {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -118,8 +70,8 @@ def sample_blocks(views: list[TrainingView], fraction: float, seed: int) -> list
 
 
 def rendered(gaussians: Gaussians, view: TrainingView, options: RasterizeOptions) -> torch.Tensor:
-    """Return the colours of a model as a training view shows them, under its exposure if it has one, shape [H, W, 3]."""
-    return seen_in(view, rasterize(gaussians, view.camera, options).rgb)
+    """Return the colours of a model as a training view shows them, shape [H, W, 3]."""
+    return view.seen(rasterize(gaussians, view.camera, options).rgb)
 
 
 def hide(view: TrainingView, blocks: Blocks) -> TrainingView:
@@ -177,16 +129,9 @@ class Gain:
     def upper_bound_below(self, least: float, noises: float) -> bool:
         """Return whether mean plus so many standard errors is below ``least`` [dB]; True for a gain that is no number.
 
-        With few blocks the noise is large, so that growth of unknown gain goes on.
+        With few blocks the noise is large, so that a fit of unknown gain goes on.
         """
         return not self.mean + noises * self.noise >= least
-
-    def cost_below(self, allowed: float, noises: float) -> bool:
-        """Return whether no more was lost than ``allowed`` [dB], or than the noise up to `MAX_COST_FACTOR` times that.
-
-        Without that bound few blocks would allow any loss: a large loss differs much from block to block.
-        """
-        return -self.mean <= max(allowed, min(noises * self.noise, MAX_COST_FACTOR * allowed))
 
 
 def gain(before: torch.Tensor, after: torch.Tensor) -> Gain:
@@ -199,23 +144,3 @@ def gain(before: torch.Tensor, after: torch.Tensor) -> Gain:
     if count == 0:
         return Gain(math.nan, math.inf)
     return Gain(float(each.mean()), float(each.std() / math.sqrt(count)) if count > 1 else math.inf)
-
-
-@dataclass(frozen=True)
-class Level:
-    """One level of growth and what it gained; plain values as metrics.json has them."""
-
-    step: int
-    """Steps done when it was measured."""
-    count: int
-    """Gaussians at that step."""
-    held_out_psnr: float
-    """PSNR of the held-out blocks, the error floor included [dB]."""
-    fall: float
-    """Fall of the held-out error since the level before, by growth and training together [dB]."""
-    own: float
-    """Loss when the Gaussians that came with the level are hidden [dB]; ``fall`` where ``holdout.stop_db`` ends the fit."""
-    gain: float
-    """The smaller of the two, which are both upper bounds of the gain by growth [dB]."""
-    noise: float
-    """Standard error of ``gain`` over the blocks [dB]."""

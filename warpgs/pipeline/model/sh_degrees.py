@@ -1,16 +1,11 @@
-"""Bounds of each Gaussian: its highest degree of harmonics and its least width, held after every step."""
+"""Degrees of each Gaussian's harmonics: coefficients without what is above them, packed, and the bytes of a model."""
 
 from __future__ import annotations
 
 import torch
 
 from warpgs.kernels.sh import MAX_DEGREE
-from warpgs.pipeline.model.table import Column, Table
 
-FINEST = 12**-0.5
-"""Least standard deviation of an axis, in pixels of the nearest view that sees the Gaussian: that of one pixel's box filter."""
-NO_BOUND = torch.finfo(torch.float32).min
-"""Least log scale [ln u] of a Gaussian that has no bound."""
 FLOAT = 4
 """Bytes of a stored number."""
 
@@ -58,29 +53,3 @@ def unpack(packed: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
         sh[rows, : (d + 1) ** 2] = packed[at : at + size].reshape(-1, (d + 1) ** 2, 3)
         at += size
     return sh
-
-
-def bound_columns(degree: int) -> dict[str, Column]:
-    """Return the columns that bounds live in.
-
-    ``max_degree``: highest degree of harmonics that a Gaussian may have; ``degree`` for new ones. ``min_log_scale``: its least
-    log scale [ln u].
-    """
-    return {"max_degree": Column(degree, torch.int32), "min_log_scale": Column(NO_BOUND)}
-
-
-@torch.no_grad()
-def enforce_bounds(table: Table) -> None:
-    """Bring parameters within their bounds, in place.
-
-    A second time changes nothing, so a captured step that is not taken may end with it.
-    """
-    log_scales, sh = table.params["log_scales"].detach(), table.params["sh"].detach()
-    log_scales.copy_(torch.maximum(log_scales, table.columns["min_log_scale"][:, None]))
-    if sh.shape[1] > 1:
-        sh.copy_(truncated(sh, table.columns["max_degree"]))
-
-
-def min_log_scale(footprint: torch.Tensor) -> torch.Tensor:
-    """Return the least log scale [N] for the width of a pixel at each Gaussian [u], shape [N]; no bound where it is 0."""
-    return torch.log(FINEST * footprint).clamp_min(NO_BOUND)

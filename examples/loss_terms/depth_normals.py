@@ -1,0 +1,68 @@
+"""A loss term on normals: neighbours on a smooth surface face the same way, except at edges of the image.
+
+    warpgs fit scene --out run --loss-terms examples/loss_terms/depth_normals.py:NormalSmoothness --normal-smoothness.weight 0.1
+
+The normals come from rendered depth (`warpgs.geometry.depth_normals`). The term is the mean of 1 - cos of the angle between
+neighbours, weighted down at edges of the image as in Godard et al. 2017, eq. 5. It grows over the first steps, in which depth
+is still noise.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+
+import warpgs
+from warpgs.errors import UsageError
+from warpgs.geometry import depth_normals
+from warpgs.pipeline.train.loss import LossInputs, register, total
+
+MIN_ALPHA = 0.5
+"""Opacity above which a pixel shows a surface."""
+EDGE = 10.0
+"""Factor of the colour difference between neighbours, in the exponent of their weight."""
+
+
+def unevenness(normals: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
+    """Return the weighted mean of 1 - cos of the angle between neighbours, shape [], in [0, 2]; 0 without any.
+
+    ``normals`` have length 1, or 0 where there is none, shape [H, W, 3]; ``image`` has shape [H, W, 3].
+    """
+    shown = normals.detach().square().sum(-1) > 0.5
+    difference, weights = normals.new_zeros(()), normals.new_zeros(())
+    for axis in (0, 1):
+        size = normals.shape[axis] - 1
+        (a, b), (sa, sb), (ia, ib) = ((t.narrow(axis, 0, size), t.narrow(axis, 1, size)) for t in (normals, shown, image))
+        weight = torch.exp(-EDGE * (ia - ib).abs().mean(-1)) * (sa & sb)
+        difference = difference + total((1 - (a * b).sum(-1)) * weight)
+        weights = weights + total(weight)
+    return difference / weights.clamp_min(1)
+
+
+@register("normal_smoothness")
+@dataclass(frozen=True)
+class NormalSmoothness(warpgs.LossTerm):
+    """Edge-aware smoothness of the normals of rendered depth; for pinhole cameras."""
+
+    needs_outputs: ClassVar[tuple[str, ...]] = ("alpha", "depth")
+    weight: float = 0.1
+    """Weight of the term, in [0, 1000]."""
+    growth: int = 500
+    """Number of steps, from the first, over which the weight grows from 0 to its full value; at least 1."""
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.weight <= 1000 and self.growth >= 1):
+            raise UsageError(
+                f"normal-smoothness: weight {self.weight} must lie between 0 and 1000, growth {self.growth} must be at least 1"
+            )
+
+    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+        """Compute the weighted unevenness of the view's normals, shape []."""
+        depth = torch.where(inputs.outputs["alpha"] <= MIN_ALPHA, 0, inputs.outputs["depth"])
+        # in the axes of the camera: angles between normals do not depend on the pose, and a refined pose gets no gradient
+        camera = dataclasses.replace(inputs.camera, viewmat=torch.eye(4, dtype=depth.dtype, device=depth.device))
+        weight = self.weight * (inputs.step / self.growth).clamp_max(1)
+        return weight * unevenness(depth_normals(camera, depth), inputs.target.image)

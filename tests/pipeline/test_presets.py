@@ -1,0 +1,245 @@
+"""Presets and settings from outside: files, objects, mappings and keywords, all of them checked and typed."""
+
+import dataclasses
+import inspect
+import json
+import sys
+
+import numpy as np
+import pytest
+
+import warpgs
+from tests.scenes import photos, seeds
+from warpgs.app.cli import main
+from warpgs.app.commands.fit import request_of
+from warpgs.errors import DataError, UsageError
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.runs.fit import fit
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loss_terms.opacity import AlphaDifference
+from warpgs.pipeline.train.overrides import keyword, setting_names, with_settings
+from warpgs.pipeline.train.presets import MAX_BYTES, PRESETS, preset_settings
+from warpgs.pipeline.train.strategies.mcmc import MCMCConfig
+from warpgs.scene import Scene
+
+OWN = """
+from warpgs.pipeline.train.config import FitConfig
+PLAIN = FitConfig(steps=5)
+SOME = {"base": "quick", "init": {"opacity": 0.5}}
+NUMBER = 3
+"""
+
+
+@pytest.fixture
+def own(tmp_path):
+    path = tmp_path / "own.py"
+    path.write_text(OWN)
+    yield path
+    for name in [n for n, m in sys.modules.items() if getattr(m, "__file__", None) == str(path)]:
+        del sys.modules[name]
+
+
+def written(folder, text, name="my.toml"):
+    (folder / name).write_text(text)
+    return folder / name
+
+
+def test_a_file_starts_from_another(tmp_path):
+    """From a preset by name, or a file beside it; numbers are of the type of their fields, open settings are none."""
+    first = written(
+        tmp_path, 'base = "3dgs"\nsteps = 40\nmemory-limit = "2GiB"\n[init]\nopacity = 1e-1\nmerge-px = 3\n', "a.toml"
+    )
+    second = written(tmp_path, 'base = "a.toml"\nabout = "mine"\nsteps = "none"\ninit.max_sh_degree = "none"\n')
+    config, origin = preset_settings(str(first))
+    assert config == dataclasses.replace(
+        PRESETS["3dgs"], preset="a.toml", steps=40, memory_limit=2 * 2**30,
+        init=dataclasses.replace(PRESETS["3dgs"].init, opacity=0.1, merge_px=3.0),
+    )  # fmt: skip
+    assert type(config.init.merge_px) is float and str(first) in origin and "SHA-256" in origin
+    config, origin = preset_settings(second)
+    assert (config.preset, config.steps, config.init.max_sh_degree, config.init.opacity) == ("my.toml", None, None, 0.1)
+    assert all(word in origin for word in (str(first), str(second), "preset 3dgs", "init.merge-px", "init.max-sh-degree"))
+    assert preset_settings(written(tmp_path, "steps = 7"))[0].strategy == PRESETS["default"].strategy
+
+
+def test_a_file_has_settings_of_the_strategy_and_of_loss_terms(tmp_path):
+    path = written(
+        tmp_path,
+        'strategy = "mcmc"\nloss-terms = "alpha"\n[mcmc]\nnoise-lr = 1e4\n[alpha]\nweight = 0.5\n',
+    )
+    config, _ = preset_settings(path)
+    assert config.strategy_config == MCMCConfig(noise_lr=1e4) and config.loss_terms == (AlphaDifference(weight=0.5),)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("stpes = 3", "my.toml: there is no setting 'stpes'; did you mean steps?"),
+        ("[init]\nopacty = 3", "there is no setting 'init.opacty'; did you mean init.opacity?"),
+        ("opacity = 0.1", "there is no setting 'opacity'; did you mean init.opacity?"),
+        ('steps = "many"', "my.toml: steps must be a whole number of 64 bits, not 'many'"),
+        ("steps = 3.5", "steps must be a whole number of 64 bits, not 3.5"),
+        ("steps = true", "steps must be a whole number of 64 bits, not True"),
+        ("steps = 0", "my.toml: steps must be at least 1, not 0"),
+        ("seed = 99999999999999999999999", "seed must be a whole number"),
+        ("steps = 2024-01-01", "steps must be a whole number of 64 bits, not date"),
+        ("dropout = nan", "dropout must be a finite number, not nan"),
+        ("init.opacity = -inf", "init.opacity must be a finite number, not -inf"),
+        ('cuda-graph = "yes"', "cuda_graph must be true or false"),
+        ("rule = 3", "rule must be text"),
+        ('memory-limit = "2 cows"', "memory limit '2 cows' is no size"),
+        ("init = 3", "init is a group of settings"),
+        ("[steps]\nx = 1", "there is no setting 'steps.x'"),
+        ("depth-mean = [0.1, 0.2]", "depth_mean must be a list of 3"),
+        ("depth-mean = [0.1, nan, 0.2]", "must be a finite number"),
+        ('strategy = "best"', "my.toml: there is no strategy 'best'"),
+        ("strategy = 3", "3 is no strategy"),
+        ('strategy = "json:JSONDecoder"', "never imported because a file names it"),
+        ('loss-terms = "json:JSONDecoder"', "never imported because a file names it"),
+        ('base = "json:dumps"', "is code, which is never imported because a file names it"),
+        ('base = "best"', "base 'best' is not one of"),
+        ("base = 3", "base must be text, not 3"),
+        ('base = "my.toml"', "leads back here"),
+        ('preset = "quick"', "there is no setting 'preset'"),
+    ],
+)
+def test_a_wrong_setting_is_named(tmp_path, text, said):
+    with pytest.raises(UsageError) as error:
+        preset_settings(written(tmp_path, text))
+    assert said in str(error.value) and str(tmp_path) in str(error.value)
+    assert len(str(error.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"steps = ", "is no TOML"),
+        (b"steps = 1\nseed = = 2", "at line 2"),
+        (b"steps = 1\nsteps = 2", "is no TOML"),
+        (b"\xff\xfe", "is no TOML"),
+        (b"x = " + b"[" * 5000 + b"]" * 5000, "in each other"),
+        (b"a = " + b"[" * 20 + b"]" * 20, "in each other"),
+        (b"#" * (MAX_BYTES + 1), "larger than"),
+        (None, "cannot be read"),
+    ],
+)
+def test_a_file_that_is_none_is_refused(tmp_path, data, said):
+    if data is not None:
+        (tmp_path / "my.toml").write_bytes(data)
+    with pytest.raises(DataError, match=said) as error:
+        preset_settings(tmp_path / "my.toml")
+    assert str(tmp_path / "my.toml") in str(error.value) and len(str(error.value)) < 400
+
+
+def test_objects_and_mappings_are_presets(own):
+    assert preset_settings(f"{own}:PLAIN")[0] == FitConfig(steps=5)
+    config, origin = preset_settings(f"{own}:SOME")
+    assert config.init.opacity == 0.5 and config.max_steps == 600 and origin.startswith(f"{own}:SOME, preset quick")
+    assert preset_settings({"base": "quick", "init.opacity": 0.5})[0] == config
+    for wrong, said in (
+        (f"{own}:NUMBER", "is of type int"),
+        (f"{own}:NONE", "is not there"),
+        ("no.such:X", "cannot be imported"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            preset_settings(wrong)
+    with pytest.raises(UsageError, match="3 is no preset"):
+        preset_settings(3)
+
+
+def test_a_registered_preset_is_taken_by_name(monkeypatch):
+    monkeypatch.setattr(PRESETS, "_made", dict(PRESETS._made))
+    PRESETS.register("mine", FitConfig(steps=3), "three steps")
+    assert preset_settings("mine")[0].steps == 3 and "mine" in PRESETS and PRESETS.described()["mine"] == "three steps"
+    for name in ("default", "a:b", "a.toml", ""):
+        with pytest.raises(UsageError, match="cannot be registered"):
+            PRESETS.register(name, FitConfig())
+
+
+def test_every_setting_has_a_keyword_of_its_own():
+    """As the flag, with underscores; none is an argument of the fit or an option of reading."""
+    for config in (FitConfig(), PRESETS["mcmc"], dataclasses.replace(PRESETS["default"], loss_terms=(AlphaDifference(2.0),))):
+        names = setting_names(config)
+        assert len({*map(keyword, names)}) == len(names) > 80
+        assert not {*map(keyword, names)} & {*inspect.signature(fit).parameters}
+    assert {"steps", "init.max_sh_degree", "depth_model", "method.sampler.fraction"} <= {*setting_names(FitConfig())}
+
+
+def test_keywords_replace_settings():
+    """Flat, or a group as a mapping or its dataclass; numbers of numpy are numbers; classes stand for themselves."""
+    made = with_settings(
+        FitConfig(), {"steps": np.int64(30), "init_max_sh_degree": 1, "dropout": np.float32(0.5), "density": {"every": 7}}, "x"
+    )
+    assert (made.steps, made.init.max_sh_degree, made.dropout, made.density.every) == (30, 1, 0.5, 7)
+    assert type(made.steps) is int and type(made.dropout) is float
+    made = with_settings(FitConfig(), {"init": InitConfig(opacity=0.3), "loss_terms": (AlphaDifference(0.2),)}, "x")
+    assert made.init.opacity == 0.3 and made.loss_terms == (AlphaDifference(0.2),)
+    made = with_settings(made, {"alpha_weight": 0.25, "strategy": "mcmc", "mcmc_every": 9}, "x")
+    assert made.loss_terms[0].weight == 0.25 and made.strategy_config.every == 9
+    assert with_settings(made, {"steps": None}, "x").steps is None
+    for wrong, said in (
+        ({3: 1}, "3 is no name"),
+        ({"loss_terms": 3}, "must be names"),
+        ({"sh_degree": 1}, "mean init.max_sh_degree"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            with_settings(FitConfig(), wrong, "x")
+
+
+def test_view_modules_are_switched_and_set_by_keyword():
+    """By their own names, as flags do, and by the list; each has settings."""
+    config = with_settings(
+        PRESETS["default"], {"exposure": True, "refine_poses_start": 0.5, "refine_poses": True}, "here", keywords=True
+    )
+    assert {m.name: m for m in config.view_modules}["refine_poses"].start == 0.5
+    assert [m.name for m in config.view_modules] == ["exposure", "refine_poses"]
+    assert [m.name for m in with_settings(config, {"exposure": False}, "here").view_modules] == ["refine_poses"]
+    assert with_settings(config, {"view_modules": "none"}, "here").view_modules == ()
+    with pytest.raises(UsageError, match="exposure"):
+        with_settings(config, {"exposure": 3}, "here")
+
+
+def test_a_fit_takes_keywords_and_records_where_settings_come_from(tmp_path):
+    """The bits are those of the same settings given whole; config.json has them resolved, with a note."""
+    scene = Scene("memory", "none", tuple(photos(3)), points=seeds())
+    path = written(tmp_path, 'base = "3dgs"\nsteps = 9\ninit.source = "points"\n')
+    options = {"device": "cpu", "verbose": False}
+    result = warpgs.fit(scene, path, steps=3, init_max_sh_degree=1, out=tmp_path / "run", **options)
+    whole = dataclasses.replace(PRESETS["3dgs"], steps=3, init=InitConfig(source="points", max_sh_degree=1))
+    again = warpgs.fit(scene, whole, **options)
+    assert result.gaussians().means.equal(again.gaussians().means) and result.config == dataclasses.replace(
+        whole, preset="my.toml"
+    )
+    record = json.loads((tmp_path / "run" / "config.json").read_text())
+    (note,) = (n for n in record["notes"] if n.startswith("settings: "))
+    assert str(path) in note and "SHA-256" in note and note.endswith("then given: steps, init.max-sh-degree")
+    assert record["config"]["preset"] == "my.toml" and record["config"]["steps"] == 3
+    for wrong, said in (
+        ({"step": 3}, r"warpgs.fit: there is no setting 'step'; did you mean steps\?"),
+        ({"steps": "3"}, "warpgs.fit: steps must be a whole number of 64 bits, not '3'"),
+        ({"init_opacity": float("nan")}, "init_opacity must be a finite number"),
+        ({"sh_degree": 1}, "did you mean init_max_sh_degree"),
+        ({"downscale": 2}, "downscale says how a scene is read"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            warpgs.fit(scene, "quick", out=tmp_path / "x", **wrong, **options)
+    assert not (tmp_path / "x").exists()
+
+
+def test_the_command_line_takes_files_and_objects(own, tmp_path, capsys):
+    """Flags come after the preset; a mistake is one line."""
+    path = written(tmp_path, "steps = 9\nseed = 4\n")
+    base = ["scene", "--out", "run"]
+    request = request_of([*base, "--preset", str(path), "--steps", "3"], "")
+    assert (request.config.steps, request.config.seed, request.config.preset) == (3, 4, "my.toml")
+    assert str(path) in request.notes[0] and request.notes[0].endswith("then given: steps")
+    assert request_of([*base, "--preset", f"{own}:PLAIN"], "").config == FitConfig(steps=5)
+    (tmp_path / "broken.py").write_text("1 / 0\n")
+    for preset, said in (
+        (f"{tmp_path}/broken.py:X", "ZeroDivisionError: division by zero"),
+        (str(written(tmp_path, "stepz = 3", "b.toml")), "did you mean steps?"),
+        ("best", "preset 'best' is not one of"),
+    ):
+        assert main(["fit", *base, "--preset", preset]) == 2
+        text = capsys.readouterr().err
+        assert said in text and len(text.splitlines()) == 1

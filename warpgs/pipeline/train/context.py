@@ -1,0 +1,94 @@
+"""Parts of a fit that a density strategy works with, and the times at which it adds Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, TypeVar
+
+import torch
+
+from warpgs.pipeline.model.table import Table
+from warpgs.pipeline.train.schedule import Phases
+from warpgs.pipeline.train.views import TrainingView
+from warpgs.render.rasterize import RasterizeOptions
+from warpgs.scene import Gaussians
+
+T = TypeVar("T")
+
+
+class Settings:
+    """Groups of the settings of a fit, each found by its class: a strategy reads its own, and knows no others."""
+
+    def __init__(self, groups: Iterable[object]):
+        """Keep the groups, one of each class."""
+        self._groups: dict[type, Any] = {type(group): group for group in groups}
+
+    def __getitem__(self, kind: type[T]) -> T:
+        """Return the group of a class."""
+        group: T = self._groups[kind]
+        return group
+
+
+class Growth(NamedTuple):
+    """Times at which a strategy adds Gaussians, in steps done."""
+
+    begins: int
+    """None are added before."""
+    ends: int
+    """None are added after."""
+    events: tuple[int, ...] = ()
+    """Times, ascending, at which many are added at once: the model is best measured right before. Empty where any time is as
+    good."""
+
+
+@dataclass
+class StrategyContext:
+    """Parts of a fit that a strategy works with. The trainer keeps them up to date.
+
+    A strategy writes into columns of the table and takes random numbers from the generator; all else it only reads.
+    """
+
+    settings: Settings
+    """Settings of the fit by group."""
+    own: Any
+    """Settings of the strategy's own class; None for their defaults."""
+    table: Table
+    """The Gaussians, with the strategy's columns."""
+    generator: torch.Generator
+    """Generator of the fit, on the CPU, so that the numbers are the same on every device."""
+    seed: int
+    """Seed of the fit."""
+    phases: Phases
+    """Phases of the fit as they are now: growth may end before its time."""
+    extent: float
+    """Size of the scene [u]."""
+    rule: str
+    """Cut-offs of the rasterizer."""
+    background: torch.Tensor
+    """Colour behind the scene, shape [3]."""
+    views: list[TrainingView] = field(default_factory=list)
+    """Views that are trained on; empty before `Strategy.setup`."""
+    capacity: int = 0
+    """Number of Gaussians that settings and memory limit allow; 0 before `Strategy.setup`."""
+    max_instances: int | None = None
+    """(Gaussian, tile) instances that a render may have at a time; None for no limit."""
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The current Gaussians, detached."""
+        return Gaussians(**{n: t.detach() for n, t in self.table.params.items()})
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the fit."""
+        return self.table.device
+
+    @property
+    def steps(self) -> int:
+        """Steps of the fit."""
+        return self.phases.steps
+
+    def render_options(self) -> RasterizeOptions:
+        """Return the settings with which training views are rendered whole, with all harmonics."""
+        return RasterizeOptions(rule=self.rule, background=self.background, max_instances=self.max_instances)

@@ -1,0 +1,39 @@
+"""The loss that every fit has: its weights, and the terms that follow from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from warpgs.errors import UsageError
+from warpgs.pipeline.train.loss import LossTerm
+from warpgs.pipeline.train.loss_terms.opacity import AlphaDifference
+from warpgs.pipeline.train.loss_terms.photometric import Photometric
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the loss."""
+
+    ssim_weight: float = 0.2
+    """Fraction lambda of the structural term, in [0, 1]."""
+    random_background: bool = True
+    """True to set views that know their opacity, and their renders, before another colour at each step: what is empty cannot
+    be matched by Gaussians in the colour of the background. Opaque views do not have it."""
+    alpha_weight: float = 1.0
+    """Weight of the mean absolute difference of opacities, in views that know theirs, in [0, 1000]; 0 for no such term."""
+
+    exposure_weight: float = 0.01
+    """Weight of the sum of squares of each view's exposure less the identity, where exposures are learned, in [0, 1000]."""
+
+    def __post_init__(self) -> None:
+        for name in ("alpha_weight", "exposure_weight"):
+            if not 0 <= getattr(self, name) <= 1000:
+                raise UsageError(f"loss {name.replace('_', ' ')} {getattr(self, name)} must lie between 0 and 1000")
+        if not 0 <= self.ssim_weight <= 1:
+            raise UsageError(f"loss ssim weight {self.ssim_weight} must lie between 0 and 1")
+
+
+def built_in_terms(config: LossConfig, cutout: bool = False) -> tuple[LossTerm, ...]:
+    """Return the terms that every fit has by its settings; ``cutout`` says that its views know their opacity."""
+    alpha = (AlphaDifference(config.alpha_weight),) if config.alpha_weight > 0 and cutout else ()
+    return (Photometric(config.ssim_weight), *alpha)

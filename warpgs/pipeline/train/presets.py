@@ -1,0 +1,216 @@
+"""Presets: named settings that a fit starts from. Ours are TOML files, and so may a user's be.
+
+Importing this costs nothing: the help of one screen reads the names. The settings load when a preset is asked for.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from warpgs.errors import DataError, UsageError
+from warpgs.input_files import read_input, unread_reason
+from warpgs.plugins import load_object
+from warpgs.runtime.terminal import Detail
+from warpgs.schema import SchemaError, check_depth
+
+if TYPE_CHECKING:
+    from warpgs.pipeline.train.config import FitConfig
+
+FOLDER = Path(__file__).parent / "preset_files"
+"""Folder of the presets of warpgs."""
+SUFFIX = ".toml"
+"""End of the names of files with a preset."""
+MAX_BYTES = 2**16
+"""Size of the largest file that is read [bytes]."""
+MAX_DEPTH = 8
+"""Number of tables and lists that may lie in each other."""
+MAX_BASES = 8
+"""Number of presets that may start from each other."""
+DEFAULT_PRESET = "default"
+"""Preset where the user names none."""
+NO_BASE = "none"
+"""Base of a preset that starts from the defaults of `FitConfig`."""
+OWN_KEYS = ("base", "about")
+"""Keys of a preset that are no settings."""
+
+
+class Presets(Mapping[str, "FitConfig"]):
+    """Settings of every preset by name."""
+
+    def __init__(self, folder: Path):
+        """Find the files of a folder; they are read when they are asked for."""
+        self._files = {p.stem: p for p in sorted(folder.glob(f"*{SUFFIX}"), key=lambda p: (p.stem != DEFAULT_PRESET, p.stem))}
+        self._made: dict[str, FitConfig] = {}
+        self._about: dict[str, str] = {}
+
+    def register(self, name: str, config: FitConfig, about: str = "") -> None:
+        """Add a preset.
+
+        Args:
+            name: Its name.
+            config: Its settings.
+            about: A line about it for the help.
+
+        Raises:
+            UsageError: One of ours has that name, or no flag could name it.
+        """
+        if name in self._files or ":" in name or name.endswith(SUFFIX) or not name.strip():
+            raise UsageError(f"a preset cannot be registered as {name!r}; choose a name without colon that is none of warpgs")
+        self._made[name], self._about[name] = config, about
+
+    def described(self) -> dict[str, str]:
+        """Return a line about each by name."""
+        return {name: self._about_of(name) for name in self}
+
+    def _about_of(self, name: str) -> str:
+        if name not in self._about and name in self._files:
+            self._about[name] = str(_read(self._files[name])[0].get("about", ""))
+        return self._about.get(name, "")
+
+    def __getitem__(self, name: str) -> FitConfig:
+        if name not in self._made:
+            self._made[name] = _config_of_file(self._files[name], name)[0]
+        return self._made[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter([*self._files, *(n for n in self._made if n not in self._files)])
+
+    def __len__(self) -> int:
+        return len([*self])
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._files or name in self._made
+
+
+PRESETS = Presets(FOLDER)
+"""Presets by name."""
+
+
+def preset_settings(preset: FitConfig | Mapping[str, Any] | str | Path | None) -> tuple[FitConfig, str]:
+    """Return the settings of a preset, and words on where they come from.
+
+    Args:
+        preset: Name of a preset; path of a .toml file; ``module:NAME`` or ``path/to/file.py:NAME`` of a `FitConfig` or a
+            mapping, which runs that code; the object itself; or None for the default preset. The keys of a mapping or a file
+            are the names of flags; ``base`` names the preset that it starts from, default where it is not given.
+
+    Raises:
+        DataError: The file cannot be read or is no TOML.
+        UsageError: There is no such preset, or one of its settings is unknown or of another type.
+    """
+    from warpgs.pipeline.train.config import FitConfig
+
+    if isinstance(preset, FitConfig):
+        return preset, f"a FitConfig of preset {preset.preset}"
+    if isinstance(preset, Mapping):
+        return _config_of(preset, "preset", 0)
+    if isinstance(preset, Path) or (isinstance(preset, str) and preset.endswith(SUFFIX)):
+        return _config_of_file(Path(preset), Path(preset).name)
+    name = DEFAULT_PRESET if preset is None else preset
+    if not isinstance(name, str):
+        raise UsageError(f"{name!r} is no preset; give a name, a path, a FitConfig or a mapping")
+    if ":" not in name:
+        return _named(name)
+    found = load_object("preset", name)
+    if not isinstance(found, (FitConfig, Mapping)):
+        raise UsageError(f"the preset {name!r} is of type {type(found).__name__}; make it a FitConfig or a mapping of settings")
+    config, origin = preset_settings(found)
+    return config, f"{name}, {origin}"
+
+
+def chosen_settings(
+    preset: FitConfig | Mapping[str, Any] | str | Path | None, overrides: Mapping[str, object]
+) -> tuple[FitConfig, list[str]]:
+    """Return the settings of a preset with some replaced, as `warpgs.fit` takes both, and notes on where they come from.
+
+    Raises:
+        DataError: The file of a preset cannot be read or is no TOML.
+        UsageError: There is no such preset, or a setting is unknown or of another type.
+    """
+    from warpgs.pipeline.train.config import FitConfig
+    from warpgs.pipeline.train.overrides import with_settings
+
+    start, origin = preset_settings(preset)
+    config = with_settings(start, overrides, "warpgs.fit", keywords=True)
+    return config, [] if isinstance(preset, FitConfig) and not overrides else [origin_note(origin, start, config)]
+
+
+def origin_note(origin: str, start: FitConfig, config: FitConfig) -> str:
+    """Return a note on where settings come from: ``origin``, and what was changed from there."""
+    from warpgs.pipeline.train.overrides import changed_settings
+
+    changed = changed_settings(start, config)
+    return Detail(f"settings: {origin}" + (f"; then given: {', '.join(changed)}" if changed else ""))
+
+
+def preset_word(preset: str) -> str:
+    """Return a short word for a preset that a user names, for folders and tables: the name, or that of its file or object."""
+    return Path(preset).stem if preset.endswith(SUFFIX) else preset.rpartition(":")[2]
+
+
+def _named(name: str) -> tuple[FitConfig, str]:
+    if name not in PRESETS:
+        raise UsageError(
+            f"preset {name!r} is not one of {', '.join(PRESETS)}; choose one, or give a {SUFFIX} file, module:NAME or "
+            "path/to/file.py:NAME"
+        )
+    return PRESETS[name], f"preset {name}"
+
+
+def _read(path: Path) -> tuple[dict[str, Any], str]:
+    """Return the values of a TOML file, and the first digits of its SHA-256.
+
+    Raises:
+        DataError: It cannot be read, is too large or too deep, or is no TOML.
+    """
+    remedy = "give a file of settings such as `steps = 300` (docs/presets.md)"
+    try:
+        data = read_input(path, MAX_BYTES)
+        values = tomllib.loads(data.decode("utf-8"))
+        check_depth(values, MAX_DEPTH)
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); {remedy}") from e
+    except (SchemaError, RecursionError) as e:
+        raise DataError(f"{path}: has more than {MAX_DEPTH} tables and lists in each other; {remedy}") from e
+    except ValueError as e:  # no TOML, or no UTF-8
+        raise DataError(f"{path}: is no TOML ({e}); {remedy}") from e
+    return values, hashlib.sha256(data).hexdigest()[:12]
+
+
+def _config_of_file(path: Path, name: str, above: int = 0) -> tuple[FitConfig, str]:
+    """Return the settings of a file, and words on where they come from; ``above`` is the number of files that start from it."""
+    import dataclasses
+
+    values, digest = _read(path)
+    config, origin = _config_of(values, str(path), above + 1, path.parent)
+    return dataclasses.replace(config, preset=name), f"preset {path.absolute()} (SHA-256 {digest}) from {origin}"
+
+
+def _config_of(values: Mapping[str, Any], place: str, above: int, folder: Path | None = None) -> tuple[FitConfig, str]:
+    """Return the settings of a mapping, and words on where they come from; a base that is a file lies below ``folder``."""
+    from warpgs.pipeline.train.config import FitConfig
+    from warpgs.pipeline.train.overrides import changed_settings, with_settings
+
+    for key in OWN_KEYS:
+        if not isinstance(values.get(key, ""), str):
+            raise UsageError(f"{place}: {key} must be text, not {values[key]!r:.60}")
+    base = values.get("base", DEFAULT_PRESET)
+    if base == NO_BASE:
+        start, origin = FitConfig(), "the defaults of FitConfig"
+    elif base.endswith(SUFFIX):
+        path = (Path() if folder is None else folder) / base
+        if above >= MAX_BASES:
+            raise UsageError(f"{place}: base {base!r} leads back here or through over {MAX_BASES} files; name another")
+        start, origin = _config_of_file(path, path.name, above)
+    elif ":" in base:
+        raise UsageError(f"{place}: base {base!r} is code, which is never imported because a file names it; name a preset")
+    elif base not in PRESETS:
+        raise UsageError(f"{place}: base {base!r} is not one of {', '.join(PRESETS)}; choose one, a {SUFFIX} file or {NO_BASE}")
+    else:
+        start, origin = _named(base)
+    config = with_settings(start, {k: v for k, v in values.items() if k not in OWN_KEYS}, place)
+    return config, f"{origin} with {', '.join(changed_settings(start, config)) or 'no change'}"

@@ -1,0 +1,240 @@
+"""Early stopping of a fit by the error of held-out blocks of pixels, beside any strategy (docs/complexity.md)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+import torch
+
+from warpgs import schema
+from warpgs.errors import DataError, UsageError
+from warpgs.pipeline.model.table import DensityUpdate
+from warpgs.pipeline.train.context import StrategyContext
+from warpgs.pipeline.train.held_out_blocks import (
+    MIN_BLOCKS,
+    Blocks,
+    Gain,
+    block_errors,
+    decibels,
+    gain,
+    hide,
+    only,
+    sample_blocks,
+)
+from warpgs.pipeline.train.strategies.base import Strategy
+from warpgs.pipeline.train.views import TrainingView
+from warpgs.runtime.terminal import Detail
+
+LATELY = 1.5
+"""Factor by which the steps grow while less than `StoppingConfig.min_gain_db` is gained, for a fit to end."""
+
+
+@dataclass(frozen=True)
+class StoppingConfig:
+    """Settings of early stopping."""
+
+    min_gain_db: float = 0.0
+    """Gain of the held-out blocks in the last third of the steps, its noise added, below which growth ends [dB]; the rest of
+    the fit is then shorter in proportion. Not before a third of the time of growth, nor while views are half their size. 0:
+    nothing is held out, and the fit takes the planned steps."""
+    fraction: float = 0.03
+    """Fraction of the pixels that is held out until growth ends."""
+    measurements: int = 12
+    """Number of intervals, equal in length, into which the time of growth is divided; the blocks are measured after each."""
+    noise: float = 1.0
+    """Standard errors of the mean gain over the blocks that count as its noise."""
+
+    def __post_init__(self):
+        if not 0 < self.fraction <= 0.5:
+            raise UsageError(f"stopping fraction {self.fraction} must lie above 0 and be at most 0.5")
+        if self.measurements < 1:
+            raise UsageError(f"stopping measurements must be at least 1, not {self.measurements}")
+        for name in ("noise", "min_gain_db"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise UsageError(f"stopping {name.replace('_', '-')} must be 0 or more and finite, not {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Held-out blocks at one time, and their gain since the measurement before; plain values as metrics.json has them."""
+
+    step: int
+    """Steps done."""
+    count: int
+    """Gaussians at that step."""
+    held_out_psnr: float
+    """PSNR of the held-out blocks, the error floor included [dB]."""
+    gain: float
+    """Mean fall of the blocks' error since the measurement before, by growth and training together [dB]."""
+    noise: float
+    """Standard error of ``gain`` over the blocks [dB]."""
+
+
+_COUNT = schema.whole(0)
+_MEASUREMENT = {f.name: _COUNT if f.name in ("step", "count") else schema.real for f in fields(Measurement)}
+STATE = schema.fields({
+    "ended": schema.or_null(_COUNT), "why": schema.text, "measured": schema.items(_COUNT),
+    "measurements": schema.items(schema.fields(_MEASUREMENT, others=False)),
+})  # fmt: skip
+"""Schema of the plain values in a checkpoint."""
+
+
+class Stopping:
+    """Held-out blocks of the training views, and the decision to end growth by their error.
+
+    Until growth ends, blocks of every view are held out of the loss and of sampling; from then on whole views are trained on.
+    The start uses whole images: the blocks measure growth, not the start.
+    """
+
+    def __init__(self, config: StoppingConfig):
+        """Begin with nothing held out."""
+        self.config = config
+        self.active = False
+        """True where blocks are held out and measured."""
+        self.ended: int | None = None
+        """Steps done when growth ended; None before."""
+        self.why = ""
+        """Reason why growth ended, for the user."""
+        self.measurements: list[Measurement] = []
+        """Measurements but the first, which has no gain."""
+        self.whole: list[TrainingView] = []
+        """Views without hidden blocks; none where nothing is held out."""
+        self.blocks: list[Blocks] = []
+        """Held-out blocks of each view."""
+        self.marks: list[int] = []
+        """Steps done when the blocks are measured: when growth begins, and after each interval."""
+        self.earliest = 0.0
+        """Steps, from the first, in which views are half their size and growth does not end."""
+        self.measured: list[tuple[int, torch.Tensor]] = []
+        """Steps done, and errors of the blocks [B], of every measurement."""
+
+    def begin(self, context: StrategyContext, strategy: Strategy, half_resolution: float) -> list[str]:
+        """Choose the blocks and the times of measurements, and return notes for the user.
+
+        Args:
+            context: Parts of the fit, with its views.
+            strategy: Density strategy.
+            half_resolution: Fraction of the planned steps, from the first, in which views are half their size.
+        """
+        if self.config.min_gain_db == 0:
+            return []
+        planned, (begins, ends, times) = context.phases.planned, strategy.growth()
+        self.earliest = half_resolution * planned
+        count = self.config.measurements
+        marks = {max(1, begins + round(k * (ends - begins) / count)) for k in range(count + 1)}
+        if times:
+            marks = {next((t for t in times if t >= m), ends) for m in marks}
+        self.marks, self.blocks = sorted(marks), sample_blocks(context.views, self.config.fraction, context.seed)
+        held = sum(map(len, self.blocks))
+        self.active = held >= MIN_BLOCKS and ends < planned and len(marks) > 1
+        if not self.active:
+            few = f"the images hold only {held} blocks" if held < MIN_BLOCKS else "growth lasts to the end of the fit"
+            return [Detail(f"stopping: nothing is held out, since {few}; the fit takes all its steps")]
+        self.whole = context.views
+        pixels = self.held_pixels / sum(v.camera.width * v.camera.height for v in self.whole)
+        return [Detail(f"stopping: {held} blocks, {pixels:.1%} of the pixels, are held out until growth ends, by step {ends}")]
+
+    @property
+    def held_pixels(self) -> int:
+        """Number of pixels in all blocks."""
+        return sum(len(b) * b.side**2 for b in self.blocks)
+
+    def hidden(self) -> list[TrainingView]:
+        """Return the views without their blocks."""
+        return [hide(v, b) for v, b in zip(self.whole, self.blocks)]
+
+    def sh_every(self, every: int, highest: int) -> int:
+        """Return the steps after which the degree in use rises, at most ``every``: ``highest`` is in use when growth begins."""
+        if not self.active or highest == 0:
+            return every
+        return max(1, min(every, self.marks[0] // highest))
+
+    def due(self, step: int) -> bool:
+        """Return whether the blocks are measured after a step."""
+        return self.active and self.ended is None and step in self.marks
+
+    def changes(self, step: int, strategy: Strategy, context: StrategyContext, degree: int) -> Iterator[DensityUpdate]:
+        """Yield the changes of the set of Gaussians after a step: those of the strategy, or the last ones, when growth ends.
+
+        Args:
+            step: Steps done.
+            strategy: Density strategy.
+            context: Parts of the fit; where growth ends, its third phase begins.
+            degree: Degree of the harmonics in use.
+        """
+        if self.due(step) and self._measured(step, strategy, context, degree):
+            self.ended, ends = step, strategy.growth().ends
+            if step < ends:
+                context.phases = context.phases.stable_from(step, ends)
+            yield from strategy.catch_up(step, [only(v, b) for v, b in zip(self.whole, self.blocks)], self.held_pixels)
+        if self.ended is None and strategy.due(step):
+            yield from strategy.update(step)
+
+    def _measured(self, step: int, strategy: Strategy, context: StrategyContext, degree: int) -> bool:
+        """Measure the blocks, where the set has changed since they were measured last; return whether growth ends."""
+        last = max((m for m in self.marks if m < step), default=step)
+        if last < step < self.marks[-1] and not any(strategy.due(s) for s in range(last, step)):
+            return False
+        options = replace(context.render_options(), sh_degree=degree)
+        errors = block_errors(context.gaussians, self.whole, self.blocks, options)
+        if self.measured:
+            found, psnr = gain(self.measured[-1][1], errors), decibels(errors)
+            self.measurements.append(Measurement(step, len(context.table), psnr, found.mean, found.noise))
+            self.why = self._reason(step, errors)
+        self.measured.append((step, errors))
+        return self.why != ""
+
+    def _reason(self, step: int, errors: torch.Tensor) -> str:
+        """Return why growth ends after a step with these errors of the blocks [B]; nothing where it goes on."""
+        c = self.config
+        since, earlier = next((m for m in reversed(self.measured) if m[0] * LATELY <= step), (0, None))
+        lately = Gain(math.inf, 0.0) if earlier is None or self._is_early(step) else gain(earlier, errors)
+        if lately.upper_bound_below(c.min_gain_db, c.noise):
+            return (
+                f"the held-out blocks gained {lately.mean:+.3f} dB in the last {step - since:,} steps, which with "
+                f"{c.noise:g} x its noise of {lately.noise:.3f} dB is less than {c.min_gain_db:g} dB"
+            )
+        if step == self.marks[-1]:
+            return f"its time was up, after {self.measurements[-1].gain:+.3f} dB since the measurement before"
+        return ""
+
+    def _is_early(self, step: int) -> bool:
+        """Return whether it is too early to end growth: in the first third of its time, or while views are half their size."""
+        return 3 * step < self.marks[-1] or step <= self.earliest
+
+    def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+        """Return the errors of the blocks at every measurement, shape [M, B], and plain values, to go on from."""
+        tensors = {"stopping.measured": torch.stack([e for _, e in self.measured])} if self.measured else {}
+        return tensors, {
+            "ended": self.ended, "why": self.why, "measured": [s for s, _ in self.measured],
+            "measurements": [asdict(m) for m in self.measurements],
+        }  # fmt: skip
+
+    def load(self, tensors: Mapping[str, torch.Tensor], plain: dict[str, Any]) -> None:
+        """Load what `state` returned, ``tensors`` of shape [...] by name.
+
+        Raises:
+            DataError: The errors of the blocks are not of these blocks.
+        """
+        shape = (len(plain["measured"]), sum(map(len, self.blocks)) if self.active else 0)
+        measured = tensors.get("stopping.measured", torch.zeros(0, shape[1]))
+        if measured.shape != shape:
+            raise DataError(
+                f"the stored errors of the held-out blocks have shape {list(measured.shape)}, not {list(shape)}; fit again"
+            )
+        self.ended, self.why = plain["ended"], plain["why"]
+        self.measurements = [Measurement(**m) for m in plain["measurements"]]
+        self.measured = list(zip(plain["measured"], measured))
+
+    def figures(self) -> dict[str, Any]:
+        """Return for metrics.json why growth ended, and the measurements; nothing where nothing was held out."""
+        if not self.active:
+            return {}
+        return {
+            "held_out": True, "why": self.why, "ended": self.ended,
+            "marginal_db": self.measurements[-1].gain if self.measurements else None,
+            "measurements": [asdict(m) for m in self.measurements],
+        }  # fmt: skip

@@ -1,0 +1,26 @@
+"""Times at which a strategy changes the set of Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class EventTimes:
+    """Events at equal distances, in steps done."""
+
+    after: int
+    """The first event comes after this."""
+    every: int
+    """Steps between two events, which lie at its multiples."""
+    until: int
+    """No event comes after this."""
+
+    @staticmethod
+    def of_fit(start: int, every: int, stop_fraction: float, steps: int) -> EventTimes:
+        """Return the times for a fit of that many steps; a short one starts after a quarter of its length."""
+        return EventTimes(min(start, steps // 4), every, int(stop_fraction * steps))
+
+    def due(self, step: int) -> bool:
+        """Return whether there is an event after a step."""
+        return self.after < step <= self.until and step % self.every == 0

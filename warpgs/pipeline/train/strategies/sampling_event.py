@@ -1,0 +1,236 @@
+"""One sampling event: score the training views, sample pixels, put fine Gaussians behind them; and its settings.
+
+Paper, sections "Multi-Modal Importance Assessment" and "Geometric-Aware Sampling".
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from warpgs import geometry
+from warpgs.errors import UsageError
+from warpgs.pipeline.model.table import DensityUpdate
+from warpgs.pipeline.train.strategies import importance as scoring
+from warpgs.pipeline.train.strategies.importance import ImportanceConfig
+from warpgs.pipeline.train.strategies.sampler import (
+    SamplerConfig,
+    fine_gaussians,
+    geometry_gate,
+    sample_pixels,
+    valid_pixels,
+)
+from warpgs.pipeline.train.views import TrainingView, half_size_camera
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.scene import Gaussians, Prior, ViewDepth
+
+FINE = 1
+"""Layer of sampled Gaussians."""
+MAX_VIEWS = 8
+"""Largest number of views that one event samples in; chosen at random where there are more."""
+MAX_WEIGHED = 32
+"""Largest number of views over which blending weights are summed for an eviction."""
+
+
+@dataclass(frozen=True)
+class ProtectConfig:
+    """Protection of new Gaussians."""
+
+    steps: int = 500
+    """Age [steps] up to which a sampled Gaussian is protected (T_protect, which the paper leaves open): five refinements."""
+    opacity: float = 0.05
+    """Least opacity of a protected Gaussian, in (0, 1) (alpha_minimum): ten times what is pruned."""
+
+    def __post_init__(self):
+        if self.steps < 0 or not 0 < self.opacity < 1:
+            raise UsageError("protect: steps must be at least 0 and opacity lie in (0, 1)")
+
+    @property
+    def logit(self) -> float:
+        """Least opacity as a logit, as it is stored."""
+        return geometry.logit(self.opacity)
+
+
+@dataclass(frozen=True)
+class MethodConfig:
+    """Switches of the paper's parts (its Table 2), and their settings. All off is plain 3D Gaussian splatting."""
+
+    events: bool = False
+    """Sampling events: fine Gaussians are added in phase 2."""
+    hier: bool = False
+    """Two layers: from phase 2 on the coarse one is neither cloned nor split, and its means move slowly."""
+    s_render: bool = True
+    """Weight of the rendering residual in the importance."""
+    s_semantic: bool = True
+    """Weight of the semantic score in the importance."""
+    s_geometry: bool = True
+    """Weight of the geometric score in the importance. A gate with gate_quantile above 0 (paper-literal) uses the map even when
+    this is off; with 0 (default, quick) no gate uses it."""
+    ra: bool = True
+    """Reliability gate: only pixels above gate_quantile of the geometric score (0: no such gate) and, with sampler.depth
+    consistent, only pixels with consistent depth in views that have some."""
+    agp: bool = True
+    """Adaptive Gaussian placement: pixels are sampled at random by importance; off takes the highest ones."""
+    pm: bool = True
+    """Protection mechanism: new fine Gaussians keep a least opacity and are not pruned."""
+    coarse_lr_factor: float = 0.1
+    """Fraction of its Adam step that each mean of the coarse layer takes from phase 2 on, in [0, 1]."""
+    importance: ImportanceConfig = field(default_factory=ImportanceConfig)
+    sampler: SamplerConfig = field(default_factory=SamplerConfig)
+    protect: ProtectConfig = field(default_factory=ProtectConfig)
+
+    def __post_init__(self):
+        if not 0 <= self.coarse_lr_factor <= 1:
+            raise UsageError(f"method coarse-lr-factor {self.coarse_lr_factor} must lie between 0 and 1")
+
+    def weights(self, semantics: bool = True) -> tuple[float, float, float]:
+        """Return the weights of the render, semantic and geometric score, 0 where switched off, scaled to sum to 1.
+
+        ``semantics`` is False for a view without a semantic score.
+        """
+        semantic = self.s_semantic and semantics
+        return scoring.weights(self.importance, render=self.s_render, semantic=semantic, geometry=self.s_geometry)
+
+
+def scored(view: TrainingView, prior: Prior, depth: ViewDepth | None, config: MethodConfig) -> TrainingView:
+    """Return the view with the scores of its prior and its geometrically consistent depth."""
+    maps = {n: torch.as_tensor(getattr(prior, n), dtype=torch.float32, device=view.image.device)
+            for n in ("disparity", "confidence", "boundary", "foreground")}  # fmt: skip
+    valid = None if view.countable is None else view.countable > 0
+    geometry = scoring.geometry_score(maps.pop("disparity"), config.importance.curvature, valid)
+    semantic = scoring.semantic_score(**maps)
+    consistent = None
+    if depth is not None and depth.valid.any():
+        consistent = torch.as_tensor(np.where(depth.valid, depth.depth, 0), dtype=torch.float32, device=view.image.device)
+    known = semantic if bool(semantic.any()) else None
+    return dataclasses.replace(view, semantic=known, geometry=geometry, consistent=consistent)
+
+
+@dataclass(frozen=True)
+class SampledView:
+    """Maps and samples of an event in one view, on the device of the fit."""
+
+    view: int
+    """Number of the training view."""
+    rendered: torch.Tensor
+    """Colours before the event, shape [H, W, 3]."""
+    scores: tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+    """Render, semantic and geometric score, each [H, W] in [0, 1]."""
+    score: torch.Tensor
+    """Their weighted sum, shape [H, W]."""
+    gate: torch.Tensor
+    """Pixels that could be sampled, bool, shape [H, W]."""
+    quantile: float
+    """Quantile of the geometric score that the gate used; lower than asked for where too few pixels passed."""
+    at: torch.Tensor
+    """Rows and columns of the sampled pixels, int64, shape [S, 2]."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """One sampling event."""
+
+    change: DensityUpdate
+    """Rows that stay and rows that are new."""
+    evicted: int
+    """Fine Gaussians that were removed for the new ones."""
+    views: tuple[SampledView, ...]
+    """Samples of each view."""
+
+
+def sample_view(
+    gaussians: Gaussians, view: TrainingView, number: int, config: MethodConfig, options: RasterizeOptions,
+    generator: torch.Generator,
+) -> tuple[SampledView, dict[str, torch.Tensor]]:  # fmt: skip
+    """Score one view, sample its pixels, and return them with the rows [S, ...] of the fine Gaussians behind them."""
+    c = config.sampler
+    render = rasterize(gaussians, view.camera, options)
+    depth, alpha = render.depth, render.alpha
+    if c.depth == "consistent" and view.consistent is not None:
+        known = view.consistent > 0
+        depth = torch.where(known, view.consistent, depth)
+        alpha = torch.where(known, 1.0, 0.0 if config.ra else alpha)
+    valid = valid_pixels(alpha, depth, view.countable, c)
+    known = view.semantic is not None
+    semantic = view.semantic if known else torch.zeros_like(view.geometry)
+    scores = (scoring.render_score(view.seen(render.rgb), view.image, valid), semantic, view.geometry)
+    score = scoring.importance(scores, config.weights(known))
+    wanted = max(1, round(c.fraction * valid.numel()))
+    gate, quantile = geometry_gate(view.geometry, valid, c.gate_quantile if config.ra else 0.0, wanted)
+    at = sample_pixels(score, gate, wanted, generator, random=config.agp)
+    rows = fine_gaussians(view.camera, view.image, depth, at, c, gaussians.sh.shape[1])
+    return SampledView(number, render.rgb, scores, score, gate, quantile, at), rows
+
+
+def least_contributing(
+    gaussians: Gaussians, candidates: torch.Tensor, count: int, views: list[TrainingView], options: RasterizeOptions
+) -> torch.Tensor:
+    """Return the rows of the ``count`` candidates (bool [N]) with the least sums of blending weights, int64 [count].
+
+    The sums are over at most `MAX_WEIGHED` views, evenly spaced, at half their size: they only have to rank.
+    """
+    total = torch.zeros(len(gaussians), device=gaussians.means.device)
+    for view in views[:: -(-len(views) // MAX_WEIGHED)]:
+        total += rasterize(gaussians, half_size_camera(view.camera), options).weight_sums[0]
+    total = torch.where(candidates, total, torch.inf)
+    return torch.topk(total, min(count, int(candidates.sum())), largest=False).indices
+
+
+@torch.no_grad()
+def sampling_event(
+    gaussians: Gaussians,
+    fine: torch.Tensor,
+    protected: torch.Tensor,
+    views: list[TrainingView],
+    config: MethodConfig,
+    *,
+    step: int,
+    capacity: int,
+    options: RasterizeOptions,
+    generator: torch.Generator,
+) -> Event:
+    """Sample fine Gaussians by the importance of the pixels of the training views.
+
+    Where the fine layer is as large as it may be (``sampler.max_fraction`` of the coarse one), those of its Gaussians that
+    contribute least to the training views are evicted, the protected ones excepted; new ones beyond the limit are not added.
+
+    Args:
+        gaussians: The current set, N rows.
+        fine: Gaussians of the fine layer, bool, shape [N].
+        protected: Gaussians that are not evicted, bool, shape [N].
+        views: Training views with their scores.
+        config: Switches and settings.
+        step: Steps done.
+        capacity: Gaussians that may be added.
+        options: Settings of the rasterizer.
+        generator: CPU generator, the same numbers on every device.
+
+    Returns:
+        The change, and the maps that led to it.
+    """
+    numbers = list(range(len(views)))
+    if len(views) > MAX_VIEWS:
+        numbers = sorted(torch.randperm(len(views), generator=generator)[:MAX_VIEWS].tolist())
+    sampled, rows = zip(*(sample_view(gaussians, views[i], i, config, options, generator) for i in numbers))
+    added = {name: torch.cat([r[name] for r in rows]) for name in rows[0]}
+    count = len(added["means"])
+
+    coarse_count, fine_count = int((~fine).sum()), int(fine.sum())
+    over = max(fine_count + count - int(config.sampler.max_fraction * coarse_count), count - capacity)
+    keep = torch.ones(len(gaussians), dtype=torch.bool, device=fine.device)
+    evicted = 0
+    if over > 0:
+        weigh = dataclasses.replace(options, contributions=True)
+        ids = least_contributing(gaussians, fine & ~protected, over, views, weigh)
+        keep[ids] = False
+        evicted = len(ids)
+        if over > evicted:  # spread over the views, as they were sampled
+            left = torch.randperm(count, generator=generator)[: max(0, count - (over - evicted))].sort().values.to(fine.device)
+            added = {name: t[left] for name, t in added.items()}
+            count = len(left)
+    parents = torch.full((count,), -1, dtype=torch.int64, device=fine.device)
+    columns = {"level": FINE, "created_step": step}
+    return Event(DensityUpdate(torch.nonzero(keep).squeeze(1), added, parents, columns), evicted, sampled)

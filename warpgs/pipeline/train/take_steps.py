@@ -1,0 +1,87 @@
+"""Steps of a fit as its device takes them: one by one, replayed as graphs, or of several views spread over processes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+
+from warpgs.pipeline.train.batch import BatchSteps
+from warpgs.pipeline.train.slots import Tree
+from warpgs.pipeline.train.step import Learned, StepBuffers, StepGraphs, StepPlan, eager_renderer, step
+from warpgs.pipeline.train.views import Kind, ViewStack
+from warpgs.runtime.ranks import Ranks
+
+
+class StepTaker:
+    """Steps of one fit."""
+
+    def __init__(
+        self, learned: Learned, buffers: StepBuffers, rule: str, background: torch.Tensor, batch: int, ranks: Ranks
+    ):  # fmt: skip
+        """Capture nothing yet.
+
+        Args:
+            learned: Tables and strategy that steps change.
+            buffers: Settings and results of steps.
+            rule: Cut-offs of the rasterizer.
+            background: Colour behind the scene, shape [3].
+            batch: Views of a step.
+            ranks: Processes that share them.
+        """
+        self.learned, self.buffers, self.rule, self.background, self.ranks = learned, buffers, rule, background, ranks
+        own = (learned, buffers, rule, background)
+        self.graphs = StepGraphs(*own) if buffers.device.type == "cuda" else None
+        self.batched = BatchSteps(*own, Tree(batch, ranks)) if batch > 1 else None
+
+    @property
+    def sums(self) -> int:
+        """Sums of gradients that a step of several views keeps."""
+        return 0 if self.batched is None else self.batched.tree.buffers
+
+    @property
+    def stopped_slot(self) -> int:
+        """First slot that stopped the last step; 0 where none did, and in steps of one view."""
+        return 0 if self.batched is None else self.batched.result()[0]
+
+    def clear(self) -> None:
+        """Drop all graphs; they are captured anew."""
+        for graphs in (self.graphs, self.batched):
+            if graphs is not None:
+                graphs.clear()
+
+    def take(
+        self, places: list[tuple[Kind, int]], settings: Callable[[], Sequence[tuple[float, ...]]],
+        stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None, *, captured: bool,
+    ) -> None:  # fmt: skip
+        """Take the steps whose learning rates and settings the buffers hold.
+
+        Args:
+            places: Kind and row of the view of each step, or of each slot of the one step of several views.
+            settings: Returns the settings of each slot.
+            stacks: Views by kind.
+            plan: Choices that the steps are made of.
+            max_instances: Instances that a view may have at a time; None for no limit.
+            captured: Whether CUDA graphs are used.
+
+        Raises:
+            OverLimitError: The capacity of a graph would be above ``max_instances``; nothing was changed.
+            ResourceError: The instances would not fit into memory, or another process is gone.
+        """
+        kinds = [kind for kind, _ in places]
+        if self.batched is not None:
+            self.batched.take(places, settings(), stacks, plan, max_instances, captured=captured)
+        elif captured and self.graphs is not None:
+            for graph in self.graphs.capture_all(kinds, stacks, plan, max_instances):
+                graph.replay()
+        else:
+            render = eager_renderer(self.rule, self.background, max_instances)
+            for kind in kinds:
+                step(self.learned, stacks[kind], self.buffers, plan, render)
+
+    def agreed(self, stopped: bool) -> bool:
+        """Return whether to end after the last step, as all processes do: one that was told to is heard in its next step."""
+        if self.batched is None or self.ranks.count == 1:
+            return stopped
+        self.batched.told_to_stop = stopped
+        return self.batched.result()[1]

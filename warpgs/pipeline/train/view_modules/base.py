@@ -1,0 +1,167 @@
+"""Base class of view modules, which learn parameters of each training view: of its camera, or of the colours that it shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+
+from warpgs.errors import UsageError
+from warpgs.plugins import Registry
+from warpgs.render.rasterize import RasterizeOptions
+from warpgs.scene import Camera, Gaussians, View
+
+CAMERA_BYTES = 4 * (16 + 9)
+"""Bytes for each Gaussian where cameras are learned: the gradient of view matrix and intrinsics, until it is summed."""
+Tensors = Mapping[str, torch.Tensor]
+"""Parameters of views, or values made of them, by name."""
+
+
+@dataclass(frozen=True)
+class FittedViews:
+    """A finished fit, as `ViewModule.figures` describes it."""
+
+    params: Tensors
+    """Parameters of the module, by name, shape [V, ...]."""
+    train: tuple[str, ...]
+    """Names of the training views, in the order of their parameters."""
+    test: Sequence[View]
+    """Held-out views, with their cameras after the fit."""
+    given: Mapping[str, Camera]
+    """Camera of each view before the fit, in scene units [u], by name."""
+    cameras: Mapping[str, Camera]
+    """Camera of each view after the fit, in scene units [u], by name."""
+    scale: float
+    """Scene units per unit of the scene's files."""
+    gaussians: Gaussians
+    """The fitted model."""
+    options: RasterizeOptions
+    """Options that it is rendered with."""
+
+
+@dataclass(frozen=True)
+class ViewModule:
+    """Something that a fit learns of each training view.
+
+    One of your own is a frozen dataclass that derives from this; its fields are its settings.
+
+    A module has no state: its parameters have a row for each training view, under dense Adam as in `torch.optim.Adam`. A step
+    has a gradient in the row of its own view and zeros in the others, which still move by their decaying momentum. Checkpoints
+    hold parameters and moments.
+
+    `values`, `before_render`, `after_render` and `regularisation` are part of the captured step: they read nothing back from
+    the device, and their tensors have the same shapes at each call.
+    """
+
+    name: ClassVar[str] = ""
+    """Name that it is registered by."""
+
+    def check(self, views: Sequence[View]) -> None:
+        """Check, before anything takes time, that the training views can have the parameters.
+
+        Raises:
+            UsageError: They cannot.
+        """
+
+    def parameters(self, views: Sequence[View]) -> dict[str, torch.Tensor]:
+        """Return the parameters before the first step, by name, float32, shape [V, ...]: a row for each training view.
+
+        No two modules of a fit may use the same name.
+        """
+        return {}
+
+    def lrs(self, progress: float, extent: float) -> dict[str, float]:
+        """Return the learning rate of each parameter by name.
+
+        Args:
+            progress: Fraction of the fit that is done, in [0, 1].
+            extent: Size of the scene [u].
+        """
+        return {}
+
+    def values(self, params: Tensors, numbers: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return what `before_render` and `after_render` get for some views: by default their rows; differentiable.
+
+        Args:
+            params: Parameters of all training views, by name, shape [V, ...].
+            numbers: Number of each of the views among them, int64, shape [B].
+
+        Returns:
+            Tensors by the names of the parameters, shape [B, ...].
+        """
+        return {n: t.index_select(0, numbers) for n, t in params.items()}  # not t[numbers], which reads them back
+
+    def before_render(self, camera: Camera, values: Tensors) -> Camera:
+        """Return the camera that views are rendered from; viewmat and intrinsics may change, and are differentiable.
+
+        Args:
+            camera: Camera of B views as given, viewmat [B, 4, 4] and K [B, 3, 3]; at half the size in some steps.
+            values: Result of `values` for these views, [B, ...].
+        """
+        return camera
+
+    def after_render(self, rgb: torch.Tensor, values: Tensors) -> torch.Tensor:
+        """Return rendered colours [H, W, 3] as one view shows them, differentiable; ``values`` are of that view, [...]."""
+        return rgb
+
+    def regularisation(self, values: Tensors) -> torch.Tensor | None:
+        """Return a term of the loss for the step's view, shape []; None for none. ``values`` are of that view, [...]."""
+        return None
+
+    def bytes(self, count: int, pixels: int) -> dict[str, int]:
+        """Return the bytes that a step takes on top, at two of its moments; none by default.
+
+        Args:
+            count: Number of Gaussians.
+            pixels: Number of pixels of the largest view.
+
+        Returns:
+            ``loss``: what stands beside the render when the loss is computed; ``projection``: what stands there when Gaussians
+            get their gradients, `CAMERA_BYTES` for each where `before_render` is learned.
+        """
+        return {}
+
+    def cameras(
+        self, given: Mapping[str, Camera], train: Sequence[str], test: Sequence[str], params: Tensors
+    ) -> Mapping[str, Camera]:
+        """Return the cameras of all views after the fit, from which they are scored and rendered; by default as given.
+
+        The images of held-out views are not there: nothing may be learned from them.
+
+        Args:
+            given: Camera of each view, numpy, in scene units [u], by name.
+            train: Names of the training views.
+            test: Names of the held-out views.
+            params: Parameters of the training views, by name, shape [V, ...].
+        """
+        return given
+
+    def figures(self, fitted: FittedViews) -> dict[str, Any]:
+        """Return what was learned, plain values for metrics.json; ``summary`` is a note for output and report."""
+        return {"summary": f"view module {self.name}: {', '.join(fitted.params)} of {len(fitted.train)} training views learned"}
+
+
+VIEW_MODULES = Registry("view module", ViewModule, __package__)
+"""View modules by name; the modules of this folder are ours."""
+register = VIEW_MODULES.register
+
+
+def check_modules(modules: Sequence[ViewModule]) -> None:
+    """Check that a run folder could name the class of each view module.
+
+    Raises:
+        UsageError: One is no view module, its class is not registered by a name of its own, or two are of one class.
+    """
+    for i, module in enumerate(modules):
+        kind = type(module)
+        if not isinstance(module, ViewModule):
+            raise UsageError(f"{module!r} is no view module: give an instance of a class that derives from warpgs.ViewModule")
+        if not VIEW_MODULES.has(kind):
+            raise UsageError(
+                f"the view module {kind.__qualname__} has no name of its own, by which a run folder could tell it; register it "
+                'with @register("name") of warpgs.pipeline.train.view_modules.base above the class, or name it as module:Class'
+            )
+        if any(type(m) is kind for m in modules[:i]):
+            raise UsageError(f"the view module {module.name!r} is given twice; leave one out")

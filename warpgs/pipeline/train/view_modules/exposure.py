@@ -1,0 +1,153 @@
+"""Exposure of training views: an affine map of the rendered colours of each, learned with the Gaussians.
+
+A camera that meters every photograph anew shows one colour brighter here and bluer there. With exposures a step compares the
+view's image with A rgb + b of its render. What is learned are the 12 numbers of [A - 1 | b], which start at zero. A step uses
+them less their mean over all training views, so that the model has their mean exposure: else all of them could turn darker
+while the Gaussians turn brighter, and no training image would tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch.autograd.function import once_differentiable
+
+from warpgs.errors import UsageError
+from warpgs.pipeline.metrics.evaluate import render_view
+from warpgs.pipeline.metrics.matched_psnr import RULE, matched_psnr
+from warpgs.pipeline.train.schedule import check_lrs, log_linear
+from warpgs.pipeline.train.view_modules.base import FittedViews, Tensors, ViewModule, register
+from warpgs.scene import View
+
+EXPOSURE = "exposure_affine"
+"""Name of the parameters: rows of [A - 1 | b], shape [V, 12]."""
+CHANNELS = 3
+GRAY = 0.5
+"""Gray whose brightness under an exposure is told."""
+
+
+def exposure_of(rows: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
+    """Return the exposure [..., 12] of views with parameters ``own`` [..., 12], among those of all views ``rows`` [V, 12].
+
+    No gradient flows into the mean: only the rows of ``own`` are learned from.
+    """
+    # in float64, whose rounding no number of threads shows in float32
+    return own - rows.detach().mean(0, dtype=torch.float64).to(own.dtype)
+
+
+class _Exposed(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, rgb: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(rgb, exposure)
+        m = exposure.view(CHANNELS, CHANNELS + 1)
+        # sums of products one by one, not a matrix product, whose order of summation is the library's
+        found = rgb + m[:, CHANNELS]
+        for k in range(CHANNELS):
+            found += rgb[..., k : k + 1] * m[:, k]
+        return found
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        rgb, exposure = ctx.saved_tensors
+        m = exposure.view(CHANNELS, CHANNELS + 1)
+        v_rgb = v.clone()
+        for c in range(CHANNELS):
+            v_rgb += v[..., c : c + 1] * m[c, :CHANNELS]
+        columns = [(v * rgb[..., k : k + 1]).sum((0, 1), dtype=torch.float64) for k in range(CHANNELS)]
+        columns.append(v.sum((0, 1), dtype=torch.float64))
+        return v_rgb, torch.stack(columns, -1).reshape(-1).to(exposure.dtype)
+
+
+def exposed(rgb: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
+    """Return colours [H, W, 3] under an exposure [12], rows of [A - 1 | b]; differentiable in both."""
+    found: torch.Tensor = _Exposed.apply(rgb, exposure)
+    return found
+
+
+@register("exposure")
+@dataclass(frozen=True)
+class Exposure(ViewModule):
+    """Learn an affine map of colours for each training view, for photographs that differ in brightness or white balance.
+
+    No held-out view has one, and no render: scores are of the model's own colours (docs/your-photos.md).
+    """
+
+    lr: float = 5e-3
+    """Learning rate of the exposures at the start."""
+    decay: float = 0.1
+    """Fraction of it that is left at the last step; log-linear between."""
+    weight: float = 0.01
+    """Weight of the sum of squares of each view's exposure less the identity, in [0, 1000]."""
+
+    def __post_init__(self) -> None:
+        check_lrs(self.name, lr=self.lr, decay=self.decay)
+        if not 0 <= self.weight <= 1000:
+            raise UsageError(f"exposure weight must lie between 0 and 1000, not {self.weight}")
+
+    def check(self, views: Sequence[View]) -> None:
+        """Check that no view knows its opacity: an exposure would change the background with the object.
+
+        Raises:
+            UsageError: One does.
+        """
+        for v in views:
+            if v.alpha is not None:
+                raise UsageError(
+                    f"--exposure is for opaque photographs, and {v.name} knows its opacity: its background is no part of the "
+                    "photograph; leave --exposure out"
+                )
+
+    def parameters(self, views: Sequence[View]) -> dict[str, torch.Tensor]:
+        """Return zeros, shape [V, 12]."""
+        return {EXPOSURE: torch.zeros(len(views), CHANNELS * (CHANNELS + 1))}
+
+    def lrs(self, progress: float, extent: float) -> dict[str, float]:
+        """Return the learning rate, which falls from the first step on."""
+        return {EXPOSURE: self.lr * log_linear(1.0, self.decay, progress)}
+
+    def values(self, params: Tensors, numbers: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return `exposure_of` the views, shape [B, 12]."""
+        rows = params[EXPOSURE]
+        return {EXPOSURE: exposure_of(rows, rows.index_select(0, numbers))}
+
+    def after_render(self, rgb: torch.Tensor, values: Tensors) -> torch.Tensor:
+        """Return `exposed` colours, shape [H, W, 3]."""
+        return exposed(rgb, values[EXPOSURE])
+
+    def regularisation(self, values: Tensors) -> torch.Tensor:
+        """Return ``weight`` times the sum of squares of [A - 1 | b], shape []: it holds an exposure to the identity."""
+        square = values[EXPOSURE].double().square().sum()
+        return (self.weight * square).to(values[EXPOSURE].dtype)
+
+    def bytes(self, count: int, pixels: int) -> dict[str, int]:
+        """Return the bytes of the render under its exposure, beside the one without."""
+        return {"loss": 4 * CHANNELS * pixels}
+
+    def figures(self, fitted: FittedViews) -> dict[str, Any]:
+        """Return what exposures were learned.
+
+        Returns:
+            ``views``, for each training view [A | b] as 3 rows of 4 and its ``gain``, the mean over channels of what a middle
+            gray becomes, over that gray; ``matched_psnr``, the mean over held-out views [dB], None without any; ``summary``.
+        """
+        rows = fitted.params[EXPOSURE].double()
+        numbers = exposure_of(rows, rows).detach().cpu().numpy().reshape(-1, CHANNELS, CHANNELS + 1)
+        maps = numbers + np.eye(CHANNELS, CHANNELS + 1)
+        gains = (maps[..., :CHANNELS].sum(-1) + maps[..., CHANNELS] / GRAY).mean(-1)
+        each = zip(fitted.train, maps, gains, strict=True)
+        views = [{"name": n, "affine": m.tolist(), "gain": float(g)} for n, m, g in each]
+        summary = (
+            f"exposures learned: the training views show a middle gray {gains.min():.2f} to {gains.max():.2f} times as bright "
+            "as the model, whose colours are those of their mean exposure; every score is of renders without an exposure"
+        )
+        renders = ((v, render_view(fitted.gaussians, v, fitted.options)[0]) for v in fitted.test)
+        scores = [s for v, image in renders if np.isfinite(s := matched_psnr(v, image))]
+        mean = float(np.mean(scores)) if scores else None
+        if mean is not None:
+            summary += f"; held-out PSNR {mean:.2f} dB {RULE}"
+        return {"views": views, "matched_psnr": mean, "summary": summary}
