@@ -132,14 +132,6 @@ def test_rules_name_what_exists(candidates):
     assert sorted((rules.HINTS | rules.CUDA_ARGUMENTS) - words) == []
 
 
-def test_every_claim_finds_its_mutant(candidates):
-    """One that no mutant answers to is out of date; each message says what to write instead."""
-    claimed = claims.load()
-    reasons, lost = claims.match(claimed, candidates)
-    assert not lost, "\n".join(lost)
-    assert len(reasons) == len(claimed.reasons)
-
-
 LOOP = """def kernel(a, n):
     total = 0.0
     for i in range(n):

@@ -30,6 +30,7 @@ from warpgs.pipeline.model.filters import box_of
 from warpgs.pipeline.runs import folder as run_folder
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
 from warpgs.pipeline.runs.failed_step import read_failed_step
+from warpgs.pipeline.train.presets import preset_settings
 from warpgs.plugins import Registry
 from warpgs.poses import record as poses_record
 from warpgs.poses import video
@@ -81,7 +82,7 @@ def weights(path):
 
 
 DOORS = {
-    **{f"a{suffix}": ("export.formats", read_gaussians) for suffix in suffixes()},
+    **{f"a{suffix}": ("export.base", read_gaussians) for suffix in suffixes()},
     "b.ply": ("export.ply", warpgs.read_ply),
     "cameras.json": ("io.camera_files", camera_files.read_cameras),
     "transforms.json": ("io.transforms", camera_files.read_cameras),
@@ -91,6 +92,7 @@ DOORS = {
     **{f"a{suffix}": ("poses.find", lambda p: find_poses(p, p.parent / "out")) for suffix in video.SUFFIXES},
     "b.mp4": ("poses.video", lambda p: video.write_frames(p, p.parent, 3, lambda line: None)),
     "path.json": ("pipeline.films.keyframes", lambda p: read_keyframes(p, CAMERA, Normalization())),
+    "preset.toml": ("pipeline.train.presets", preset_settings),
     "crop.json": ("pipeline.model.filters", lambda p: box_of(str(p))),
     "jobs.jsonl": ("pipeline.farm.listing", lambda p: list_jobs(str(p))),
     RECORD: ("pipeline.farm.record", job_record),
@@ -116,7 +118,7 @@ DOORS = {
 """By the name of a file: the module that opens it, and what reads it."""
 PROBED = {"plugin.py", "b.flo"}
 """Files that are looked for first, where one of another kind counts as none."""
-EMPTY_IS_FINE = {"metrics.jsonl", "artefact", "plugin.py", "render.png"}
+EMPTY_IS_FINE = {"preset.toml", "metrics.jsonl", "artefact", "plugin.py", "render.png"}
 """Files that may be empty: a log of no events, those of which the bytes are wanted, code without the class."""
 
 
