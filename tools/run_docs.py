@@ -35,7 +35,7 @@ LEFT_OUT = (
     (r"warpgs .*--device cuda\b", "GPU"),
     (r"torchrun ", "several GPUs"),
     (r"make (demo|test|install)\b", "the workflow test runs it"),
-    (r"(python3 -m venv|source .*activate|pip install (\.|torch)|git clone)", "installing, which --install runs"),
+    (r"(python3 -m venv|source .*activate|pip install '?(\.|torch)|git clone)", "installing, which --install runs"),
 )
 """Beginnings of lines that are left out, and why."""
 INPUTS = ("scene", "photographs", "PHOTOGRAPHS", "run", "scenes", "keyframes.json", "examples")

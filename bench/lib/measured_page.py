@@ -107,7 +107,7 @@ Poses found by `warpgs poses`, then a fit with preset `quick`; fern at 126 x 94 
 seeds, by training views. {_where(result)}.
 
 {table(["poses", *map(str, counts)], body)}
-What the differences come from, who was registered, and how long it takes: [poses](poses.md).
+Causes, registration and times: [decision 017](decisions/017-poses-from-photos.md).
 """
 
 

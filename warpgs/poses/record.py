@@ -19,7 +19,7 @@ FORMAT = 1
 SHOWN_PARTNERS = 5
 """Matched photographs that the record names for each."""
 FEW = 5
-"""Photographs up to which a focal length that EXIF does not tell is called uncertain (docs/poses.md, what was measured)."""
+"""Most photographs with which a focal length without EXIF is called uncertain (decision 017)."""
 _PHOTOGRAPH = schema.fields(
     {
         "name": schema.text, "sha256": schema.text, "registered": schema.flag, "keypoints": schema.whole(0),

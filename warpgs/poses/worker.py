@@ -1,7 +1,7 @@
 """The process that calls pycolmap: features, matches, poses. It reads one job and prints lines of JSON.
 
 It is a process of its own for three reasons: pycolmap ends the process it runs in where something is wrong inside of it, cannot
-be interrupted, and its wheels hold code under the GPL (docs/poses.md). Nothing else in warpgs imports it.
+be interrupted, and its wheels contain code under the GPL (decision 017). Nothing else in warpgs imports it.
 
 A line holds ``progress``, a text for the user, or ``result``, the last one.
 """
@@ -28,9 +28,9 @@ CAMERA_MODEL = "SIMPLE_RADIAL"
 """One focal length and one coefficient of distortion: what a handful of photographs can tell."""
 
 KEEP_FOCAL = 4
-"""Most photographs with which a focal length that EXIF tells is kept: they tell it less well (docs/poses.md)."""
+"""Most photographs with which EXIF's focal length is kept: a free one is less accurate (decision 017)."""
 MAX_RATIO = 1.05
-"""Mean reprojection error with EXIF's focal length over that with a free one, up to which EXIF is believed (docs/poses.md)."""
+"""Mean reprojection error with EXIF's focal length over that with a free one, up to which EXIF's is kept (decision 017)."""
 
 
 def _say(**values: Any) -> None:
