@@ -5,11 +5,13 @@ import torch
 from bench.lib import roofline
 from bench.lib.timing import OURS, Task
 from warpgs.kernels.dropout import opacity_dropout
+from warpgs.kernels.step_buffers import Setting
 
 AXES = ("count",)
 PROGRAMS = {OURS: ("forward",)}
 
 
 def tasks(point, device, wanted):
-    settings = torch.tensor([0.2, 1.0, 0.0, 0.0, 0.0, 0.0], device=device)
+    row = Setting.row(dropout=0.2, number=1, step=1, means_lr=0.0, shift=(0.0, 0.0, 0.0))
+    settings = torch.tensor(row, dtype=torch.float32, device=device)
     yield Task(OURS, "forward", lambda: opacity_dropout(point.count, settings, 0), roofline.dropout(point.count))

@@ -11,7 +11,7 @@ from warpgs.scene import Mesh
 MAX_JUMP = 1.1
 """Largest difference of the distances at two neighbouring grid points, over the truncation, that a surface may lie between.
 With less, what is seen at a grazing angle is left out; with more, skirts hang behind the edges of what a view sees. Chosen, as
-the truncation was, on a demo scene of another seed than the one that is reported (docs/mesh.md)."""
+the truncation was, on a demo scene of another seed than the one that is reported (docs/decisions/019-thresholds.md)."""
 NO_SURFACE = (
     "the training views agree on no surface inside the grid; give another --voxel (larger; smaller where it is near the size "
     "of the scene), or fit with more steps"

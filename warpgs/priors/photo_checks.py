@@ -1,7 +1,7 @@
 """Faults of photographs that explain a bad model: blur, and light or colours that differ from photograph to photograph.
 
 Photographs are compared at the places that two of them show: SIFT matches that agree with the poses. So it does not count
-what a photograph shows, only how (docs/scenes.md, "Photographs with faults").
+what a photograph shows, only how (docs/scenes.md, "Photo checks").
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from warpgs.scene import View
 
 MIN_SHARPNESS = 0.87
 """Sharpness below which a photograph is named: untouched ones of five scenes have 0.88 and more, those blurred by a disk of 3
-px 0.5 to 0.85 (docs/scenes.md)."""
+px 0.5 to 0.85 (docs/decisions/019-thresholds.md)."""
 MAX_BRIGHTNESS = 1.2
 """Factor of brightness, up or down, beyond which a photograph is named; below 1.1 where the exposure does not change."""
 MAX_TINT = 1.1

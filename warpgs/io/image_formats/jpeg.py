@@ -1,6 +1,6 @@
 """JPEG: markers and scans are walked, then libjpeg-turbo decodes strictly: what it would only warn of is refused.
 
-JPEG has no checksum: damage that leaves a valid code of the same length is not seen (docs/scenes.md has the figures).
+JPEG has no checksum: damage that leaves a valid code of the same length is not seen (docs/decisions/012-files-from-anyone.md).
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from warpgs.scene import Camera, Gaussians
 
 TOLERANCE = 0.02
 """Largest difference of two depths of one surface, as a fraction of the depth. From training photographs alone: there two of
-them differ at one point by twice the squared error (3 dB) that they have where depths agree best (docs/evaluation.md)."""
+them differ at one point by twice the squared error (3 dB) that they have where depths agree best (decision 019)."""
 MIN_ALPHA = 0.5
 """Least opacity of a pixel that shows a surface, and so has a depth."""
 MAX_COUNT = 255

@@ -30,7 +30,7 @@ NEIGHBORS = 8
 MAX_DEPTH_ERROR = 0.1
 """Largest relative difference between the depths at which two views show the same point."""
 MIN_AREA = 0.004
-"""Fraction of the image that one region must fill to be reported; static scenes have up to 0.002 (docs/scenes.md)."""
+"""Fraction of the image that one region must fill to be reported; static scenes have up to 0.002 (decision 019)."""
 MAX_MISFIT = 5.0
 """Median residual of a view, in medians of all views, from which it fits badly as a whole: then no single region stands out."""
 HIGH_MISFIT = 0.002
