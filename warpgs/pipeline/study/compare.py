@@ -32,7 +32,7 @@ ABLATION_ROWS: dict[str, dict[str, bool]] = {
     "uniform": dict.fromkeys(SCORES, False),
     "residual only": dict.fromkeys(SCORES[1:], False),
 }
-"""Switches of each row of the ablation: all on; each part off alone; pixels drawn uniformly, or by the residual alone. "no
+"""Switches of each row of the ablation: all on; each part off alone; pixels sampled uniformly, or by the residual alone. "no
 s_geometry" and "no s_semantic" are the residual with one of the other scores."""
 
 
