@@ -55,7 +55,7 @@ def test_the_page_on_presets_says_what_the_rule_chooses():
         train = [SimpleNamespace(camera=SimpleNamespace(width=8, height=6))] * views
         config, _ = settings_by_views(PRESETS["default"], train, "cuda")
         chosen = (
-            config.steps, config.init.max_sh_degree, config.optimizer.scales_lr, config.optimizer.opacities_lr,
+            config.steps, config.sh_degree, config.optimizer.scales_lr, config.optimizer.opacities_lr,
             config.half_resolution,
         )  # fmt: skip
         assert tuple(float(row[column].replace(",", "")) for row in rows[2:]) == chosen, views

@@ -123,7 +123,7 @@ def fit(
         ranks: Processes that fit together, from `warpgs.runtime.ranks.join`, all with the same arguments. The first alone
             prints, writes and scores; the others return a result without metrics.
         **overrides: Settings that replace those of the preset, by the names of their flags with underscores, such as
-            ``steps=300`` or ``init_max_sh_degree=1``; or a group as a mapping, ``init={"max_sh_degree": 1}``. `FitConfig` lists
+            ``steps=300`` or ``init_opacity=0.2``; or a group as a mapping, ``init={"opacity": 0.2}``. `FitConfig` lists
             them, and `warpgs fit --help-all`.
 
     Raises:

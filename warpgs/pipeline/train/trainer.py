@@ -86,7 +86,8 @@ class Trainer:
         self.radius = scene_radius(cameras, cloud)
         """Radius of the scene [u], as `scene_radius` measures it."""
         self.scene_background, self.background = background, torch.tensor(background, dtype=torch.float32, device=device)
-        assert config.steps is not None and config.half_resolution is not None  # `settings_by_views` has chosen
+        # `settings_by_views` has chosen
+        assert config.steps is not None and config.sh_degree is not None and config.half_resolution is not None
         self.half_resolution = config.half_resolution
         """Fraction of the planned steps, from the first, in which views are half their size."""
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
@@ -99,7 +100,7 @@ class Trainer:
         self.order: list[int] = []
         """Views that are still to come before any comes again, the next one last."""
 
-        self.table = Table.of_gaussians(initial_gaussians(cloud, config.init, extent, device), {})
+        self.table = Table.of_gaussians(initial_gaussians(cloud, config.init, config.sh_degree, extent, device), {})
         self.context = StrategyContext(
             config.groups(), config.strategy_config, self.table, self.generator, config.seed,
             plan_phases(config.phases, config.steps), extent, config.rule, self.background,
@@ -151,7 +152,7 @@ class Trainer:
 
     def degree(self, step: int) -> int:
         """Return the degree of the harmonics in use at a step."""
-        highest = self.config.init.max_sh_degree
+        highest = self.config.sh_degree
         assert highest is not None  # `settings_by_views` has chosen
         return sh_degree(step, self.stopping.sh_every(self.config.sh_every, highest), highest)
 
