@@ -18,27 +18,12 @@ from warpgs.kernels.blend_channels import blend_channels
 from warpgs.kernels.median_depth import median_depth
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs, checked_factors
-from warpgs.kernels.tiles import Tiles, bin_tiles
+from warpgs.kernels.tiles import AS_NEEDED, InstanceMemory, Tiles, bin_tiles
 from warpgs.render.settings import RenderSettings
-from warpgs.runtime.allocator import TORCH, Allocator
 from warpgs.scene import Camera, Gaussians
 
 Images = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 """Colour [C, H, W, 3], or [C, H, W, D] of Gaussians with D channels; alpha and expected z-depth [C, H, W]."""
-
-
-@dataclass(frozen=True)
-class InstanceMemory:
-    """Memory that the (Gaussian, tile) instances of a render may take."""
-
-    budget: int | None = None
-    """Bytes; None for four fifths of what is free."""
-    capacity: int | None = None
-    """Number of instances to allocate for, without asking the device how many there are; None for as many as there are."""
-    overflow: torch.Tensor | None = None
-    """Set to 1 where there are more instances than the capacity; int32, shape [1]."""
-    allocator: Allocator = TORCH
-    """Provider of the lists' memory."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +77,7 @@ def settings_of(camera: Camera, degree: int, rule: Any, **others: Any) -> Render
 
 
 def bin_projected(
-    projected: torch.Tensor, tile_counts: torch.Tensor, settings: RenderSettings, memory: InstanceMemory = InstanceMemory(),
+    projected: torch.Tensor, tile_counts: torch.Tensor, settings: RenderSettings, memory: InstanceMemory = AS_NEEDED,
     slotted: bool = True,
 ) -> Tiles:  # fmt: skip
     """Return the instances of each tile of the window.
@@ -108,13 +93,12 @@ def bin_projected(
         ResourceError: There are more than memory allows.
     """
     return bin_tiles(
-        projected, tile_counts, tile_size=settings.tile_size, budget_bytes=memory.budget, capacity=memory.capacity,
-        overflow=memory.overflow, allocator=memory.allocator, slotted=slotted, **settings.of_window(),
-    )  # fmt: skip
+        projected, tile_counts, tile_size=settings.tile_size, memory=memory, slotted=slotted, **settings.of_window()
+    )
 
 
 def compose(
-    inputs: ProjectInputs, backgrounds: torch.Tensor, settings: RenderSettings, memory: InstanceMemory = InstanceMemory(),
+    inputs: ProjectInputs, backgrounds: torch.Tensor, settings: RenderSettings, memory: InstanceMemory = AS_NEEDED,
     deterministic: bool = True,
 ) -> Composed:  # fmt: skip
     """Render the window of a batch of cameras. Differentiable as `project` and `blend` are.
@@ -139,7 +123,7 @@ def compose(
 
 def bin_and_blend(
     projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: RenderSettings,
-    memory: InstanceMemory = InstanceMemory(), deterministic: bool = True, colors: torch.Tensor | None = None,
+    memory: InstanceMemory = AS_NEEDED, deterministic: bool = True, colors: torch.Tensor | None = None,
 ) -> tuple[Tiles, Images]:  # fmt: skip
     """Return the instances and the images of projected Gaussians [C, N, 12], see `compose` and `images_of`."""
     tiles = bin_projected(projected, tile_counts, settings, memory, needs_slots((projected, backgrounds, colors)))

@@ -20,8 +20,8 @@ from torch.autograd.function import once_differentiable
 from warpgs.kernels import blend, project
 from warpgs.kernels.cameras.base import CAMERA_MODELS
 from warpgs.kernels.project_inputs import ProjectInputs
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, Tiles
-from warpgs.render.compose import InstanceMemory, composite_into, count_instances
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, Tiles
+from warpgs.render.compose import composite_into, count_instances
 from warpgs.render.settings import RenderSettings
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import Allocator, fetch

@@ -17,7 +17,7 @@ from warpgs.constants import RULES
 from warpgs.errors import ResourceError
 from warpgs.kernels.dropout import opacity_dropout
 from warpgs.kernels.step_buffers import NOT_FINITE, SHIFT, Setting, begin_step, end_step
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, InstanceMemory
 from warpgs.pipeline.metrics.psnr import masked_mse
 from warpgs.pipeline.model.scale_limits import NO_LIMITS, Limits
 from warpgs.pipeline.model.table import Table
@@ -26,7 +26,7 @@ from warpgs.pipeline.train.learned_views import LearnedViews, seen
 from warpgs.pipeline.train.loss import LossInputs, LossTerm, Target, outputs_of, term_values
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.views import Kind, Rows, ViewStack, current
-from warpgs.render.compose import InstanceMemory, compose, count_instances, inputs_of, settings_of
+from warpgs.render.compose import compose, count_instances, inputs_of, settings_of
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.runtime.cuda_graph import CapturedGraph, GraphMemory
 from warpgs.runtime.device_memory import available_bytes
