@@ -190,7 +190,7 @@ class Page:
     coverage: CoverageReport | None = None
     """Scores of held-out views by what training views saw, or None."""
     held_out: bool = True
-    """Whether the views are held out; else the fit was trained on them."""
+    """True where the views are held out; False where the fit was trained on them."""
 
 
 def write_page(path: Path, page: Page) -> None:

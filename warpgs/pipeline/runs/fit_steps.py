@@ -67,7 +67,7 @@ class RunRecorder:
 
 
 class StepTeller:
-    """Takes each step's report to the terminal, the log and the caller."""
+    """Receiver of each step's report, for the terminal, the log and the caller."""
 
     def __init__(self, job: FitJob, trainer: Trainer, recorder: RunRecorder, progress: Progress | None):
         """Start before the first step; ``progress`` is None for a fit that shows none."""
