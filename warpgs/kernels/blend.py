@@ -202,7 +202,11 @@ class _Blend(torch.autograd.Function):
 
 
 def check_slots(tiles: Tiles) -> None:
-    """Raise ValueError where the instances have no slots."""
+    """Check that the instances have slots.
+
+    Raises:
+        ValueError: They have none.
+    """
     if len(tiles.slots) != len(tiles.gaussian_ids):
         raise ValueError("tiles have no slots, which gradients and contributions need: make them by bin_tiles(slotted=True)")
 
