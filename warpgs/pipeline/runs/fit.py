@@ -230,7 +230,11 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, State | None, 
             check_checkpoint(state[1], stored, resumed)
     c = job.config
     with background_warmup(c, job.device) as ready:
-        job.photographs = check_photos([*job.train, *job.test], job.progress)
+        if job.other_models:
+            models = " and ".join(job.other_models)
+            job.notes.append(f"camera model {models}: photographs are not compared with each other; coverage is not measured")
+        else:
+            job.photographs = check_photos([*job.train, *job.test], job.progress)
         of = job.train, job.scene.points, c, job.device, job.scene.background
         trainer = Trainer(*of, ready=ready, progress=job.progress, ranks=job.ranks)
     if job.device.type == "cuda":
@@ -291,7 +295,7 @@ def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict
     names = image_names(v.name for v in scene.views)
     scored, tell = (job.out, gaussians, train, test, c.rule, scene.background), job.progress
     metrics = evaluate_run(*scored, job.lpips, trainer.context.max_instances, names=names, tell=tell)
-    if test:
+    if test and not job.other_models:
         metrics["coverage"] = coverage_of_run(*scored, trainer.context.max_instances, names=names, tell=tell)
     tell("comparing renders with float64")
     rule = rule_report_of(
@@ -300,9 +304,11 @@ def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict
     )  # fmt: skip
     shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.context.extent, [v.camera for v in train])
     options = options_for(c.rule, scene.background, gaussians, trainer.context.max_instances)
-    shown = counted(train, job.progress, "looking for what moved", "views")
-    fractions = moved_fractions(train, (Rendered(*render_view(gaussians, v, options)) for v in shown))
-    moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
+    moved = {}
+    if not job.other_models:
+        shown = counted(train, job.progress, "looking for what moved", "views")
+        fractions = moved_fractions(train, (Rendered(*render_view(gaussians, v, options)) for v in shown))
+        moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
     complexity = complexity_figures(trainer)
     learned = learned_figures(trainer.learned.views, scene, job.split, given, test, gaussians, options)
     details = [rule["summary"], shape_summary(shape), complexity_summary(complexity)]
