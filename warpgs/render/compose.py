@@ -1,7 +1,7 @@
 """Project, bin, blend: the one way from Gaussians to images.
 
-`rasterize`, chunked and graphed rendering and the training step all come here, each with its own memory: what a render
-depends on (camera model, channels, cut-offs, window) stands in `RenderSettings` and `ProjectInputs`, and nowhere else.
+`rasterize`, chunked and graphed rendering and the training step all call these functions, each with its own memory. Camera
+model, channels, cut-offs and window of a render are in `RenderSettings` and `ProjectInputs`, and nowhere else.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Images = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 @dataclass(frozen=True)
 class Composed:
-    """A render with what it was made of."""
+    """A render, with its projected Gaussians and their tiles."""
 
     images: Images
     """Colour, alpha and depth."""
@@ -41,7 +41,7 @@ class Composed:
 
 
 def as_batch(array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
-    """Return an array of one camera or of a batch, of ``axes`` axes each, as a tensor [C, ...] of the type of ``like``."""
+    """Return an array as a tensor [C, ...] of the type of ``like``; that of a single camera has ``axes`` axes."""
     tensor: torch.Tensor = array
     if not (isinstance(array, torch.Tensor) and array.dtype == like.dtype and array.device == like.device):
         tensor = torch.as_tensor(array, dtype=like.dtype, device=like.device)
@@ -125,13 +125,13 @@ def bin_and_blend(
     projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: RenderSettings,
     memory: InstanceMemory = AS_NEEDED, deterministic: bool = True, colors: torch.Tensor | None = None,
 ) -> tuple[Tiles, Images]:  # fmt: skip
-    """Return the instances and the images of projected Gaussians [C, N, 12], see `compose` and `images_of`."""
+    """Bin and blend projected Gaussians [C, N, 12]; arguments are those of `compose` and `images_of`."""
     tiles = bin_projected(projected, tile_counts, settings, memory, needs_slots((projected, backgrounds, colors)))
     return tiles, images_of(projected, tiles, backgrounds, settings, deterministic, colors)
 
 
 def needs_slots(tensors: Iterable[torch.Tensor | None]) -> bool:
-    """Return whether gradients of a render may be asked for: those of tensors of any shape [...]."""
+    """Return whether autograd is on and one of the tensors, of any shape [...], requires gradients."""
     return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
 
 
@@ -175,14 +175,14 @@ def composite_into(
     projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: RenderSettings,
     memory: InstanceMemory,
 ) -> tuple[Tiles, Sequence[torch.Tensor]]:  # fmt: skip
-    """Return instances, and images with what their gradients take; none is recorded, and all memory is the allocator's.
+    """Bin and blend without autograd, in memory of the allocator; returns what the backward pass needs, too.
 
     Args:
         projected: Projected Gaussians, contiguous, shape [C, N, 12].
         tile_counts: Number of tiles that each touches, int32, shape [C, N].
         backgrounds: Colour behind everything, contiguous, shape [C, 3].
         settings: Settings of the render.
-        memory: Memory of the instances, and of all else.
+        memory: Memory of the instances; its allocator provides all other tensors.
 
     Returns:
         The instances, and the tensors [...] that `blending.composite` returns.
