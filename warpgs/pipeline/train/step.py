@@ -110,7 +110,7 @@ class StepBuffers:
 
 
 Renderer = Callable[[Gaussians, Camera, int, "torch.Tensor | None", "torch.Tensor | None"], Render]
-"""Function that renders Gaussians. Arguments: a batch of one camera, the degree, opacity factors, a shift of the background [3]."""
+"""Renderer of a batch of one camera. Further arguments: the degree, opacity factors, and a shift of the background [3]."""
 
 
 def eager_renderer(rule: str, background: torch.Tensor, max_instances: int | None) -> Renderer:
