@@ -154,7 +154,8 @@ def test_capacity_to_the_instance(device):
     assert int(counts.min()) > 2
     for capacity in (total, total - 1, total - 2, total // 2):
         mine, overflow = counts.clone(), torch.zeros(1, dtype=torch.int32, device=device)
-        made = tiles.bin_tiles(projected, mine, width=48, height=48, rule=EXACT, capacity=capacity, overflow=overflow)
+        memory = tiles.InstanceMemory(capacity=capacity, overflow=overflow)
+        made = tiles.bin_tiles(projected, mine, width=48, height=48, rule=EXACT, memory=memory)
         assert int(overflow) == (capacity < total)
         assert int(made.counts.sum()) == capacity and len(made.gaussian_ids) == capacity
 
@@ -311,8 +312,9 @@ def test_lists_are_those_of_the_cpu(tile_size):
             projected, counts = run(gaussians, cam, window=(x, y, width, height), tile_size=tile_size)
             how = {"width": width, "height": height, "rule": EXACT, "tile_size": tile_size, "origin": (x, y)}
             made = tiles.bin_tiles(projected, counts, **how)
-            room = {"capacity": len(made.slots) + 50, "overflow": torch.zeros(1, dtype=torch.int32, device=device)}
-            spare = tiles.bin_tiles(projected, counts, **how, **room)
+            overflow = torch.zeros(1, dtype=torch.int32, device=device)
+            memory = tiles.InstanceMemory(capacity=len(made.slots) + 50, overflow=overflow)
+            spare = tiles.bin_tiles(projected, counts, **how, memory=memory)
             assert int(counts.max()) > 100 and {31, 32, 33} & set(counts.view(-1).tolist())
             for m in (made, spare):
                 count = int(m.total)

@@ -20,7 +20,7 @@ from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.view_modules.poses import ROTATION, RefinePoses
 
 CPU = torch.device("cpu")
-PLAIN = FitConfig(steps=8, init=InitConfig(source="points", max_sh_degree=0))
+PLAIN = FitConfig(steps=8, init=InitConfig(source="points"), sh_degree=0)
 
 
 @pytest.fixture(autouse=True)

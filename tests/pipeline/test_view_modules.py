@@ -23,7 +23,7 @@ from warpgs.pipeline.train.views import current
 from warpgs.synthetic.demo import split_spec, write_demo
 
 CPU = torch.device("cpu")
-PLAIN = FitConfig(steps=60, init=InitConfig(source="points", max_sh_degree=0))
+PLAIN = FitConfig(steps=60, init=InitConfig(source="points"), sh_degree=0)
 OWN = '''
 from dataclasses import dataclass, replace
 

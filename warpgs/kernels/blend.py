@@ -202,7 +202,7 @@ class _Blend(torch.autograd.Function):
 
 
 def check_slots(tiles: Tiles) -> None:
-    """Check that instances have slots.
+    """Check that the instances have slots.
 
     Raises:
         ValueError: They have none.

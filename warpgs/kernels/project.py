@@ -332,10 +332,8 @@ def project(
         distortion = viewmats.new_empty(len(viewmats), 0)
     factors = checked_factors(means, opacity_factors)
     inputs = ProjectInputs(means, quats, log_scales, logit_opacities, sh_coefficients, viewmats, Ks, distortion, factors)
-    count = sh.coefficient_count(degree)
-    return project_inputs(
-        inputs, ProjectSettings((width, height), window or (0, 0, width, height), count, rule, tile_size, camera_model)
-    )
+    count, window = sh.coefficient_count(degree), window or (0, 0, width, height)
+    return project_inputs(inputs, ProjectSettings((width, height), window, count, rule, tile_size, camera_model))
 
 
 def project_inputs(inputs: ProjectInputs, settings: ProjectSettings) -> tuple[torch.Tensor, torch.Tensor]:

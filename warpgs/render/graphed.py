@@ -20,8 +20,8 @@ from torch.autograd.function import once_differentiable
 from warpgs.kernels import blend, project
 from warpgs.kernels.cameras.base import CAMERA_MODELS
 from warpgs.kernels.project_inputs import ProjectInputs
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, Tiles
-from warpgs.render.compose import InstanceMemory, composite_into, count_instances
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, Tiles
+from warpgs.render.compose import composite_into, count_instances
 from warpgs.render.settings import RenderSettings
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import Allocator, fetch
@@ -97,7 +97,7 @@ class GraphedRasterizer:
             backgrounds = self._black
         backgrounds = backgrounds.contiguous()
         images, block = self._forward_blend(*projection, backgrounds.detach())
-        projected = _projected(*inputs[:7], self, cameras, projection)
+        projected = _projected(self, cameras, projection, *inputs[:7])
         images = _blended(projected, backgrounds, self, projection[1], images, block)
         if self._total_ready is not None:
             self._total_ready.synchronize()  # not before: the device goes on meanwhile
@@ -194,8 +194,8 @@ class _Projected(torch.autograd.Function):
     """The projected Gaussians as an autograd result of the seven tensors."""
 
     @staticmethod
-    def forward(ctx, means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks, rasterizer, cameras, projection):
-        ctx.save_for_backward(means, quats, log_scales, logit_opacities, coefficients, cameras, *projection)
+    def forward(ctx, rasterizer, cameras, projection, *inputs):
+        ctx.save_for_backward(*inputs[:5], cameras, *projection)  # viewmats and Ks are in cameras
         ctx.rasterizer = rasterizer
         ctx.set_materialize_grads(False)
         return projection[0]
@@ -203,8 +203,8 @@ class _Projected(torch.autograd.Function):
     @staticmethod
     @_once
     def backward(ctx, v_projected):
-        wants_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
-        return *ctx.rasterizer.project_gradients(ctx.saved_tensors, v_projected, wants_camera), None, None, None
+        wants_camera = ctx.needs_input_grad[8] or ctx.needs_input_grad[9]  # viewmats and Ks
+        return None, None, None, *ctx.rasterizer.project_gradients(ctx.saved_tensors, v_projected, wants_camera)
 
 
 class _Blended(torch.autograd.Function):

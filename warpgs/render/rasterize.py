@@ -13,10 +13,10 @@ from warpgs.errors import UsageError
 from warpgs.kernels.cameras.base import check_camera
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs
+from warpgs.kernels.tiles import InstanceMemory
 from warpgs.render import graphed
 from warpgs.render.chunked import ChunkedFrame, blend_chunked, contributions_chunked, median_depth_chunked
 from warpgs.render.compose import (
-    InstanceMemory,
     bin_projected,
     images_of,
     inputs_of,

@@ -43,7 +43,7 @@ class Trainer:
     """The state of one fit: everything that changes from step to step, and nothing else."""
 
     chosen: list[int] | None = None
-    """Views of the steps that are being taken; None where none is."""
+    """Numbers of the views of the steps in progress; None between steps."""
 
     def __init__(
         self, train: list[View], points: PointCloud | None, config: FitConfig, device: torch.device,
@@ -86,7 +86,8 @@ class Trainer:
         self.radius = scene_radius(cameras, cloud)
         """Radius of the scene [u], as `scene_radius` measures it."""
         self.scene_background, self.background = background, torch.tensor(background, dtype=torch.float32, device=device)
-        assert config.steps is not None and config.half_resolution is not None  # `settings_by_views` has chosen
+        # `settings_by_views` has chosen
+        assert config.steps is not None and config.sh_degree is not None and config.half_resolution is not None
         self.half_resolution = config.half_resolution
         """Fraction of the planned steps, from the first, in which views are half their size."""
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
@@ -99,7 +100,7 @@ class Trainer:
         self.order: list[int] = []
         """Views that are still to come before any comes again, the next one last."""
 
-        self.table = Table.of_gaussians(initial_gaussians(cloud, config.init, extent, device), {})
+        self.table = Table.of_gaussians(initial_gaussians(cloud, config.init, config.sh_degree, extent, device), {})
         self.context = StrategyContext(
             config.groups(), config.strategy_config, self.table, self.generator, config.seed,
             plan_phases(config.phases, config.steps), extent, config.rule, self.background,
@@ -151,12 +152,12 @@ class Trainer:
 
     def degree(self, step: int) -> int:
         """Return the degree of the harmonics in use at a step."""
-        highest = self.config.init.max_sh_degree
+        highest = self.config.sh_degree
         assert highest is not None  # `settings_by_views` has chosen
         return sh_degree(step, self.stopping.sh_every(self.config.sh_every, highest), highest)
 
     def plan_of(self, step: int) -> StepPlan:
-        """Return the plan of a step, counted from 1."""
+        """Return the choices that step number ``step``, from 1, is made with."""
         c = self.config
         terms = tuple(t for t in self.terms if t.active(step, self.phases.planned))
         strategy, half = self.strategy, step <= self.half_resolution * self.phases.planned
@@ -164,7 +165,7 @@ class Trainer:
         return StepPlan(self.degree(step), half, terms, strategy.phase(step), limits)
 
     def next_view(self) -> int:
-        """Return the number of the next view; they come in random order, each once before any comes again."""
+        """Return the number of the next view. The order is random; each view comes once before any comes again."""
         if not self.order:
             self.order = torch.randperm(len(self.views), generator=self.generator).tolist()
         return self.order.pop()
@@ -188,7 +189,7 @@ class Trainer:
             raise self._no_memory(e) from e
 
     def _no_memory(self, error: Exception) -> OutOfMemoryError:
-        """Return the error for a step that found no memory; where none of its series was taken, its views come again."""
+        """Return the error for a step that found no memory. Where no step of its series was taken, its views are put back."""
         chosen, self.chosen = self.chosen, None
         intact = chosen is not None and int(self.buffers.counter) == 0
         if chosen is not None and intact:
@@ -279,6 +280,7 @@ class Trainer:
         return True
 
     def _lr_row(self, step: int) -> list[float]:
+        """Return the learning rates of a step as `StepBuffers` holds them: of the Gaussians, then of view modules."""
         row = self.table.lr_row(self.lrs(step), step, self.config.optimizer.head_lrs)
         views = self.learned.views
         return row + views.table.lr_row(views.lrs(self.progress(step), self.context.extent), step, {})
@@ -342,7 +344,7 @@ class Trainer:
         self.count_changed()
 
     def count_changed(self) -> None:
-        """Set how many instances a step may have at a time, None for no limit: it depends on the number of Gaussians."""
+        """Update the limit of instances, which depends on the number of Gaussians; None for no limit."""
         limit = self.memory_limit
         self.context.max_instances = None if limit is None else self.layout.most_instances(len(self.table), limit)
 
