@@ -107,7 +107,8 @@ class DTUReader(Reader):
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""
         path = next((folder / f for f in FILES if (folder / f).is_file()), folder / FILES[0])
-        matrices = _read_matrices(path)
+        scene = SceneFolder(folder, options)
+        matrices = _read_matrices(scene.inside(path))
         images = next((folder / f for f in FOLDERS if (folder / f).is_dir()), folder / FOLDERS[0])
         files = list_images(images)
         cameras = sum(key.startswith("world_mat_") for key in matrices)
@@ -116,7 +117,7 @@ class DTUReader(Reader):
                 f"{path}: has {cameras} cameras, but {images} holds {len(files)} images. They are matched in sorted order, so "
                 "the counts must agree: restore the set"
             )
-        scene, masks, views = SceneFolder(folder, options), _masks(folder, files), ViewList()
+        masks, views = _masks(folder, files), ViewList()
         for i, file in enumerate(files):
             name = file.relative_to(images).as_posix()
             where = f"{path}, image {name!r}"
