@@ -18,7 +18,7 @@ from warpgs.pipeline.runs.fit import fit
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss_terms.opacity import AlphaDifference
 from warpgs.pipeline.train.overrides import keyword, setting_names, with_settings
-from warpgs.pipeline.train.presets import MAX_BYTES, PRESETS, preset_settings
+from warpgs.pipeline.train.presets import MAX_BYTES, MAX_DOTS, PRESETS, preset_settings
 from warpgs.pipeline.train.strategies.mcmc import MCMCConfig
 from warpgs.scene import Scene
 
@@ -120,6 +120,7 @@ def test_a_wrong_setting_is_named(tmp_path, text, said):
         (b"x = " + b"[" * 5000 + b"]" * 5000, "in each other"),
         (b"a = " + b"[" * 20 + b"]" * 20, "in each other"),
         (b"#" * (MAX_BYTES + 1), "larger than"),
+        (b"a = 1\n" + b"a." * (MAX_DOTS + 1) + b"a = 1", "more than 100 dots in a line"),
         (None, "cannot be read"),
     ],
 )
