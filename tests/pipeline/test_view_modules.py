@@ -52,8 +52,8 @@ class Vignetting(warpgs.ViewModule):
     def regularisation(self, values):
         return 1e-3 * values["falloff"].square().sum()
 
-    def bytes(self, count, pixels):
-        return {"loss": 4 * 5 * pixels}
+    def bytes(self, sizes):
+        return {"loss": 4 * 5 * sizes.pixels}
 
     def figures(self, fitted):
         found = fitted.params["falloff"][:, 0].tolist()

@@ -15,6 +15,21 @@ from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.tiles import Tiles, grid
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
+from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
+
+
+def step_bytes(sizes: StepSizes) -> Needs:
+    """Return the bytes of images, of what blending leaves for its gradient, and of gradient slots at each moment of a step."""
+    slots, states = blend_cuda.instance_bytes(sizes) if sizes.cuda else (FLOAT * VALUES * sizes.instances, 0)
+    images = (COLORS + 2) * FLOAT * sizes.pixels  # colour, alpha, depth
+    kept = 3 * FLOAT * sizes.pixels + states  # transmittance, weight, end
+    lean = sizes.cuda and not (sizes.depth or sizes.cutout)  # there only colour has a gradient
+    upstream = (COLORS if lean else COLORS + 2) * FLOAT * sizes.pixels
+    whole = images + upstream if sizes.chunked else 0  # images of the frame stand beside those of a chunk
+    return {
+        BINNING: whole, LOSS: images + (0 if sizes.chunked else kept), BLENDING: kept + slots + images + (whole or upstream),
+        PROJECTION: images + upstream, SAMPLING: 3 * images,
+    }  # fmt: skip
 
 
 @functools.cache

@@ -11,13 +11,14 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from warpgs.constants import SMALLEST_WEIGHT
+from warpgs.constants import SMALLEST_WEIGHT, TILE_SIZE
 from warpgs.kernels.blend_records import COLORS
 from warpgs.kernels.blend_settings import BlendSettings, make_struct
-from warpgs.kernels.tiles import Tiles
+from warpgs.kernels.tiles import Tiles, grid
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
 from warpgs.runtime.cuda_source import source
+from warpgs.runtime.step_sizes import FLOAT, StepSizes
 
 CHUNKS = (64, 128)
 """Instances that one warp of the backward pass takes: the first number in images of up to MAX_SMALL_TILES tiles, to have enough
@@ -212,9 +213,16 @@ def _ints(*tensors: torch.Tensor) -> list[interop.View]:
     return [interop.view(t.view(-1), wp.int32) for t in tensors]
 
 
-def chunk_of(tiles: Tiles, deterministic: bool) -> int:
+def chunk_of(tiles: int, deterministic: bool) -> int:
     """Return the instances per chunk: the larger number, which takes less memory, also where order is given up for memory."""
-    return CHUNKS[int(tiles.ranges.shape[0] > MAX_SMALL_TILES or not deterministic)]
+    return CHUNKS[int(tiles > MAX_SMALL_TILES or not deterministic)]
+
+
+def instance_bytes(sizes: StepSizes) -> tuple[int, int]:
+    """Return the bytes of a step's gradient slots, and of the states that blending leaves for its backward pass."""
+    columns, rows = (0, 0) if sizes.chunked else grid(sizes.width, sizes.height, TILE_SIZE)
+    state = FLOAT * STATE * TILE_SIZE * TILE_SIZE // chunk_of(columns * rows, True)
+    return FLOAT * STRIDE * sizes.instances, state * sizes.instances
 
 
 def forward(
@@ -238,7 +246,7 @@ def forward(
     transmittances, weights = allocator.saved((2, *(shape if save else (0,))), torch.float32, device).unbind()
     ends = allocator.saved(shape, torch.int32, device)
     pixels = tiles.size * tiles.size
-    chunk = chunk_of(tiles, settings.deterministic)
+    chunk = chunk_of(tiles.ranges.shape[0], settings.deterministic)
     rows, state = tiles.slots.shape[0] // chunk + 1 if save else 0, STATE + channels - COLORS
     states = allocator.saved((rows, state * pixels), torch.float32, device)
     k, count = make_kernels(tiles.size), tiles.ranges.shape[0]
@@ -278,7 +286,7 @@ def backward(
     v_rgb, v_alpha, v_depth = v_images
     device, count, deterministic = projected.device, tiles.slots.shape[0], settings.deterministic
     with_depth = v_alpha is not None or v_depth is not None
-    chunk = chunk_of(tiles, deterministic)
+    chunk = chunk_of(tiles.ranges.shape[0], deterministic)
     k = make_backward(tiles.size, with_depth, chunk, not deterministic, backgrounds.shape[1])
     if with_depth:
         v_alpha, v_depth = (torch.zeros_like(depth) if v is None else v.contiguous() for v in (v_alpha, v_depth))

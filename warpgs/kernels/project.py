@@ -19,11 +19,24 @@ from warpgs.kernels.project_backward import make_backward
 from warpgs.kernels.project_inputs import ProjectInputs, ProjectSettings, checked_factors
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
+from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
 
 PROJECTED_SIZE = 12
 """Numbers of a projected Gaussian, 16-byte aligned in float32:
 0:2 mean [px], 2:5 factor u11 u12 u22 [1/px], 5 opacity, 6:9 colour, 9 z-depth [u],
 10:12 half width and half height [px] of the box that holds every pixel with alpha at or above the cut."""
+
+
+def step_bytes(sizes: StepSizes) -> Needs:
+    """Return the bytes of projected Gaussians with their tile counts, and of gradients, at each moment of a step."""
+    one = FLOAT * PROJECTED_SIZE * sizes.count
+    projected = one + FLOAT * sizes.count
+    # of chunks, the gradient of one and of all; the last copy is what statistics are computed from
+    sums = 2 * one if sizes.chunked else 0
+    return {
+        BINNING: projected + sums, LOSS: projected, BLENDING: projected + max(one, sums),
+        PROJECTION: projected + 2 * one + sizes.row * sizes.count, SAMPLING: projected,
+    }  # fmt: skip
 
 
 @functools.cache

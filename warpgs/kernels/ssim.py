@@ -13,6 +13,13 @@ from torch.autograd.function import once_differentiable
 from warpgs.kernels import ssim_cpu, ssim_cuda
 from warpgs.kernels.ssim_cpu import BLOCK, CHANNELS, LANES, PADDING, RADIUS, make_functions
 from warpgs.runtime import interop
+from warpgs.runtime.step_sizes import FLOAT, StepSizes
+
+
+def difference_bytes(sizes: StepSizes) -> int:
+    """Return the bytes of `differences` and its gradient: three partials, the gradient, and on a CPU five sums a block."""
+    images = 4 * CHANNELS * FLOAT * sizes.pixels
+    return images + (0 if sizes.cuda else 5 * FLOAT * (CHANNELS * sizes.width + 2 * PADDING) * -(-sizes.height // BLOCK))
 
 
 @functools.cache

@@ -14,6 +14,7 @@ from warpgs.kernels.tiles_emit import make_emit, make_find_ranges
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
 from warpgs.runtime.device_memory import available_bytes, installed_bytes
+from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, SAMPLING, Needs, StepSizes
 
 LIST_BYTES = 20
 """Bytes of an instance while the lists are made: two sort buffers of (key, slot), and the owner."""
@@ -103,6 +104,16 @@ def _checked_tiles(cameras: int, width: int, height: int, tile_size: int) -> int
             f"{interop.MAX_SIZE:,} that can be numbered; render fewer cameras at once, or a window of each"
         )
     return tiles
+
+
+def step_bytes(sizes: StepSizes) -> Needs:
+    """Return the bytes of the lists at each moment of a step; the owners of instances are given up once these are sorted."""
+    columns, rows = grid(sizes.width, sizes.height, TILE_SIZE)
+    ranges = 2 * FLOAT * columns * rows + (FLOAT + 8) * sizes.count  # of each tile; first slots and ends of each Gaussian
+    sorting = (2 * 2 * FLOAT + 2 * 8) * sizes.count  # depths and order twice, two running sums of int64
+    lists, kept = LIST_BYTES * sizes.instances, (LIST_BYTES - FLOAT) * sizes.instances
+    waiting = 0 if sizes.chunked else ranges + kept  # nothing of a chunk waits for the loss
+    return {BINNING: ranges + sorting + lists, LOSS: waiting, BLENDING: ranges + kept, SAMPLING: ranges + lists}
 
 
 @functools.cache

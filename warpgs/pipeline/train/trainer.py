@@ -21,10 +21,9 @@ from warpgs.pipeline.train.background import random_shift
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.context import StrategyContext
 from warpgs.pipeline.train.learned_views import LearnedViews
-from warpgs.pipeline.train.loss import outputs_of
 from warpgs.pipeline.train.memory_plan import Layout, layout_of, most_instances, plan
 from warpgs.pipeline.train.schedule import Phases, plan_phases, sh_degree
-from warpgs.pipeline.train.setup import prepare, prepared_views, samples, terms_of
+from warpgs.pipeline.train.setup import prepare, prepared_views, terms_of
 from warpgs.pipeline.train.step import CAPACITY_FACTOR, MAX_STEPS, Learned, OverLimitError, StepBuffers, StepPlan
 from warpgs.pipeline.train.step_report import StepReport
 from warpgs.pipeline.train.stopping import STATE, Stopping
@@ -108,15 +107,20 @@ class Trainer:
         """What the strategy sees of the fit; views, phases and the scene's size have their place there."""
         self.strategy, self.stopping = find_strategy(config.strategy)(self.context), Stopping(config.stopping)
         self.table.add_columns(self.strategy.columns())
-        of_views = LearnedViews.first(config.view_modules, train, device)
-        self.table.batch = of_views.table.batch = self.batch
-        self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(of_views.table.params)))
-        dropout_seed, centers = config.seed if self.dropout > 0 else None, camera_centers(cameras, device)
-        self.learned = Learned(self.table, of_views, self.strategy, dropout_seed, centers)
+        self.learned = self._make_learned(train)
+        learned = self.learned.views
+        self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(learned.table.params)))
         self.taker = StepTaker(self.learned, self.buffers, config.rule, self.background, self.batch, ranks)
         self.layout: Layout
         views, self.disparities = prepared_views(train, made, config, self.terms, device)
-        self._begin(with_learned(views, of_views))
+        self._begin(with_learned(views, learned))
+
+    def _make_learned(self, train: list[View]) -> Learned:
+        """Return what steps change: the Gaussians, the parameters of view modules, and the strategy."""
+        views = LearnedViews.first(self.config.view_modules, train, self.device)
+        self.table.batch = views.table.batch = self.batch
+        seed = self.config.seed if self.dropout > 0 else None
+        return Learned(self.table, views, self.strategy, seed, camera_centers([v.camera for v in train], self.device))
 
     def _begin(self, views: list[TrainingView]) -> None:
         """Train on these views, or on what early stopping leaves of them."""
@@ -332,8 +336,8 @@ class Trainer:
         shown, self.stacks, self.places = stack_views(shown, len(views))
         self.context.views = shown[: len(views)]
         layout = layout_of(
-            self.table, shown, kept=self.stopping.whole, scored=samples(c), captured=self.captured,
-            depth_supervised="depth" in outputs_of(self.terms), modules=c.view_modules, sums=self.taker.sums,
+            self.table, shown, self.terms, self.strategy, c.view_modules, kept=self.stopping.whole, captured=self.captured,
+            sums=self.taker.sums,
         )  # fmt: skip
         most = most_instances(self.gaussians, [v.camera for v in shown], c.rule)
         self.memory, self.layout = plan(
