@@ -21,7 +21,7 @@ from warpgs.kernels.project_inputs import ProjectInputs, checked_factors
 from warpgs.kernels.tiles import Tiles, bin_tiles
 from warpgs.render.settings import RenderSettings
 from warpgs.runtime.allocator import TORCH, Allocator
-from warpgs.scene import Camera, Gaussians
+from warpgs.scene import ActivatedGaussians, Camera, Gaussians
 
 Images = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 """Colour [C, H, W, 3], or [C, H, W, D] of Gaussians with D channels; alpha and expected z-depth [C, H, W]."""
@@ -63,7 +63,9 @@ def as_batch(array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
     return tensor[None] if tensor.ndim == axes else tensor
 
 
-def inputs_of(gaussians: Gaussians, camera: Camera, opacity_factors: torch.Tensor | None = None) -> ProjectInputs:
+def inputs_of(
+    gaussians: Gaussians | ActivatedGaussians, camera: Camera, opacity_factors: torch.Tensor | None = None
+) -> ProjectInputs:
     """Return the tensors of a render; the camera's are brought to the type and device of ``gaussians.means``.
 
     Args:

@@ -27,7 +27,7 @@ from warpgs.render.compose import (
 )  # fmt: skip
 from warpgs.render.settings import RenderSettings, Window
 from warpgs.runtime import interop
-from warpgs.scene import Camera, Gaussians, Render
+from warpgs.scene import ActivatedGaussians, Camera, Gaussians, Render
 
 TILE_SIZES = (8, 16)
 """Sides of a tile that the kernels can be made for [px]."""
@@ -86,7 +86,7 @@ class RasterizeOptions:
         return plain and all(o is None for o in others)
 
 
-ARGUMENTS = (Gaussians, Camera, RasterizeOptions)
+ARGUMENTS = ((Gaussians, ActivatedGaussians), (Camera,), (RasterizeOptions,))
 """Types of the arguments of `rasterize`."""
 
 
@@ -107,20 +107,23 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
     return rule
 
 
-def _check_arguments(gaussians: Gaussians, camera: Camera, options: RasterizeOptions) -> None:
+def _check_arguments(gaussians: Gaussians | ActivatedGaussians, camera: Camera, options: RasterizeOptions) -> None:
     """Check types, and the shapes of the camera; those of other tensors are checked where they are used.
 
     Nothing is read from the device: values are not checked, and a Gaussian that is not finite is culled.
 
     Raises:
         TypeError: An argument, or the size of the image, is of another type.
-        UsageError: A background has nothing before it.
+        UsageError: A background has nothing before it, or Gaussians have no colours.
         ValueError: A shape is another.
     """
-    for name, given, kind in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
-        if not isinstance(given, kind):
+    for name, given, kinds in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
+        if not isinstance(given, kinds):
             order = "the order is rasterize(gaussians, camera, options)"
-            raise TypeError(f"{name} must be of {kind.__name__}, not {type(given).__name__}; {order}")
+            wanted = " or ".join(kind.__name__ for kind in kinds)
+            raise TypeError(f"{name} must be of {wanted}, not {type(given).__name__}; {order}")
+    if gaussians.sh is None and options.colors is None:
+        raise UsageError("gaussians have no sh: give sh=..., or RasterizeOptions(colors=...)")
     for name, tensor in gaussians.tensors().items():
         if not isinstance(tensor, torch.Tensor):
             raise TypeError(f"{name} must be a tensor, not {type(tensor).__name__}; torch.as_tensor makes one")
@@ -134,7 +137,7 @@ def _check_arguments(gaussians: Gaussians, camera: Camera, options: RasterizeOpt
             raise TypeError(f"camera.{name} must be a whole number of pixels, not {size!r}")
     if options.feature_background is not None and options.features is None:
         raise UsageError("feature_background is behind features: give features=..., too, or leave it out")
-    sh = gaussians.sh
+    sh = gaussians.tensors()["sh"]
     if sh.ndim != 3 or sh.shape[1] != (gaussians.sh_degree + 1) ** 2:
         raise ValueError(f"sh must have shape [N, K, 3], where K is 1, 4, 9 or 16, not {list(sh.shape)}")
 
@@ -192,7 +195,9 @@ def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: Proj
     return _Layer(colors, values.expand(len(like), channels) if values.ndim == 1 else values)
 
 
-def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = RasterizeOptions()) -> Render:
+def rasterize(
+    gaussians: Gaussians | ActivatedGaussians, camera: Camera, options: RasterizeOptions = RasterizeOptions()
+) -> Render:
     """Render Gaussians as one camera, or each camera of a batch, sees them.
 
     Differentiable in the five tensors of ``gaussians``, in ``camera.viewmat`` and ``camera.K`` where those are tensors that
@@ -201,7 +206,7 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
     backgrounds are moved to the type and device of ``gaussians.means``.
 
     Args:
-        gaussians: The scene, N Gaussians.
+        gaussians: N Gaussians: by log scales and logits (`Gaussians`), or by scales and opacities (`ActivatedGaussians`).
         camera: One camera ([4, 4], [3, 3]) or C of them ([C, 4, 4], [C, 3, 3]).
         options: Options.
 
@@ -221,7 +226,8 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
     inputs = inputs_of(gaussians, camera, options.opacity_factors)
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
     degree = degree if options.colors is None else 0  # as little as can be of what is not shown
-    settings = settings_of(camera, degree, rule, window=_checked_window(camera, options), tile_size=options.tile_size)
+    named = {"window": _checked_window(camera, options), "tile_size": options.tile_size}
+    settings = settings_of(camera, degree, rule, activated=isinstance(gaussians, ActivatedGaussians), **named)
     colors = _checked_channels("colors", options.colors, inputs)
     features = _checked_channels("features", options.features, inputs)
     if inputs.means.is_cuda and options.repeatable():

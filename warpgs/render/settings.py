@@ -32,11 +32,13 @@ class RenderSettings:
     """Side of a tile [px]."""
     camera_model: str = "pinhole"
     """Name of the camera model."""
+    activated: bool = False
+    """True where scales and opacities are given themselves (`ProjectSettings.activated`)."""
 
     def projection(self) -> ProjectSettings:
         """Return what the projection takes."""
         size, count = (self.width, self.height), sh.coefficient_count(self.degree)
-        return ProjectSettings(size, self.window, count, self.rule, self.tile_size, self.camera_model)
+        return ProjectSettings(size, self.window, count, self.rule, self.tile_size, self.camera_model, self.activated)
 
     def of_window(self) -> dict[str, Any]:
         """Return size, place and cut-offs of the window, as binning and blending take them by name."""
