@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from warpgs.constants import Rule
 from warpgs.kernels import blend_cpu, blend_cuda
@@ -15,6 +14,7 @@ from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.tiles import Tiles, grid
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
+from warpgs.runtime.derivatives import first_order
 
 
 @functools.cache
@@ -192,7 +192,7 @@ class _Blend(torch.autograd.Function):
         return rgb, alpha, depth
 
     @staticmethod
-    @once_differentiable
+    @first_order
     def backward(ctx, *v_images):
         projected, backgrounds, *tensors = ctx.saved_tensors
         saved, tiles = tensors[:6], Tiles(ctx.tile_size, *tensors[6:])

@@ -10,13 +10,13 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
-from torch.autograd.function import once_differentiable
 
 from warpgs.constants import Rule
 from warpgs.kernels.blend import background_gradient, check_slots, check_tiles, composite, composite_gradients, is_native
 from warpgs.kernels.blend_records import COLORS, WIDTHS
 from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.tiles import Tiles
+from warpgs.runtime.derivatives import first_order
 
 GEOMETRY = 6
 """Values of a projected Gaussian before its colour; its depth and its box follow that."""
@@ -77,7 +77,7 @@ class _BlendChannels(torch.autograd.Function):
         return image, alpha, depth
 
     @staticmethod
-    @once_differentiable
+    @first_order
     def backward(ctx, v_image, v_alpha, v_depth):
         projected, colors, backgrounds, image, *tensors = ctx.saved_tensors
         shared, tiles = tensors[:5], Tiles(ctx.tile_size, *tensors[5:], ctx.visible)

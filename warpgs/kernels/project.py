@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from warpgs.constants import LARGEST_COEFFICIENT, Rule
 from warpgs.errors import UsageError
@@ -19,6 +18,7 @@ from warpgs.kernels.project_backward import make_backward
 from warpgs.kernels.project_inputs import ProjectInputs, ProjectSettings, checked_factors
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
+from warpgs.runtime.derivatives import first_order
 
 PROJECTED_SIZE = 12
 """Numbers of a projected Gaussian, 16-byte aligned in float32:
@@ -214,7 +214,7 @@ class _Project(torch.autograd.Function):
         return projected, tile_counts
 
     @staticmethod
-    @once_differentiable
+    @first_order
     def backward(ctx, v_projected, _):
         *inputs, projected, tile_counts = ctx.saved_tensors
         wants_camera = ctx.needs_input_grad[6] or ctx.needs_input_grad[7]  # viewmats and Ks, behind the settings

@@ -27,6 +27,7 @@ from warpgs.render.compose import (
 )  # fmt: skip
 from warpgs.render.settings import RenderSettings, Window
 from warpgs.runtime import interop
+from warpgs.runtime.derivatives import refuse_transforms
 from warpgs.scene import ActivatedGaussians, Camera, Gaussians, Render
 
 TILE_SIZES = (8, 16)
@@ -203,7 +204,8 @@ def rasterize(
     Differentiable in the five tensors of ``gaussians``, in ``camera.viewmat`` and ``camera.K`` where those are tensors that
     require gradients, and in the colours, features and backgrounds of ``options``. Float32 or float64, CPU or CUDA, as the
     tensors are; the same inputs give the same bits every time, unless ``options.deterministic`` is False. Cameras and
-    backgrounds are moved to the type and device of ``gaussians.means``.
+    backgrounds are moved to the type and device of ``gaussians.means``. There are no second derivatives, torch.func is refused,
+    and torch.compile breaks its graph here.
 
     Args:
         gaussians: N Gaussians: by log scales and logits (`Gaussians`), or by scales and opacities (`ActivatedGaussians`).
@@ -217,10 +219,15 @@ def rasterize(
     Raises:
         ResourceError: The Gaussians touch more tiles than memory allows.
         TypeError: An argument is of another type; a scalar type is neither float32 nor float64, or they differ.
-        UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, or options exclude each
-            other.
+        UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, options exclude each
+            other, a transform of torch.func is active, or a second derivative is asked for.
         ValueError: A shape or device disagrees; the message names argument, wanted and found.
     """
+    if torch.compiler.is_dynamo_compiling():
+        torch._dynamo.graph_break(msg="rasterize runs outside of compiled graphs: leave out fullgraph=True")
+        eager: Render = torch.compiler.disable(rasterize)(gaussians, camera, options)
+        return eager
+    refuse_transforms()
     _check_arguments(gaussians, camera, options)
     rule = _checked_rule(camera, options)
     inputs = inputs_of(gaussians, camera, options.opacity_factors)
