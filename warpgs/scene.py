@@ -293,6 +293,30 @@ class Render:
     features: torch.Tensor | None = None
     """Channels of ``RasterizeOptions.features`` over their background, shape [..., H, W, D]; only where those were given."""
 
+    absgrad: bool = False
+    """True where ``RasterizeOptions.absgrad`` was set."""
+
+    @cached_property
+    def means2d(self) -> torch.Tensor:
+        """Projected means [px], shape [C, N, 2]; read them before the backward pass.
+
+        After it ``means2d.grad`` holds their gradients, shape [C, N, 2], and ``means2d.absgrad``, with
+        ``RasterizeOptions.absgrad``, the sums over pixels of the gradients' magnitudes. They are a copy for a strategy to hold:
+        no gradient flows through them into the Gaussians.
+        """
+        means2d = self.projected.detach()[..., :2]
+        columns = {"grad": slice(0, 2)} | ({"absgrad": slice(10, 12)} if self.absgrad else {})
+
+        def keep(gradient: torch.Tensor) -> None:
+            for name, part in columns.items():
+                before, found = getattr(means2d, name, None), gradient.detach()[..., part]
+                setattr(means2d, name, found if before is None else before + found)
+
+        if self.projected.requires_grad:
+            means2d.requires_grad_()
+            self.projected.register_hook(keep)
+        return means2d
+
     @property
     def visible(self) -> torch.Tensor:
         """Mask [C, N], True where a Gaussian touches at least one tile."""

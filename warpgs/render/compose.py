@@ -167,7 +167,7 @@ def images_of(
         deterministic: True to sum gradients in a fixed order.
         colors: Channels of each Gaussian, shape [1, N, D] or [C, N, D]; None for their own colours.
     """
-    named = {"deterministic": deterministic, **settings.of_window()}
+    named = {"deterministic": deterministic, "absgrad": settings.absgrad, **settings.of_window()}
     if colors is None:
         return blend(projected, tiles, backgrounds, **named)
     return blend_channels(projected, tiles, colors, backgrounds, **named)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 
 from warpgs.constants import RULES, Rule
 from warpgs.errors import UsageError
+from warpgs.kernels.blend_records import WIDTHS
 from warpgs.kernels.cameras.base import check_camera
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs
@@ -63,6 +64,9 @@ class RasterizeOptions:
     """Bytes that the (Gaussian, tile) instances may take; None for four fifths of the free memory."""
     deterministic: bool = True
     """True to sum gradients in a fixed order, so that the same inputs give the same bits. False takes less memory on CUDA."""
+    absgrad: bool = False
+    """True to sum magnitudes of the gradients of projected means over pixels, too: ``Render.means2d.absgrad``. At most 11
+    channels of ``colors``, and no ``features``. Such calls are not captured as CUDA graphs."""
     opacity_factors: torch.Tensor | None = None
     """Factors of the opacities, at least 0, shape [N]; 0 hides a Gaussian. None for 1. Not differentiable."""
     capacity: int | None = None
@@ -83,7 +87,7 @@ class RasterizeOptions:
     def repeatable(self) -> bool:
         """Return whether calls with these options may be captured as CUDA graphs."""
         others = (self.colors, self.features, self.opacity_factors, self.memory_budget, self.capacity, self.max_instances)
-        plain = self.record and self.deterministic and not self.contributions and not self.median_depth
+        plain = self.record and self.deterministic and not (self.contributions or self.median_depth or self.absgrad)
         return plain and all(o is None for o in others)
 
 
@@ -103,6 +107,9 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
     if options.tile_size not in TILE_SIZES:
         raise UsageError(f"tile size {options.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
     check_camera(camera)
+    channels = 0 if options.colors is None else options.colors.shape[-1]
+    if options.absgrad and (options.features is not None or channels > WIDTHS[-1]):
+        raise UsageError(f"absgrad takes at most {WIDTHS[-1]} channels in colors and no features: render those in another call")
     if options.max_instances is not None and (options.capacity is not None or options.max_instances < 1):
         raise UsageError("max_instances must be at least 1 and does not go with a capacity")
     return rule
@@ -213,8 +220,8 @@ def rasterize(
         options: Options.
 
     Returns:
-        The images, without a leading axis for a single camera. To get gradients of the projected means, call
-        ``render.projected.retain_grad()`` before the backward pass: they are ``render.projected.grad[..., :2]``.
+        The images, without a leading axis for a single camera. ``render.means2d``, read before the backward
+        pass, holds the gradients of the projected means after it.
 
     Raises:
         ResourceError: The Gaussians touch more tiles than memory allows.
@@ -233,7 +240,7 @@ def rasterize(
     inputs = inputs_of(gaussians, camera, options.opacity_factors)
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
     degree = degree if options.colors is None else 0  # as little as can be of what is not shown
-    named = {"window": _checked_window(camera, options), "tile_size": options.tile_size}
+    named = {"window": _checked_window(camera, options), "tile_size": options.tile_size, "absgrad": options.absgrad}
     settings = settings_of(camera, degree, rule, activated=isinstance(gaussians, ActivatedGaussians), **named)
     colors = _checked_channels("colors", options.colors, inputs)
     features = _checked_channels("features", options.features, inputs)
@@ -246,7 +253,8 @@ def rasterize(
     if features is not None:
         layers.append(_layer("feature_background", options.feature_background, features, inputs))
     *found, features_found, median = _rasterize(inputs, layers, settings, options)
-    return _as_render(camera, *found, features=features_found, median_depth=median)
+    render = _as_render(camera, *found, features=features_found, median_depth=median)
+    return replace(render, absgrad=options.absgrad)
 
 
 def _rasterize(

@@ -34,6 +34,8 @@ class RenderSettings:
     """Name of the camera model."""
     activated: bool = False
     """True where scales and opacities are given themselves (`ProjectSettings.activated`)."""
+    absgrad: bool = False
+    """True to sum magnitudes of the gradients of projected means, too (`BlendSettings.absgrad`)."""
 
     def projection(self) -> ProjectSettings:
         """Return what the projection takes."""
@@ -48,4 +50,4 @@ class RenderSettings:
     def blending(self, deterministic: bool = True) -> BlendSettings:
         """Return what blending takes; ``deterministic`` sums gradients in a fixed order."""
         x, y, width, height = self.window
-        return BlendSettings((x, y), width, height, self.rule, deterministic)
+        return BlendSettings((x, y), width, height, self.rule, deterministic, self.absgrad)
