@@ -81,7 +81,7 @@ def main(arguments: list[str] | None = None) -> float:
     strategy.check_sanity(params, optimizers)
     state = strategy.initialize_state(scene_scale=1.0) if default else strategy.initialize_state()
     extra = {"packed": False} if default else {"lr": LRS["means"]}
-    options = warpgs.RasterizeOptions(rule="gsplat", absgrad=default)
+    options = warpgs.RasterizeOptions(absgrad=default)
     errors = []
     for step in range(a.steps):
         found, info = render(params, camera, options)
