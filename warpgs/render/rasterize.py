@@ -291,4 +291,6 @@ def _as_render(camera: Camera, images: tuple[torch.Tensor, ...], *rest: Any, **m
     def own(image: torch.Tensor) -> torch.Tensor:
         return image.squeeze(0) if single else image  # not image[0], whose gradient would be a copy among zeros
 
-    return Render(*map(own, images), *rest, **{name: own(image) for name, image in maps.items() if image is not None})
+    shaped: dict[str, Any] = {name: own(image) for name, image in maps.items() if image is not None}
+    rgb, alpha, depth = map(own, images)
+    return Render(rgb, alpha, depth, *rest, **shaped)
