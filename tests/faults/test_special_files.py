@@ -119,7 +119,7 @@ DOORS = {
 PROBED = {"plugin.py", "b.flo"}
 """Files that are looked for first, where one of another kind counts as none."""
 EMPTY_IS_FINE = {"preset.toml", "metrics.jsonl", "artefact", "plugin.py", "render.png"}
-"""Files that may be empty: a preset without changes, a log of no events, those of which the bytes are wanted, code without the class."""
+"""Files that may be empty: a preset without changes, a log of no events, any bytes, code without the class."""
 
 
 @pytest.fixture(autouse=True)

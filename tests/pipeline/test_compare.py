@@ -85,6 +85,7 @@ def test_table_is_of_these_runs(finished):
     text = (request.out / "table.md").read_text()
     figures, gaps = cells(text)
     psnr = {v: [metrics_of(request, v, s)["test"]["psnr"] for s in (0, 1)] for v in ("a", "b b")}
+    assert "The t interval has 95 %" in text  # one difference needs no correction
     assert [r[0] for r in figures[2:]] == ["a", "b b"]
     for row in figures[2:]:
         values = psnr[row[0]]
@@ -272,9 +273,11 @@ FULL = dataclasses.replace(A, preset="whole", method=MethodConfig(events=True, h
 
 
 def test_ablation_rows_switch_off_one_part_each():
-    """Full, seven parts of the paper's table, and no sampling at all; check marks in the order of the headings."""
+    """Full, seven parts of the paper's table, no sampling at all, uniform draws and the residual alone; marks by heading."""
     variants, marks = ablation_variants(FULL)
-    assert list(variants) == list(ABLATION_ROWS) and len(variants) == 9 and variants["full"] == FULL
+    assert list(variants) == list(ABLATION_ROWS) and len(variants) == 11 and variants["full"] == FULL
+    weights = [variants[row].method.weights() for row in ("uniform", "residual only", "no s_geometry")]
+    assert weights == [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), pytest.approx((2 / 3, 1 / 3, 0.0))]
     for (row, variant), name in zip(list(variants.items())[1:], SWITCHES):
         switches = dataclasses.asdict(variant.method)
         assert [s for s, value in switches.items() if value is False] == [name] and row == f"no {name}"
@@ -286,7 +289,7 @@ def test_ablation_rows_switch_off_one_part_each():
 
 
 def test_command_ablates(scene, tmp_path, capsys, monkeypatch):
-    """`warpgs ablate` from flags to a table with check marks; two of the nine rows, for time."""
+    """`warpgs ablate` from flags to a table with check marks; two of its rows, for time."""
     monkeypatch.setitem(PRESETS._made, "whole", FULL)
     monkeypatch.setattr("warpgs.pipeline.study.compare.ABLATION_ROWS", {n: ABLATION_ROWS[n] for n in ("full", "no pm")})
     monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "cache"))
@@ -302,7 +305,8 @@ def test_command_ablates(scene, tmp_path, capsys, monkeypatch):
     assert "[2/2] still, no pm, seed 0" in capsys.readouterr().out
     figures, gaps = cells((tmp_path / "out" / "table.md").read_text())
     assert figures[0][1:9] == ["Hier", "S_rend", "S_sem", "S_geo", "RA", "AGP", "PM", "Events"]
-    assert [r[1:9] for r in figures[2:]] == [["✓"] * 8, ["✓"] * 6 + ["✗", "✓"]] and gaps[2][0] == "no pm"
+    assert [r[1:9] for r in figures[2:]] == [["✓"] * 8, ["✓"] * 6 + ["✗", "✓"]]
+    assert gaps[2] == ["no pm", "not exercised", "not exercised", "not exercised", "1"]  # two steps end before any event
     off = dataclasses.replace(FULL.method, pm=False)
     assert asked == [(0, FULL.method), (0, off)]
     assert main(["ablate", scene.path, "--out", str(tmp_path / "y"), "--preset", "3dgs"]) == 2

@@ -92,6 +92,15 @@ def put_checkpoint(folder, tensors, state):
     (folder / TENSORS).write_bytes(body + hashlib.sha256(body).digest())
 
 
+def test_a_path_that_is_too_long_for_any_system(run, capsys):
+    """No scene has it."""
+    record = json.loads((run / "config.json").read_text())
+    record["scene"]["path"] = "x" * 5000
+    (run / "config.json").write_text(json.dumps(record))
+    for command in (["eval", str(run), "--device", "cpu"], ["fit", "--out", str(run), "--resume"]):
+        assert main(command) == 3 and "internal error" not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

@@ -17,6 +17,8 @@ from warpgs.files import remove_leftovers, write_bytes
 from warpgs.input_files import open_input, read_input, unread_reason
 
 FORMAT = "warpgs-lpips-1"
+MAX_PICKLE = 2**20
+"""Largest size of everything in a .pth file but the tensors [bytes]; published files have a few KiB. torch copies it twice."""
 
 
 @dataclass(frozen=True)
@@ -117,12 +119,20 @@ def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
 
 
 def _check_unpacked(file: BinaryIO) -> None:
-    """Raise a ValueError where an archive unpacks to more than its own size; torch packs nothing."""
+    """Check that an archive unpacks to no more than its own size, for torch packs nothing, and has no large pickle.
+
+    Raises:
+        ValueError: It does, or has.
+    """
     if zipfile.is_zipfile(file):
         with zipfile.ZipFile(file) as archive:
-            unpacked = sum(member.file_size for member in archive.infolist())
+            members = archive.infolist()
+        unpacked = sum(member.file_size for member in members)
         if unpacked > file.seek(0, os.SEEK_END):
             raise ValueError(f"it unpacks to {unpacked:,} bytes, more than its size")
+        others = sum(member.file_size for member in members if Path(member.filename).parent.name != "data")
+        if others > MAX_PICKLE:
+            raise ValueError(f"it holds {others:,} bytes beside its tensors, more than {MAX_PICKLE:,}")
     file.seek(0)
 
 

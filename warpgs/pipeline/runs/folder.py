@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import json
+import os
 import platform
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
@@ -238,7 +239,7 @@ def _stored_scene(folder: Path, record: dict[str, Any], reader: str | None) -> S
             "warpgs.evaluate"
         )
     request = SceneRequest(**record["scene"])
-    if not Path(request.path).exists() and (folder / POSED_SCENE / POSES).is_file():
+    if not os.path.exists(request.path) and (folder / POSED_SCENE / POSES).is_file():
         request = replace(request, path=str(folder / POSED_SCENE))  # the run folder was moved, and its scene with it
     if request.reader is not None and ":" in request.reader and reader != request.reader:
         raise UsageError(

@@ -24,8 +24,16 @@ from warpgs.pipeline.train.presets import preset_settings, preset_word
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.runtime.terminal import say
 
-ABLATION_ROWS: dict[str, dict[str, bool]] = {"full": {}, **{f"no {name}": {name: False} for name in SWITCHES}}
-"""Switches of each row of the ablation: all on, then each part off alone, last the whole sampling (not in the paper's)."""
+SCORES = ("s_render", "s_semantic", "s_geometry")
+"""Switches of the scores that the importance map is the sum of."""
+ABLATION_ROWS: dict[str, dict[str, bool]] = {
+    "full": {},
+    **{f"no {name}": {name: False} for name in SWITCHES},
+    "uniform": dict.fromkeys(SCORES, False),
+    "residual only": dict.fromkeys(SCORES[1:], False),
+}
+"""Switches of each row of the ablation: all on; each part off alone; pixels sampled uniformly, or by the residual alone. "no
+s_geometry" and "no s_semantic" are the residual with one of the other scores."""
 
 
 def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]:

@@ -29,6 +29,8 @@ class Line:
     """Difference of each seed."""
     difference: Difference | None
     """Their mean and interval; None for the base."""
+    exercised: bool = True
+    """False where its runs gave the same files as the base's."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,8 @@ def _line(panel: Panel, line: Line, y: float, x0: float, px: Callable[[float], f
     d, right = line.difference, x0 + PANEL + 12
     if d is None:
         return [_text(right, y + 7, "the base", 11, color=SOFT)]
+    if not line.exercised:
+        return [_text(right, y + 7, "not exercised", 11, color=SOFT)]
     if not math.isfinite(d.mean):
         return [_text(right, y + 7, "not measured", 11, color=SOFT)]
     good = d.mean > 0 if panel.upwards else d.mean < 0
@@ -122,7 +126,8 @@ def forest(title: str, base: str, panels: Sequence[Panel]) -> str:
             out += _line(panel, line, TOP + ROW * (i + 0.5) - 3, x0, px)
     if not panels:
         out.append(_text(MARGIN, 66, "no pair of runs to compare", 13, color=SOFT))
-    words = "large dot: mean; bar: its 95 % t interval; small dots: single seeds"
+    together = ", the bars of a panel together" if len(names) > 2 else ""
+    words = f"large dot: mean; bar: 95 % t interval{together}; small dots: single seeds"
     out.append(_text(MARGIN, height - 18, words, 11, color=SOFT))
     x = MARGIN + 6.0 * len(words) + 8
     for color, meaning in ((BETTER, "better"), (WORSE, "worse"), (UNDECIDED, "undecided: the interval holds 0")):

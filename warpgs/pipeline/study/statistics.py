@@ -10,6 +10,11 @@ CONFIDENCE = 0.95
 """Probability that an interval holds the true mean."""
 
 
+def family_confidence(count: int, confidence: float = CONFIDENCE) -> float:
+    """Return the confidence of each of ``count`` intervals, so that all hold at once with ``confidence`` (Bonferroni 1936)."""
+    return 1 - (1 - confidence) / max(1, count)
+
+
 @dataclass(frozen=True)
 class Sample:
     """Mean and spread of repeated measurements."""

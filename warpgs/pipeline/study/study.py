@@ -15,12 +15,13 @@ from warpgs.errors import UsageError
 from warpgs.files import write_bytes, write_json, write_text
 from warpgs.io.splits import Split
 from warpgs.pipeline.farm.ensure_run import Outcome
+from warpgs.pipeline.farm.record import PLY, file_digest
 from warpgs.pipeline.farm.run import EngineRequest
 from warpgs.pipeline.runs.request import SceneRequest
 from warpgs.pipeline.runs.results import LABELS
 from warpgs.pipeline.study.plots import Line, Panel, forest
 from warpgs.pipeline.study.qualitative import strips
-from warpgs.pipeline.study.statistics import paired_difference, sample
+from warpgs.pipeline.study.statistics import family_confidence, paired_difference, sample
 from warpgs.pipeline.study.table import Metric, Row, Table, csv_text, latex, markdown
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.report.sheet import sheet
@@ -127,10 +128,20 @@ def _metrics(runs: Runs) -> tuple[Metric, ...]:
     )  # fmt: skip
 
 
+def _same_files(request: StudyRequest, runs: Runs, scenes: list[str], variant: str, base: str) -> bool:
+    """Return whether every run of a variant gave the same PLY as the base with the same scene and seed."""
+    pairs = [(p, s) for p in scenes for s in range(request.seeds) if runs[p, variant, s].metrics and runs[p, base, s].metrics]
+
+    def digest(name: str, pair: tuple[str, int]) -> str:
+        return file_digest(run_folder(request, pair[0], name, pair[1]) / PLY)
+
+    return bool(pairs) and all(digest(variant, p) == digest(base, p) for p in pairs)
+
+
 def _table(request: StudyRequest, runs: Runs, scenes: list[str], metrics: tuple[Metric, ...], caption: str) -> Table:
     """Return the means of all variants over scenes and seeds, and their differences to the first."""
     base = next(iter(request.variants))
-    rows = []
+    confidence, rows = family_confidence(len(request.variants) - 1), []
     for name in request.variants:
         samples, differences = {}, {}
         for m in metrics:
@@ -140,8 +151,9 @@ def _table(request: StudyRequest, runs: Runs, scenes: list[str], metrics: tuple[
                 samples[m.key] = sample(list(ours.values()))
             common = sorted(ours.keys() & theirs.keys())
             if name != base:
-                differences[m.key] = paired_difference([ours[s] for s in common], [theirs[s] for s in common])
-        rows.append(Row(name, samples, differences, request.marks.get(name, ())))
+                differences[m.key] = paired_difference([ours[s] for s in common], [theirs[s] for s in common], confidence)
+        exercised = name == base or not _same_files(request, runs, scenes, name, base)
+        rows.append(Row(name, samples, differences, request.marks.get(name, ()), exercised))
     return Table(caption, base, metrics, tuple(rows), tuple(SWITCHES.values()) if request.marks else ())
 
 
@@ -154,7 +166,7 @@ def _plot(request: StudyRequest, runs: Runs, scenes: list[str], table: Table) ->
         for row in table.rows:
             ours = _by_seed(runs, scenes, row.name, m.key, request.seeds)
             pairs = () if row.name == table.base else tuple(ours[s] - theirs[s] for s in sorted(ours.keys() & theirs.keys()))
-            lines.append(Line(row.name, pairs, row.differences.get(m.key)))
+            lines.append(Line(row.name, pairs, row.differences.get(m.key), row.exercised))
         panels.append(Panel(m.label + (" [dB]" if m.key == "psnr" else ""), m.upwards, m.digits, tuple(lines)))
     return forest(table.caption, table.base, panels)
 

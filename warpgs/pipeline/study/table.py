@@ -11,6 +11,8 @@ from warpgs.pipeline.study.statistics import Difference, Sample
 
 NONE = "-"
 """Sign for a figure that was not measured."""
+NOT_EXERCISED = "not exercised"
+"""Words for a difference between runs that gave the same files."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,8 @@ class Row:
     """Paired difference to the table's base by metric; empty for the base itself."""
     marks: tuple[bool, ...] = ()
     """Check marks, one for each of the table's switches."""
+    exercised: bool = True
+    """False where every run gave the same file as the base: its settings made no difference to test."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,10 @@ class Table:
         means = [round(r.samples[metric.key].mean, metric.digits) for r in self.rows if metric.key in r.samples]
         means = [m for m in means if math.isfinite(m)]
         return (max if metric.upwards else min)(means, default=math.nan)
+
+
+INTERVALS = ("The t interval has 95 %", "The t intervals of a column hold together with 95 % (Bonferroni)")
+"""Words on the intervals of a table with one difference, or with several."""
 
 
 def figure(sample: Sample | None, digits: int, plus_minus: str = " ± ") -> str:
@@ -121,13 +129,15 @@ def markdown(table: Table) -> str:
         for r in table.rows
     ]  # fmt: skip
     lines = [*_grid(head, body, 1 + len(marks)), ""]
+    rows = [r for r in table.rows if r.differences]
     lines += [
-        f"Difference to {table.base}, paired by seed, with its 95 % t interval (an interval without 0 is marked \\*):",
+        f"Difference to {table.base}, paired by seed. {INTERVALS[len(rows) > 1]}; an interval without 0 is marked \\*:",
         "",
     ]
-    rows = [r for r in table.rows if r.differences]
 
     def gap(row: Row, m: Metric) -> str:
+        if not row.exercised:
+            return NOT_EXERCISED
         d = row.differences.get(m.key)
         return interval(d, m.digits) + (" \\*" if d is not None and d.excludes_zero else "")
 
@@ -149,7 +159,9 @@ def csv_text(table: Table) -> str:
         for m in table.metrics:
             s, d = row.samples.get(m.key), row.differences.get(m.key)
             measured = ["", "", 0] if s is None else [number(s.mean), number(s.sd), s.count]
-            paired = ["", "", "", ""] if d is None else [number(d.mean), number(d.low), number(d.high), d.count]
+            paired = ["", "", "", ""]
+            if d is not None and row.exercised:
+                paired = [number(d.mean), number(d.low), number(d.high), d.count]
             writer.writerow([row.name, *(int(x) for x in row.marks), m.key, *measured, *paired])
     return out.getvalue()
 
@@ -173,6 +185,8 @@ def latex(table: Table) -> str:
         return f"$\\mathbf{{{text}}}$" if s is not None and round(s.mean, m.digits) == table.best(m) else f"${text}$"
 
     def gap(row: Row) -> str:
+        if not row.exercised:
+            return NOT_EXERCISED
         text = interval(row.differences.get(first.key), first.digits)
         return "--" if text == NONE else f"${text.replace(' [', space)}$"
 
