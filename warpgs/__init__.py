@@ -18,6 +18,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 __all__ = [
     "PRESETS",
+    "ActivatedGaussians",
     "Camera",
     "FitConfig",
     "FitResult",
@@ -70,7 +71,7 @@ if TYPE_CHECKING:
     from warpgs.render.graphed import clear_graph_cache
     from warpgs.render.rasterize import RasterizeOptions, rasterize
     from warpgs.render.rule_costs import select_rule
-    from warpgs.scene import Camera, Gaussians, Normalization, PointCloud, Render, Scene, View
+    from warpgs.scene import ActivatedGaussians, Camera, Gaussians, Normalization, PointCloud, Render, Scene, View
 
 _HOMES = {
     name: module
@@ -93,7 +94,7 @@ _HOMES = {
         "warpgs.render.graphed": ("clear_graph_cache",),
         "warpgs.render.rasterize": ("RasterizeOptions", "rasterize"),
         "warpgs.render.rule_costs": ("select_rule",),
-        "warpgs.scene": ("Camera", "Gaussians", "Normalization", "PointCloud", "Render", "Scene", "View"),
+        "warpgs.scene": ("ActivatedGaussians", "Camera", "Gaussians", "Normalization", "PointCloud", "Render", "Scene", "View"),
     }.items()
     for name in names
 }

@@ -127,12 +127,12 @@ def test_gradient_on_the_clamp(device):
 
 @pytest.mark.parametrize("logit", [20.0, 88.0, 200.0, 1e38, math.inf, -20.0, -88.0, -200.0, -1e38, -math.inf])
 def test_opacity_logits(device, dtype, logit):
-    """C3: any finite one is opaque or not there, gradients finite; an infinite one is not there."""
+    """C3: any one is opaque or not there, gradients finite."""
     gaussians, cam = layers([0.5, 0.5], 4, dtype, device, logits=torch.tensor([logit, 0.3]))
     found = images(gaussians, cam, background=1.0)
     v = gradients(sum(t.sum() for t in found), gaussians)
     assert finite(*found, *v.values())
-    if logit > 0 and math.isfinite(logit):
+    if logit > 0:
         assert float(found[1].detach().min()) >= 0.99
     else:
         alone = Gaussians(**{n: t.detach()[1:] for n, t in gaussians.tensors().items()})

@@ -147,7 +147,7 @@ def test_arguments_of_another_type_or_shape_are_named():
     """Before any work, on the CPU and on CUDA alike: nothing of it is read from the device."""
     gaussians, cam = cloud(3), camera(8, 8, dtype=torch.float32)
     wrong = [
-        (TypeError, "gaussians must be of Gaussians, not Camera", (cam, gaussians)),
+        (TypeError, "gaussians must be of Gaussians or ActivatedGaussians, not Camera", (cam, gaussians)),
         (TypeError, "options must be of RasterizeOptions, not str", (gaussians, cam, "fast")),
         (TypeError, "means must be a tensor, not ndarray", (dataclasses.replace(gaussians, means=np.zeros((3, 3))), cam)),
         (ValueError, r"camera.K must have shape \[3, 3\] or", (gaussians, dataclasses.replace(cam, K=torch.eye(4)))),

@@ -27,6 +27,8 @@ class ProjectSettings:
     """Side of a tile [px]."""
     camera_model: str
     """Name of the camera model."""
+    activated: bool = False
+    """True where ``log_scales`` and ``logit_opacities`` of `ProjectInputs` hold scales and opacities themselves."""
 
 
 class ProjectInputs(NamedTuple):
@@ -37,9 +39,9 @@ class ProjectInputs(NamedTuple):
     quats: torch.Tensor
     """Rotations wxyz, shape [N, 4]."""
     log_scales: torch.Tensor
-    """Logarithm of the axis lengths [u], shape [N, 3]."""
+    """Logarithm of the axis lengths [u], or the lengths (`ProjectSettings.activated`), shape [N, 3]."""
     logit_opacities: torch.Tensor
-    """Inverse sigmoid of the opacity, shape [N]."""
+    """Inverse sigmoid of the opacity, or the opacity, shape [N]."""
     sh: torch.Tensor
     """Spherical-harmonics coefficients of the colour, shape [N, K, 3]."""
     viewmats: torch.Tensor

@@ -20,7 +20,7 @@ from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs, checked_factors
 from warpgs.kernels.tiles import AS_NEEDED, InstanceMemory, Tiles, bin_tiles
 from warpgs.render.settings import RenderSettings
-from warpgs.scene import Camera, Gaussians
+from warpgs.scene import ActivatedGaussians, Camera, Gaussians
 
 Images = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 """Colour [C, H, W, 3], or [C, H, W, D] of Gaussians with D channels; alpha and expected z-depth [C, H, W]."""
@@ -48,7 +48,9 @@ def as_batch(array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
     return tensor[None] if tensor.ndim == axes else tensor
 
 
-def inputs_of(gaussians: Gaussians, camera: Camera, opacity_factors: torch.Tensor | None = None) -> ProjectInputs:
+def inputs_of(
+    gaussians: Gaussians | ActivatedGaussians, camera: Camera, opacity_factors: torch.Tensor | None = None
+) -> ProjectInputs:
     """Return the tensors of a render; the camera's are brought to the type and device of ``gaussians.means``.
 
     Args:
@@ -149,7 +151,7 @@ def images_of(
         deterministic: True to sum gradients in a fixed order.
         colors: Channels of each Gaussian, shape [1, N, D] or [C, N, D]; None for their own colours.
     """
-    named = {"deterministic": deterministic, **settings.of_window()}
+    named = {"deterministic": deterministic, "absgrad": settings.absgrad, **settings.of_window()}
     if colors is None:
         return blend(projected, tiles, backgrounds, **named)
     return blend_channels(projected, tiles, colors, backgrounds, **named)

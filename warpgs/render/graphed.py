@@ -15,7 +15,6 @@ import weakref
 
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from warpgs.kernels import blend, project
 from warpgs.kernels.cameras.base import CAMERA_MODELS
@@ -26,6 +25,7 @@ from warpgs.render.settings import RenderSettings
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import Allocator, fetch
 from warpgs.runtime.cuda_graph import MIN_REPLAYS, GraphedFunction, GraphPool
+from warpgs.runtime.derivatives import first_order
 from warpgs.runtime.device_memory import available_bytes
 
 MIN_CALLS = 3
@@ -179,17 +179,6 @@ class GraphedRasterizer:
         return *found, None, None
 
 
-def _once(backward):
-    """Wrap a backward function as torch's `once_differentiable` does, but only where a gradient of it is possible."""
-    checked = once_differentiable(backward)
-
-    @functools.wraps(backward)
-    def once(ctx, *gradients):
-        return (checked if torch.is_grad_enabled() else backward)(ctx, *gradients)
-
-    return once
-
-
 class _Projected(torch.autograd.Function):
     """The projected Gaussians as an autograd result of the seven tensors."""
 
@@ -201,7 +190,7 @@ class _Projected(torch.autograd.Function):
         return projection[0]
 
     @staticmethod
-    @_once
+    @first_order
     def backward(ctx, v_projected):
         wants_camera = ctx.needs_input_grad[8] or ctx.needs_input_grad[9]  # viewmats and Ks
         return None, None, None, *ctx.rasterizer.project_gradients(ctx.saved_tensors, v_projected, wants_camera)
@@ -219,7 +208,7 @@ class _Blended(torch.autograd.Function):
         return tuple(images)
 
     @staticmethod
-    @_once
+    @first_order
     def backward(ctx, *v_images):
         return *ctx.rasterizer.blend_gradients(ctx.saved_tensors, v_images, ctx.needs_input_grad[1]), None, None, None, None
 

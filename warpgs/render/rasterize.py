@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 
 from warpgs.constants import RULES, Rule
 from warpgs.errors import UsageError
+from warpgs.kernels.blend_records import WIDTHS
 from warpgs.kernels.cameras.base import check_camera
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs
@@ -27,7 +28,8 @@ from warpgs.render.compose import (
 )  # fmt: skip
 from warpgs.render.settings import RenderSettings, Window
 from warpgs.runtime import interop
-from warpgs.scene import Camera, Gaussians, Render
+from warpgs.runtime.derivatives import refuse_transforms
+from warpgs.scene import ActivatedGaussians, Camera, Gaussians, Render
 
 TILE_SIZES = (8, 16)
 """Sides of a tile that the kernels can be made for [px]."""
@@ -62,6 +64,9 @@ class RasterizeOptions:
     """Bytes that the (Gaussian, tile) instances may take; None for four fifths of the free memory."""
     deterministic: bool = True
     """True to sum gradients in a fixed order, so that the same inputs give the same bits. False takes less memory on CUDA."""
+    absgrad: bool = False
+    """True to sum magnitudes of the gradients of projected means over pixels, too: ``Render.means2d.absgrad``. At most 11
+    channels of ``colors``, and no ``features``. Such calls are not captured as CUDA graphs."""
     opacity_factors: torch.Tensor | None = None
     """Factors of the opacities, at least 0, shape [N]; 0 hides a Gaussian. None for 1. Not differentiable."""
     capacity: int | None = None
@@ -82,11 +87,11 @@ class RasterizeOptions:
     def repeatable(self) -> bool:
         """Return whether calls with these options may be captured as CUDA graphs."""
         others = (self.colors, self.features, self.opacity_factors, self.memory_budget, self.capacity, self.max_instances)
-        plain = self.record and self.deterministic and not self.contributions and not self.median_depth
+        plain = self.record and self.deterministic and not (self.contributions or self.median_depth or self.absgrad)
         return plain and all(o is None for o in others)
 
 
-ARGUMENTS = (Gaussians, Camera, RasterizeOptions)
+ARGUMENTS = ((Gaussians, ActivatedGaussians), (Camera,), (RasterizeOptions,))
 """Types of the arguments of `rasterize`."""
 
 
@@ -102,25 +107,31 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
     if options.tile_size not in TILE_SIZES:
         raise UsageError(f"tile size {options.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
     check_camera(camera)
+    channels = 0 if options.colors is None else options.colors.shape[-1]
+    if options.absgrad and (options.features is not None or channels > WIDTHS[-1]):
+        raise UsageError(f"absgrad takes at most {WIDTHS[-1]} channels in colors and no features: render those in another call")
     if options.max_instances is not None and (options.capacity is not None or options.max_instances < 1):
         raise UsageError("max_instances must be at least 1 and does not go with a capacity")
     return rule
 
 
-def _check_arguments(gaussians: Gaussians, camera: Camera, options: RasterizeOptions) -> None:
+def _check_arguments(gaussians: Gaussians | ActivatedGaussians, camera: Camera, options: RasterizeOptions) -> None:
     """Check types, and the shapes of the camera; those of other tensors are checked where they are used.
 
     Nothing is read from the device: values are not checked, and a Gaussian that is not finite is culled.
 
     Raises:
         TypeError: An argument, or the size of the image, is of another type.
-        UsageError: A background has nothing before it.
+        UsageError: A background has nothing before it, or Gaussians have no colours.
         ValueError: A shape is another.
     """
-    for name, given, kind in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
-        if not isinstance(given, kind):
+    for name, given, kinds in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
+        if not isinstance(given, kinds):
             order = "the order is rasterize(gaussians, camera, options)"
-            raise TypeError(f"{name} must be of {kind.__name__}, not {type(given).__name__}; {order}")
+            wanted = " or ".join(kind.__name__ for kind in kinds)
+            raise TypeError(f"{name} must be of {wanted}, not {type(given).__name__}; {order}")
+    if gaussians.sh is None and options.colors is None:
+        raise UsageError("gaussians have no sh: give sh=..., or RasterizeOptions(colors=...)")
     for name, tensor in gaussians.tensors().items():
         if not isinstance(tensor, torch.Tensor):
             raise TypeError(f"{name} must be a tensor, not {type(tensor).__name__}; torch.as_tensor makes one")
@@ -134,7 +145,7 @@ def _check_arguments(gaussians: Gaussians, camera: Camera, options: RasterizeOpt
             raise TypeError(f"camera.{name} must be a whole number of pixels, not {size!r}")
     if options.feature_background is not None and options.features is None:
         raise UsageError("feature_background is behind features: give features=..., too, or leave it out")
-    sh = gaussians.sh
+    sh = gaussians.tensors()["sh"]
     if sh.ndim != 3 or sh.shape[1] != (gaussians.sh_degree + 1) ** 2:
         raise ValueError(f"sh must have shape [N, K, 3], where K is 1, 4, 9 or 16, not {list(sh.shape)}")
 
@@ -192,36 +203,45 @@ def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: Proj
     return _Layer(colors, values.expand(len(like), channels) if values.ndim == 1 else values)
 
 
-def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = RasterizeOptions()) -> Render:
+def rasterize(
+    gaussians: Gaussians | ActivatedGaussians, camera: Camera, options: RasterizeOptions = RasterizeOptions()
+) -> Render:
     """Render Gaussians as one camera, or each camera of a batch, sees them.
 
     Differentiable in the five tensors of ``gaussians``, in ``camera.viewmat`` and ``camera.K`` where those are tensors that
     require gradients, and in the colours, features and backgrounds of ``options``. Float32 or float64, CPU or CUDA, as the
     tensors are; the same inputs give the same bits every time, unless ``options.deterministic`` is False. Cameras and
-    backgrounds are moved to the type and device of ``gaussians.means``.
+    backgrounds are moved to the type and device of ``gaussians.means``. There are no second derivatives, torch.func is refused,
+    and torch.compile breaks its graph here.
 
     Args:
-        gaussians: The scene, N Gaussians.
+        gaussians: N Gaussians: by log scales and logits (`Gaussians`), or by scales and opacities (`ActivatedGaussians`).
         camera: One camera ([4, 4], [3, 3]) or C of them ([C, 4, 4], [C, 3, 3]).
         options: Options.
 
     Returns:
-        The images, without a leading axis for a single camera. To get gradients of the projected means, call
-        ``render.projected.retain_grad()`` before the backward pass: they are ``render.projected.grad[..., :2]``.
+        The images, without a leading axis for a single camera. ``render.means2d``, read before the backward
+        pass, holds the gradients of the projected means after it.
 
     Raises:
         ResourceError: The Gaussians touch more tiles than memory allows.
         TypeError: An argument is of another type; a scalar type is neither float32 nor float64, or they differ.
-        UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, or options exclude each
-            other.
+        UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, options exclude each
+            other, a transform of torch.func is active, or a second derivative is asked for.
         ValueError: A shape or device disagrees; the message names argument, wanted and found.
     """
+    if torch.compiler.is_dynamo_compiling():
+        torch._dynamo.graph_break(msg="rasterize runs outside of compiled graphs: leave out fullgraph=True")
+        eager: Render = torch.compiler.disable(rasterize)(gaussians, camera, options)
+        return eager
+    refuse_transforms()
     _check_arguments(gaussians, camera, options)
     rule = _checked_rule(camera, options)
     inputs = inputs_of(gaussians, camera, options.opacity_factors)
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
     degree = degree if options.colors is None else 0  # as little as can be of what is not shown
-    settings = settings_of(camera, degree, rule, window=_checked_window(camera, options), tile_size=options.tile_size)
+    named = {"window": _checked_window(camera, options), "tile_size": options.tile_size, "absgrad": options.absgrad}
+    settings = settings_of(camera, degree, rule, activated=isinstance(gaussians, ActivatedGaussians), **named)
     colors = _checked_channels("colors", options.colors, inputs)
     features = _checked_channels("features", options.features, inputs)
     if inputs.means.is_cuda and options.repeatable():
@@ -233,7 +253,8 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
     if features is not None:
         layers.append(_layer("feature_background", options.feature_background, features, inputs))
     *found, features_found, median = _rasterize(inputs, layers, settings, options)
-    return _as_render(camera, *found, features=features_found, median_depth=median)
+    render = _as_render(camera, *found, features=features_found, median_depth=median)
+    return replace(render, absgrad=options.absgrad)
 
 
 def _rasterize(
@@ -270,4 +291,6 @@ def _as_render(camera: Camera, images: tuple[torch.Tensor, ...], *rest: Any, **m
     def own(image: torch.Tensor) -> torch.Tensor:
         return image.squeeze(0) if single else image  # not image[0], whose gradient would be a copy among zeros
 
-    return Render(*map(own, images), *rest, **{name: own(image) for name, image in maps.items() if image is not None})
+    shaped: dict[str, Any] = {name: own(image) for name, image in maps.items() if image is not None}
+    rgb, alpha, depth = map(own, images)
+    return Render(rgb, alpha, depth, *rest, **shaped)
