@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from warpgs.constants import RULES, Rule
+from warpgs.constants import Rule
 from warpgs.errors import UsageError
 from warpgs.kernels.cameras.base import check_camera
 from warpgs.kernels.project import project_inputs
@@ -26,6 +26,7 @@ from warpgs.render.compose import (
     weights_of,
 )  # fmt: skip
 from warpgs.render.settings import RenderSettings, Window
+from warpgs.rules import rule_named
 from warpgs.runtime import interop
 from warpgs.scene import Camera, Gaussians, Render
 
@@ -38,7 +39,7 @@ class RasterizeOptions:
     """Options of `rasterize`; the defaults are exact."""
 
     rule: str | Rule = "exact"
-    """Cut-offs: exact, balanced, fast (docs/trade.md), gsplat, inria, or a `Rule` of your own."""
+    """Cut-offs: exact, balanced, fast (docs/trade.md), gsplat-1.6, gsplat-1.5, inria, or a `Rule` of your own."""
     sh_degree: int | None = None
     """Spherical-harmonics degree used; None for all that is stored."""
     background: torch.Tensor | None = None
@@ -96,9 +97,7 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
     Raises:
         UsageError: The rule, the tile size or the camera model is unknown, or options exclude each other.
     """
-    rule = options.rule if isinstance(options.rule, Rule) else RULES.get(options.rule)
-    if rule is None:
-        raise UsageError(f"unknown rule {options.rule!r}: choose one of {', '.join(RULES)}, or give a Rule")
+    rule = options.rule if isinstance(options.rule, Rule) else rule_named(options.rule)
     if options.tile_size not in TILE_SIZES:
         raise UsageError(f"tile size {options.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
     check_camera(camera)
