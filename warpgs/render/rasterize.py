@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,6 +33,11 @@ from warpgs.scene import Camera, Gaussians, Render
 TILE_SIZES = (8, 16)
 """Sides of a tile that the kernels can be made for [px]."""
 
+BOUND_ROUNDING = 2.0**-29
+"""Largest rounding error of a float64 render, as a fraction of the largest colour. If every alpha is off by a fraction e, a
+colour is off by at most 2 e: an alpha moves its weight between its own colour and those behind, and the weights sum to 1. The
+unit of float64 is 2^29 times finer than that of float32, so e is at most 2^-30 where float32 knows alpha within a half."""
+
 
 @dataclass(frozen=True)
 class RasterizeOptions:
@@ -59,6 +64,10 @@ class RasterizeOptions:
     """True to report sum and maximum of each Gaussian's blending weight, too."""
     median_depth: bool = False
     """True to render the depth at which transmittance falls to one half, too."""
+    error_bound: bool = False
+    """True to bound the error of ``rgb`` against rule `exact`, too: for each pixel the distance of this render from one under
+    `exact` in float64, plus the rounding of float64. So it covers cut-offs and float32 together. It costs a render in float64,
+    several times the time of one in float32 (docs/trade.md). Not with ``capacity``."""
     memory_budget: int | None = None
     """Bytes that the (Gaussian, tile) instances may take; None for four fifths of the free memory."""
     deterministic: bool = True
@@ -76,14 +85,14 @@ class RasterizeOptions:
     gradients. That is the same image in less memory and more time. None for all at once. Not with ``capacity``."""
     record: bool = True
     """True to let CUDA graphs replay the calls that a loop repeats: the same bits in half the time. It applies to small calls
-    with gradients in a fixed order, without colors, features, opacity factors, contributions, median depth and limits
-    (docs/decisions/010-recorded-calls.md). Choose False where other threads wait for the whole device, as
+    with gradients in a fixed order, without colors, features, opacity factors, contributions, median depth, error bound and
+    limits (docs/decisions/010-recorded-calls.md). Choose False where other threads wait for the whole device, as
     torch.cuda.synchronize does."""
 
     def repeatable(self) -> bool:
         """Return whether calls with these options may be captured as CUDA graphs."""
         others = (self.colors, self.features, self.opacity_factors, self.memory_budget, self.capacity, self.max_instances)
-        plain = self.record and self.deterministic and not self.contributions and not self.median_depth
+        plain = self.record and self.deterministic and not (self.contributions or self.median_depth or self.error_bound)
         return plain and all(o is None for o in others)
 
 
@@ -103,6 +112,8 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
     check_camera(camera)
     if options.max_instances is not None and (options.capacity is not None or options.max_instances < 1):
         raise UsageError("max_instances must be at least 1 and does not go with a capacity")
+    if options.error_bound and options.capacity is not None:
+        raise UsageError("error_bound reads sizes from the device, which a capacity forbids: leave out one of them")
     return rule
 
 
@@ -232,7 +243,28 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
     if features is not None:
         layers.append(_layer("feature_background", options.feature_background, features, inputs))
     *found, features_found, median = _rasterize(inputs, layers, settings, options)
-    return _as_render(camera, *found, features=features_found, median_depth=median)
+    render = _as_render(camera, *found, features=features_found, median_depth=median)
+    if options.error_bound:
+        return replace(render, error_bound=_error_bound(render.rgb.detach(), gaussians, camera, options))
+    return render
+
+
+@torch.no_grad()
+def _error_bound(rgb: torch.Tensor, gaussians: Gaussians, camera: Camera, options: RasterizeOptions) -> torch.Tensor:
+    """Return the bound of the error of colours [..., H, W, D], shape [..., H, W]; see `RasterizeOptions.error_bound`."""
+
+    def doubled(holder: Any) -> dict[str, Any]:
+        values = {f.name: getattr(holder, f.name) for f in fields(holder)}
+        return {n: v.double() if isinstance(v, torch.Tensor) else v for n, v in values.items()}
+
+    only_rgb = {"features": None, "feature_background": None, "contributions": False, "median_depth": False}
+    reference = RasterizeOptions(**doubled(options) | only_rgb | {"rule": "exact", "error_bound": False, "record": False})
+    found = rasterize(Gaussians(**doubled(gaussians)), Camera(**doubled(camera)), reference)
+    colors = found.projected[..., 6:9] if reference.colors is None else reference.colors
+    background = found.rgb.new_zeros(1) if reference.background is None else torch.as_tensor(reference.background).to(found.rgb)
+    largest = torch.cat([colors.reshape(-1), background.reshape(-1)]).abs().amax()
+    bound = (rgb - found.rgb).abs().amax(-1) + BOUND_ROUNDING * largest
+    return torch.nextafter(bound.to(rgb.dtype), torch.full_like(bound, torch.inf, dtype=rgb.dtype))
 
 
 def _rasterize(
