@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from warpgs.constants import Rule
-from warpgs.errors import UsageError
+from warpgs.errors import ResourceError, UsageError
 from warpgs.kernels.cameras.base import check_camera
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs
@@ -28,6 +28,7 @@ from warpgs.render.compose import (
 from warpgs.render.settings import RenderSettings, Window
 from warpgs.rules import rule_named
 from warpgs.runtime import interop
+from warpgs.runtime.device_memory import available_bytes, installed_bytes
 from warpgs.scene import Camera, Gaussians, Render
 
 TILE_SIZES = (8, 16)
@@ -96,6 +97,8 @@ class RasterizeOptions:
         return plain and all(o is None for o in others)
 
 
+K_TOLERANCE = 1e-5
+"""Largest error of the fixed entries of K. It moves the pixels of an image of 2000 px by 0.02 px."""
 ARGUMENTS = (Gaussians, Camera, RasterizeOptions)
 """Types of the arguments of `rasterize`."""
 
@@ -120,12 +123,13 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
 def _check_arguments(gaussians: Gaussians, camera: Camera, options: RasterizeOptions) -> None:
     """Check types, and the shapes of the camera; those of other tensors are checked where they are used.
 
-    Nothing is read from the device: values are not checked, and a Gaussian that is not finite is culled.
+    Nothing is read from a GPU: a K there is taken as it is, other values are not checked, and a Gaussian that is not finite is
+    culled.
 
     Raises:
         TypeError: An argument, or the size of the image, is of another type.
         UsageError: A background has nothing before it.
-        ValueError: A shape is another.
+        ValueError: A shape is another, or K has a skew or another last row than 0, 0, 1.
     """
     for name, given, kind in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
         if not isinstance(given, kind):
@@ -138,6 +142,14 @@ def _check_arguments(gaussians: Gaussians, camera: Camera, options: RasterizeOpt
         shape = tuple(np.shape(getattr(camera, name)))
         if len(shape) not in (2, 3) or shape[-2:] != (rows, rows):
             raise ValueError(f"camera.{name} must have shape [{rows}, {rows}] or [C, {rows}, {rows}], not {list(shape)}")
+    K = camera.K
+    if not (isinstance(K, torch.Tensor) and K.is_cuda):
+        fixed = torch.as_tensor(K)[..., (0, 1, 2, 2, 2), (1, 0, 0, 1, 2)] - torch.tensor([0, 0, 0, 0, 1])
+        if not bool((fixed.abs() <= K_TOLERANCE).all()):
+            raise ValueError(
+                "camera.K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: skew is not rendered; divide K by K[2, 2], and "
+                "undistort images with skew"
+            )
     for name in ("width", "height"):
         size = getattr(camera, name)
         if not isinstance(size, (int, np.integer)):
@@ -180,6 +192,20 @@ def _checked_channels(name: str, values: torch.Tensor | None, inputs: ProjectInp
     return values if values.ndim == 3 else values[None]
 
 
+def _check_memory(window: Window, layers: list[_Layer], like: torch.Tensor) -> None:
+    """Raise ResourceError where the images [C, H, W, D] of the layers need more memory than the device of ``like`` has free."""
+    channels = sum(layer.backgrounds.shape[1] + 4 for layer in layers)  # and alpha, depth, transmittance, sum of weights
+    needed = len(layers[0].backgrounds) * window[2] * window[3] * channels * like.element_size()
+    if needed < installed_bytes(like.device) // 20:  # asking for what is free takes 0.1 ms
+        return
+    free = available_bytes(like.device)
+    if needed > free:
+        raise ResourceError(
+            f"images of {window[2]} x {window[3]} px need {needed:,} bytes, and {free:,} are free on {like.device}: render "
+            "smaller images, fewer cameras at once, or parts of an image by RasterizeOptions(window=...)"
+        )
+
+
 class _Layer(NamedTuple):
     """Values that are blended into one image."""
 
@@ -220,11 +246,12 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
         ``render.projected.retain_grad()`` before the backward pass: they are ``render.projected.grad[..., :2]``.
 
     Raises:
-        ResourceError: The Gaussians touch more tiles than memory allows.
+        ResourceError: The images, or the tiles that the Gaussians touch, need more memory than there is.
         TypeError: An argument is of another type; a scalar type is neither float32 nor float64, or they differ.
         UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, or options exclude each
             other.
-        ValueError: A shape or device disagrees; the message names argument, wanted and found.
+        ValueError: A shape or device disagrees; the message names argument, wanted and found. Or ``camera.K``, unless it is on
+            a GPU, has a skew or another last row than 0, 0, 1.
     """
     _check_arguments(gaussians, camera, options)
     rule = _checked_rule(camera, options)
@@ -242,6 +269,7 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
     layers = [_layer("background", options.background, colors, inputs)]
     if features is not None:
         layers.append(_layer("feature_background", options.feature_background, features, inputs))
+    _check_memory(settings.window, layers, inputs.means)
     *found, features_found, median = _rasterize(inputs, layers, settings, options)
     render = _as_render(camera, *found, features=features_found, median_depth=median)
     if options.error_bound:
