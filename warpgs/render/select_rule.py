@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import torch
@@ -16,8 +16,8 @@ FASTEST_FIRST = ("fast", "balanced", "exact")
 """Rules to choose from; each skips all that the next one skips, and more."""
 DEFAULTS = RasterizeOptions()
 """Options where none are given."""
-MEASURES = {"mean": torch.mean, "max": torch.amax}
-"""What is taken of the pixels of a view."""
+MEASURES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {"mean": torch.mean, "max": torch.amax}
+"""Reductions over the pixels of a view, by name."""
 
 
 @torch.no_grad()
