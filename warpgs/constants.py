@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from warpgs.field_docs import document_fields
+
 ALPHA_CUT = 1.0 / 255.0
 """Smallest alpha that is blended: half of what an 8-bit channel resolves, doubled (Kerbl et al. 2023, renderer)."""
 
@@ -52,6 +54,7 @@ FRUSTUM_MARGIN = 0.15
 image with this margin: the factor 1.3 on tan(fov / 2) of Kerbl et al. 2023 for a centred principal point."""
 
 
+@document_fields
 @dataclass(frozen=True)
 class Rule:
     """A consistent set of cut-offs for projection and blending."""

@@ -10,6 +10,7 @@ import torch
 
 from warpgs.constants import Rule
 from warpgs.errors import ResourceError, UsageError
+from warpgs.field_docs import document_fields
 from warpgs.kernels.cameras.base import check_camera
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs
@@ -40,6 +41,7 @@ colour is off by at most 2 e: an alpha moves its weight between its own colour a
 unit of float64 is 2^29 times finer than that of float32, so e is at most 2^-30 where float32 knows alpha within a half."""
 
 
+@document_fields
 @dataclass(frozen=True)
 class RasterizeOptions:
     """Options of `rasterize`; the defaults are exact."""
