@@ -37,7 +37,7 @@ def test_help_describes_every_option(kind):
     """The class documentation has the field's name and at least 20 letters about it."""
     text = inspect.getdoc(kind)
     assert len(dataclasses.fields(kind)) >= 8
-    assert all(re.search(rf"^    {f.name}: \w.{20}", text, re.MULTILINE) for f in dataclasses.fields(kind))
+    assert all(re.search(rf"^    {f.name}: \w.{{20}}", text, re.MULTILINE) for f in dataclasses.fields(kind))
 
 
 def test_type_checkers_see_the_same_names():
