@@ -290,6 +290,9 @@ class Render:
     median_depth: torch.Tensor | None = None
     """z-depth [u] of the Gaussian at which transmittance falls to one half, shape [..., H, W]; 0 where alpha is below 1/2. No
     gradients flow into it; only where it was requested."""
+    error_bound: torch.Tensor | None = None
+    """Upper bound of the error of ``rgb`` against rule `exact`, over all channels, shape [..., H, W]; see
+    ``RasterizeOptions.error_bound``. No gradients flow into it; only where it was requested."""
     features: torch.Tensor | None = None
     """Channels of ``RasterizeOptions.features`` over their background, shape [..., H, W, D]; only where those were given."""
 

@@ -178,7 +178,7 @@ def same_image() -> str:
         body.append([size, *(f"{d:.1e}" for d in differences)])
     return f"""## The same image as gsplat
 
-Rule `gsplat` against gsplat {result["versions"]["gsplat"]}, {_where(result)}:
+Rule `gsplat-1.5` against gsplat {result["versions"]["gsplat"]}, {_where(result)}:
 
 {table(["degree, image", "mean difference", "largest", "largest relative difference of a gradient"], body)}
 How far images and gradients are from float64, line by line: [accuracy](accuracy.md).

@@ -8,6 +8,7 @@ from typing import NamedTuple, Self
 import torch
 
 from warpgs.constants import Rule
+from warpgs.errors import UsageError
 from warpgs.runtime import interop
 
 
@@ -67,9 +68,12 @@ def checked_factors(means: torch.Tensor, factors: torch.Tensor | None) -> torch.
 
     Raises:
         TypeError: The scalar types differ.
+        UsageError: A gradient of the factors would be recorded.
         ValueError: The shape or the device differs.
     """
     if factors is None:
         return means.new_empty(0)
     interop.check(means=(means, "N 3"), opacity_factors=(factors, "N"))
+    if factors.requires_grad and torch.is_grad_enabled():
+        raise UsageError("opacity_factors have no gradient: detach them, or multiply the opacities themselves")
     return factors.detach()

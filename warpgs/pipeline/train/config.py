@@ -9,7 +9,6 @@ import typing
 from dataclasses import dataclass, field
 from typing import Any
 
-from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.kernels.sh import MAX_DEGREE
 from warpgs.pipeline.model.init import InitConfig
@@ -26,6 +25,7 @@ from warpgs.pipeline.train.strategies.sampling_event import MethodConfig
 from warpgs.pipeline.train.view_modules.base import VIEW_MODULES, ViewModule, check_modules
 from warpgs.plugins import Registry
 from warpgs.priors.view_prior import PriorConfig
+from warpgs.rules import rule_named
 from warpgs.schema import SchemaError, anything, mapping, of_type
 
 
@@ -121,8 +121,7 @@ class FitConfig:
             raise UsageError(f"sh-degree must lie in [0, {MAX_DEGREE}], not {self.sh_degree}")
         if not 0 <= self.dropout < 1:
             raise UsageError(f"dropout must lie in [0, 1), not {self.dropout}")
-        if self.rule not in RULES:
-            raise UsageError(f"rule {self.rule!r} is not one of {', '.join(RULES)}")
+        rule_named(self.rule)
         color_of(self.background)
         check_terms(self.loss_terms)
         check_modules(self.view_modules)
