@@ -119,7 +119,8 @@ def _make_functions(real: type) -> SimpleNamespace:
         b = position[1] / position[2]
         count = int(RIM_SAMPLES)  # a loop, not sixteen copies
         for i in range(count):  # also beyond a fold the map may rise again
-            s = real(i + 1) / real(RIM_SAMPLES)
+            part = real(i + 1) / real(RIM_SAMPLES)
+            s = wp.sqrt(part / (one + (one - part) * (a * a + b * b)))  # evenly spaced in the squared sine of the angle
             d = lensed.distort(s * a, s * b, lens)
             if d.folded:
                 return False
