@@ -6,6 +6,7 @@ Functions that take tensors import torch when they are called, so that readers o
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -65,9 +66,20 @@ def check_pinhole(camera: Camera) -> None:
     """
     if camera.model != "pinhole":
         raise UsageError(
-            f"this needs pinhole cameras, and this camera is {camera.model!r}; read the scene with --lenses undistort, or "
-            "undistort the images first"
+            f"this works for pinhole cameras only, and this one is {camera.model!r}; read the scene with --lenses "
+            "undistort, or undistort the images first"
         )
+
+
+def pinhole_of(camera: Camera) -> Camera:
+    """Return the pinhole of the same pose, K and size, which renders without distortion; it sees less than a wide fisheye.
+
+    Raises:
+        UsageError: The camera is orthographic, or its model is known to the kernels alone.
+    """
+    if camera.model not in ("pinhole", "opencv", "fisheye"):
+        check_pinhole(camera)
+    return replace(camera, model="pinhole", distortion=None) if camera.model != "pinhole" else camera
 
 
 def matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Camera models outside of the kernels: positions in the camera to the image plane and back, as arrays or tensors.
 
-The image plane holds points (u, v) that K takes to pixels: x / z and y / z for a pinhole. The kernels have formulas of their own.
+The image plane holds points (u, v) that K takes to pixels: x / z and y / z for a pinhole. The kernels have formulas of
+their own.
 """
 
 from __future__ import annotations

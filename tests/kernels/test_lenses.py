@@ -186,7 +186,9 @@ def test_extremes_give_finite_numbers(model):
     for case in range(4):
         cam = lens_camera(model, cameras=1, dtype=torch.float32)
         if cam.distortion is not None:
-            cam = dataclasses.replace(cam, distortion=magnitudes(-6, 4, *cam.distortion.shape).abs() if case else cam.distortion)
+            cam = dataclasses.replace(
+                cam, distortion=magnitudes(-6, 4, *cam.distortion.shape).abs() if case else cam.distortion
+            )
         g, K = leaves(gaussians), cam.K.clone().requires_grad_()
         values = projected(g, dataclasses.replace(cam, K=K), RULES["exact"])
         drawn += int((values[..., 5] > 0).sum())

@@ -20,6 +20,7 @@ from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.strategies.sampling_event import scored
 from warpgs.pipeline.train.views import TrainingView, with_alpha
 from warpgs.priors.cache import cache_folder
+from warpgs.priors.pinhole_views import lens_depth, pinhole_view
 from warpgs.priors.view_prior import view_priors
 from warpgs.runtime.terminal import Detail
 from warpgs.scene import PointCloud, Prior, View
@@ -69,7 +70,10 @@ def prepare(
     @functools.cache
     def start() -> Start:
         progress("finding the first points")
-        found = initial_points(train, points, config.init, generator, usable, progress)
+        # what is searched for along lines is searched for in pinholes
+        found = initial_points([pinhole_view(v) for v in train], points, config.init, generator, usable, progress)
+        if found.depths is not None:
+            found = found._replace(depths=[lens_depth(v.camera, d) for v, d in zip(train, found.depths, strict=True)])
         return subsample(found, config.max_gaussians, generator)
 
     notes = []
