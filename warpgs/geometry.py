@@ -77,7 +77,7 @@ def pinhole_of(camera: Camera) -> Camera:
     Raises:
         UsageError: The camera is orthographic, or its model is known to the kernels alone.
     """
-    if camera.model not in ("pinhole", "opencv", "fisheye"):
+    if camera.model not in lenses.CENTRAL:
         check_pinhole(camera)
     return replace(camera, model="pinhole", distortion=None) if camera.model != "pinhole" else camera
 

@@ -91,9 +91,14 @@ def test_a_step_renders_by_the_views_own_camera(fit, captured):
 
 
 def test_a_step_in_chunks_renders_the_same(fit):
-    """Chunks count the tiles of each window by the same camera."""
+    """Chunks count the tiles of each window by the same camera; its coefficients move Gaussians by tiles."""
     whole, chunks = rendered_alone(fit, 1), rendered_alone(fit, 1, max_instances=20)
     assert torch.equal(whole, chunks)
+    camera = ring(1, 160, 128)[0]
+    for number in (1, -1):
+        c = bent(camera, (0.8 * number, 0.0, -0.8 * number, 0.0))
+        renders = [rasterize(three_gaussians(), c, RasterizeOptions(max_instances=most)) for most in (None, 20)]
+        assert torch.equal(renders[0].rgb, renders[1].rgb) and float(renders[0].alpha.max()) > 0.5
 
 
 def test_memory_is_planned_for_the_instances_of_the_model(fit):

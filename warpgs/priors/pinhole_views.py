@@ -25,11 +25,10 @@ def pinhole_view(view: View) -> View:
     camera = view.camera
     if camera.model == "pinhole":
         return view
-    lenses.check_known(camera.model)
-    if camera.model == "orthographic":
+    if camera.model not in lenses.CENTRAL:
         raise UsageError(
-            "depth is not searched for in orthographic views: start from points (--init.source points) with --strategy "
-            "clone_split or mcmc"
+            f"depth is not searched for in views of the camera model {camera.model!r}: start from points (--init.source points), "
+            "with --strategy clone_split or mcmc"
         )
     maps = _lens_pixels(camera) - 0.5  # OpenCV's pixel centres are at whole numbers
     shape = (camera.height, camera.width)

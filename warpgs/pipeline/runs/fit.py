@@ -16,6 +16,7 @@ from warpgs.errors import DataError, NotFiniteError, UsageError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.splits import Split, check_spec
+from warpgs.lenses import CENTRAL
 from warpgs.pipeline.metrics.evaluate import options_for, render_view
 from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.metrics.moved import Rendered, moved_fractions, moved_notes
@@ -298,7 +299,7 @@ def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict
     names = image_names(v.name for v in scene.views)
     scored, tell = (job.out, gaussians, train, test, c.rule, scene.background), job.progress
     metrics = evaluate_run(*scored, job.lpips, trainer.context.max_instances, names=names, tell=tell)
-    if test:
+    if test and all(v.camera.model in CENTRAL for v in (*train, *test)):
         metrics["coverage"] = coverage_of_run(*scored, trainer.context.max_instances, names=names, tell=tell)
     tell("comparing renders with float64")
     rule = rule_report_of(

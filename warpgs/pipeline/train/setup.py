@@ -70,8 +70,9 @@ def prepare(
     @functools.cache
     def start() -> Start:
         progress("finding the first points")
-        # what is searched for along lines is searched for in pinholes
-        found = initial_points([pinhole_view(v) for v in train], points, config.init, generator, usable, progress)
+        # what is searched for along lines is searched for in pinholes; given points need no search
+        views = train if config.init.source == "points" else [pinhole_view(v) for v in train]
+        found = initial_points(views, points, config.init, generator, usable, progress)
         if found.depths is not None:
             found = found._replace(depths=[lens_depth(v.camera, d) for v, d in zip(train, found.depths, strict=True)])
         return subsample(found, config.max_gaussians, generator)
