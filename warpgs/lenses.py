@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 MODELS = ("pinhole", "orthographic", "opencv", "fisheye")
 """Camera models that are known here."""
 CENTRAL = ("pinhole", "opencv", "fisheye")
-"""Those with a centre of projection, for which a pinhole of the same K can stand."""
+"""Camera models with a centre of projection, for which a pinhole of the same K can stand."""
 NEWTON_STEPS = 30
 """Steps of Newton's method for a way back; five reach float64's last digits for usual lenses, more are bisections."""
 

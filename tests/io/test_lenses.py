@@ -11,15 +11,14 @@ from warpgs.geometry import project_points
 from warpgs.io.load import load_scene
 
 F, CX, CY = scenes.FOCAL, scenes.WIDTH / 2, scenes.HEIGHT / 2
+EIGHT = (0.1, -0.02, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06)
 COLMAP = {
     "SIMPLE_PINHOLE": ((F, CX, CY), "pinhole", ()),
     "PINHOLE": ((F, F, CX, CY), "pinhole", ()),
     "SIMPLE_RADIAL": ((F, CX, CY, 0.1), "opencv", (0.1,)),
     "RADIAL": ((F, CX, CY, 0.1, -0.02), "opencv", (0.1, -0.02)),
     "OPENCV": ((F, F, CX, CY, 0.1, -0.02, 0.01, 0.02), "opencv", (0.1, -0.02, 0.01, 0.02)),
-    "FULL_OPENCV": (
-        (F, F, CX, CY, 0.1, -0.02, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06), "opencv", (0.1, -0.02, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06),
-    ),
+    "FULL_OPENCV": ((F, F, CX, CY, *EIGHT), "opencv", EIGHT),
     "OPENCV_FISHEYE": ((F, F, CX, CY, 0.1, -0.02, 0.01, 0.02), "fisheye", (0.1, -0.02, 0.01, 0.02)),
     "SIMPLE_RADIAL_FISHEYE": ((F, CX, CY, 0.1), "fisheye", (0.1,)),
     "RADIAL_FISHEYE": ((F, CX, CY, 0.1, -0.02), "fisheye", (0.1, -0.02)),
@@ -90,7 +89,7 @@ def lenses_reach(camera) -> np.ndarray:
 def test_errors_name_the_way_to_keep_a_lens(tmp_path):
     """Undistorting stays the default; terms that no model here has are refused either way."""
     scenes.write_colmap(tmp_path / "a", model="OPENCV_FISHEYE", parameters=COLMAP["OPENCV_FISHEYE"][0])
-    with pytest.raises(DataError, match="OPENCV_FISHEYE is not supported.*or fit with --lenses native"):
+    with pytest.raises(DataError, match=r"OPENCV_FISHEYE is not supported.*or fit with --lenses native"):
         load_scene(tmp_path / "a")
     for values, message in (
         ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE is not supported.*or fit them with --lenses native"),

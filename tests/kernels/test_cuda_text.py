@@ -3,7 +3,8 @@
 import pytest
 import warp as wp
 
-from warpgs.kernels import blend_channels, blend_cuda, median_depth
+from warpgs.kernels import blend_channels, blend_cuda, median_depth, project
+from warpgs.kernels.cameras.base import CAMERA_MODELS
 from warpgs.pipeline.runs.precompile import fit_kernels
 
 ARCHITECTURE = 75
@@ -17,6 +18,8 @@ def modules() -> dict[str, wp.Module]:
     for channels in blend_channels.WIDTHS:
         kernels += [blend_cuda.make_forward(8, save, per, channels) for save in (True, False) for per in (1, 2)]
         kernels += [blend_cuda.make_backward(8, depth, 64, True, channels).backward for depth in (True, False)]
+    for model in CAMERA_MODELS.names():
+        kernels += [project.make_forward(wp.float32, True, model), project.make_backward(wp.float32, True, model)]
     return {k.module.name: k.module for k in kernels}
 
 

@@ -27,8 +27,8 @@ def pinhole_view(view: View) -> View:
         return view
     if camera.model not in lenses.CENTRAL:
         raise UsageError(
-            f"depth is not searched for in views of the camera model {camera.model!r}: start from points (--init.source points), "
-            "with --strategy clone_split or mcmc"
+            f"searching for depth and coverage need pinholes, which cannot stand for the camera model {camera.model!r}: start "
+            "from points (--init.source points), with --strategy clone_split or mcmc"
         )
     maps = _lens_pixels(camera) - 0.5  # OpenCV's pixel centres are at whole numbers
     shape = (camera.height, camera.width)
@@ -71,7 +71,7 @@ def lens_depth(camera: Camera, found: ViewDepth) -> ViewDepth:
 
 
 def _lens_pixels(camera: Camera) -> np.ndarray:
-    """Return the pixels [H * W, 2] of the lens that show what a pinhole of the same K shows at each of its own; far off if none."""
+    """Return the pixels [H * W, 2] of the lens that show the same as the pixels of a pinhole of its K; far off if none do."""
     plane = (pixel_grid(camera) - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
     positions = np.concatenate([plane, np.ones((len(plane), 1))], 1)
     with np.errstate(all="ignore"):

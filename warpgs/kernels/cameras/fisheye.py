@@ -10,7 +10,7 @@ from warpgs.kernels.cameras.base import CameraModel, register
 from warpgs.kernels.cameras.linear import make_linear
 
 ANTIPODE = 1e-3
-"""Sine of the angle from the backward axis below which nothing is drawn: there the image of a point is a circle."""
+"""Sine of the angle from the backward axis below which nothing is rendered: there the image of a point is a circle."""
 NEAR_AXIS = 0.04
 """Squared tangent of the angle from the axis below which series replace quotients that would cancel."""
 TERMS = 12
