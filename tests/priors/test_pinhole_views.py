@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -43,6 +44,27 @@ def test_a_lens_view_becomes_that_of_a_pinhole_and_back(model):
     # where neighbouring pixels show one depth; the nearest pixel is taken
     assert both.mean() > 0.3 and np.median(np.abs(back.depth / shown.depth.numpy() - 1)[both]) < 0.01
     assert not back.depth[~back.valid].any() and np.isinf(back.sensitivity[~back.valid]).all()
+
+
+@pytest.mark.parametrize("model", ["opencv", "fisheye"])
+def test_depth_moves_with_its_pixel(model):
+    """Each pixel of the lens has the depth of the pinhole's pixel that OpenCV names, a fisheye as distance."""
+    cam = arrays(lens_camera(model, width=120, height=90))
+    x, y = np.meshgrid(np.arange(120) + 0.5, np.arange(90) + 0.5)
+    ramp = (1 + x / 120 + y / 30).astype(np.float32)
+    back = lens_depth(cam, ViewDepth(ramp, np.ones((90, 120), bool), ramp))
+    undistort = cv2.fisheye.undistortPoints if model == "fisheye" else cv2.undistortPoints
+    rays = undistort(np.stack([x, y], -1).reshape(-1, 1, 2), cam.K, cam.distortion)[:, 0]
+    u, v = (rays * np.diag(cam.K)[:2] + cam.K[:2, 2]).T
+    inside = (u > 0.01) & (v > 0.01) & (u < 119.99) & (v < 89.99)
+    wanted = 1 + (np.floor(u) + 0.5) / 120 + (np.floor(v) + 0.5) / 30
+    if model == "fisheye":
+        wanted *= np.hypot(1, np.linalg.norm(rays, axis=1))
+    moved = np.abs(wanted.reshape(90, 120) - ramp)[inside.reshape(90, 120)]
+    error = np.abs(back.depth.ravel() - wanted)[inside & back.valid.ravel()]
+    # rounding may floor a few pixels to a neighbour, an iteration of OpenCV's ends at 0.01 px
+    assert moved.mean() > 0.01 and (error < 1e-5).mean() > 0.95 and error.max() < 0.1
+    assert inside.mean() > 0.7 and (back.valid.ravel() == inside).mean() > 0.97
 
 
 def test_pinholes_stay_and_parallel_rays_are_refused():
