@@ -10,7 +10,7 @@ import torch
 
 import warpgs
 from tests.io.scenes import save
-from tests.scenes import ring
+from tests.scenes import ring, seeds, three_gaussians
 from warpgs import lenses
 from warpgs.app.cli import main
 from warpgs.errors import UsageError
@@ -21,7 +21,8 @@ from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.setup import prepare
-from warpgs.scene import Camera
+from warpgs.render.rasterize import rasterize
+from warpgs.scene import Camera, Scene, View
 from warpgs.synthetic.demo import split_spec, write_demo
 
 LENS = ("OPENCV_FISHEYE", "fisheye", (2.0, 0, 0, 0))
@@ -96,6 +97,26 @@ def test_commands_know_the_lens_or_take_its_pinhole(run, tmp_path, capsys):
     assert "lenses with distortion, written as pinholes of the same K" in capsys.readouterr().out
     frame = json.loads((tmp_path / "transforms.json").read_text())["frames"][0]
     assert frame["fl_x"] == pytest.approx(camera.K[0, 0])
+
+
+@pytest.mark.slow
+def test_orthographic_views_are_fitted_from_points(tmp_path):
+    """With scores and a report; where a pinhole would be needed, the error says what to do."""
+    views = []
+    for i, c in enumerate(ring(8)):
+        K = np.concatenate([c.K[:, :2] / 2.2, c.K[:, 2:]], 1)
+        c = dataclasses.replace(c, K=K, model="orthographic")
+        views.append(View(f"{i}.png", c, rasterize(three_gaussians(), c).rgb.clamp(0, 1).numpy()))
+    scene = Scene("", "own", tuple(views), points=seeds())
+    options = {"device": "cpu", "verbose": False, "split": "every:4"}
+    result = warpgs.fit(scene, "3dgs", steps=60, init={"source": "points"}, out=tmp_path / "run", **options)
+    # 16.7 dB; 16.8 by pinholes
+    assert result.metrics["test"]["psnr"] > 16 and "coverage" not in result.metrics
+    assert result.metrics["rule"]["mean"] < 1e-5 and (tmp_path / "run" / "report.html").is_file()
+    with pytest.raises(UsageError, match=r"camera model 'orthographic': start from points \(--init.source points\)"):
+        warpgs.fit(scene, steps=2, **options)
+    with pytest.raises(UsageError, match="'orthographic'"):
+        warpgs.render_path(result, "turntable", out=tmp_path / "film", frames=2)
 
 
 def test_a_pinhole_in_place_of_a_lens():

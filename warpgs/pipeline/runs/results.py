@@ -93,7 +93,7 @@ def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
         lines = [
             f"held-out {score_line(metrics['test'])} over {len(metrics['views'])} views",
             *([f"  for comparison, without a fit: {best}"] if best else []),
-            f"  {metrics['coverage']['summary']}",
+            *([f"  {metrics['coverage']['summary']}"] if "coverage" in metrics else []),  # not of orthographic views
         ]
     else:
         lines = [NO_SCORES, f"training PSNR {metrics['train']['psnr']:.2f} dB"]
