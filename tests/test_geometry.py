@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from tests.gaussians import camera
+from tests.gaussians import camera, cloud
+from tests.lens_cameras import LENSES, lens_camera
 from warpgs import geometry
 from warpgs.errors import UsageError
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera
 
 
@@ -112,13 +114,31 @@ def test_gradient_of_normals():
     assert not bool(geometry.depth_normals(cam, depth[:2]).any())
 
 
+@pytest.mark.parametrize("model", LENSES)
+def test_points_come_back_from_lenses(model):
+    """Pixels and depths of the rasterizer, and back; behind a pinhole there is nothing to see."""
+    cam = lens_camera(model, width=40, height=30)
+    arrays = Camera(*(a if isinstance(a, int | str | None) else a.numpy() for a in vars(cam).values()))
+    points = np.random.default_rng(2).uniform(-1, 1, (50, 3)) + np.array([0, 0, 4])
+    pixels, depths = geometry.project_points(arrays, points)
+    gaussians = cloud(50, torch.float64)
+    drawn = rasterize(dataclasses.replace(gaussians, means=torch.from_numpy(points)), cam).projected[0]
+    shown = drawn[:, 5] > 0
+    assert shown.any() and np.allclose(drawn[shown][:, [0, 1, 9]], np.column_stack([pixels, depths])[shown], atol=1e-9)
+    assert np.allclose(geometry.back_project(arrays, pixels, depths), points, atol=1e-9)
+    found = geometry.back_project_tensors(cam, torch.from_numpy(pixels), torch.from_numpy(depths))
+    assert np.allclose(found.numpy(), points, atol=1e-9)
+    if model == "opencv":
+        assert geometry.project_points(arrays, -points)[1].tolist() == [0] * 50
+
+
 def test_other_camera_models_are_refused():
     """Their projection is known to the kernels alone: an error, not wrong points."""
     cam = camera()
-    arrays = Camera(cam.viewmat.numpy(), cam.K.numpy(), 18, 17, "orthographic")
-    with pytest.raises(UsageError, match="'orthographic'; undistort"):
+    arrays = Camera(cam.viewmat.numpy(), cam.K.numpy(), 18, 17, "own")
+    with pytest.raises(UsageError, match="'own'; undistort"):
         geometry.project_points(arrays, np.zeros((1, 3)))
     with pytest.raises(UsageError, match="undistort"):
         geometry.back_project(arrays, np.zeros((1, 2)), np.ones(1))
     with pytest.raises(UsageError, match="undistort"):
-        geometry.back_project_tensors(dataclasses.replace(cam, model="orthographic"), torch.zeros(1, 2), torch.ones(1))
+        geometry.back_project_tensors(dataclasses.replace(cam, model="own"), torch.zeros(1, 2), torch.ones(1))
