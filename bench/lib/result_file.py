@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 import shlex
 import subprocess
 import sys
@@ -113,6 +114,17 @@ def read(path: Path) -> dict:
     if missing:
         raise ValueError(f"{path}: no result, it has no {', '.join(missing)}; measure again or choose another file")
     return values
+
+
+def source(name: str) -> str:
+    """Return a line on a kept result for the pages: file, machine, commit, command without its output, note."""
+    values = read(FOLDER / f"{name}.json")
+    machine = "2 cores" if values["machine"]["device"] == "cpu" else values["machine"]["name"].removeprefix("NVIDIA ")
+    command = re.sub(r" --out [\w./]+", "", values["command"] or "")
+    fence = "``" if "`" in command else "`"
+    ran = f"{fence}{command}{fence}" if command else "command not kept"
+    note = f" {values['note']}" if values.get("note") else ""
+    return f"Source: `{name}.json`; {machine}; commit {values['commit'] or 'not kept'}; {ran}.{note}\n"
 
 
 def stored(kind: str) -> dict[str, dict]:
