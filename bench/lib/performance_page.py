@@ -18,6 +18,8 @@ WORDS = ("op", "program", "direction", "machine", "other", "Gaussians, image", "
 """Columns that hold words."""
 POINTS = (Point(10_000), Point(100_000), Point(1_000_000), Point(1_000_000, 1920, 1080))
 """Sizes of the table of renders and training steps."""
+WHOLE = (("render", "forward"), ("render", "both"), ("step", "step"))
+"""Ops and directions of that table."""
 
 
 def _name(result: dict) -> str:
@@ -70,9 +72,7 @@ def sizes_table(results: dict[str, dict]) -> str:
     body = []
     for point in POINTS:
         for result in results.values():
-            rows = [
-                _find(result, (op, OURS, d), point) for op, d in (("render", "forward"), ("render", "both"), ("step", "step"))
-            ]
+            rows = [_find(result, (op, OURS, direction), point) for op, direction in WHOLE]
             if any(rows):
                 size = f"{point.count:,}, {point.width} x {point.height}"
                 body.append([size, _name(result), *map(_timing, rows)])
@@ -113,14 +113,12 @@ def _roof(rows: list[dict], op: str, direction: str) -> str:
 
 def ops_table(results: dict[str, dict]) -> str:
     """Return time, memory and fraction of the roof of each of our tasks at the base size, by machine."""
-    every = dict.fromkeys(
-        (op, direction) for r in results.values() for op, program, direction in tasks(r["rows"]) if program == OURS
-    )
+    every = [task for result in results.values() for task in tasks(result["rows"]) if task[1] == OURS]
     head, body = ["op", "direction"], []
     for result in results.values():
         memory = [f"{_name(result)} [MiB]"] if result["machine"]["device"] == "cuda" else []
         head += [f"{_name(result)} [ms]", *memory, f"{_name(result)}: of the roof"]
-    for op, direction in every:
+    for op, _, direction in dict.fromkeys(every):
         cells = [op, direction]
         for result in results.values():
             row = _find(result, (op, OURS, direction), BASE)

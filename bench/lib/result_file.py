@@ -123,8 +123,9 @@ def source(name: str) -> str:
     command = re.sub(r" --out [\w./]+", "", values["command"] or "")
     fence = "``" if "`" in command else "`"
     ran = f"{fence}{command}{fence}" if command else "command not kept"
+    commit = values.get("commits", {}).get("new") or values["commit"] or "not kept"
     note = f" {values['note']}" if values.get("note") else ""
-    return f"Source: `{name}.json`; {machine}; commit {values['commit'] or 'not kept'}; {ran}.{note}\n"
+    return f"Source: `{name}.json`; {machine}; commit {commit}; {ran}.{note}\n"
 
 
 def stored(kind: str) -> dict[str, dict]:
