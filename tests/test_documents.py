@@ -81,7 +81,7 @@ def named_results(text: str) -> set[str]:
 
 
 def gone_presets(command: str) -> set[str]:
-    """Return the presets of a stored command that are gone; ``default:setting=value`` and ``pruned/default`` count as default."""
+    """Return the presets of a command that are gone; ``default:setting=value`` and ``pruned/default`` count as default."""
     names, taking = set(), False
     for word in command.split():
         if word.startswith("--"):
