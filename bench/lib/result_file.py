@@ -119,7 +119,8 @@ def read(path: Path) -> dict:
 def source(name: str) -> str:
     """Return a line on a kept result for the pages: file, machine, commit, command without its output, note."""
     values = read(FOLDER / f"{name}.json")
-    machine = "2 cores" if values["machine"]["device"] == "cpu" else values["machine"]["name"].removeprefix("NVIDIA ")
+    name = values["machine"]["name"].replace("(R)", "").removesuffix(" Processor").removeprefix("NVIDIA ")
+    machine = f"2 cores, {name}" if values["machine"]["device"] == "cpu" else name
     command = re.sub(r" --out [\w./]+", "", values["command"] or "")
     fence = "``" if "`" in command else "`"
     ran = f"{fence}{command}{fence}" if command else "command not kept"
