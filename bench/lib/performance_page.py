@@ -22,10 +22,6 @@ WHOLE = (("render", "forward"), ("render", "both"), ("step", "step"))
 """Ops and directions of that table."""
 
 
-def _name(result: dict) -> str:
-    return "2 cores" if result["machine"]["device"] == "cpu" else result["machine"]["name"].removeprefix("NVIDIA ")
-
-
 def _sources(kind: str, results: dict[str, dict]) -> str:
     return "\n" + "\n".join(result_file.source(f"{kind}_{stem}") for stem in results)
 
@@ -75,7 +71,7 @@ def sizes_table(results: dict[str, dict]) -> str:
             rows = [_find(result, (op, OURS, direction), point) for op, direction in WHOLE]
             if any(rows):
                 size = f"{point.count:,}, {point.width} x {point.height}"
-                body.append([size, _name(result), *map(_timing, rows)])
+                body.append([size, result_file.machine_name(result), *map(_timing, rows)])
     head = ["Gaussians, image", "machine", "render [ms]", "with gradients [ms]", "training step [ms]"]
     return markdown(head, body, WORDS)
 
@@ -116,8 +112,8 @@ def ops_table(results: dict[str, dict]) -> str:
     every = [task for result in results.values() for task in tasks(result["rows"]) if task[1] == OURS]
     head, body = ["op", "direction"], []
     for result in results.values():
-        memory = [f"{_name(result)} [MiB]"] if result["machine"]["device"] == "cuda" else []
-        head += [f"{_name(result)} [ms]", *memory, f"{_name(result)}: of the roof"]
+        memory = [f"{result_file.machine_name(result)} [MiB]"] if result["machine"]["device"] == "cuda" else []
+        head += [f"{result_file.machine_name(result)} [ms]", *memory, f"{result_file.machine_name(result)}: of the roof"]
     for op, _, direction in dict.fromkeys(every):
         cells = [op, direction]
         for result in results.values():
@@ -142,7 +138,7 @@ def peers_table(results: dict[str, dict]) -> str:
             mine = ours[r["op"], r["direction"], _key(r)]
             size = ", ".join(filter(None, _sizes(r, ["N", "image"])))
             cells = [program, _timing(r), _timing(mine), figure(r["median_ms"] / mine["median_ms"])]
-            body.append([_name(result), op, direction, size, *cells])
+            body.append([result_file.machine_name(result), op, direction, size, *cells])
     head = ["machine", "op", "direction", "Gaussians, image", "other", "other [ms]", "warpgs [ms]", "other / warpgs"]
     return markdown(head, body, WORDS)
 

@@ -116,11 +116,17 @@ def read(path: Path) -> dict:
     return values
 
 
+def machine_name(values: dict) -> str:
+    """Return the machine of a result in the words of the pages: ``2 cores``, ``H200``."""
+    return "2 cores" if values["machine"]["device"] == "cpu" else values["machine"]["name"].removeprefix("NVIDIA ")
+
+
 def source(name: str) -> str:
     """Return a line on a kept result for the pages: file, machine, commit, command without its output, note."""
     values = read(FOLDER / f"{name}.json")
-    name = values["machine"]["name"].replace("(R)", "").removesuffix(" Processor").removeprefix("NVIDIA ")
-    machine = f"2 cores, {name}" if values["machine"]["device"] == "cpu" else name
+    machine = machine_name(values)
+    if values["machine"]["device"] == "cpu":
+        machine += ", " + values["machine"]["name"].replace("(R)", "").removesuffix(" Processor")
     command = re.sub(r" --out [\w./]+", "", values["command"] or "")
     fence = "``" if "`" in command else "`"
     ran = f"{fence}{command}{fence}" if command else "command not kept"
